@@ -1,0 +1,212 @@
+"""The command line: list, run and compare problems.
+
+Exit codes: 0 finished; 2 bad input (names, values, a problem file, an option); 3 a folder or file cannot be written;
+4 the run ended early because a signal was not finite (`run` only; `compare` reports it); 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fpirhc.studies.compare import Comparison, Progress
+
+OK, BAD_INPUT, NOT_WRITABLE, ENDED_EARLY, INTERRUPTED = 0, 2, 3, 4, 130
+
+_EXAMPLES = """examples:
+  fpirhc list                                   shipped problems
+  fpirhc compare two_mass                       every controller of a problem, with a report
+  fpirhc compare my_arm.py --controllers RHC RHC+FPI --out results/arm
+  fpirhc compare two_mass --json                one JSON object on standard output
+  fpirhc run two_mass "RHC+FPI" --out results   one run, saved as .npz and .png
+
+exit codes: 0 finished, 2 bad input, 3 cannot write, 4 the run ended early (run only), 130 interrupted
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    options = _parser().parse_args(arguments)
+    from fpirhc.errors import FpirhcError, OutputError
+
+    try:
+        return int(options.command(options))
+    except OutputError as error:
+        return _complain(error, NOT_WRITABLE)
+    except FpirhcError as error:
+        return _complain(error, BAD_INPUT)
+    except KeyboardInterrupt:
+        return _complain("interrupted", INTERRUPTED)
+
+
+def _complain(error: object, code: int) -> int:
+    print(f"fpirhc: {error}", file=sys.stderr)
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="fpirhc",
+        description="Adaptive receding-horizon control by fixed-point iteration.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="store_true", help="print the version and exit")
+    parser.set_defaults(command=_no_command)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    _add_compare(commands)
+    _add_run(commands)
+    listing = commands.add_parser("list", help="list the shipped problems")
+    listing.set_defaults(command=_list)
+    return parser
+
+
+def _add_compare(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    command = commands.add_parser(
+        "compare",
+        help="run several controllers on one problem and write a report",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _add_common(command)
+    command.add_argument("--controllers", nargs="+", metavar="NAME", help="only these controllers (default: all)")
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
+    command.set_defaults(command=_compare)
+
+
+def _add_run(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    command = commands.add_parser(
+        "run",
+        help="run one controller and save every signal",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _add_common(command)
+    command.add_argument("controller", metavar="CONTROLLER", help="name of a controller in the problem file")
+    command.set_defaults(command=_run)
+
+
+def _add_common(command: argparse.ArgumentParser) -> None:
+    command.add_argument("problem", metavar="PROBLEM", help="name of a shipped problem, or path of a problem file")
+    command.add_argument("--out", metavar="FOLDER", help="where results are written (default: results/PROBLEM)")
+    command.add_argument("--seed", type=int, default=0, help="seed of the disturbances' noise (default: 0)")
+    command.add_argument("--no-compile", action="store_true", help="use CasADi's virtual machine even with a C compiler")
+
+
+def _no_command(options: argparse.Namespace) -> int:
+    if options.version:
+        from importlib.metadata import version
+
+        print(f"fpirhc {version('fpirhc')}")
+        return OK
+    _parser().print_help()
+    return OK
+
+
+def _list(options: argparse.Namespace) -> int:  # noqa: ARG001
+    from fpirhc.studies.problem_file import shipped_problems, title_of
+
+    for name, path in shipped_problems().items():
+        print(f"{name:20s} {title_of(path)}")
+    return OK
+
+
+def _compare(options: argparse.Namespace) -> int:
+    from fpirhc.report.html import write_report
+    from fpirhc.report.terminal import announce_backend, progress_bars, show
+    from fpirhc.studies.compare import compare
+    from fpirhc.studies.problem_file import load_problem
+
+    task = load_problem(options.problem)
+    folder = _folder(options, task.name)
+    with progress_bars() as progress:
+        comparison = compare(
+            task,
+            seed=options.seed,
+            controllers=options.controllers,
+            compiled=not options.no_compile,
+            command=_command(options),
+            progress=progress,
+        )
+    report = folder / "report.html"
+    write_report(comparison, report)
+    announce_backend(comparison)
+    if options.json:
+        from fpirhc.report.as_json import to_json
+
+        print(to_json(comparison))
+    else:
+        show(comparison, report)
+    return _comparison_code(comparison)
+
+
+def _comparison_code(comparison: Comparison) -> int:
+    if any(why.startswith("interrupted") for why in comparison.skipped.values()):
+        return INTERRUPTED
+    if not comparison.entries:
+        return BAD_INPUT
+    return OK
+
+
+def _run(options: argparse.Namespace) -> int:
+    from dataclasses import replace
+
+    from fpirhc.report.figures import save_figure
+    from fpirhc.report.terminal import progress_bars, show_run
+    from fpirhc.simulate import simulate
+    from fpirhc.studies.compare import select
+    from fpirhc.studies.problem_file import load_problem
+
+    task = load_problem(options.problem)
+    controller = select(task, [options.controller])[options.controller]
+    folder = _folder(options, task.name)
+    with progress_bars() as progress:
+        run = simulate(
+            task.problem,
+            controller,
+            seed=options.seed,
+            name=options.controller,
+            compiled=not options.no_compile,
+            progress=_named(progress, options.controller),
+        )
+    run = replace(run, problem=task.name)
+    stem = "".join(c if c.isalnum() else "_" for c in options.controller)
+    run.save(folder / f"{stem}.npz")
+    save_figure(run.plot(), folder / f"{stem}.png")
+    show_run(task.problem, run, folder / f"{stem}.npz")
+    return OK if run.stop is None else ENDED_EARLY
+
+
+def _named(progress: Progress, name: str):  # type: ignore[no-untyped-def]
+    return lambda done, total: progress(name, done, total)
+
+
+def _folder(options: argparse.Namespace, name: str) -> Path:
+    """Create the output folder before anything runs, so that a wrong path fails at once."""
+    from fpirhc.errors import OutputError
+
+    folder = Path(options.out) if options.out else Path("results") / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".fpirhc-probe"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise OutputError(f"cannot write to the folder '{folder}': {error.strerror}; choose another with --out") from None
+    return folder
+
+
+def _command(options: argparse.Namespace) -> str:
+    """The command that reproduces this comparison."""
+    import shlex
+
+    words = ["fpirhc", "compare", options.problem, "--seed", str(options.seed)]
+    if options.controllers:
+        words += ["--controllers", *options.controllers]
+    if options.no_compile:
+        words.append("--no-compile")
+    return shlex.join(words)

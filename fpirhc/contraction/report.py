@@ -1,0 +1,108 @@
+"""What a deformation with its gain will do on plants with a given spectrum."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fpirhc.contraction.gains import linear_limit, optimal_gain, predicted_factor, require_one_sign, sector_limit
+from fpirhc.contraction.spectrum import Spectrum
+from fpirhc.deformation.base import Deformation
+from fpirhc.errors import NotContractive
+
+SECTOR_SHARE = 0.8  # recommended gains keep this distance from the sector bound
+
+
+@dataclass(frozen=True)
+class ContractionReport:
+    """What a deformation will do on a plant with a given spectrum.
+
+    `linear_limit` and `sector_limit` are intervals of the effective gain, `own_linear_limit` and `own_sector_limit` the
+    same in the deformation's own gain (`gain_name`), and so is `recommended`. Within the sector limit no error is
+    large enough to start a bounded oscillation; between the two limits only small errors converge.
+    """
+
+    predicted: float
+    effective_gain: float
+    gain_name: str
+    linear_limit: tuple[float, float]
+    sector_limit: tuple[float, float]
+    own_linear_limit: tuple[float, float]
+    own_sector_limit: tuple[float, float]
+    recommended: float
+    within_sector: bool
+    text: str
+
+
+def check_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionReport:
+    """Return what the deformation will do on plants with these eigenvalues.
+
+    A gain between the sector and the linear limit is reported (`within_sector` False), not refused.
+
+    Raises:
+        NotContractive: real parts of both signs (no gain converges), a gain of the wrong sign, or one beyond the linear
+            limit; the message gives the admissible gains.
+    """
+    require_one_sign(spectrum)
+    gain = deformation.effective_gain()
+    if gain == 0:
+        raise NotContractive(f"{deformation} does not iterate, so there is no contraction to check; use Sigmoid(gain=...)")
+    linear = linear_limit(spectrum.eigenvalues)
+    sector = sector_limit(deformation, spectrum.eigenvalues)
+    name, own = _own_gain(deformation)
+    own_linear, own_sector = (_scaled(limit, own / gain) for limit in (linear, sector))
+    best = min(abs(optimal_gain(spectrum.eigenvalues)), SECTOR_SHARE * _size(sector))
+    recommended = best * (1 if linear[1] > 0 else -1) * own / gain
+    predicted = predicted_factor(spectrum.eigenvalues, gain)
+    admissible = _admissible(name, own_linear, own_sector, recommended)
+    if not linear[0] < gain < linear[1]:
+        fault = (
+            "has the wrong sign, so every cycle enlarges the error"
+            if gain * sum(linear) < 0
+            else f"is too large: errors grow by the factor {predicted:.3g} per cycle"
+        )
+        raise NotContractive(f"{type(deformation).__name__}({name}={own:.4g}) {fault}; use {admissible}")
+    within = sector[0] < gain < sector[1]
+    return ContractionReport(
+        predicted=predicted,
+        effective_gain=gain,
+        gain_name=name,
+        linear_limit=linear,
+        sector_limit=sector,
+        own_linear_limit=own_linear,
+        own_sector_limit=own_sector,
+        recommended=recommended,
+        within_sector=within,
+        text=_verdict(f"{type(deformation).__name__}({name}={own:.4g})", predicted, within, admissible),
+    )
+
+
+def _own_gain(deformation: Deformation) -> tuple[str, float]:
+    """The gain that the user sets, by name; the effective gain for a map that has none."""
+    own = getattr(deformation, deformation.gain_name, None)
+    return ("effective gain", deformation.effective_gain()) if own is None else (deformation.gain_name, float(own))
+
+
+def _scaled(limit: tuple[float, float], factor: float) -> tuple[float, float]:
+    ends = sorted(end * factor + 0.0 for end in limit)
+    return ends[0], ends[1]
+
+
+def _size(limit: tuple[float, float]) -> float:
+    return max(abs(limit[0]), abs(limit[1]))
+
+
+def _admissible(name: str, linear: tuple[float, float], sector: tuple[float, float], recommended: float) -> str:
+    sign = "positive" if recommended > 0 else "negative"
+    bounds = f"{_size(linear):.3g} (linear limit: small errors converge)"
+    if not np.isclose(_size(linear), _size(sector)):
+        bounds += f" and < {_size(sector):.3g} (sector limit: errors of any size converge)"
+    return f"a {sign} {name}, 0 < |{name}| < {bounds}; recommended {name}={recommended:.3g}"
+
+
+def _verdict(what: str, predicted: float, within: bool, admissible: str) -> str:
+    text = f"{what} shrinks an error of the request at least to {predicted:.3g} of it per cycle"
+    if not within:
+        text += ", but only a small one: it is beyond the sector limit, where large errors may end in a bounded oscillation"
+    return f"{text}. Admissible: {admissible}."

@@ -1,0 +1,160 @@
+"""Eigenvalues of the response Jacobian J = df/dr, over a run or over a box of parameters."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
+from fpirhc.plant import Plant
+
+Array = npt.NDArray[Any]
+
+LARGEST_SAMPLE = 2000  # cycles of a run whose eigenvalues are computed; longer runs are thinned evenly
+_NO_SIGN = 1e-9  # real parts below this share of the largest eigenvalue have no sign
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Eigenvalues of the response Jacobian, one row per sample, shape (samples, n), complex."""
+
+    eigenvalues: Array
+
+    def __post_init__(self) -> None:
+        rows = np.atleast_2d(np.asarray(self.eigenvalues, dtype=complex))
+        finite = rows[np.isfinite(rows).all(axis=1)]
+        if finite.size == 0:
+            raise InvalidValue(
+                "no finite eigenvalue of the response Jacobian: the inverse response is singular at every sample; check "
+                "that the inputs act on the controlled coordinates there"
+            )
+        kept = np.array(finite)
+        kept.setflags(write=False)
+        object.__setattr__(self, "eigenvalues", kept)
+
+    @cached_property
+    def smallest_real(self) -> float:
+        """Smallest real part."""
+        return float(self.eigenvalues.real.min())
+
+    @cached_property
+    def largest_real(self) -> float:
+        """Largest real part."""
+        return float(self.eigenvalues.real.max())
+
+    @cached_property
+    def one_sign(self) -> bool:
+        """Whether all real parts have the same sign and none is zero."""
+        small = _NO_SIGN * float(np.abs(self.eigenvalues).max())
+        return self.smallest_real > small or self.largest_real < -small
+
+
+def response_jacobian(plant: Plant) -> ca.Function:
+    """Return Function (state, deformed, exact, approximate) -> J = df/dr of the controlled coordinates, n x n.
+
+        f(r) = response(state, inverse(state, r; approximate); exact)
+
+    Raises:
+        NotInvertible: the inputs and the controlled coordinates differ in number.
+    """
+    kind = ca.MX if plant.inverse_opaque else ca.SX
+    x = kind.sym("x", plant.state.size)
+    r = kind.sym("r", len(plant.controlled_names))
+    exact = kind.sym("exact", plant.parameter.size if plant.parameters else 0)
+    believed = kind.sym("approximate", exact.numel())
+    realised = plant.controlled_response_function(x, plant.inverse_function(x, r, believed), exact)
+    jacobian = ca.densify(ca.jacobian(realised, r))
+    names = ["state", "deformed", "exact", "approximate"]
+    return ca.Function("fpirhc_response_jacobian", [x, r, exact, believed], [jacobian], names, ["jacobian"])
+
+
+def spectrum_over_run(
+    plant: Plant, states: Array, deformed: Array, *, exact: Array | None = None, approximate: Array | None = None
+) -> Spectrum:
+    """Return the eigenvalues of J along a run; long runs are thinned to `LARGEST_SAMPLE` cycles.
+
+    Parameters: `states` (cycles, nx) and `deformed` (cycles, n), row k the state and the request of cycle k; parameter
+    vectors are the plant's own unless given.
+
+    Raises:
+        InvalidShape: arrays that do not fit the plant or each other. InvalidValue: no finite eigenvalue.
+    """
+    states, deformed = _checked_rows(plant, states, deformed)
+    thinned = np.unique(np.linspace(0, len(states) - 1, min(len(states), LARGEST_SAMPLE)).astype(int))
+    true = plant.exact if exact is None else np.asarray(exact, dtype=float)
+    parameters = np.repeat(true[None, :], len(thinned), axis=0)
+    return _spectrum(plant, states[thinned], deformed[thinned], parameters, approximate)
+
+
+def spectrum_over_box(
+    plant: Plant,
+    box: Mapping[str, tuple[float, float]],
+    states: Array,
+    deformed: Array,
+    *,
+    samples: int,
+    seed: int,
+) -> Spectrum:
+    """Return the eigenvalues of J for exact parameters drawn from a box, at states drawn from the given rows.
+
+    Every corner of the box is among the samples when they are at least as many; the rest is uniform. Parameters that the
+    box does not name keep the plant's exact value.
+
+    Raises:
+        InvalidName: the box names an unknown parameter. InvalidValue: an interval whose ends are swapped or not finite,
+        or samples < 1. InvalidShape: arrays that do not fit the plant or each other.
+    """
+    states, deformed = _checked_rows(plant, states, deformed)
+    if samples < 1:
+        raise InvalidValue(f"samples={samples}: expected at least 1")
+    lower, upper = _box_ends(plant, box)
+    generator = np.random.default_rng(seed)
+    parameters = generator.uniform(lower, upper, size=(samples, lower.size))
+    places = [list(plant.parameters).index(name) for name in box]
+    if 2 ** len(places) <= samples:
+        for row, upper_ends in enumerate(itertools.product((False, True), repeat=len(places))):
+            parameters[row, places] = np.where(upper_ends, upper[places], lower[places])
+    rows = generator.integers(len(states), size=samples)
+    return _spectrum(plant, states[rows], deformed[rows], parameters, None)
+
+
+def _spectrum(plant: Plant, states: Array, deformed: Array, exact: Array, approximate: Array | None) -> Spectrum:
+    model = plant.approximate if approximate is None else np.asarray(approximate, dtype=float)
+    function, n = response_jacobian(plant), deformed.shape[1]
+    count = len(states)
+    stacked = function.map(count)(states.T, deformed.T, exact.T, np.repeat(model[:, None], count, axis=1))
+    jacobians = np.asarray(stacked.full()).reshape((n, count, n)).transpose(1, 0, 2)
+    finite = jacobians[np.isfinite(jacobians).all(axis=(1, 2))]
+    return Spectrum(np.linalg.eigvals(finite))
+
+
+def _checked_rows(plant: Plant, states: Array, deformed: Array) -> tuple[Array, Array]:
+    states = np.atleast_2d(np.asarray(states, dtype=float))
+    deformed = np.atleast_2d(np.asarray(deformed, dtype=float))
+    wanted = (plant.state.size, len(plant.controlled_names))
+    if (states.shape[1], deformed.shape[1]) != wanted or len(states) != len(deformed):
+        raise InvalidShape(
+            f"states {states.shape} and deformed {deformed.shape}: expected (cycles, {wanted[0]}) and (cycles, {wanted[1]})"
+        )
+    if len(states) == 0:
+        raise InvalidShape("states and deformed have no rows; give at least one state and request")
+    return states, deformed
+
+
+def _box_ends(plant: Plant, box: Mapping[str, tuple[float, float]]) -> tuple[Array, Array]:
+    lower, upper = plant.exact.copy(), plant.exact.copy()
+    names = list(plant.parameters)
+    for name, (low, high) in box.items():
+        if name not in names:
+            raise InvalidName(f"box: parameter '{name}' is unknown.{nearest(name, names)}")
+        if not -np.inf < low <= high < np.inf:
+            raise InvalidValue(f"box: '{name}' is from {low!r} to {high!r}; expected finite ends with lower <= upper")
+        lower[names.index(name)], upper[names.index(name)] = low, high
+    return lower, upper

@@ -1,0 +1,1 @@
+"""Controllers: blocks from a measurement to a command."""

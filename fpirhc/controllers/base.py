@@ -1,0 +1,208 @@
+"""The contract of controllers, and the part of a control cycle that all of them share.
+
+Every controller reads (time, state, realised, parameters) and ends in the same four blocks:
+
+    deform   q^Def from the pair (request, response) of the last cycle and q^Des
+    invert   the command that the model needs for q^Def
+    limit    clip it; what the clipped command means becomes the stored q^Def (anti-windup)
+    judge    one status for the cycle
+
+A command that is not finite never reaches the plant: the last command is held and the cycle's status says so.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.deformation.base import Deformation
+from fpirhc.plant import Plant
+from fpirhc.problem import Problem
+from fpirhc.status import Status
+from fpirhc.symbolic.block import Block, Composite, Delay, compose
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+
+FINITE = 1e300  # |v| <= FINITE is false for NaN and infinity, and CasADi does not simplify it away
+
+
+class Controller(ABC):
+    """Contract: a frozen value that becomes blocks for a given problem."""
+
+    @property
+    @abstractmethod
+    def adaptive(self) -> Deformation:
+        """The deformation in use (Identity when there is none)."""
+
+    @abstractmethod
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Blocks of one control cycle, from (time, state, realised, parameters) to 'command'."""
+
+    def parameters(self, plant: Plant) -> np.ndarray:
+        """Parameters that the controller believes: the approximate ones."""
+        return plant.approximate
+
+    def resolved(self, problem: Problem) -> Controller:  # noqa: ARG002
+        """Return the controller with every automatic setting replaced by its value for this problem."""
+        return self
+
+    def check(self, problem: Problem) -> None:  # noqa: B027 -- most controllers fit every problem
+        """Raise if the controller cannot serve the problem."""
+
+
+def controller_reads(plant: Plant) -> Layout:
+    """What every controller is given each cycle."""
+    return Layout((scalar("time", "s"), plant.state, plant.response_signal("realised"), plant.parameter))
+
+
+def compose_controller(problem: Problem, controller: Controller) -> Composite:
+    """Return the controller as one step: (time, state, realised, parameters, memory) -> (memory, trace, command)."""
+    chosen = controller.resolved(problem)
+    chosen.check(problem)
+    blocks, delays = chosen.blocks(problem)
+    return compose("controller", controller_reads(problem.plant), blocks, delays, outputs=("command",))
+
+
+def reference_block(problem: Problem) -> Block:
+    """Block (time, state) -> (reference state, its response, error) of the controlled coordinates."""
+    plant = problem.plant
+    function = problem.reference.function(plant)
+    chosen = list(plant.controlled_indices)
+    places = [plant.state.elements.index(c) for c in plant.controlled_names]
+    units = [plant.coordinates[c] for c in plant.controlled_names]
+
+    def step(s: Any) -> dict[str, Expression]:
+        state, response = function(s.time)
+        return {
+            "reference": state,
+            "_reference_response": response[chosen],
+            "error": state[places] - s.state[places],
+        }
+
+    reads = Layout((scalar("time", "s"), plant.state))
+    writes = (
+        like(plant.state, "reference"),
+        plant.response_signal("_reference_response"),
+        vector("error", plant.controlled_names, units),
+    )
+    return Block("reference", reads, Layout(writes), step, opaque=problem.reference.opaque)
+
+
+def rename(name: str, source: Signal, target: Signal) -> Block:
+    """Block that gives `source` a second name."""
+    return Block(name, Layout((source,)), Layout((target,)), lambda s: {target.name: getattr(s, source.name)})
+
+
+def closing_blocks(
+    problem: Problem, deformation: Deformation, judged: Sequence[Signal] = ()
+) -> tuple[list[Block], list[Delay]]:
+    """Return the blocks deform, invert, limit and judge with what they remember; `judged` are solver statuses."""
+    plant = problem.plant
+    blocks = [
+        deform_block(plant, deformation),
+        _invert_block(plant),
+        _limit_block(problem),
+        _judge_block(judged),
+    ]
+    delays = [
+        Delay(scalar("started"), "_running"),
+        Delay(plant.response_signal("_request_before"), "deformed"),
+        Delay(like(plant.input, "_command_before"), "command"),
+    ]
+    return blocks, delays
+
+
+def deform_block(plant: Plant, deformation: Deformation) -> Block:
+    """Block (request before, realised, desired) -> deformed request; without a valid pair it passes the desired one."""
+    memory = deformation.memory(plant.controlled_names)
+    reads = (
+        plant.response_signal("_request_before"),
+        plant.response_signal("realised"),
+        plant.response_signal("desired"),
+        scalar("started"),
+    )
+
+    def step(s: Any) -> dict[str, Expression]:
+        remembered = {m: getattr(s, m) for m in memory.names}
+        deformed, following = deformation.step(s._request_before, s.realised, s.desired, remembered)
+        valid = s.started > 0.5
+        kept = {f"{m}_next": ca.if_else(valid, following[m], remembered[m]) for m in memory.names}
+        return {"_deformed_wanted": ca.if_else(valid, deformed, s.desired), **kept}
+
+    return Block("deform", Layout(reads), Layout((plant.response_signal("_deformed_wanted"),)), step, memory)
+
+
+def _invert_block(plant: Plant) -> Block:
+    reads = Layout((plant.state, plant.response_signal("_deformed_wanted"), plant.parameter))
+    inverse = plant.inverse_function
+
+    def step(s: Any) -> dict[str, Expression]:
+        return {"requested": inverse(s.state, s._deformed_wanted, s.parameters)}
+
+    return Block("invert", reads, Layout((like(plant.input, "requested"),)), step, opaque=plant.inverse_opaque)
+
+
+def _limit_block(problem: Problem) -> Block:
+    plant = problem.plant
+    lower, upper = problem.limits.input_bounds(plant)
+    response = plant.controlled_response_function
+    reads = (
+        like(plant.input, "requested"),
+        plant.response_signal("_deformed_wanted"),
+        plant.state,
+        plant.parameter,
+        like(plant.input, "_command_before"),
+    )
+    writes = (
+        plant.input,
+        plant.response_signal("deformed"),
+        scalar("clipped"),
+        scalar("_held"),
+        scalar("_running"),
+    )
+
+    def step(s: Any) -> dict[str, Expression]:
+        # Finiteness is asked before the clamp: fmin and fmax turn NaN into a full-scale command.
+        finite = ca.mmin(ca.fabs(s.requested) <= FINITE)
+        safe = ca.if_else(finite, s.requested, s._command_before)
+        command = _clip(safe, lower, upper)
+        clipped = ca.mmax(command != s.requested)
+        meant = response(s.state, command, s.parameters)
+        return {
+            "command": command,
+            "deformed": ca.if_else(clipped, meant, s._deformed_wanted),
+            "clipped": clipped,
+            "_held": 1 - finite,
+            "_running": 1,
+        }
+
+    return Block("limit", Layout(reads), Layout(writes), step)
+
+
+def _clip(u: Expression, lower: np.ndarray, upper: np.ndarray) -> Expression:
+    """Clip entry by entry; a free side costs nothing."""
+    entries = []
+    for k, (low, high) in enumerate(zip(lower, upper, strict=True)):
+        entry = u[k] if np.isinf(low) else ca.fmax(u[k], low)
+        entries.append(entry if np.isinf(high) else ca.fmin(entry, high))
+    return ca.vertcat(*entries)
+
+
+def _judge_block(judged: Sequence[Signal]) -> Block:
+    reads = Layout((scalar("_held"), *judged))
+
+    def step(s: Any) -> dict[str, Expression]:
+        worst: Expression = s._held * int(Status.NON_FINITE)
+        for signal in judged:
+            worst = ca.fmax(worst, getattr(s, signal.name))
+        return {"status": worst}
+
+    return Block("judge", reads, Layout((scalar("status"),)), step)
+
+
+def like(signal: Signal, name: str) -> Signal:
+    """Return a signal of the same shape and units under another name."""
+    return Signal(name, signal.elements, signal.units)

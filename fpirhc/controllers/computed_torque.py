@@ -1,0 +1,53 @@
+"""Computed torque: track the reference with the model's inverse, with or without deformation.
+
+    q^Des = q^(r),N + feedback of the tracking law;   u = inverse model of the deformed q^Des.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block, rename
+from fpirhc.controllers.scale import scaled_for_reference
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.problem import Problem
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.tracking.base import Tracking
+
+
+@dataclass(frozen=True)
+class ComputedTorque(Controller):
+    """Inverse dynamics with a tracking law; adaptive when given a deformation.
+
+    Parameters:
+        tracking: the law that gives the desired response.
+        deformation: the fixed-point map between desired response and request; Identity() is no adaptation.
+    """
+
+    tracking: Tracking
+    deformation: Deformation = field(default_factory=Identity)
+
+    @property
+    def adaptive(self) -> Deformation:
+        """The deformation in use."""
+        return self.deformation
+
+    def resolved(self, problem: Problem) -> ComputedTorque:
+        """Return the controller with the deformation's scale chosen."""
+        return replace(self, deformation=scaled_for_reference(self.deformation, problem))
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Blocks reference, tracking, deform, invert, limit, judge, tracking update."""
+        plant = problem.plant
+        closing, delays = closing_blocks(problem, self.deformation)
+        response = plant.response_signal("_reference_response")
+        blocks = [
+            reference_block(problem),
+            rename("target", like(plant.state, "reference"), like(plant.state, "_target")),
+            rename("nominal", response, plant.response_signal("nominal")),
+            self.tracking.law(plant),
+            *closing,
+            self.tracking.update(plant, problem.period),
+        ]
+        return blocks, [*delays, *self.tracking.delays(plant)]

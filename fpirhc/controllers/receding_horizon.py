@@ -1,0 +1,181 @@
+"""Receding-horizon control whose nominal acceleration is deformed.
+
+Every n-th cycle (one stage of the horizon) the optimiser plans inputs u_0 ... u_{N-1} with the approximate model. The
+response that the model gives to the plan's first input is the nominal one; it is re-evaluated in every cycle at the measured
+(or propagated) state, deformed, inverted, and applied. The deformation changes the command by
+
+    delta = command - inverse model(q^Des),
+
+so the optimiser is given input bounds shifted by -delta of the last cycle: what it plans stays feasible for the actuator.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import casadi as ca
+
+from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
+from fpirhc.controllers.nominal import Nominal, Restart
+from fpirhc.controllers.on_failure import HoldPlan, OnFailure
+from fpirhc.controllers.scale import scaled_for_plan
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import InvalidProblem
+from fpirhc.horizon.cost import Cost
+from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
+from fpirhc.horizon.rollout import rollout
+from fpirhc.optimisers.base import Optimiser
+from fpirhc.problem import Problem, cycles_per_stage
+from fpirhc.status import Status
+from fpirhc.symbolic.block import Block, Delay, every
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+
+_SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")
+
+
+@dataclass(frozen=True)
+class RecedingHorizon(Controller):
+    """Model-predictive control with a fixed-point deformation of its nominal acceleration.
+
+    Parameters:
+        optimiser: finds the plan.
+        deformation: the map between desired response and request; Identity() is plain RHC.
+        nominal: where each horizon starts and what is tracked in between (Restart, RestartAndTrack, OpenPlan).
+        on_failure: what is applied when a solve fails (HoldPlan, Feedforward, StopRun).
+        cost: another cost than the problem's own (None: the problem's).
+    """
+
+    optimiser: Optimiser
+    deformation: Deformation = field(default_factory=Identity)
+    nominal: Nominal = field(default_factory=Restart)
+    on_failure: OnFailure = field(default_factory=HoldPlan)
+    cost: Cost | None = None
+
+    @property
+    def adaptive(self) -> Deformation:
+        """The deformation in use."""
+        return self.deformation
+
+    def resolved(self, problem: Problem) -> RecedingHorizon:
+        """Return the controller with the deformation's scale chosen."""
+        return replace(self, deformation=scaled_for_plan(self.deformation, problem))
+
+    def check(self, problem: Problem) -> None:
+        """Raise if the problem has no horizon or cost, or the optimiser cannot serve it.
+
+        Raises:
+            InvalidProblem: horizon or cost missing. NotSupported: bounds that the optimiser cannot keep.
+        """
+        if problem.horizon is None:
+            raise InvalidProblem("RecedingHorizon needs Problem(horizon=...), which this problem does not have")
+        if self.cost is None and problem.cost is None:
+            raise InvalidProblem("RecedingHorizon needs Problem(cost=...) or a cost of its own")
+        self.optimiser.check(_optimal_control(self._planned(problem)))
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Blocks reference, plan (every n-th cycle), nominal, deform, invert, limit, judge."""
+        problem = self._planned(problem)
+        assert problem.horizon is not None
+        plant = problem.plant
+        cycles = cycles_per_stage(problem.horizon, problem.period)
+        before, after, late, remembered = self.nominal.parts(problem)
+        plan = every(_plan_block(problem, self.optimiser, self.on_failure), cycles)
+        closing, delays = closing_blocks(problem, self.deformation, [scalar("_solve_status")])
+        blocks = [reference_block(problem), _due_block(cycles), *before, plan, *after, *closing, *late]
+        delays = [*delays, *remembered]
+        blocks.append(_correction_block(problem, self.deformation))
+        delays.append(Delay(like(plant.input, "_correction_before"), "correction"))
+        return blocks, delays
+
+    def _planned(self, problem: Problem) -> Problem:
+        """The problem with the cost that this controller plans with."""
+        return problem if self.cost is None else replace(problem, cost=self.cost)
+
+
+def _optimal_control(problem: Problem) -> OptimalControl:
+    assert problem.horizon is not None
+    assert problem.cost is not None
+    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits)
+
+
+def _due_block(cycles: int) -> Block:
+    """Block that says whether a new plan is due in this cycle."""
+    count = scalar("plan_count")
+
+    def step(s: Any) -> dict[str, Expression]:
+        following = s.plan_count + 1
+        return {
+            "_due": s.plan_count < 0.5,
+            "plan_count_next": ca.if_else(following > cycles - 0.5, 0, following),
+        }
+
+    return Block("due", Layout(), Layout((scalar("_due"),)), step, Layout((count,)))
+
+
+def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -> Block:
+    """Block (time, plan state, parameters, correction) -> (planned input, solve statistics, cost by term)."""
+    assert problem.horizon is not None
+    assert problem.cost is not None
+    plant, ocp = problem.plant, _optimal_control(problem)
+    memory = optimiser.memory(ocp)
+    solve, predict = optimiser.step(ocp), rollout(ocp)
+    data_of = stage_data(plant, problem.reference, problem.horizon, problem.cost)
+    feedforward_of = _feedforward(problem)
+    reads = (
+        scalar("time", "s"),
+        like(plant.state, "_plan_state"),
+        plant.parameter,
+        like(plant.input, "_correction_before"),
+        like(plant.input, "_command_before"),
+    )
+    writes = (
+        like(plant.input, "planned"),
+        Signal("solve", _SOLVE),
+        vector("planned_cost", ocp.terms),
+        scalar("_solve_status"),
+    )
+
+    def step(s: Any) -> dict[str, Expression]:
+        data = data_of(s.time, s.parameters)
+        first = s._plan_state
+        if ocp.state.size > plant.state.size:
+            first = ca.vertcat(first, s._command_before)
+        lower, upper = ocp.input_lower - s._correction_before, ocp.input_upper - s._correction_before
+        remembered = memory.join({m: getattr(s, m) for m in memory.names})
+        inputs, diagnostics, following = solve(first, data, lower, upper, remembered)
+        _, _, terms = predict(first, inputs, data)
+        status = diagnostics[_SOLVE.index("status")]
+        failed = status > int(Status.NOT_CONVERGED) + 0.5
+        planned, judged = on_failure.choose(failed, inputs[:, 0], feedforward_of(s.time, s.parameters), status)
+        kept = {f"{m}_next": v for m, v in memory.split(following).items()}
+        return {"planned": planned, "solve": diagnostics, "planned_cost": terms, "_solve_status": judged, **kept}
+
+    return Block("plan", Layout(reads), Layout(writes), step, memory, opaque=True)
+
+
+def _feedforward(problem: Problem) -> ca.Function:
+    """Function (time, parameters) -> input that the model needs along the reference (zero when it has no inverse)."""
+    plant = problem.plant
+    t, p = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
+    state, response = problem.reference.function(plant)(t)
+    if plant.controlled is None and len(plant.inputs) != len(plant.names):
+        needed = ca.MX.zeros(len(plant.inputs))
+    else:
+        needed = plant.inverse_function(state, response[list(plant.controlled_indices)], p)
+    return ca.Function("fpirhc_feedforward", [t, p], [needed])
+
+
+def _correction_block(problem: Problem, deformation: Deformation) -> Block:
+    """Block that measures by how much the deformation changes the command; zero without adaptation."""
+    plant = problem.plant
+    inverse = plant.inverse_function
+    reads = Layout((plant.state, plant.response_signal("desired"), plant.input, plant.parameter))
+
+    def step(s: Any) -> dict[str, Expression]:
+        if isinstance(deformation, Identity):
+            return {"correction": 0 * s.command}
+        return {"correction": s.command - inverse(s.state, s.desired, s.parameters)}
+
+    return Block("correction", reads, Layout((like(plant.input, "correction"),)), step, opaque=plant.inverse_opaque)

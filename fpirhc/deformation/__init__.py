@@ -1,0 +1,11 @@
+"""Deformations: fixed-point maps that make the plant respond as desired although the model is wrong."""
+
+from fpirhc.deformation.affine import Affine
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.deformation.rfpt import Rfpt
+from fpirhc.deformation.rfpt_vector import RfptVector
+from fpirhc.deformation.rotation import Rotation
+from fpirhc.deformation.sigmoid import Sigmoid
+
+__all__ = ["Affine", "Deformation", "Identity", "Rfpt", "RfptVector", "Rotation", "Sigmoid"]

@@ -1,0 +1,46 @@
+"""No adaptation: the request is the desired response."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+from fpirhc.deformation.base import Deformation
+from fpirhc.errors import NotSupported
+from fpirhc.symbolic.layout import Expression
+
+
+@dataclass(frozen=True)
+class Identity(Deformation):
+    """r+ = d: the model is trusted, whatever the plant answers.
+
+    It is the only map that does not iterate: its gains are zero and no response error is ever corrected.
+    """
+
+    def step(
+        self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+    ) -> tuple[Expression, dict[str, Expression]]:
+        """Return the desired response."""
+        del request, response, memory
+        return desired, {}
+
+    def effective_gain(self) -> float:
+        """Zero: the response is not looked at."""
+        return 0.0
+
+    def secant_gain(self) -> float:
+        """Zero: the response is not looked at."""
+        return 0.0
+
+    def largest_step(self) -> float:
+        """Infinite: the request jumps with the desired response."""
+        return float("inf")
+
+    def with_effective_gain(self, gain: float) -> Self:
+        """Raise, because there is no gain to change.
+
+        Raises:
+            NotSupported: always.
+        """
+        raise NotSupported(f"Identity() has no gain, so it cannot take {gain!r}; use Sigmoid(gain=...), the usual choice")

@@ -1,0 +1,67 @@
+"""The robust fixed point transformation, coordinate by coordinate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Self
+
+import casadi as ca
+
+from fpirhc.deformation.base import Deformation, require_numbers
+from fpirhc.errors import InvalidValue
+from fpirhc.symbolic.layout import Expression
+
+
+@dataclass(frozen=True)
+class Rfpt(Deformation):
+    """r+ = (K_c + r) [1 + B_c tanh(A_c (f - d))] - K_c, for each coordinate by itself.
+
+    The gains hold for |K_c| >> |r|; at a request r they are larger by the factor 1 + r / K_c. A second, false fixed point
+    r = -K_c repels the iteration when B_c tanh(A_c (f(-K_c) - d)) > 0. One step is at most |K_c + r|.
+
+    Parameters:
+        offset: K_c, 10 to 100 times the largest |request|, in units of the response.
+        sign: B_c, -1 or 1; the opposite of the sign of K_c df/dr.
+        gain: A_c, in reciprocal units of the response; a / |K_c| with a = 0.2 ... 0.6 / max df/dr.
+
+    Raises:
+        InvalidValue: offset or gain zero or not finite, or a sign other than -1 and 1.
+
+    References:
+        J. K. Tar, J. F. Bitó, L. Nádai, J. A. Tenreiro Machado, Robust fixed point transformations in adaptive control
+        using local basin of attraction, Acta Polytechnica Hungarica 6(1), 2009.
+    """
+
+    offset: float
+    sign: float
+    gain: float
+
+    def __post_init__(self) -> None:
+        require_numbers("Rfpt", {"offset": self.offset, "gain": self.gain})
+        if self.sign not in (-1, 1):
+            raise InvalidValue(f"Rfpt(sign={self.sign!r}): expected -1 or 1; -1 for offset > 0 and a model of right sign")
+
+    def step(
+        self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+    ) -> tuple[Expression, dict[str, Expression]]:
+        """Return r + (K_c + r) B_c tanh(A_c (f - d)); adding and taking away K_c would cost digits."""
+        del memory
+        bent = self.sign * ca.tanh(self.gain * (response - desired))
+        return request + (self.offset + request) * bent, {}
+
+    def effective_gain(self) -> float:
+        """a = -K_c B_c A_c."""
+        return -self.offset * self.sign * self.gain
+
+    def secant_gain(self) -> float:
+        """The effective gain: tanh is steepest at zero."""
+        return self.effective_gain()
+
+    def largest_step(self) -> float:
+        """Infinite: the bound |K_c + r| grows with the request."""
+        return float("inf")
+
+    def with_effective_gain(self, gain: float) -> Self:
+        """Return the map with A_c = -a / (K_c B_c)."""
+        return replace(self, gain=-gain / (self.offset * self.sign))

@@ -1,0 +1,74 @@
+"""The robust fixed point transformation along the direction of the response error."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Self
+
+import casadi as ca
+
+from fpirhc.deformation.base import Deformation, require_numbers, smooth_norm
+from fpirhc.errors import InvalidValue
+from fpirhc.symbolic.layout import Expression
+
+_FLOOR = 1e-9  # A_c |h| below which the norm is rounded off, so that its derivatives exist at zero
+
+
+@dataclass(frozen=True)
+class RfptVector(Deformation):
+    """r+ = (1 + B) r + B K_c h / |h|, with B = B_c tanh(A_c |h|) and h = f - d.
+
+    The gains hold for |K_c| >> |r|. One step is at most |r| + |K_c|.
+
+    Parameters:
+        offset: K_c, 10 to 100 times the largest |request|, in units of the response.
+        sign: B_c, -1 or 1; the opposite of the sign of K_c times the eigenvalues of df/dr.
+        gain: A_c, in reciprocal units of the response; a / |K_c| with a = 0.2 ... 0.6 / max eigenvalue of df/dr.
+
+    Raises:
+        InvalidValue: offset or gain zero or not finite, or a sign other than -1 and 1.
+
+    References:
+        J. K. Tar, J. F. Bitó, L. Nádai, J. A. Tenreiro Machado, Robust fixed point transformations in adaptive control
+        using local basin of attraction, Acta Polytechnica Hungarica 6(1), 2009.
+    """
+
+    offset: float
+    sign: float
+    gain: float
+
+    def __post_init__(self) -> None:
+        require_numbers("RfptVector", {"offset": self.offset, "gain": self.gain})
+        if self.sign not in (-1, 1):
+            raise InvalidValue(
+                f"RfptVector(sign={self.sign!r}): expected -1 or 1; -1 for offset > 0 and a model of right sign"
+            )
+
+    def step(
+        self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+    ) -> tuple[Expression, dict[str, Expression]]:
+        """Return r + B_c [tanh(A_c s) / s] (n r + K_c h), where s is |h| never zero and n is |h| zero at h = 0."""
+        del memory
+        error = response - desired
+        floor = _FLOOR / abs(self.gain)
+        size = smooth_norm(error, floor)
+        vanishing = ca.sumsqr(error) / (size + floor)
+        bent = self.sign * ca.tanh(self.gain * size) / size
+        return request + bent * (vanishing * request + self.offset * error), {}
+
+    def effective_gain(self) -> float:
+        """a = -K_c B_c A_c."""
+        return -self.offset * self.sign * self.gain
+
+    def secant_gain(self) -> float:
+        """The effective gain: tanh is steepest at zero."""
+        return self.effective_gain()
+
+    def largest_step(self) -> float:
+        """Infinite: the bound |r| + |K_c| grows with the request."""
+        return float("inf")
+
+    def with_effective_gain(self, gain: float) -> Self:
+        """Return the map with A_c = -a / (K_c B_c)."""
+        return replace(self, gain=-gain / (self.offset * self.sign))

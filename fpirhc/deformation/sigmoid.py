@@ -1,0 +1,151 @@
+"""The sigmoid-generated fixed point transformation: saturating, along the direction of the response error.
+
+With zeta(x) = atanh(tanh(x + D) / 2) and its fixed point x*, the addition theorems of tanh and atanh give the step without
+cancellation and without a special case at zero,
+
+    zeta(w + x*) - x* = atanh( zeta'(x*) tanh(w) / (1 + q tanh(w)) ),    q = 3 y / (2 (1 - y^2)),  y = tanh(x*).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import casadi as ca
+
+from fpirhc.deformation.base import Deformation, require_numbers, smooth_norm
+from fpirhc.errors import InvalidValue
+from fpirhc.symbolic.layout import Expression
+
+LARGEST_SHIFT = 5.0  # beyond it zeta'(x*) is below 2e-4: the map hardly moves and loses digits
+_FLOOR = 1e-9  # |h| / S below which the norm is rounded off, so that its derivatives exist at zero
+_BISECTIONS = 60
+
+
+@dataclass(frozen=True)
+class Sigmoid(Deformation):
+    """r+ = r + S [zeta(A_c |h| / S + x*) - x*] h / |h|, with zeta(x) = atanh(tanh(x + D) / 2) and h = f - d.
+
+    Small errors shrink exponentially, large ones by at most `largest_step()` per cycle, so S must cover the largest change
+    of the desired response in one cycle; apart from that S does not matter.
+
+    Parameters:
+        gain: A_c, dimensionless; negative where the model has the sign of the plant's input effect right.
+        shift: D, dimensionless, |D| <= 5. Give it the sign opposite to A_c, or the largest step shrinks (for |D| = 0.3
+            from 0.81 S to 0.29 S).
+        scale: S, in units of the response; None leaves the choice to the controller.
+
+    Raises:
+        InvalidValue: the gain zero or not finite, the shift too large, or the scale not positive.
+
+    References:
+        A. Dineva, J. K. Tar, A. Várkonyi-Kóczy, V. Piuri, Generalization of a sigmoid generated fixed point
+        transformation from SISO to MIMO systems, IEEE INES 2015.
+        H. Khan, J. K. Tar, I. J. Rudas, Robot. Autom. Eng. J. 3(5), 2018, eq. (6), with x* subtracted and added to
+        the last request as in the former.
+    """
+
+    gain: float
+    shift: float = 0.3
+    scale: float | None = None
+
+    def __post_init__(self) -> None:
+        require_numbers("Sigmoid", {"gain": self.gain})
+        if not abs(self.shift) <= LARGEST_SHIFT:
+            raise InvalidValue(f"Sigmoid(shift={self.shift!r}): expected at most {LARGEST_SHIFT:g} in size; 0.3 is usual")
+        if self.scale is not None and not (0 < self.scale < math.inf):
+            raise InvalidValue(f"Sigmoid(scale={self.scale!r}): expected a positive number in units of the response")
+
+    def with_scale(self, scale: float) -> Self:
+        """Return the same map with scale S."""
+        return replace(self, scale=scale)
+
+    @cached_property
+    def _tanh_fixed_point(self) -> float:
+        """y = tanh(x*), the root of 2 t y^2 + y = t with t = tanh(D), in the form that has no 0/0 at D = 0."""
+        t = math.tanh(self.shift)
+        return 2 * t / (1 + math.sqrt(1 + 8 * t**2))
+
+    @property
+    def fixed_point(self) -> float:
+        """x* = zeta(x*)."""
+        return math.atanh(self._tanh_fixed_point)
+
+    @property
+    def slope(self) -> float:
+        """zeta'(x*), between 0 and 1/2."""
+        y = self._tanh_fixed_point
+        return (1 - 4 * y**2) / (2 * (1 - y**2))
+
+    @cached_property
+    def steepest_secant(self) -> float:
+        """Largest [zeta(w + x*) - x*] / w over the w that the sign of A_c allows.
+
+        Towards the inflection of zeta the secant is steepest where it is a tangent, between one and two times the
+        distance to the inflection; away from it, at w = 0.
+        """
+        if self.shift * self.gain >= 0:
+            return self.slope
+        mirrored = replace(self, gain=-abs(self.gain), shift=abs(self.shift))
+        near, far = mirrored.fixed_point + mirrored.shift, 2 * (mirrored.fixed_point + mirrored.shift)
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (near + far)
+            x = mirrored.fixed_point - middle
+            beyond = mirrored._slope_at(x) * middle < mirrored.fixed_point - mirrored._kernel(x)
+            near, far = (near, middle) if beyond else (middle, far)
+        return (mirrored.fixed_point - mirrored._kernel(mirrored.fixed_point - near)) / near
+
+    def step(
+        self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+    ) -> tuple[Expression, dict[str, Expression]]:
+        """Return r + S [zeta(A_c |h| / S + x*) - x*] h / |h|.
+
+        Raises:
+            InvalidValue: the scale is still to be chosen.
+        """
+        del memory
+        scale = self._chosen_scale()
+        error = response - desired
+        size = smooth_norm(error, _FLOOR * scale)
+        bent = ca.tanh((self.gain / scale) * size)
+        y = self._tanh_fixed_point
+        growth = ca.atanh(self.slope * bent / (1 + 1.5 * y / (1 - y**2) * bent))
+        return request + (scale * growth / size) * error, {}
+
+    def effective_gain(self) -> float:
+        """a = -A_c zeta'(x*)."""
+        return -self.gain * self.slope
+
+    def secant_gain(self) -> float:
+        """-A_c times the steepest secant of zeta at x*."""
+        return -self.gain * self.steepest_secant
+
+    def largest_step(self) -> float:
+        """S (atanh(1/2) + x*) for A_c < 0 and S (atanh(1/2) - x*) for A_c > 0.
+
+        Raises:
+            InvalidValue: the scale is still to be chosen.
+        """
+        return self._chosen_scale() * (math.atanh(0.5) - math.copysign(self.fixed_point, self.shift * self.gain))
+
+    def with_effective_gain(self, gain: float) -> Self:
+        """Return the map with A_c = -a / zeta'(x*)."""
+        return replace(self, gain=-gain / self.slope)
+
+    def _kernel(self, x: float) -> float:
+        return math.atanh(0.5 * math.tanh(x + self.shift))
+
+    def _slope_at(self, x: float) -> float:
+        t = math.tanh(x + self.shift)
+        return 0.5 * (1 - t**2) / (1 - 0.25 * t**2)
+
+    def _chosen_scale(self) -> float:
+        if self.scale is None:
+            raise InvalidValue(
+                "Sigmoid(scale=None): the scale is still to be chosen; give Sigmoid(scale=...) or use with_scale(S), with S "
+                "above the largest change of the desired response in one cycle"
+            )
+        return self.scale

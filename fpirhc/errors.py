@@ -1,0 +1,98 @@
+"""Misuse raises one of these; a bad outcome of a run is data, not an exception.
+
+Every error says what is wrong, where, what was expected, and how to mend it. `Mistakes` collects
+all of a value's mistakes, so that a user sees them together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class FpirhcError(Exception):
+    """Base of all errors that fpirhc raises on purpose."""
+
+
+class InvalidName(FpirhcError, AttributeError, KeyError):
+    """A name that does not exist; the nearest valid one is offered."""
+
+    def __str__(self) -> str:
+        return str(self.args[0]) if self.args else ""
+
+
+class InvalidValue(FpirhcError, ValueError):
+    """A number or value outside what is allowed."""
+
+
+class InvalidShape(FpirhcError, ValueError):
+    """A vector or matrix of the wrong size."""
+
+
+class InvalidProblem(FpirhcError, ValueError):
+    """One or more mistakes in a plant, a problem or a controller, listed together."""
+
+
+class ProblemFileError(FpirhcError):
+    """A problem file that cannot be found, imported, or understood."""
+
+
+class NotInvertible(FpirhcError, ValueError):
+    """The response cannot be solved for the inputs."""
+
+
+class NotContractive(FpirhcError, ValueError):
+    """No gain, or not this gain, makes the fixed-point iteration converge."""
+
+
+class NotSupported(FpirhcError, ValueError):
+    """A valid wish that this member of a family cannot serve; the message names one that can."""
+
+
+class OutputError(FpirhcError, OSError):
+    """A file or folder that cannot be written or read."""
+
+
+class CompileError(FpirhcError, RuntimeError):
+    """The C compiler failed on generated code."""
+
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """Return ' Did you mean ...? Valid: ...' for a message about an unknown `name`."""
+    names = list(valid)
+    if not names:
+        return " No names are valid here."
+    close = get_close_matches(name, names, n=1, cutoff=0.5)
+    hint = f" Did you mean '{close[0]}'?" if close else ""
+    return f"{hint} Valid: {', '.join(names)}."
+
+
+class Mistakes:
+    """Collects the mistakes of one value and raises them together."""
+
+    def __init__(self, where: str) -> None:
+        self._where = where
+        self._found: list[str] = []
+
+    def add(self, mistake: str) -> None:
+        """Note one mistake."""
+        self._found.append(mistake)
+
+    def unknown(self, what: str, names: Iterable[str], valid: Iterable[str]) -> None:
+        """Note each of `names` that is not in `valid`, with the nearest valid name."""
+        allowed = list(valid)
+        for name in names:
+            if name not in allowed:
+                self.add(f"{what} '{name}' is unknown.{nearest(str(name), allowed)}")
+
+    def raise_if_any(self) -> None:
+        """Raise InvalidProblem with all mistakes, if there is one.
+
+        Raises:
+            InvalidProblem: listing every mistake found.
+        """
+        if len(self._found) == 1:
+            raise InvalidProblem(f"{self._where}: {self._found[0]}")
+        if self._found:
+            lines = "\n".join(f"  {k}. {m}" for k, m in enumerate(self._found, 1))
+            raise InvalidProblem(f"{self._where}: {len(self._found)} mistakes\n{lines}")

@@ -1,0 +1,125 @@
+"""References: the nominal motion and its derivatives, as a function of time.
+
+Every reference gives one Function t -> (nominal state, nominal response): the coordinates with all derivatives that the
+plant's state has, and the highest derivative of each. Derivatives are found by automatic differentiation.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
+from fpirhc.plant import Plant
+from fpirhc.symbolic.layout import Expression
+
+
+class Reference(ABC):
+    """Contract: the nominal motion of every coordinate."""
+
+    @property
+    def opaque(self) -> bool:
+        """Whether the reference holds operations that scalar expressions cannot (a table's look-up)."""
+        return False
+
+    @abstractmethod
+    def coordinates(self, t: Expression) -> Mapping[str, Expression]:
+        """Return {coordinate: expression of t}."""
+
+    def function(self, plant: Plant) -> ca.Function:
+        """Function t -> (nominal state (nx), nominal response (n)).
+
+        Raises:
+            InvalidProblem: a coordinate is missing, unknown, or not a scalar.
+        """
+        kind = ca.MX if self.opaque else ca.SX
+        t = kind.sym("t")
+        given = {name: kind(value) for name, value in self.coordinates(t).items()}
+        _check(plant, given)
+        ladder = {c: _differentiate(given[c], t, r) for c, r in zip(plant.names, plant.orders, strict=True)}
+        state = [ladder[e.rstrip("'")][e.count("'")] for e in plant.state.elements]
+        response = [ladder[c][r] for c, r in zip(plant.names, plant.orders, strict=True)]
+        results = [ca.densify(ca.vertcat(*state)), ca.densify(ca.vertcat(*response))]
+        return ca.Function("fpirhc_reference", [t], results, ["t"], ["state", "response"])
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory(Reference):
+    """A nominal motion given as expressions of time: Trajectory(lambda t: {"q1": ca.sin(2 * t)})."""
+
+    motion: Callable[[Expression], Mapping[str, Expression]]
+
+    def coordinates(self, t: Expression) -> Mapping[str, Expression]:
+        """Return {coordinate: expression of t}."""
+        return self.motion(t)
+
+
+@dataclass(frozen=True, eq=False)
+class Table(Reference):
+    """A nominal motion given by samples, joined by splines; held constant outside the table.
+
+    Parameters:
+        times: increasing sample times, shape (m,), s.
+        values: coordinate -> samples, shape (m,).
+        degree: degree of the splines; derivatives are continuous up to degree - 1.
+
+    Raises:
+        InvalidValue: times not increasing or values not finite. InvalidShape: lengths differ or too few samples.
+    """
+
+    times: Sequence[float]
+    values: Mapping[str, Sequence[float]]
+    degree: int = 5
+
+    def __post_init__(self) -> None:
+        times = np.asarray(self.times, dtype=float)
+        if times.ndim != 1 or times.size < self.degree + 1:
+            raise InvalidShape(f"a table of degree {self.degree} needs at least {self.degree + 1} times")
+        if not np.all(np.isfinite(times)) or np.any(np.diff(times) <= 0):
+            raise InvalidValue("the times of a table must be finite and increasing")
+        for name, samples in self.values.items():
+            column = np.asarray(samples, dtype=float)
+            if column.shape != times.shape:
+                raise InvalidShape(f"table '{name}' has shape {column.shape}, expected {times.shape} as its times")
+            if not np.all(np.isfinite(column)):
+                raise InvalidValue(f"table '{name}' holds values that are not finite")
+
+    @property
+    def opaque(self) -> bool:
+        """A table is looked up, which scalar expressions cannot."""
+        return True
+
+    def coordinates(self, t: Expression) -> Mapping[str, Expression]:
+        """Return {coordinate: spline of t}."""
+        times = np.asarray(self.times, dtype=float)
+        inside = ca.fmin(ca.fmax(t, times[0]), times[-1])
+        return {
+            name: ca.interpolant(f"fpirhc_table_{name}", "bspline", [times], np.asarray(v, float), {"degree": [self.degree]})(
+                inside
+            )
+            for name, v in self.values.items()
+        }
+
+
+def _differentiate(value: Expression, t: Expression, order: int) -> list[Expression]:
+    ladder = [value]
+    for _ in range(order):
+        ladder.append(ca.jacobian(ladder[-1], t))
+    return ladder
+
+
+def _check(plant: Plant, given: Mapping[str, Expression]) -> None:
+    mistakes = Mistakes("reference")
+    mistakes.unknown("coordinate", given, plant.coordinates)
+    for c in plant.names:
+        if c not in given:
+            mistakes.add(f"coordinate '{c}' has no nominal motion; add '{c}' to the reference")
+        elif given[c].numel() != 1:
+            mistakes.add(f"coordinate '{c}' must be one scalar, got shape {given[c].shape}")
+    mistakes.raise_if_any()
+
+

@@ -1,0 +1,96 @@
+"""What a user sees on the terminal: progress bars, the table, the verdict."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from fpirhc.metrics import measure
+
+if TYPE_CHECKING:
+    from fpirhc.problem import Problem
+    from fpirhc.run import Run
+    from fpirhc.studies.compare import Comparison, Entry
+    from fpirhc.studies.compare import Progress as Report
+
+
+@contextmanager
+def progress_bars() -> Iterator[Report]:
+    """Yield a function (name, done, total) that shows one bar per controller on standard error."""
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+        known: dict[str, TaskID] = {}
+
+        def report(name: str, done: int, total: int) -> None:
+            if name not in known:
+                known[name] = bars.add_task(name, total=total)
+            bars.update(known[name], completed=done)
+
+        yield report
+
+
+def announce_backend(comparison: Comparison) -> None:
+    """Say on standard error when loops ran without compiled C, and why."""
+    reasons = {e.run.settings["why not compiled"] for e in comparison.entries if not e.run.compiled}
+    for reason in sorted(reasons):
+        print(f"fpirhc: some loops ran in CasADi's virtual machine, more slowly ({reason})", file=sys.stderr)
+
+
+def show(comparison: Comparison, report: Path) -> None:
+    """Print the verdict, the table and where the report is."""
+    console = Console()
+    console.print(comparison.title, style="bold", markup=False, highlight=False)
+    for sentence in comparison.verdict:
+        console.print(f"- {sentence}", markup=False, highlight=False)
+    console.print(_table(comparison))
+    for name, why in comparison.skipped.items():
+        console.print(f"skipped {name}: {why}", markup=False, highlight=False)
+    console.print(f"report: {report}", markup=False, highlight=False, soft_wrap=True)
+
+
+def show_run(problem: Problem, run: Run, saved: Path) -> None:
+    """Print one run's metrics and where it is saved."""
+    console, metrics = Console(), measure(problem, run)
+    for name in metrics.rms_error:
+        unit = run.unit(f"error.{name}")
+        line = f"{name}: rms error {metrics.rms_error[name]:.4g} {unit}, max {metrics.max_error[name]:.4g} {unit}"
+        console.print(line, markup=False, highlight=False)
+    if run.stop:
+        console.print(f"ended early: {run.stop}", markup=False, highlight=False)
+    console.print(f"saved: {saved}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _table(comparison: Comparison) -> Table:
+    table = Table(title=f"{comparison.problem}, from t = {comparison.measure_from:g} s, seed {comparison.seed}")
+    table.add_column("controller")
+    first = comparison.entries[0] if comparison.entries else None
+    names = list(first.metrics.rms_error) if first else []
+    for name in names:
+        unit = first.run.unit(f"error.{name}") if first else ""
+        table.add_column(f"rms / max error {name} [{unit}]".replace("[", "\\["), justify="right")
+    for head in ("cycle us", "p99", "clipped", "contraction", "status"):
+        table.add_column(head, justify="right")
+    for entry in comparison.entries:
+        table.add_row(*_row(entry, names))
+    return table
+
+
+def _row(entry: Entry, names: list[str]) -> list[str]:
+    metrics, cycle, contraction = entry.metrics, entry.cycle, entry.contraction
+    errors = [f"{_number(metrics.rms_error[n])} / {_number(metrics.max_error[n])}" for n in names]
+    times = [f"{cycle.median:.2g}", f"{cycle.p99:.3g}"] if cycle else ["", ""]
+    factor = f"{contraction.predicted:.3f} / {contraction.measured:.3f}" if contraction else ""
+    status = "ended early" if entry.run.stop else metrics.worst_status.lower().replace("_", " ")
+    return [entry.name.replace("[", "\\["), *errors, *times, f"{100 * metrics.clipped_share:.2g} %", factor, status]
+
+
+def _number(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3g}"

@@ -1,0 +1,129 @@
+"""A run: every signal of a closed loop by name and unit, and what became of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fpirhc.errors import InvalidName, OutputError, nearest
+from fpirhc.symbolic.layout import Layout, Signal
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+FORMAT = 1  # of saved runs
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """The log of one closed-loop run.
+
+    Parameters:
+        problem, controller: their names. seed: what the disturbances were drawn with. period: s.
+        layout: the logged signals. log: shape (cycles, layout.size), read-only.
+        stop: why the run ended early, None when it did not.
+        compiled: whether the loop ran as compiled C. settings: of problem and controller, as plain data.
+
+    `run["desired"]` has shape (cycles, entries); `run["desired.q1"]` has shape (cycles,).
+    """
+
+    problem: str
+    controller: str
+    seed: int
+    period: float
+    layout: Layout
+    log: np.ndarray
+    stop: str | None
+    compiled: bool
+    settings: Mapping[str, Any]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name in self.layout:
+            return self.log[:, self.layout.slice(name)]
+        if name in self.layout.columns:
+            return self.log[:, self.layout.columns.index(name)]
+        valid = [*self.layout.names, *self.layout.columns]
+        raise InvalidName(f"signal '{name}' is not in this run.{nearest(name, valid)}")
+
+    @property
+    def time(self) -> np.ndarray:
+        """Time of every cycle, shape (cycles,), s."""
+        return self["time"][:, 0]
+
+    @property
+    def cycles(self) -> int:
+        """Number of cycles that were run."""
+        return int(self.log.shape[0])
+
+    def unit(self, column: str) -> str:
+        """Unit of one column."""
+        return self.layout.units[self.layout.columns.index(column)]
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """All signals as a pandas DataFrame with one column per entry, indexed by time."""
+        import pandas as pd
+
+        return pd.DataFrame(self.log, columns=list(self.layout.columns), index=pd.Index(self.time, name="time [s]"))
+
+    def plot(self) -> Figure:
+        """Errors, commands and responses over time as a matplotlib Figure."""
+        from fpirhc.report.figures import run_figure
+
+        return run_figure(self)
+
+    def save(self, path: str | Path) -> None:
+        """Write the run to a .npz file (no pickle).
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        facts = {
+            "format": FORMAT,
+            "problem": self.problem,
+            "controller": self.controller,
+            "seed": self.seed,
+            "period": self.period,
+            "stop": self.stop,
+            "compiled": self.compiled,
+            "settings": self.settings,
+            "signals": [[s.name, list(s.elements), list(s.units)] for s in self.layout.signals],
+        }
+        try:
+            with Path(path).open("wb") as file:
+                np.savez_compressed(file, log=self.log, facts=np.array(json.dumps(facts)))
+        except OSError as error:
+            raise OutputError(f"cannot write the run to '{path}': {error.strerror}") from None
+
+
+def load_run(path: str | Path) -> Run:
+    """Read a run that `Run.save` wrote.
+
+    Raises:
+        OutputError: the file is missing, damaged, or of another format.
+    """
+    try:
+        with np.load(Path(path), allow_pickle=False) as stored:
+            facts, log = json.loads(str(stored["facts"])), stored["log"]
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise OutputError(f"cannot read a run from '{path}': {error}") from None
+    if facts.get("format") != FORMAT:
+        raise OutputError(f"'{path}' has format {facts.get('format')}, this version reads {FORMAT}")
+    layout = Layout(tuple(Signal(n, tuple(e), tuple(u)) for n, e, u in facts["signals"]))
+    log.setflags(write=False)
+    return Run(
+        facts["problem"],
+        facts["controller"],
+        facts["seed"],
+        facts["period"],
+        layout,
+        log,
+        facts["stop"],
+        facts["compiled"],
+        facts["settings"],
+    )

@@ -1,0 +1,161 @@
+"""Runs a closed loop and logs every signal.
+
+The loop's one-cycle Function is accumulated over a chunk of cycles inside CasADi (compiled when a C compiler is found),
+so Python is entered once per chunk: to fill in disturbances, to check that all signals are finite, to report progress.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller
+from fpirhc.describe import describe
+from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.loop import close_loop
+from fpirhc.problem import Problem
+from fpirhc.run import Run
+from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.layout import Layout, Signal
+from fpirhc.symbolic.native import native
+
+CHUNK = 500  # cycles per call: long enough to hide Python, short enough for progress and Ctrl-C
+Progress = Callable[[int, int], None]
+
+
+def simulate(
+    problem: Problem,
+    controller: Controller,
+    *,
+    seed: int,
+    name: str = "",
+    compiled: bool = True,
+    progress: Progress | None = None,
+) -> Run:
+    """Run the closed loop of problem and controller and return every signal.
+
+    Parameters: `seed` of the disturbances' noise; `name` of the controller in the results; `compiled`: use C when there
+    is a compiler; `progress` is called with (cycles done, cycles in all).
+
+    A signal that becomes NaN or infinite ends the run at that cycle; the finite part is kept and `Run.stop` says why.
+    """
+    chosen = controller.resolved(problem)
+    loop = close_loop(problem, chosen)
+    chunked = loop.function.mapaccum(f"{loop.function.name()}_run", CHUNK)
+    backend = native(chunked) if compiled else None
+    evaluator = Evaluator(backend.function if backend else chunked)
+    log, stop = _run_chunks(problem, loop.memory, loop.trace, evaluator, seed, progress)
+    layout = loop.trace
+    if problem.cost is not None and problem.horizon is not None:
+        costs = _costs(problem, layout, log)
+        layout, log = layout + Layout((costs[0],)), np.hstack([log, costs[1]])
+    log.setflags(write=False)
+    step_limit = chosen.adaptive.largest_step()
+    settings = {
+        "step_limit": step_limit if np.isfinite(step_limit) else None,
+        "controller": describe(chosen),
+        "problem": describe(problem),
+        "backend": "compiled C" if backend and backend.compiled else "CasADi virtual machine",
+        "why not compiled": backend.reason if backend else "not asked for",
+    }
+    was_compiled = bool(backend and backend.compiled)
+    return Run("", name or type(chosen).__name__, seed, problem.period, layout, log, stop, was_compiled, settings)
+
+
+def disturbance_table(problem: Problem, seed: int, cycles: int) -> np.ndarray:
+    """Return the disturbances of every cycle, shape (cycles, number of disturbances); each has its own stream."""
+    times = np.arange(cycles) * problem.period
+    streams = np.random.SeedSequence(seed).spawn(len(problem.disturbances))
+    columns = [
+        d.values(times, np.random.default_rng(stream))
+        for d, stream in zip(problem.disturbances.values(), streams, strict=True)
+    ]
+    return np.column_stack(columns) if columns else np.zeros((cycles, 0))
+
+
+def _run_chunks(
+    problem: Problem,
+    memory: Layout,
+    trace: Layout,
+    evaluator: Evaluator,
+    seed: int,
+    progress: Progress | None,
+) -> tuple[np.ndarray, str | None]:
+    cycles = problem.cycles
+    padded = -(-cycles // CHUNK) * CHUNK
+    table = disturbance_table(problem, seed, padded)
+    log = np.empty((cycles, trace.size))
+    evaluator.arguments[-1][:] = memory.start()
+    for at in range(0, cycles, CHUNK):
+        if table.shape[1]:
+            evaluator.arguments[0].ravel()[:] = table[at : at + CHUNK].ravel()
+        evaluator.evaluate()
+        rows = evaluator.results[1].reshape(CHUNK, trace.size)[: cycles - at]
+        log[at : at + rows.shape[0]] = rows
+        bad = _first_bad(rows)
+        if bad is not None:
+            row, column = bad
+            return log[: at + row].copy(), _why(trace, at + row, column, problem.period)
+        evaluator.arguments[-1][:] = evaluator.results[0].reshape(CHUNK, memory.size)[-1]
+        if progress:
+            progress(at + rows.shape[0], cycles)
+    return log, None
+
+
+def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:
+    """Row and column of the first value that is not finite."""
+    finite = np.isfinite(rows)
+    if finite.all():
+        return None
+    row = int(np.argmin(finite.all(axis=1)))
+    return row, int(np.argmin(finite[row]))
+
+
+def _why(trace: Layout, cycle: int, column: int, period: float) -> str:
+    return (
+        f"signal '{trace.columns[column]}' is not finite at t = {cycle * period:g} s (cycle {cycle}); "
+        "the run keeps what came before"
+    )
+
+
+def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, np.ndarray]:
+    """The stage cost of every cycle by term, at the actual state and command, with the exact parameters.
+
+    All controllers of a problem are judged by the same cost, whatever they believe: effort relative to a feedforward
+    means the plant's own.
+    """
+    assert problem.horizon is not None
+    assert problem.cost is not None
+    plant = problem.plant
+    one_cycle = replace(problem.horizon, stages=1, step=problem.period)
+    ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits)
+    data_of = stage_data(plant, problem.reference, one_cycle, problem.cost)
+    states, commands = log[:, layout.slice("state")], log[:, layout.slice("command")]
+    if ocp.state.size > plant.state.size:
+        states = np.hstack([states, np.vstack([commands[:1], commands[:-1]])])
+    times = log[:, layout.slice("time")]
+    function = _cost_function(ocp, data_of, CHUNK)
+    evaluator = Evaluator(function)
+    found = np.empty((log.shape[0], len(ocp.terms)))
+    evaluator.arguments[3][:] = plant.exact
+    for at in range(0, log.shape[0], CHUNK):
+        size = min(CHUNK, log.shape[0] - at)
+        for argument, source in zip(evaluator.arguments, (times, states, commands), strict=False):
+            argument.reshape(CHUNK, -1)[:size] = source[at : at + size]
+        evaluator.evaluate()
+        found[at : at + size] = evaluator.results[0].reshape(CHUNK, -1)[:size]
+    return Signal("cost", tuple(ocp.terms)), found
+
+
+def _cost_function(ocp, data_of, count):
+    import casadi as ca
+
+    t, s = ca.MX.sym("t"), ca.MX.sym("s", ocp.state.size)
+    u, p = ca.MX.sym("u", ocp.input.size), ca.MX.sym("p", data_of.size1_in(1))
+    one = ca.Function("fpirhc_cost", [t, s, u, p], [ocp.stage_cost(s, u, data_of(t, p)[:, 0])[1]])
+    times, states = ca.MX.sym("t", 1, count), ca.MX.sym("s", ocp.state.size, count)
+    inputs = ca.MX.sym("u", ocp.input.size, count)
+    given = one.map(count)(times, states, inputs, ca.repmat(p, 1, count))
+    return ca.Function("fpirhc_costs", [times, states, inputs, p], [given])

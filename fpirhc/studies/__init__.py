@@ -1,0 +1,1 @@
+"""Studies: what a user asks of several runs."""

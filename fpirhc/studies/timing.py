@@ -1,0 +1,47 @@
+"""How long one control cycle takes: the controller alone, from measurement to command."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller
+from fpirhc.problem import Problem
+from fpirhc.run import Run
+from fpirhc.stepper import Stepper
+
+REPLAYED = 2000  # cycles of the run that are stepped again, one by one
+
+
+@dataclass(frozen=True)
+class CycleTime:
+    """Wall time of one call of `Stepper.step`, microseconds; `first` is kept apart from the rest."""
+
+    median: float
+    p99: float
+    maximum: float
+    first: float
+
+
+def measure_cycle(problem: Problem, controller: Controller, run: Run, *, compiled: bool = True) -> CycleTime | None:
+    """Replay the run's measurements through the controller, one call per cycle, and return the times.
+
+    The replay computes what the run computed: the controller's memory starts afresh and sees the same measurements.
+    None when the run is too short to say anything.
+    """
+    cycles = min(run.cycles, REPLAYED)
+    if cycles < 2:
+        return None
+    stepper = Stepper(problem, controller, compiled=compiled)
+    memory = stepper.start()
+    taken = np.empty(cycles)
+    times, states, realised = run.time[:cycles], run["state"][:cycles], run["realised"][:cycles]
+    for k in range(cycles):
+        begin = time.perf_counter_ns()
+        _, memory = stepper.step(times[k], states[k], realised[k], memory)
+        taken[k] = time.perf_counter_ns() - begin
+    micro = taken / 1e3
+    later = micro[1:]
+    return CycleTime(float(np.median(later)), float(np.quantile(later, 0.99)), float(later.max()), float(micro[0]))

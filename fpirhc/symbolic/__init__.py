@@ -1,0 +1,1 @@
+"""Symbols and the one door through which numbers meet CasADi."""

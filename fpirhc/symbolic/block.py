@@ -1,0 +1,199 @@
+"""The contract of everything that happens in a control cycle, and how blocks become one Function.
+
+A `Block` reads named signals, writes named signals and may remember some: its `step` is written in
+CasADi expressions and has no side effects. `compose` wires blocks by signal name into one `Composite`
+whose Function maps (reads, memory) to (memory, trace). A `Delay` carries a signal to the next cycle, so that
+what a late block writes (the clipped command, say) is what an early block reads one cycle later. Signals whose name
+begins with '_' are wires between blocks and stay out of the trace.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from types import SimpleNamespace
+from typing import Any
+
+import casadi as ca
+
+from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+
+Step = Callable[[Any], Mapping[str, Expression]]
+PREFIX = "fpirhc_"  # keeps generated C names away from those of libc
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A named step: (reads, memory) -> (writes, memory).
+
+    `step` gets one object with every read and remembered signal as an attribute and returns a mapping with every
+    written signal and, for each remembered signal m, 'm_next'. An `opaque` block holds operations that scalar
+    expressions cannot (solver calls, table look-up, short circuits) and is built with MX.
+    """
+
+    name: str
+    reads: Layout
+    writes: Layout
+    step: Step
+    memory: Layout = Layout()
+    opaque: bool = False
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """Function of (each read, each remembered) -> (each written, each remembered, one cycle later).
+
+        Raises:
+            InvalidName: the step forgot a signal. InvalidShape: a signal has the wrong size.
+        """
+        kind = ca.MX if self.opaque else ca.SX
+        taken = [*self.reads.signals, *self.memory.signals]
+        symbols = {s.name: kind.sym(s.name, s.size) for s in taken}
+        given = self.step(SimpleNamespace(**symbols))
+        results = []
+        for signal, key in self._results():
+            if key not in given:
+                raise InvalidName(f"block '{self.name}' does not give '{key}'.{nearest(key, given)}")
+            value = kind(given[key])
+            if value.numel() != signal.size:
+                raise InvalidShape(
+                    f"block '{self.name}' gives '{key}' with {value.numel()} entries, expected {signal.size}"
+                )
+            results.append(ca.densify(value.reshape((signal.size, 1))))
+        keys = [key for _, key in self._results()]
+        return ca.Function(PREFIX + self.name, list(symbols.values()), results, list(symbols), keys)
+
+    def _results(self) -> list[tuple[Signal, str]]:
+        written = [(s, s.name) for s in self.writes.signals]
+        return written + [(s, f"{s.name}_next") for s in self.memory.signals]
+
+
+@dataclass(frozen=True, eq=False)
+class Delay:
+    """Signal `now` is what `source` was one cycle ago (its start value in the first cycle)."""
+
+    now: Signal
+    source: str
+
+
+@dataclass(frozen=True, eq=False)
+class Composite:
+    """Blocks as one step: `function` maps (each read..., memory) to (memory, trace)."""
+
+    name: str
+    blocks: tuple[Block, ...]
+    delays: tuple[Delay, ...]
+    reads: Layout
+    memory: Layout
+    trace: Layout
+    function: ca.Function
+
+    @property
+    def opaque(self) -> bool:
+        """Whether some block holds operations that scalar expressions cannot."""
+        return any(b.opaque for b in self.blocks)
+
+
+def compose(
+    name: str, reads: Layout, blocks: Sequence[Block], delays: Sequence[Delay] = (), outputs: Sequence[str] = ()
+) -> Composite:
+    """Wire `blocks`, in order, by signal name into one step.
+
+    Parameters: `reads` come from outside; `delays` carry signals to the next cycle; `outputs` names traced
+    signals that the Function returns once more by themselves, after (memory, trace).
+
+    Raises:
+        InvalidName: a block reads what nobody wrote, or two blocks write the same name.
+        InvalidShape: a reader and a writer disagree on a size.
+    """
+    memory = Layout(tuple(d.now for d in delays) + tuple(s for b in blocks for s in b.memory.signals))
+    trace = Layout(tuple(s for b in blocks for s in b.writes.signals if not s.name.startswith("_")))
+    inputs = {s.name: ca.MX.sym(s.name, s.size) for s in reads.signals}
+    remembered = ca.MX.sym("memory", memory.size)
+    known: dict[str, Expression] = {**memory.split(remembered), **inputs}
+    following: dict[str, Expression] = {}
+    for block in blocks:
+        _call(block, known, following)
+    for delay in delays:
+        following[delay.now.name] = _lookup(f"delay '{delay.now.name}'", delay.now, delay.source, known)
+    returned = [memory.join(following), trace.join(known), *(known[o] for o in outputs)]
+    function = ca.Function(
+        PREFIX + name,
+        [*inputs.values(), remembered],
+        [ca.densify(ca.MX(r)) for r in returned],
+        [*inputs, "memory"],
+        ["memory_next", "trace", *outputs],
+    )
+    if not any(b.opaque for b in blocks):
+        function = function.expand(PREFIX + name)
+    return Composite(name, tuple(blocks), tuple(delays), reads, memory, trace, function)
+
+
+def every(block: Block, cycles: int) -> Block:
+    """Return a block that runs `block` in every `cycles`-th cycle and holds its writes in between.
+
+    The skipped cycles do not evaluate it (short circuit), so an expensive block costs only when it runs.
+    """
+    if cycles < 1:
+        raise InvalidValue(f"block '{block.name}' is to run every {cycles} cycles; expected 1 or more")
+    if cycles == 1:
+        return block
+    phase = scalar(f"{block.name}_phase")
+    held = Layout(tuple(Signal(f"{block.name}_held_{s.name}", s.elements, s.units, s.start) for s in block.writes.signals))
+    own = Layout((phase, *held.signals)) + block.memory
+    run, hold = _branches(block, held)
+
+    def step(signals: Any) -> dict[str, Expression]:
+        taken = [getattr(signals, n) for n in (*held.names, *block.reads.names, *block.memory.names)]
+        choice = ca.Function.if_else(f"{PREFIX}{block.name}_every", run, hold)
+        due = getattr(signals, phase.name) < 0.5
+        given = choice(due, *taken)
+        values = dict(zip([key for _, key in block._results()], ca.vertsplit(given, _ends(block)), strict=True))
+        values |= {f"{h}_next": values[s] for h, s in zip(held.names, block.writes.names, strict=True)}
+        counted = getattr(signals, phase.name) + 1
+        values[f"{phase.name}_next"] = ca.if_else(counted > cycles - 0.5, 0, counted)
+        return values
+
+    return Block(f"{block.name}_every_{cycles}", block.reads, block.writes, step, own, opaque=True)
+
+
+def _ends(block: Block) -> list[int]:
+    ends = [0]
+    for signal, _ in block._results():
+        ends.append(ends[-1] + signal.size)
+    return ends
+
+
+def _branches(block: Block, held: Layout) -> tuple[ca.Function, ca.Function]:
+    """The two sides of the switch, both (held writes, reads, memory) -> one column of results."""
+    kept = [ca.MX.sym(s.name, s.size) for s in held.signals]
+    reads = [ca.MX.sym(s.name, s.size) for s in block.reads.signals]
+    memory = [ca.MX.sym(s.name, s.size) for s in block.memory.signals]
+    given = block.function(*reads, *memory)
+    fresh = ca.vertcat(*given) if isinstance(given, tuple) else given
+    arguments = [*kept, *reads, *memory]
+    run = ca.Function(f"{PREFIX}{block.name}_run", arguments, [fresh])
+    hold = ca.Function(f"{PREFIX}{block.name}_hold", arguments, [ca.vertcat(*kept, *memory)])
+    return run, hold
+
+
+def _call(block: Block, known: dict[str, Expression], following: dict[str, Expression]) -> None:
+    taken = [_lookup(f"block '{block.name}'", s, s.name, known) for s in block.reads.signals]
+    given = block.function(*taken, *(known[m] for m in block.memory.names))
+    values = given if isinstance(given, tuple) else (given,)
+    results = dict(zip([key for _, key in block._results()], values, strict=True))
+    for name in block.writes.names:
+        if name in known:
+            raise InvalidName(f"block '{block.name}' writes '{name}', which is already written")
+        known[name] = results[name]
+    following.update({m: results[f"{m}_next"] for m in block.memory.names})
+
+
+def _lookup(reader: str, signal: Signal, source: str, known: Mapping[str, Expression]) -> Expression:
+    if source not in known:
+        raise InvalidName(f"{reader} reads '{source}', which no earlier block writes.{nearest(source, known)}")
+    found = known[source]
+    if found.numel() != signal.size:
+        raise InvalidShape(f"{reader} reads '{source}' with {signal.size} entries, but it has {found.numel()}")
+    return found

@@ -1,0 +1,15 @@
+"""Functions that models need often and that must stay smooth for derivatives."""
+
+from __future__ import annotations
+
+from fpirhc.symbolic.layout import Expression
+
+SMOOTHING = 1e-6  # in the unit of the argument: where the power is rounded off around zero
+
+
+def signed_power(d: Expression, exponent: Expression) -> Expression:
+    """Return sign(d) |d|^exponent, rounded off within 1e-6 of zero so that its derivatives stay finite.
+
+    Computed as d (d^2 + 1e-12)^((exponent - 1)/2).
+    """
+    return d * (d * d + SMOOTHING**2) ** ((exponent - 1) / 2)

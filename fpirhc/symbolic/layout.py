@@ -1,0 +1,196 @@
+"""Named signals laid out in one flat vector.
+
+A `Signal` is a short vector with a name, a unit, named elements and a start value. A `Layout` is an
+ordered set of signals: it turns names into places of a flat vector and back, for numbers and for
+CasADi expressions alike. `Named` gives a vector's elements by attribute: `q.q1`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
+
+Expression = Any  # a CasADi SX, MX or DM column; CasADi's own stubs do not name their union
+
+
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """A named vector: `elements` name its entries (empty: a scalar), `units` theirs, `start` the first value."""
+
+    name: str
+    elements: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
+    start: tuple[float, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Number of entries."""
+        return max(1, len(self.elements))
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the entries in a table: 'desired.q1', or the signal's name for a scalar."""
+        return tuple(f"{self.name}.{e}" for e in self.elements) or (self.name,)
+
+    @property
+    def entry_units(self) -> tuple[str, ...]:
+        """One unit per entry; '1' where none was given."""
+        if not self.units:
+            return ("1",) * self.size
+        return self.units if len(self.units) == self.size else self.units * self.size
+
+    def start_vector(self) -> np.ndarray:
+        """Start value, shape (size,); zeros where none was given."""
+        return np.array(self.start if self.start else (0.0,) * self.size, dtype=float)
+
+
+def scalar(name: str, unit: str = "1", start: float = 0.0) -> Signal:
+    """Return a scalar signal."""
+    return Signal(name, (), (unit,), (start,))
+
+
+def vector(
+    name: str, elements: Sequence[str], units: Sequence[str] | str = "1", start: Sequence[float] = ()
+) -> Signal:
+    """Return a vector signal with named elements; one unit serves all."""
+    every = (units,) * len(elements) if isinstance(units, str) else tuple(units)
+    return Signal(name, tuple(elements), every, tuple(float(v) for v in start))
+
+
+class Named:
+    """The elements of one vector by name: `q.q1`; `q.vector` is the whole column."""
+
+    __slots__ = ("_elements", "_what", "vector")
+
+    def __init__(self, elements: Sequence[str], column: Expression, what: str = "name") -> None:
+        self._elements = tuple(elements)
+        self._what = what
+        self.vector = column
+
+    def __getattr__(self, name: str) -> Expression:
+        return self[name]
+
+    def __getitem__(self, name: str) -> Expression:
+        try:
+            return self.vector[self._elements.index(name)]
+        except ValueError:
+            raise InvalidName(f"{self._what} '{name}' is unknown.{nearest(name, self._elements)}") from None
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._elements)
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """An ordered set of named signals in one flat vector."""
+
+    signals: tuple[Signal, ...] = ()
+
+    def __post_init__(self) -> None:
+        names = [s.name for s in self.signals]
+        for name in names:
+            if names.count(name) > 1:
+                raise InvalidName(f"signal '{name}' appears twice in one layout")
+        for s in self.signals:
+            if s.start and len(s.start) != s.size:
+                raise InvalidShape(f"signal '{s.name}' has {s.size} entries but {len(s.start)} start values")
+            if not np.all(np.isfinite(s.start_vector())):
+                raise InvalidValue(f"start value of '{s.name}' is not finite: {s.start}")
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the signals in order."""
+        return tuple(s.name for s in self.signals)
+
+    @cached_property
+    def size(self) -> int:
+        """Length of the flat vector."""
+        return sum(s.size for s in self.signals)
+
+    @cached_property
+    def columns(self) -> tuple[str, ...]:
+        """Names of all entries of the flat vector."""
+        return tuple(c for s in self.signals for c in s.columns)
+
+    @cached_property
+    def units(self) -> tuple[str, ...]:
+        """Units of all entries of the flat vector."""
+        return tuple(u for s in self.signals for u in s.entry_units)
+
+    @cached_property
+    def _slices(self) -> dict[str, slice]:
+        places, at = {}, 0
+        for s in self.signals:
+            places[s.name] = slice(at, at + s.size)
+            at += s.size
+        return places
+
+    def __getitem__(self, name: str) -> Signal:
+        self.slice(name)
+        return self.signals[self.names.index(name)]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._slices
+
+    def __add__(self, other: Layout) -> Layout:
+        return Layout(self.signals + other.signals)
+
+    def slice(self, name: str) -> slice:
+        """Place of one signal in the flat vector.
+
+        Raises:
+            InvalidName: with the nearest valid name.
+        """
+        try:
+            return self._slices[name]
+        except KeyError:
+            raise InvalidName(f"signal '{name}' is unknown.{nearest(name, self.names)}") from None
+
+    def start(self) -> np.ndarray:
+        """Start values, shape (size,)."""
+        return np.concatenate([s.start_vector() for s in self.signals]) if self.signals else np.zeros(0)
+
+    def pack(self, values: Mapping[str, Any]) -> np.ndarray:
+        """Numbers by name -> flat vector; signals not named take their start value.
+
+        Raises:
+            InvalidName: an unknown signal. InvalidShape: a wrong number of entries.
+        """
+        flat = self.start()
+        for name, value in values.items():
+            place = self.slice(name)
+            entries = np.asarray(value, dtype=float).ravel()
+            if entries.size != place.stop - place.start:
+                raise InvalidShape(
+                    f"signal '{name}' has {place.stop - place.start} entries, got {entries.size}"
+                )
+            flat[place] = entries
+        return flat
+
+    def unpack(self, flat: np.ndarray) -> dict[str, np.ndarray]:
+        """Flat vector(s), entries along the last axis -> arrays by name.
+
+        Raises:
+            InvalidShape: the last axis is not `size` long.
+        """
+        if flat.shape[-1] != self.size:
+            raise InvalidShape(f"expected {self.size} entries, got {flat.shape[-1]}")
+        return {name: flat[..., place] for name, place in self._slices.items()}
+
+    def split(self, flat: Expression) -> dict[str, Expression]:
+        """CasADi column -> expressions by name."""
+        if not self.signals:
+            return {}
+        ends = [0, *(place.stop for place in self._slices.values())]
+        return dict(zip(self.names, ca.vertsplit(flat, ends), strict=True))
+
+    def join(self, expressions: Mapping[str, Expression]) -> Expression:
+        """CasADi expressions by name -> column, in the layout's order."""
+        return ca.vertcat(*(expressions[name] for name in self.names)) if self.signals else ca.DM(0, 1)

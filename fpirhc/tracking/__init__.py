@@ -1,0 +1,1 @@
+"""Tracking laws: the desired response that brings the plant back to its nominal motion."""

@@ -1,0 +1,117 @@
+"""Exponential decay of the tracking error, for any relative order.
+
+With e = q^N - q and e_int its integral the law prescribes (d/dt + rate)^(n+1) e_int = 0, that is
+
+    q^(n),Des = q^(n),N + sum_{s=0}^{n} C(n+1, s) rate^(n+1-s) e_int^(s),   e_int^(s) = e^(s-1) for s >= 1,
+
+and without the integral (d/dt + rate)^n e = 0. Error: nominal minus actual, hence plus signs throughout.
+
+References: J. K. Tar, J. F. Bito, I. Rudas, Acta Polytechnica Hungarica 13(1), 2016.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+
+from fpirhc.errors import InvalidValue
+from fpirhc.plant import Plant
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+from fpirhc.tracking.base import Tracking
+
+
+@dataclass(frozen=True)
+class Exponential(Tracking):
+    """All error modes decay as exp(-rate t).
+
+    Parameters:
+        rate: Lambda, 1/s. The digital loop needs rate x period well below 0.667 for n = 2 (0.412 for n = 4).
+        integral: include the integral of the error (removes constant offsets, adds an undershoot).
+        bumpless: start the integral so that the first desired response is the nominal one.
+
+    Raises:
+        InvalidValue: rate not positive.
+    """
+
+    rate: float
+    integral: bool = True
+    bumpless: bool = True
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.rate) and self.rate > 0):
+            raise InvalidValue(f"tracking rate must be positive (1/s), got {self.rate}")
+
+    def gains(self, order: int) -> tuple[float, ...]:
+        """Gains of (e_int, e, e', ...) with the integral, of (e, e', ...) without; lowest derivative first."""
+        degree = order + 1 if self.integral else order
+        return tuple(math.comb(degree, s) * self.rate ** (degree - s) for s in range(degree))
+
+    def law(self, plant: Plant) -> Block:
+        """Block (state, target, nominal, started, integral) -> (error to the target, desired, integral in use)."""
+        reads = (
+            plant.state,
+            Signal("_target", plant.state.elements, plant.state.units),
+            plant.response_signal("nominal"),
+            scalar("started"),
+            _integral(plant, "_integral_before"),
+        )
+        writes = (_error(plant), plant.response_signal("desired"), _integral(plant, "_integral_used"))
+
+        def step(s: Any) -> dict[str, Expression]:
+            errors = _error_chains(plant, s._target - s.state)
+            begin = ca.vertcat(*(self._first_integral(chain) for chain in errors))
+            used = ca.if_else(s.started > 0.5, s._integral_before, begin)
+            feedback = [self._feedback(used[k], chain) for k, chain in enumerate(errors)]
+            return {
+                "_target_error": ca.vertcat(*(chain[0] for chain in errors)),
+                "desired": s.nominal + ca.vertcat(*feedback),
+                "_integral_used": used,
+            }
+
+        return Block("tracking", Layout(reads), Layout(writes), step)
+
+    def update(self, plant: Plant, period: float) -> Block:
+        """Block that integrates the error, except while the command is clipped."""
+        reads = (_error(plant), scalar("clipped"), _integral(plant, "_integral_used"))
+
+        def step(s: Any) -> dict[str, Expression]:
+            return {"integral": s._integral_used + (1 - s.clipped) * period * s._target_error}
+
+        return Block("tracking_update", Layout(reads), Layout((_integral(plant, "integral"),)), step)
+
+    def delays(self, plant: Plant) -> tuple[Delay, ...]:
+        """The integral of the error is remembered."""
+        return (Delay(_integral(plant, "_integral_before"), "integral"),)
+
+    def _feedback(self, integral: Expression, chain: list[Expression]) -> Expression:
+        terms = [integral, *chain] if self.integral else chain
+        return sum(g * e for g, e in zip(self.gains(len(chain)), terms, strict=True))
+
+    def _first_integral(self, chain: list[Expression]) -> Expression:
+        if not (self.integral and self.bumpless):
+            return chain[0] * 0
+        first, *others = self.gains(len(chain))
+        return -sum(g * e for g, e in zip(others, chain, strict=True)) / first
+
+
+def _error(plant: Plant) -> Signal:
+    units = [plant.coordinates[c] for c in plant.controlled_names]
+    return vector("_target_error", plant.controlled_names, units)
+
+
+def _integral(plant: Plant, name: str) -> Signal:
+    units = [f"{plant.coordinates[c]} s" for c in plant.controlled_names]
+    return vector(name, plant.controlled_names, units)
+
+
+def _error_chains(plant: Plant, error: Expression) -> list[list[Expression]]:
+    """Per controlled coordinate: [e, e', ...] below its order."""
+    chains = []
+    for k in plant.controlled_indices:
+        name, order = plant.names[k], plant.orders[k]
+        chains.append([error[plant.state.elements.index(name + "'" * s)] for s in range(order)])
+    return chains

@@ -1,0 +1,43 @@
+"""Small plants that several tests share."""
+
+from __future__ import annotations
+
+import fpirhc as fp
+
+
+def linear(gain: float, believed: float) -> fp.Plant:
+    """y'' = gain u with a wrong gain: the response Jacobian is gain / believed."""
+    return fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "N"},
+        parameters={"b": fp.Parameter(approximate=believed, exact=gain, unit="1/kg")},
+        response=lambda q, v, u, p: {"y": p.b * u.u},
+    )
+
+
+def pendulum(mass: float = 1.0, believed: float = 1.4) -> fp.Plant:
+    """A pendulum with a torque, q measured from hanging down."""
+    import casadi as ca
+
+    return fp.Plant(
+        coordinates={"angle": "rad"},
+        inputs={"torque": "N m"},
+        parameters={
+            "m": fp.Parameter(approximate=believed, exact=mass, unit="kg"),
+            "l": fp.Parameter(approximate=0.5, exact=0.6, unit="m"),
+        },
+        response=lambda q, v, u, p: {
+            "angle": (u.torque - 0.1 * v.angle) / (p.m * p.l**2) - 9.81 / p.l * ca.sin(q.angle)
+        },
+    )
+
+
+def chain(order: int) -> fp.Plant:
+    """A chain of integrators of any order: y^(order) = u / m."""
+    responses = {
+        1: lambda q, u, p: {"y": u.u / p.m},
+        2: lambda q, v, u, p: {"y": u.u / p.m},
+        3: lambda q, v, a, u, p: {"y": u.u / p.m},
+        4: lambda q, v, a, j, u, p: {"y": u.u / p.m},
+    }
+    return fp.Plant({"y": "m"}, {"u": "N"}, {"m": fp.Parameter(1.0, 1.0, "kg")}, responses[order], order=order)

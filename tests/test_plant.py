@@ -1,0 +1,126 @@
+"""Laws and mistakes of plants."""
+
+from __future__ import annotations
+
+import casadi as ca
+import fpirhc as fp
+import numpy as np
+import pytest
+from fpirhc.errors import InvalidProblem, NotInvertible
+from plants import chain, linear, pendulum
+
+TWO = {"m": fp.Parameter(1.5, 1.0, "kg"), "k": fp.Parameter(3.0, 2.0, "N/m")}
+
+
+def two_mass_chain(controlled=None):
+    """Force on the second mass only: the first is reached after four derivatives."""
+    return fp.Plant(
+        {"a": "m", "b": "m"},
+        {"F": "N"},
+        TWO,
+        lambda q, v, u, p: {"a": p.k * (q.b - q.a) / p.m, "b": (u.F - p.k * (q.b - q.a)) / p.m},
+        controlled=controlled,
+    )
+
+
+@pytest.mark.parametrize("plant", [pendulum(), linear(2.0, 3.0), chain(1), chain(3), chain(4)])
+def test_inverse_undoes_response(plant):
+    """f(x, f^-1(x, r)) = r: the model's inverse is an inverse."""
+    random = np.random.default_rng(1)
+    for _ in range(20):
+        x, r = random.normal(size=plant.state.size), random.normal(size=1)
+        u = plant.inverse_function(x, r, plant.approximate)
+        back = plant.controlled_response_function(x, u, plant.approximate)
+        np.testing.assert_allclose(back.full().ravel(), r, rtol=1e-12, atol=1e-12, equal_nan=False)
+
+
+def test_state_is_derivative_major():
+    """Named entries: all q, then all q'."""
+    assert two_mass_chain(("b",)).state.elements == ("a", "b", "a'", "b'")
+
+
+def test_mixed_orders():
+    """Orders are data: a coordinate of order 1 has no velocity in the state."""
+    plant = fp.Plant(
+        {"a": "m", "b": "rad"},
+        {"u": "N", "w": "N"},
+        {},
+        lambda q, v, u, p: {"a": u.u - q.a, "b": u.w - v.b},
+        order={"a": 1, "b": 2},
+    )
+    assert plant.state.elements == ("a", "b", "b'")
+    assert plant.orders == (1, 2)
+
+
+def test_non_affine_response_is_inverted_numerically():
+    """u + u^3 = r has one real root; Newton finds it, and a missing root is NaN, never a wrong number."""
+    cubic = fp.Plant({"y": "1"}, {"u": "1"}, {}, lambda q, u, p: {"y": u.u + u.u**3 - q.y}, order=1)
+    assert not cubic.affine
+    assert float(cubic.inverse_function([0.0], [2.0], [])) == pytest.approx(1.0, abs=1e-9)
+    square = fp.Plant({"y": "1"}, {"u": "1"}, {}, lambda q, u, p: {"y": (u.u - 1) ** 2}, order=1)
+    assert np.isnan(float(square.inverse_function([0.0], [-1.0], [])))
+
+
+def test_user_inverse_is_used():
+    """A given inverse replaces the derived one."""
+    plant = fp.Plant(
+        {"y": "1"},
+        {"u": "1"},
+        {},
+        lambda q, u, p: {"y": ca.exp(u.u)},
+        order=1,
+        inverse=lambda q, r, p: {"u": ca.log(r.y)},
+    )
+    assert float(plant.inverse_function([0.0], [np.e], [])) == pytest.approx(1.0)
+
+
+def test_structural_order_of_the_far_mass_is_four():
+    """m1 <- spring <- m2 <- F: two integrations each."""
+    assert fp.structural_order(two_mass_chain(("b",)), "a") == 4
+    assert fp.structural_order(two_mass_chain(("b",)), "b") == 2
+
+
+def test_wrong_order_names_the_right_one():
+    """A coordinate whose response has no input cannot be controlled at that order."""
+    with pytest.raises(InvalidProblem, match="number 4"):
+        two_mass_chain(("a",))
+
+
+def test_underactuated_plant_asks_for_a_choice():
+    """One input cannot prescribe two coordinates."""
+    with pytest.raises(NotInvertible, match="controlled="):
+        _ = two_mass_chain().controlled_names
+
+
+BAD = {
+    "approximate must be a finite number, got None": {"parameters": {**TWO, "m": fp.Parameter(None, 1.0, "kg")}},
+    "exact must be a finite number, got nan": {"parameters": {**TWO, "m": fp.Parameter(1.0, float("nan"), "kg")}},
+    "has no unit": {"parameters": {**TWO, "m": fp.Parameter(1.0, 1.0, "")}},
+    "Did you mean 'm'": {"response": lambda q, v, u, p: {"y": u.u / p.mm}},
+    "does not give the derivative y''": {"response": lambda q, v, u, p: {}},
+    "coordinate 'z' is unknown": {"response": lambda q, v, u, p: {"y": u.u, "z": u.u}},
+    "takes 3 argument": {"response": lambda q, u, p: {"y": u.u}},
+    "order must be a whole number": {"order": 0},
+    "must be one scalar": {"response": lambda q, v, u, p: {"y": ca.vertcat(u.u, u.u)}},
+    "no input reaches coordinate": {"response": lambda q, v, u, p: {"y": -q.y}},
+    "names both a coordinate and an input": {"inputs": {"y": "N"}},
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_mistakes_are_named(message):
+    """Each mistake says what, where, and how to mend it."""
+    good = {
+        "coordinates": {"y": "m"},
+        "inputs": {"u": "N"},
+        "parameters": TWO,
+        "response": lambda q, v, u, p: {"y": u.u / p.m},
+    }
+    with pytest.raises(InvalidProblem, match="(?s)" + message.replace("(", r"\(")):
+        fp.Plant(**{**good, **BAD[message]})
+
+
+def test_all_mistakes_come_at_once():
+    """A user sees every mistake of the parameters in one error."""
+    with pytest.raises(InvalidProblem, match="(?s)2 mistakes.*approximate.*unit"):
+        fp.Plant({"y": "m"}, {"u": "N"}, {"m": fp.Parameter(None, 1.0, "")}, lambda q, v, u, p: {"y": u.u})
