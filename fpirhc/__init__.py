@@ -42,7 +42,7 @@ _HOMES = {
     "fpirhc.controllers.nominal": ("Restart", "RestartAndTrack", "OpenPlan"),
     "fpirhc.controllers.on_failure": ("HoldPlan", "Feedforward", "StopRun"),
     "fpirhc.controllers.informed": ("Informed",),
-    "fpirhc.simulate": ("simulate",),
+    "fpirhc.simulation": ("simulate",),
     "fpirhc.stepper": ("Stepper",),
     "fpirhc.run": ("Run", "load_run"),
     "fpirhc.metrics": ("Metrics", "measure"),

@@ -94,7 +94,9 @@ def _add_common(command: argparse.ArgumentParser) -> None:
     command.add_argument("problem", metavar="PROBLEM", help="name of a shipped problem, or path of a problem file")
     command.add_argument("--out", metavar="FOLDER", help="where results are written (default: results/PROBLEM)")
     command.add_argument("--seed", type=int, default=0, help="seed of the disturbances' noise (default: 0)")
-    command.add_argument("--no-compile", action="store_true", help="use CasADi's virtual machine even with a C compiler")
+    command.add_argument(
+        "--no-compile", action="store_true", help="use CasADi's virtual machine even with a C compiler"
+    )
 
 
 def _no_command(options: argparse.Namespace) -> int:
@@ -157,7 +159,7 @@ def _run(options: argparse.Namespace) -> int:
 
     from fpirhc.report.figures import save_figure
     from fpirhc.report.terminal import progress_bars, show_run
-    from fpirhc.simulate import simulate
+    from fpirhc.simulation import simulate
     from fpirhc.studies.compare import select
     from fpirhc.studies.problem_file import load_problem
 
@@ -196,7 +198,9 @@ def _folder(options: argparse.Namespace, name: str) -> Path:
         probe.touch()
         probe.unlink()
     except OSError as error:
-        raise OutputError(f"cannot write to the folder '{folder}': {error.strerror}; choose another with --out") from None
+        raise OutputError(
+            f"cannot write to the folder '{folder}': {error.strerror}; choose another with --out"
+        ) from None
     return folder
 
 

@@ -68,7 +68,9 @@ class Cvodes(Integrator):
         x, u, p, w = (ca.SX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))
         given = ca.vertcat(u, p, w)
         options = {"reltol": self.tolerance, "abstol": self.tolerance}
-        solver = ca.integrator("fpirhc_cvodes", "cvodes", {"x": x, "p": given, "ode": rate(x, u, p, w)}, 0.0, period, options)
+        solver = ca.integrator(
+            "fpirhc_cvodes", "cvodes", {"x": x, "p": given, "ode": rate(x, u, p, w)}, 0.0, period, options
+        )
         xm, um, pm, wm = (ca.MX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))
         following = solver(x0=xm, p=ca.vertcat(um, pm, wm))["xf"]
         return ca.Function("fpirhc_cvodes_step", [xm, um, pm, wm], [following], ["x", "u", "p", "w"], ["x_next"])

@@ -19,7 +19,7 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 
 def close_loop(problem: Problem, controller: Controller) -> Composite:
-    """Return the closed loop as one step: ([disturbance], memory) -> (memory, trace).
+    """Return the closed loop as one step: (memory, [disturbance]) -> (memory, trace).
 
     Both parameter sets are part of the memory (constant), so that other values need no new Function. The disturbance
     input exists only when the problem has disturbances.

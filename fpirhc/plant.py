@@ -339,9 +339,7 @@ def _check_response(plant: Plant, mistakes: Mistakes) -> None:
         return
     x, u, p = plant._symbols()
     try:
-        given = plant.response(
-            *plant._derivatives(x), Named(plant.input.elements, u, "input"), plant._parameters(p)
-        )
+        given = plant.response(*plant._derivatives(x), Named(plant.input.elements, u, "input"), plant._parameters(p))
     except FpirhcError as error:
         mistakes.add(f"response: {error}")
         return

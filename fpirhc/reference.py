@@ -98,9 +98,9 @@ class Table(Reference):
         times = np.asarray(self.times, dtype=float)
         inside = ca.fmin(ca.fmax(t, times[0]), times[-1])
         return {
-            name: ca.interpolant(f"fpirhc_table_{name}", "bspline", [times], np.asarray(v, float), {"degree": [self.degree]})(
-                inside
-            )
+            name: ca.interpolant(
+                f"fpirhc_table_{name}", "bspline", [times], np.asarray(v, float), {"degree": [self.degree]}
+            )(inside)
             for name, v in self.values.items()
         }
 
@@ -121,5 +121,3 @@ def _check(plant: Plant, given: Mapping[str, Expression]) -> None:
         elif given[c].numel() != 1:
             mistakes.add(f"coordinate '{c}' must be one scalar, got shape {given[c].shape}")
     mistakes.raise_if_any()
-
-

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -108,9 +109,9 @@ def load_run(path: str | Path) -> Run:
         OutputError: the file is missing, damaged, or of another format.
     """
     try:
-        with np.load(Path(path), allow_pickle=False) as stored:
+        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as stored:
             facts, log = json.loads(str(stored["facts"])), stored["log"]
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
         raise OutputError(f"cannot read a run from '{path}': {error}") from None
     if facts.get("format") != FORMAT:
         raise OutputError(f"'{path}' has format {facts.get('format')}, this version reads {FORMAT}")

@@ -31,7 +31,7 @@ class Stepper:
         self.memory: Layout = composite.memory
         self.signals: Layout = composite.trace
         self._evaluator = Evaluator(backend.function if backend else composite.function)
-        self._time, self._state, self._realised, parameters, self._memory = self._evaluator.arguments
+        self._memory, self._time, self._state, self._realised, parameters = self._evaluator.arguments
         self._memory_next, self._trace, self._command = self._evaluator.results
         parameters[:] = controller.parameters(problem.plant)
         self._evaluate = self._evaluator.evaluate

@@ -25,8 +25,8 @@ def check_deformation(
 ) -> None:
     """Check every law on a deformation that iterates (Identity, which does not, is no candidate).
 
-    Parameters: `elements` names the coordinates, `seed` draws the vectors, `amplitude` is the size of typical responses in
-    their unit (the effective gain is exact near zero request, so laws about it use requests far below the amplitude).
+    Parameters: `elements` names the coordinates, `seed` draws the vectors, `amplitude` is the size of typical responses
+    in their unit (the effective gain is exact near zero request, so laws about it use requests far below it).
 
     Raises:
         AssertionError: the first law that does not hold, in one sentence.
@@ -61,19 +61,21 @@ class _Trial:
     def matrix_function(self) -> ca.Function:
         return self._function(ca.MX)
 
-    def _function(self, kind: type) -> ca.Function:
-        pair = [kind.sym(name, self.size) for name in ("request", "response", "desired")]  # type: ignore[attr-defined]
-        memory = kind.sym("memory", self.layout.size)  # type: ignore[attr-defined]
-        deformed, following = self.deformation.step(*pair, self.layout.split(memory))
+    def _function(self, kind: Any) -> ca.Function:
+        request, response, desired = (kind.sym(name, self.size) for name in ("request", "response", "desired"))
+        memory = kind.sym("memory", self.layout.size)
+        deformed, following = self.deformation.step(request, response, desired, self.layout.split(memory))
         _hold(
             set(following) == set(self.layout.names),
             f"step remembers {sorted(following)} but memory() lays out {sorted(self.layout.names)}",
         )
         column = kind(deformed)
-        _hold(column.shape == (self.size, 1), f"step gives a request of shape {column.shape}, expected ({self.size}, 1)")
+        _hold(
+            column.shape == (self.size, 1), f"step gives a request of shape {column.shape}, expected ({self.size}, 1)"
+        )
         outputs = [ca.densify(column), ca.densify(kind(self.layout.join(following)))]
         _hold(outputs[1].numel() == self.layout.size, "step remembers vectors of another size than memory() lays out")
-        return ca.Function("map", [*pair, memory], outputs)
+        return ca.Function("map", [request, response, desired, memory], outputs)
 
     def __call__(self, request: Array, response: Array, desired: Array) -> Array:
         return np.asarray(self.scalar_function(request, response, desired, self.layout.start())[0].full())[:, 0]
@@ -154,8 +156,8 @@ def secant_is_bounded(trial: _Trial, generator: np.random.Generator) -> None:
     for size in np.logspace(-6, 6, 200):
         desired = trial.vector(generator) * generator.choice([0.0, 1.0, size])
         response = desired + size * trial.vector(generator)
-        error = np.linalg.norm(response - desired)
-        secant = np.linalg.norm(trial(zero, response, desired)) / error
+        error = float(np.linalg.norm(response - desired))
+        secant = float(np.linalg.norm(trial(zero, response, desired))) / error
         _hold(
             secant <= bound * (1 + 1e-9),
             f"an error of {error:.3g} causes a step of {secant:.6g} per unit, above |secant_gain()| = {bound:.6g}",
@@ -167,7 +169,8 @@ def step_is_bounded(trial: _Trial, generator: np.random.Generator) -> None:
     bound = trial.deformation.largest_step()
     for size in np.logspace(-3, 6, 50):
         request, desired = trial.vector(generator), trial.vector(generator)
-        moved = np.linalg.norm(trial(request, desired + size * trial.vector(generator), desired) - request)
+        response = desired + size * trial.vector(generator)
+        moved = float(np.linalg.norm(trial(request, response, desired) - request))
         _hold(moved <= bound * (1 + 1e-9), f"the request moved by {moved:.6g}, above largest_step() = {bound:.6g}")
 
 

@@ -41,7 +41,10 @@ def sector_limit(deformation: Deformation, eigenvalues: Array) -> tuple[float, f
         NotContractive: eigenvalues with real parts of both signs, or zero.
     """
     lower, upper = linear_limit(eigenvalues)
-    steeper = deformation.secant_gain() / deformation.effective_gain() if deformation.effective_gain() else 1.0
+    if deformation.effective_gain() == 0:
+        return lower, upper
+    right = deformation.with_effective_gain(0.5 * (lower + upper))  # the secant depends on the gain's sign
+    steeper = right.secant_gain() / right.effective_gain()
     return lower / steeper, upper / steeper
 
 
@@ -57,7 +60,9 @@ def optimal_gain(eigenvalues: Array) -> float:
         return 2 / (spectrum.smallest_real + spectrum.largest_real)
     for _ in range(_SEARCH_STEPS):  # max|1 - a lambda| is convex in a
         third = (upper - lower) / 3
-        if predicted_factor(spectrum.eigenvalues, lower + third) < predicted_factor(spectrum.eigenvalues, upper - third):
+        if predicted_factor(spectrum.eigenvalues, lower + third) < predicted_factor(
+            spectrum.eigenvalues, upper - third
+        ):
             upper -= third
         else:
             lower += third
@@ -73,7 +78,7 @@ def require_one_sign(spectrum: Spectrum) -> None:
     if not spectrum.one_sign:
         raise NotContractive(
             "the response Jacobian has eigenvalues with real parts of both signs or zero (from "
-            f"{spectrum.smallest_real:.4g} to {spectrum.largest_real:.4g}), so no gain makes the iteration converge: it "
-            "enlarges the error in some direction. Check that each input acts on its own coordinate and that the approximate "
-            "parameters give the effect of every input its true sign"
+            f"{spectrum.smallest_real:.4g} to {spectrum.largest_real:.4g}), so no gain makes the iteration converge: "
+            "it enlarges the error in some direction. Check that each input acts on its own coordinate and that the "
+            "approximate parameters give the effect of every input its true sign"
         )

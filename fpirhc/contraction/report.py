@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from fpirhc.contraction.gains import linear_limit, optimal_gain, predicted_factor, require_one_sign, sector_limit
+from fpirhc.contraction.gains import linear_limit, optimal_gain, predicted_factor, sector_limit
 from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotContractive
@@ -20,7 +21,8 @@ class ContractionReport:
 
     `linear_limit` and `sector_limit` are intervals of the effective gain, `own_linear_limit` and `own_sector_limit` the
     same in the deformation's own gain (`gain_name`), and so is `recommended`. Within the sector limit no error is
-    large enough to start a bounded oscillation; between the two limits only small errors converge.
+    large enough to start a bounded oscillation; between the two limits only small errors converge. Where no gain
+    converges the limits are empty and `recommended` is NaN.
     """
 
     predicted: float
@@ -31,6 +33,7 @@ class ContractionReport:
     own_linear_limit: tuple[float, float]
     own_sector_limit: tuple[float, float]
     recommended: float
+    contractive: bool
     within_sector: bool
     text: str
 
@@ -41,29 +44,35 @@ def check_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionRepor
     A gain between the sector and the linear limit is reported (`within_sector` False), not refused.
 
     Raises:
-        NotContractive: real parts of both signs (no gain converges), a gain of the wrong sign, or one beyond the linear
-            limit; the message gives the admissible gains.
+        NotContractive: real parts of both signs (no gain converges), a gain of the wrong sign or none, or one beyond
+            the linear limit; the message gives the admissible gains.
     """
-    require_one_sign(spectrum)
+    report = assess_gain(deformation, spectrum)
+    if not report.contractive:
+        raise NotContractive(report.text)
+    return report
+
+
+def assess_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionReport:
+    """Return what `check_gain` returns, and where that raises a report with `contractive` False and the same text."""
     gain = deformation.effective_gain()
-    if gain == 0:
-        raise NotContractive(f"{deformation} does not iterate, so there is no contraction to check; use Sigmoid(gain=...)")
-    linear = linear_limit(spectrum.eigenvalues)
-    sector = sector_limit(deformation, spectrum.eigenvalues)
     name, own = _own_gain(deformation)
+    predicted = predicted_factor(spectrum.eigenvalues, gain)
+    try:
+        linear = linear_limit(spectrum.eigenvalues)
+    except NotContractive as error:
+        return _hopeless(predicted, gain, name, str(error))
+    if gain == 0:
+        text = f"{deformation} does not iterate, so nothing contracts; use Sigmoid(gain=...)"
+        return _hopeless(predicted, gain, name, text)
+    sector = sector_limit(deformation, spectrum.eigenvalues)
     own_linear, own_sector = (_scaled(limit, own / gain) for limit in (linear, sector))
     best = min(abs(optimal_gain(spectrum.eigenvalues)), SECTOR_SHARE * _size(sector))
     recommended = best * (1 if linear[1] > 0 else -1) * own / gain
-    predicted = predicted_factor(spectrum.eigenvalues, gain)
+    contractive, within = linear[0] < gain < linear[1], sector[0] < gain < sector[1]
     admissible = _admissible(name, own_linear, own_sector, recommended)
-    if not linear[0] < gain < linear[1]:
-        fault = (
-            "has the wrong sign, so every cycle enlarges the error"
-            if gain * sum(linear) < 0
-            else f"is too large: errors grow by the factor {predicted:.3g} per cycle"
-        )
-        raise NotContractive(f"{type(deformation).__name__}({name}={own:.4g}) {fault}; use {admissible}")
-    within = sector[0] < gain < sector[1]
+    what = f"{type(deformation).__name__}({name}={own:.4g})"
+    verdict = _verdict(what, predicted, within, admissible) if contractive else ""
     return ContractionReport(
         predicted=predicted,
         effective_gain=gain,
@@ -73,9 +82,21 @@ def check_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionRepor
         own_linear_limit=own_linear,
         own_sector_limit=own_sector,
         recommended=recommended,
+        contractive=contractive,
         within_sector=within,
-        text=_verdict(f"{type(deformation).__name__}({name}={own:.4g})", predicted, within, admissible),
+        text=verdict or f"{what} {_fault(gain, linear, predicted)}; use {admissible}",
     )
+
+
+def _hopeless(predicted: float, gain: float, name: str, text: str) -> ContractionReport:
+    none = (0.0, 0.0)
+    return ContractionReport(predicted, gain, name, none, none, none, none, math.nan, False, False, text)
+
+
+def _fault(gain: float, linear: tuple[float, float], predicted: float) -> str:
+    if gain * sum(linear) < 0:
+        return "has the wrong sign, so every cycle enlarges the error"
+    return f"is too large: errors grow by the factor {predicted:.3g} per cycle"
 
 
 def _own_gain(deformation: Deformation) -> tuple[str, float]:
@@ -104,5 +125,7 @@ def _admissible(name: str, linear: tuple[float, float], sector: tuple[float, flo
 def _verdict(what: str, predicted: float, within: bool, admissible: str) -> str:
     text = f"{what} shrinks an error of the request at least to {predicted:.3g} of it per cycle"
     if not within:
-        text += ", but only a small one: it is beyond the sector limit, where large errors may end in a bounded oscillation"
+        text += (
+            ", but only a small one: it is beyond the sector limit, where large errors may end in a bounded oscillation"
+        )
     return f"{text}. Admissible: {admissible}."

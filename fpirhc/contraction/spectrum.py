@@ -32,8 +32,8 @@ class Spectrum:
         finite = rows[np.isfinite(rows).all(axis=1)]
         if finite.size == 0:
             raise InvalidValue(
-                "no finite eigenvalue of the response Jacobian: the inverse response is singular at every sample; check "
-                "that the inputs act on the controlled coordinates there"
+                "no finite eigenvalue of the response Jacobian: the inverse response is singular at every sample; "
+                "check that the inputs act on the controlled coordinates there"
             )
         kept = np.array(finite)
         kept.setflags(write=False)
@@ -64,7 +64,7 @@ def response_jacobian(plant: Plant) -> ca.Function:
     Raises:
         NotInvertible: the inputs and the controlled coordinates differ in number.
     """
-    kind = ca.MX if plant.inverse_opaque else ca.SX
+    kind: Any = ca.MX if plant.inverse_opaque else ca.SX
     x = kind.sym("x", plant.state.size)
     r = kind.sym("r", len(plant.controlled_names))
     exact = kind.sym("exact", plant.parameter.size if plant.parameters else 0)
@@ -94,18 +94,12 @@ def spectrum_over_run(
 
 
 def spectrum_over_box(
-    plant: Plant,
-    box: Mapping[str, tuple[float, float]],
-    states: Array,
-    deformed: Array,
-    *,
-    samples: int,
-    seed: int,
+    plant: Plant, box: Mapping[str, tuple[float, float]], states: Array, deformed: Array, *, samples: int, seed: int
 ) -> Spectrum:
     """Return the eigenvalues of J for exact parameters drawn from a box, at states drawn from the given rows.
 
-    Every corner of the box is among the samples when they are at least as many; the rest is uniform. Parameters that the
-    box does not name keep the plant's exact value.
+    Every corner of the box is among the samples when they are at least as many; the rest is uniform. Parameters that
+    the box does not name keep the plant's exact value.
 
     Raises:
         InvalidName: the box names an unknown parameter. InvalidValue: an interval whose ends are swapped or not finite,
@@ -141,7 +135,8 @@ def _checked_rows(plant: Plant, states: Array, deformed: Array) -> tuple[Array, 
     wanted = (plant.state.size, len(plant.controlled_names))
     if (states.shape[1], deformed.shape[1]) != wanted or len(states) != len(deformed):
         raise InvalidShape(
-            f"states {states.shape} and deformed {deformed.shape}: expected (cycles, {wanted[0]}) and (cycles, {wanted[1]})"
+            f"states {states.shape} and deformed {deformed.shape}: expected (cycles, {wanted[0]}) "
+            f"and (cycles, {wanted[1]})"
         )
     if len(states) == 0:
         raise InvalidShape("states and deformed have no rows; give at least one state and request")

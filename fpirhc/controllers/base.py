@@ -59,7 +59,7 @@ def controller_reads(plant: Plant) -> Layout:
 
 
 def compose_controller(problem: Problem, controller: Controller) -> Composite:
-    """Return the controller as one step: (time, state, realised, parameters, memory) -> (memory, trace, command)."""
+    """Return the controller as one step: (memory, time, state, realised, parameters) -> (memory, trace, command)."""
     chosen = controller.resolved(problem)
     chosen.check(problem)
     blocks, delays = chosen.blocks(problem)
@@ -148,10 +148,11 @@ def _invert_block(plant: Plant) -> Block:
 def _limit_block(problem: Problem) -> Block:
     plant = problem.plant
     lower, upper = problem.limits.input_bounds(plant)
-    response = plant.controlled_response_function
+    meant = _meaning(plant)
     reads = (
         like(plant.input, "requested"),
         plant.response_signal("_deformed_wanted"),
+        plant.response_signal("desired"),
         plant.state,
         plant.parameter,
         like(plant.input, "_command_before"),
@@ -169,17 +170,32 @@ def _limit_block(problem: Problem) -> Block:
         finite = ca.mmin(ca.fabs(s.requested) <= FINITE)
         safe = ca.if_else(finite, s.requested, s._command_before)
         command = _clip(safe, lower, upper)
-        clipped = ca.mmax(command != s.requested)
-        meant = response(s.state, command, s.parameters)
+        clipped_request = meant(s.state, command, safe, s._deformed_wanted, s.parameters)
         return {
             "command": command,
-            "deformed": ca.if_else(clipped, meant, s._deformed_wanted),
-            "clipped": clipped,
+            "deformed": ca.if_else(finite, clipped_request, s.desired),
+            "clipped": ca.mmax(command != s.requested),
             "_held": 1 - finite,
             "_running": 1,
         }
 
     return Block("limit", Layout(reads), Layout(writes), step)
+
+
+def _meaning(plant: Plant) -> ca.Function:
+    """Function (state, command, wanted command, wanted response, parameters) -> response that the command asks for.
+
+    For a response affine in the inputs this is wanted + B (command - wanted command): exactly the wanted response where
+    nothing was clipped, and without evaluating the model again.
+    """
+    x, u, p = plant._symbols()
+    wanted, r = ca.SX.sym("wanted", u.numel()), ca.SX.sym("r", len(plant.controlled_names))
+    response = plant.controlled_response_function(x, u, p)
+    if plant.affine:
+        means = r + ca.mtimes(ca.jacobian(response, u), u - wanted)
+    else:
+        means = ca.if_else(ca.mmax(u != wanted), response, r)
+    return ca.Function("fpirhc_meaning", [x, u, wanted, r, p], [ca.densify(means)])
 
 
 def _clip(u: Expression, lower: np.ndarray, upper: np.ndarray) -> Expression:

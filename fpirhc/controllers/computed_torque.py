@@ -1,6 +1,6 @@
 """Computed torque: track the reference with the model's inverse, with or without deformation.
 
-    q^Des = q^(r),N + feedback of the tracking law;   u = inverse model of the deformed q^Des.
+q^Des = q^(r),N + feedback of the tracking law;   u = inverse model of the deformed q^Des.
 """
 
 from __future__ import annotations

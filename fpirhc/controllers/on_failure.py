@@ -19,9 +19,9 @@ class OnFailure(ABC):
     """Contract: the input to apply when the solve failed, and the status to report."""
 
     @abstractmethod
-    def choose(self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression) -> tuple[
-        Expression, Expression
-    ]:
+    def choose(
+        self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
+    ) -> tuple[Expression, Expression]:
         """Return (input, status) from the plan's first input and the model's feedforward along the reference."""
 
 
@@ -30,7 +30,11 @@ class HoldPlan(OnFailure):
     """Keep using the last good plan, shifted."""
 
     def choose(
-        self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression  # noqa: ARG002
+        self,
+        failed: Expression,
+        planned: Expression,
+        feedforward: Expression,
+        status: Expression,  # noqa: ARG002
     ) -> tuple[Expression, Expression]:
         """The optimiser already returns its last good plan when it fails."""
         return planned, ca.if_else(failed, int(Status.HELD), status)
@@ -52,7 +56,11 @@ class StopRun(OnFailure):
     """Stop: the planned input becomes NaN, which holds the last command and ends the run with this status."""
 
     def choose(
-        self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression  # noqa: ARG002
+        self,
+        failed: Expression,
+        planned: Expression,
+        feedforward: Expression,
+        status: Expression,  # noqa: ARG002
     ) -> tuple[Expression, Expression]:
         """Make the failure visible as NaN."""
         return ca.if_else(failed, math.nan, planned), status

@@ -1,9 +1,9 @@
 """The contract of deformations: how the next request follows from the last request and its response error.
 
-A controller wants a response d (desired) and asks its model for r (the request, or deformed response); the plant answers
-f(r). A deformation is the fixed-point iteration r+ = G(r, f, d) with G(r, d, d) = r: where the response is the desired one
-the request stays, so at the fixed point the plant does what was desired although the model is wrong. To first order
-every map here is r+ = r - a (f - d) with one number a, its effective gain.
+A controller wants a response d (desired) and asks its model for r (the request, or deformed response); the plant
+answers f(r). A deformation is the fixed-point iteration r+ = G(r, f, d) with G(r, d, d) = r: where the response is the
+desired one the request stays, so at the fixed point the plant does what was desired although the model is wrong. To
+first order every map here is r+ = r - a (f - d) with one number a, its effective gain.
 """
 
 from __future__ import annotations

@@ -17,8 +17,8 @@ from fpirhc.symbolic.layout import Expression
 class Rfpt(Deformation):
     """r+ = (K_c + r) [1 + B_c tanh(A_c (f - d))] - K_c, for each coordinate by itself.
 
-    The gains hold for |K_c| >> |r|; at a request r they are larger by the factor 1 + r / K_c. A second, false fixed point
-    r = -K_c repels the iteration when B_c tanh(A_c (f(-K_c) - d)) > 0. One step is at most |K_c + r|.
+    The gains hold for |K_c| >> |r|; at a request r they are larger by the factor 1 + r / K_c. A second, false fixed
+    point r = -K_c repels the iteration when B_c tanh(A_c (f(-K_c) - d)) > 0. One step is at most |K_c + r|.
 
     Parameters:
         offset: K_c, 10 to 100 times the largest |request|, in units of the response.
@@ -40,7 +40,9 @@ class Rfpt(Deformation):
     def __post_init__(self) -> None:
         require_numbers("Rfpt", {"offset": self.offset, "gain": self.gain})
         if self.sign not in (-1, 1):
-            raise InvalidValue(f"Rfpt(sign={self.sign!r}): expected -1 or 1; -1 for offset > 0 and a model of right sign")
+            raise InvalidValue(
+                f"Rfpt(sign={self.sign!r}): expected -1 or 1; -1 for offset > 0 and a model of right sign"
+            )
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]

@@ -3,7 +3,8 @@
 Response f and desired d are augmented by a dummy component to vectors of equal norm R; the rotation that turns the
 augmented f towards the augmented d, by a fraction of the angle between them, is applied to the augmented request.
 
-With unit vectors a = f/R, b = d/R (augmented), their angle phi and the skew matrix B = b a' - a b', the rotation by theta is
+With unit vectors a = f/R, b = d/R (augmented), their angle phi and the skew matrix B = b a' - a b', the rotation by
+theta is
 
     O = I + sin(theta)/sin(phi) B + (1 - cos(theta))/sin(phi)^2 B^2,
 
@@ -32,8 +33,8 @@ _SECANT = 2 * math.pi / (3 * math.sqrt(3))  # longest arc per unit of response e
 class Rotation(Deformation):
     """r+ = r turned by a fraction of the angle that turns f into d, in the space with one dummy component.
 
-    r+ = r - fraction (f - d) up to terms of third order in |vectors| / R. Where a vector is longer than radius / 2, R grows to
-    twice its length, so the map is defined everywhere and its steps are bounded by the secant gain.
+    r+ = r - fraction (f - d) up to terms of third order in |vectors| / R. Where a vector is longer than radius / 2, R
+    grows to twice its length, so the map is defined everywhere and its steps are bounded by the secant gain.
 
     Parameters:
         fraction: of the angle, dimensionless; positive where the model has the sign of the input effect right, and
@@ -105,9 +106,7 @@ class Rotation(Deformation):
 
 
 def _turned(
-    unit: tuple[Expression, Expression],
-    chord: tuple[Expression, Expression],
-    vector: tuple[Expression, Expression],
+    unit: tuple[Expression, Expression], chord: tuple[Expression, Expression], vector: tuple[Expression, Expression]
 ) -> tuple[Expression, Expression]:
     """B v = a (c'v) - c (a'v) with c = a - b, each vector as (column, dummy component)."""
     along_unit = ca.dot(unit[0], vector[0]) + unit[1] * vector[1]

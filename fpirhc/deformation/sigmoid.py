@@ -1,7 +1,7 @@
 """The sigmoid-generated fixed point transformation: saturating, along the direction of the response error.
 
-With zeta(x) = atanh(tanh(x + D) / 2) and its fixed point x*, the addition theorems of tanh and atanh give the step without
-cancellation and without a special case at zero,
+With zeta(x) = atanh(tanh(x + D) / 2) and its fixed point x*, the addition theorems of tanh and atanh give the step
+without cancellation and without a special case at zero,
 
     zeta(w + x*) - x* = atanh( zeta'(x*) tanh(w) / (1 + q tanh(w)) ),    q = 3 y / (2 (1 - y^2)),  y = tanh(x*).
 """
@@ -29,8 +29,8 @@ _BISECTIONS = 60
 class Sigmoid(Deformation):
     """r+ = r + S [zeta(A_c |h| / S + x*) - x*] h / |h|, with zeta(x) = atanh(tanh(x + D) / 2) and h = f - d.
 
-    Small errors shrink exponentially, large ones by at most `largest_step()` per cycle, so S must cover the largest change
-    of the desired response in one cycle; apart from that S does not matter.
+    Small errors shrink exponentially, large ones by at most `largest_step()` per cycle, so S must cover the largest
+    change of the desired response in one cycle; apart from that S does not matter.
 
     Parameters:
         gain: A_c, dimensionless; negative where the model has the sign of the plant's input effect right.
@@ -55,7 +55,9 @@ class Sigmoid(Deformation):
     def __post_init__(self) -> None:
         require_numbers("Sigmoid", {"gain": self.gain})
         if not abs(self.shift) <= LARGEST_SHIFT:
-            raise InvalidValue(f"Sigmoid(shift={self.shift!r}): expected at most {LARGEST_SHIFT:g} in size; 0.3 is usual")
+            raise InvalidValue(
+                f"Sigmoid(shift={self.shift!r}): expected at most {LARGEST_SHIFT:g} in size; 0.3 is usual"
+            )
         if self.scale is not None and not (0 < self.scale < math.inf):
             raise InvalidValue(f"Sigmoid(scale={self.scale!r}): expected a positive number in units of the response")
 
@@ -90,7 +92,7 @@ class Sigmoid(Deformation):
         if self.shift * self.gain >= 0:
             return self.slope
         mirrored = replace(self, gain=-abs(self.gain), shift=abs(self.shift))
-        near, far = mirrored.fixed_point + mirrored.shift, 2 * (mirrored.fixed_point + mirrored.shift)
+        near, far = (mirrored.fixed_point + mirrored.shift, 2 * (mirrored.fixed_point + mirrored.shift))
         for _ in range(_BISECTIONS):
             middle = 0.5 * (near + far)
             x = mirrored.fixed_point - middle
@@ -145,7 +147,7 @@ class Sigmoid(Deformation):
     def _chosen_scale(self) -> float:
         if self.scale is None:
             raise InvalidValue(
-                "Sigmoid(scale=None): the scale is still to be chosen; give Sigmoid(scale=...) or use with_scale(S), with S "
-                "above the largest change of the desired response in one cycle"
+                "Sigmoid(scale=None): the scale is still to be chosen; give Sigmoid(scale=...) or use with_scale(S), "
+                "with S above the largest change of the desired response in one cycle"
             )
         return self.scale

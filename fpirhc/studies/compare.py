@@ -18,7 +18,7 @@ from fpirhc.errors import FpirhcError, InvalidName, Mistakes, nearest
 from fpirhc.metrics import Metrics, measure
 from fpirhc.problem import Problem
 from fpirhc.run import Run
-from fpirhc.simulate import simulate
+from fpirhc.simulation import simulate
 from fpirhc.studies.problem_file import Task
 from fpirhc.studies.timing import CycleTime, measure_cycle
 from fpirhc.studies.verdict import verdict
@@ -71,7 +71,9 @@ class Comparison:
         for entry in self.entries:
             if entry.name == name:
                 return entry
-        raise InvalidName(f"controller '{name}' is not in this comparison.{nearest(name, [e.name for e in self.entries])}")
+        raise InvalidName(
+            f"controller '{name}' is not in this comparison.{nearest(name, [e.name for e in self.entries])}"
+        )
 
 
 def select(task: Task, names: Sequence[str] | None) -> dict[str, Controller]:

@@ -68,7 +68,9 @@ def find_problem(name_or_path: str) -> Path:
     if path.suffix == ".py" or path.parent != Path():
         if path.is_file():
             return path
-        raise ProblemFileError(f"no file at '{name_or_path}'; give the path of a problem file, or a name from 'fpirhc list'")
+        raise ProblemFileError(
+            f"no file at '{name_or_path}'; give the path of a problem file, or a name from 'fpirhc list'"
+        )
     shipped = shipped_problems()
     if name_or_path in shipped:
         return shipped[name_or_path]
@@ -112,7 +114,9 @@ def _import(path: Path) -> ModuleType:
     try:
         spec.loader.exec_module(module)
     except SyntaxError as error:
-        raise ProblemFileError(f"{path.name}, line {error.lineno}: {error.msg}\n    {(error.text or '').strip()}") from None
+        raise ProblemFileError(
+            f"{path.name}, line {error.lineno}: {error.msg}\n    {(error.text or '').strip()}"
+        ) from None
     except Exception as error:  # noqa: BLE001 -- whatever a user's file raises is shown with its own line
         raise ProblemFileError(f"{_own_line(path, error)}\n    {type(error).__name__}: {error}") from None
     return module

@@ -19,9 +19,7 @@ HURTS = 1.1
 SLEW_SHARE = 1e-3  # share of cycles in which the desired response outruns the step limit, from which it is a cause
 
 
-def verdict(
-    entries: Sequence[Entry], skipped: Mapping[str, str], headline: tuple[str, str] | None
-) -> tuple[str, ...]:
+def verdict(entries: Sequence[Entry], skipped: Mapping[str, str], headline: tuple[str, str] | None) -> tuple[str, ...]:
     """Return the verdict's sentences, the headline pair first."""
     by_name = {e.name: e for e in entries}
     pairs = [(by_name[e.pair], e) for e in entries if e.pair in by_name]

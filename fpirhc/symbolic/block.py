@@ -2,7 +2,7 @@
 
 A `Block` reads named signals, writes named signals and may remember some: its `step` is written in
 CasADi expressions and has no side effects. `compose` wires blocks by signal name into one `Composite`
-whose Function maps (reads, memory) to (memory, trace). A `Delay` carries a signal to the next cycle, so that
+whose Function maps (memory, reads) to (memory, trace). A `Delay` carries a signal to the next cycle, so that
 what a late block writes (the clipped command, say) is what an early block reads one cycle later. Signals whose name
 begins with '_' are wires between blocks and stay out of the trace.
 """
@@ -79,7 +79,7 @@ class Delay:
 
 @dataclass(frozen=True, eq=False)
 class Composite:
-    """Blocks as one step: `function` maps (each read..., memory) to (memory, trace)."""
+    """Blocks as one step: `function` maps (memory, each read...) to (memory, trace)."""
 
     name: str
     blocks: tuple[Block, ...]
@@ -120,9 +120,9 @@ def compose(
     returned = [memory.join(following), trace.join(known), *(known[o] for o in outputs)]
     function = ca.Function(
         PREFIX + name,
-        [*inputs.values(), remembered],
+        [remembered, *inputs.values()],
         [ca.densify(ca.MX(r)) for r in returned],
-        [*inputs, "memory"],
+        ["memory", *inputs],
         ["memory_next", "trace", *outputs],
     )
     if not any(b.opaque for b in blocks):
@@ -140,7 +140,9 @@ def every(block: Block, cycles: int) -> Block:
     if cycles == 1:
         return block
     phase = scalar(f"{block.name}_phase")
-    held = Layout(tuple(Signal(f"{block.name}_held_{s.name}", s.elements, s.units, s.start) for s in block.writes.signals))
+    held = Layout(
+        tuple(Signal(f"{block.name}_held_{s.name}", s.elements, s.units, s.start) for s in block.writes.signals)
+    )
     own = Layout((phase, *held.signals)) + block.memory
     run, hold = _branches(block, held)
 

@@ -56,9 +56,7 @@ def scalar(name: str, unit: str = "1", start: float = 0.0) -> Signal:
     return Signal(name, (), (unit,), (start,))
 
 
-def vector(
-    name: str, elements: Sequence[str], units: Sequence[str] | str = "1", start: Sequence[float] = ()
-) -> Signal:
+def vector(name: str, elements: Sequence[str], units: Sequence[str] | str = "1", start: Sequence[float] = ()) -> Signal:
     """Return a vector signal with named elements; one unit serves all."""
     every = (units,) * len(elements) if isinstance(units, str) else tuple(units)
     return Signal(name, tuple(elements), every, tuple(float(v) for v in start))
@@ -168,9 +166,7 @@ class Layout:
             place = self.slice(name)
             entries = np.asarray(value, dtype=float).ravel()
             if entries.size != place.stop - place.start:
-                raise InvalidShape(
-                    f"signal '{name}' has {place.stop - place.start} entries, got {entries.size}"
-                )
+                raise InvalidShape(f"signal '{name}' has {place.stop - place.start} entries, got {entries.size}")
             flat[place] = entries
         return flat
 

@@ -79,7 +79,7 @@ class Exponential(Tracking):
         reads = (_error(plant), scalar("clipped"), _integral(plant, "_integral_used"))
 
         def step(s: Any) -> dict[str, Expression]:
-            return {"integral": s._integral_used + (1 - s.clipped) * period * s._target_error}
+            return {"integral": s._integral_used + period * ca.if_else(s.clipped, 0, s._target_error)}
 
         return Block("tracking_update", Layout(reads), Layout((_integral(plant, "integral"),)), step)
 

@@ -87,10 +87,10 @@ def _run_chunks(
     padded = -(-cycles // CHUNK) * CHUNK
     table = disturbance_table(problem, seed, padded)
     log = np.empty((cycles, trace.size))
-    evaluator.arguments[-1][:] = memory.start()
+    evaluator.arguments[0][:] = memory.start()
     for at in range(0, cycles, CHUNK):
         if table.shape[1]:
-            evaluator.arguments[0].ravel()[:] = table[at : at + CHUNK].ravel()
+            evaluator.arguments[1].reshape(CHUNK, -1)[:] = table[at : at + CHUNK]
         evaluator.evaluate()
         rows = evaluator.results[1].reshape(CHUNK, trace.size)[: cycles - at]
         log[at : at + rows.shape[0]] = rows
@@ -98,7 +98,7 @@ def _run_chunks(
         if bad is not None:
             row, column = bad
             return log[: at + row].copy(), _why(trace, at + row, column, problem.period)
-        evaluator.arguments[-1][:] = evaluator.results[0].reshape(CHUNK, memory.size)[-1]
+        evaluator.arguments[0][:] = evaluator.results[0].reshape(CHUNK, memory.size)[-1]
         if progress:
             progress(at + rows.shape[0], cycles)
     return log, None

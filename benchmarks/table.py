@@ -1,0 +1,40 @@
+"""Prints a benchmark's table, and writes it into docs/performance.md when asked with --write."""
+
+from __future__ import annotations
+
+import platform
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from fpirhc.studies.compare import versions
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "performance.md"
+
+
+def write_table(name: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print the table; with --write, replace the part of docs/performance.md between the marks of this name."""
+    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    lines += ["| " + " | ".join(row) + " |" for row in rows]
+    found = versions()
+    lines += ["", f"{_processor()}; " + ", ".join(f"{k} {v}" for k, v in found.items()) + "."]
+    text = "\n".join(lines)
+    print(text)
+    if "--write" in sys.argv:
+        begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
+        page = PAGE.read_text(encoding="utf-8")
+        pattern = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
+        if not pattern.search(page):
+            sys.exit(f"{PAGE} has no marks '{begin}' ... '{end}'")
+        PAGE.write_text(pattern.sub(lambda _: f"{begin}\n{text}\n{end}", page), encoding="utf-8")
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

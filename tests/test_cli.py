@@ -1,0 +1,189 @@
+"""User journeys through the command line, with right and wrong input."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import fpirhc as fp
+import pytest
+from fpirhc.cli import main
+
+GOOD = '''"""A mass on a line with a wrong gain."""
+import casadi as ca
+import fpirhc as fp
+
+plant = fp.Plant(
+    coordinates={"y": "m"},
+    inputs={"u": "N"},
+    parameters={"b": fp.Parameter(approximate=1.0, exact=1.6, unit="1/kg"), "k": fp.Parameter(2.0, 5.0, "1/s^2")},
+    response=lambda q, v, u, p: {"y": p.b * u.u - p.k * q.y},
+)
+problem = fp.Problem(
+    plant=plant,
+    reference=fp.Trajectory(lambda t: {"y": ca.sin(2 * t)}),
+    start={"y": 0.0, "y'": 2.0},
+    period=1e-3,
+    duration=2.0,
+    measure_from=1.0,
+)
+tracking = fp.Exponential(rate=6.0)
+controllers = {
+    "CTC": fp.ComputedTorque(tracking),
+    "CTC+FPI": fp.ComputedTorque(tracking, fp.Sigmoid(gain=-0.5)),
+}
+'''
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """An empty working folder with one problem file."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "line.py").write_text(GOOD)
+    return tmp_path
+
+
+def _write(folder: Path, old: str, new: str) -> None:
+    assert old in GOOD
+    (folder / "line.py").write_text(GOOD.replace(old, new))
+
+
+def test_compare_writes_a_report_and_says_what_it_found(folder, capsys):
+    """A verdict, a table, and one file."""
+    assert main(["compare", "line.py", "--no-compile"]) == 0
+    printed = capsys.readouterr()
+    assert "CTC+FPI lowers the rms error of y" in printed.out.replace("\n", " ")
+    assert (folder / "results" / "line" / "report.html").stat().st_size < 3e6
+    assert "virtual machine" in printed.err
+
+
+def test_json_is_one_object_on_standard_output(folder, capsys):
+    """Machines read the same numbers that people see."""
+    assert main(["compare", "line.py", "--json", "--seed", "3", "--no-compile"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["problem"] == "line"
+    assert found["seed"] == 3
+    assert set(found["versions"]) >= {"fpirhc", "casadi"}
+    plain, adaptive = found["controllers"]["CTC"], found["controllers"]["CTC+FPI"]
+    assert adaptive["rms_error"]["y"] < 0.1 * plain["rms_error"]["y"]
+    assert plain["contraction"] is None
+    assert adaptive["contraction"]["predicted"] == pytest.approx(1 - 0.5 * 0.396737 * 1.6, abs=1e-3)
+    assert adaptive["contraction"]["measured"] == pytest.approx(adaptive["contraction"]["predicted"], abs=0.02)
+    assert set(adaptive["cycle_us"]) == {"median", "p99", "max", "first"}
+    assert adaptive["statuses"] == {"OK": 2000}
+
+
+def test_controllers_can_be_chosen(folder, capsys):
+    """Only the named ones run; without a pair the verdict does not judge adaptation."""
+    assert main(["compare", "line.py", "--controllers", "CTC", "--no-compile"]) == 0
+    assert "adaptation itself is not judged" in capsys.readouterr().out.replace("\n", " ")
+
+
+def test_run_saves_every_signal(folder, capsys):
+    """A run is a file that loads again, and a picture."""
+    assert main(["run", "line.py", "CTC+FPI", "--out", "kept", "--no-compile"]) == 0
+    run = fp.load_run(folder / "kept" / "CTC_FPI.npz")
+    assert run.problem == "line"
+    assert run["deformed.y"].shape == (2000,)
+    assert (folder / "kept" / "CTC_FPI.png").stat().st_size > 1000
+    assert "rms error" in capsys.readouterr().out
+
+
+def test_list_and_help(capsys):
+    """What there is, and how to use it."""
+    assert main(["list"]) == 0
+    assert "two_mass" in capsys.readouterr().out
+    assert main([]) == 0
+    assert "examples:" in capsys.readouterr().out
+    assert main(["--version"]) == 0
+    with pytest.raises(SystemExit) as stop:
+        main(["compare", "--help"])
+    assert stop.value.code == 0
+
+
+BAD = {
+    "misspelt parameter": (("p.k * q.y", "p.kk * q.y"), "parameter 'kk' is unknown. Did you mean 'k'"),
+    "misspelt input": (("u.u", "u.v"), "input 'v' is unknown"),
+    "approximate None": (("approximate=1.0", "approximate=None"), "approximate must be a finite number, got None"),
+    "misspelt public name": (("fp.Sigmoid", "fp.Sigmod"), "Did you mean 'Sigmoid'"),
+    "raises on import": (("tracking =", "1 / 0\ntracking ="), "line.py, line 20: 1 / 0"),
+    "syntax error": (("problem = fp", "problem = = fp"), "line.py, line 11"),
+    "no controllers": (("controllers =", "others ="), "it must define controllers"),
+    "start not finite": (('"y": 0.0', '"y": float("nan")'), "must be a finite number, got nan"),
+    "unknown field": (("measure_from", "measure_form"), "measure_form"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_problem_files(case, folder, capsys):
+    """One clear error with the user's own line where there is one; exit code 2; nothing written."""
+    (old, new), message = BAD[case]
+    _write(folder, old, new)
+    assert main(["compare", "line.py"]) == 2
+    assert message in capsys.readouterr().err
+    assert not (folder / "results").exists()
+
+
+def test_wrong_sign_of_the_gain_is_explained(folder, capsys):
+    """The comparison runs and the verdict says which sign is right."""
+    _write(folder, "gain=-0.5", "gain=0.5, scale=1.0")
+    main(["compare", "line.py", "--no-compile"])
+    printed = capsys.readouterr().out.replace("\n", " ")
+    assert "wrong sign" in printed
+    assert "negative gain" in printed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["compare", "two_mas"], "Did you mean 'two_mass'"),
+        (["compare", "nowhere/x.py"], "no file at 'nowhere/x.py'"),
+        (["compare", "line.py", "--controllers", "CTC+FPY"], "Did you mean 'CTC+FPI'"),
+        (["run", "line.py", "CCT"], "Did you mean 'CTC'"),
+    ],
+)
+def test_bad_arguments(arguments, message, folder, capsys):
+    """Exit code 2, the nearest valid name, nothing written."""
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err
+    assert not list(folder.rglob("report.html"))
+
+
+def test_folder_that_cannot_be_written(folder, capsys):
+    """It fails before anything runs, with exit code 3."""
+    (folder / "taken").write_text("a file, not a folder")
+    assert main(["compare", "line.py", "--out", "taken/results"]) == 3
+    assert "cannot write to the folder" in capsys.readouterr().err
+
+
+def test_ended_run_has_its_own_exit_code(folder, capsys):
+    """A signal that is not finite ends the run; its name, time and finite part are kept."""
+    _write(folder, "- p.k * q.y", "- p.k * q.y + 1e-9 * ca.sqrt(0.9 - q.y)")
+    assert main(["run", "line.py", "CTC", "--no-compile"]) == 4
+    assert "is not finite at t = 0." in capsys.readouterr().out.replace("\n", " ")
+    assert fp.load_run(folder / "results" / "line" / "CTC.npz").cycles > 100
+
+
+def test_ctrl_c_keeps_what_is_finished(folder, capsys, monkeypatch):
+    """The finished controller is reported, the other is named as interrupted; exit code 130."""
+    from fpirhc.studies import compare as study
+
+    ordinary = study.simulate
+
+    def interrupted(problem, controller, **settings):
+        if settings["name"] == "CTC+FPI":
+            raise KeyboardInterrupt
+        return ordinary(problem, controller, **settings)
+
+    monkeypatch.setattr(study, "simulate", interrupted)
+    assert main(["compare", "line.py", "--no-compile"]) == 130
+    assert (folder / "results" / "line" / "report.html").exists()
+    assert "interrupted before it finished" in capsys.readouterr().out.replace("\n", " ")
+
+
+def test_without_a_compiler_it_says_so(folder, capsys, monkeypatch):
+    """Slower, announced, and the same numbers."""
+    monkeypatch.setitem(os.environ, "FPIRHC_CC", "none")
+    assert main(["compare", "line.py"]) == 0
+    assert "virtual machine, more slowly" in capsys.readouterr().err

@@ -1,0 +1,389 @@
+"""Laws of the deformation maps: fixed point, gains, convergence and its limits."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import math
+import pkgutil
+from dataclasses import FrozenInstanceError, dataclass, replace
+from decimal import Decimal, getcontext
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import fpirhc.deformation
+from fpirhc.deformation import Affine, Deformation, Identity, Rfpt, RfptVector, Rotation, Sigmoid
+from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.testing import check_deformation
+
+ITERATING = (
+    Affine(gain=-0.5),
+    Rfpt(offset=1e5, sign=-1, gain=5e-6),
+    Rfpt(offset=-1e4, sign=1, gain=4e-5),
+    RfptVector(offset=1e5, sign=-1, gain=5e-6),
+    Sigmoid(gain=-0.5, scale=1.0),
+    Sigmoid(gain=-1.5, shift=0.0, scale=20.0),
+    Sigmoid(gain=0.5, shift=-0.3, scale=1.0),
+    Sigmoid(gain=0.5, shift=0.3, scale=1.0),
+    Rotation(fraction=0.4, radius=1e3),
+    Rotation(fraction=0.4, radius=1.0),
+)
+MAPS = (Identity(), *ITERATING)
+NEARLY_LINEAR = (
+    Affine(gain=-0.5),
+    Rfpt(offset=1e5, sign=-1, gain=5e-6),
+    RfptVector(offset=1e5, sign=-1, gain=5e-6),
+    Sigmoid(gain=-0.5, scale=1e4),
+    Rotation(fraction=0.4, radius=1e4),
+)
+
+
+def name_of(deformation: Deformation) -> str:
+    return repr(deformation).replace(" ", "")
+
+
+def advance(deformation: Deformation, request: Any, response: Any, desired: Any) -> np.ndarray:
+    """One step with numbers, through an SX Function."""
+    n = np.size(request)
+    symbols = [ca.SX.sym(s, n) for s in ("r", "f", "d")]
+    function = ca.Function("map", symbols, [deformation.step(*symbols, {})[0]])
+    return np.asarray(function(request, response, desired).full())[:, 0]
+
+
+def iterate(deformation: Deformation, jacobian: np.ndarray, start: np.ndarray, cycles: int) -> np.ndarray:
+    """Requests r_0 ... r_cycles on the plant f(r) = J r with desired response 0, so with fixed point 0."""
+    n = len(start)
+    r = ca.SX.sym("r", n)
+    one = ca.Function("one", [r], [deformation.step(r, ca.mtimes(ca.DM(jacobian), r), ca.SX.zeros(n), {})[0]])
+    return np.vstack([start, np.asarray(one.mapaccum(cycles)(start).full()).T])
+
+
+def rate(requests: np.ndarray, first: int, last: int) -> float:
+    """Mean factor per cycle between two cycles."""
+    sizes = np.linalg.norm(requests, axis=1)
+    return float((sizes[last] / sizes[first]) ** (1 / (last - first)))
+
+
+def concrete_maps() -> set[type[Deformation]]:
+    found = set()
+    for module in pkgutil.iter_modules(fpirhc.deformation.__path__):
+        for _, member in inspect.getmembers(
+            importlib.import_module(f"fpirhc.deformation.{module.name}"), inspect.isclass
+        ):
+            if issubclass(member, Deformation) and not inspect.isabstract(member):
+                found.add(member)
+    return found
+
+
+def test_every_map_is_tested() -> None:
+    """A new file in the package must join the tuples above, or its laws would go unchecked."""
+    assert concrete_maps() == {type(m) for m in MAPS}
+
+
+@pytest.mark.parametrize("elements", [("q1",), ("q1", "q2", "q3")], ids=len)
+@pytest.mark.parametrize("deformation", ITERATING, ids=name_of)
+def test_conformance(deformation: Deformation, elements: tuple[str, ...]) -> None:
+    """Every map keeps the public laws, for one coordinate and for several."""
+    check_deformation(deformation, elements=elements, seed=1)
+
+
+@pytest.mark.parametrize("deformation", MAPS, ids=name_of)
+def test_maps_are_values(deformation: Deformation) -> None:
+    """A map is a frozen value: equal when its settings are, changed only by replacement."""
+    assert deformation == replace(deformation)
+    with pytest.raises((FrozenInstanceError, TypeError)):
+        deformation.gain = 1.0  # type: ignore[attr-defined]
+
+
+def test_identity_asks_for_what_is_desired() -> None:
+    """Without adaptation the response plays no part."""
+    assert advance(Identity(), [1.0, 2.0], [np.nan, 7.0], [3.0, 4.0]).tolist() == [3.0, 4.0]
+    with pytest.raises(NotSupported, match="Sigmoid"):
+        Identity().with_effective_gain(0.5)
+
+
+@dataclass(frozen=True)
+class _Careless(Affine):
+    """A map that claims twice the gain it has."""
+
+    def effective_gain(self) -> float:
+        return -self.gain
+
+
+@dataclass(frozen=True)
+class _Bare(Affine):
+    """A map that divides by the norm of the error."""
+
+    def step(self, request: Any, response: Any, desired: Any, memory: Any) -> Any:
+        del memory
+        error = response - desired
+        unit = ca.if_else(ca.norm_2(error) > 1e-10, error / ca.norm_2(error), 0)
+        return request + 0.5 * self.gain * ca.norm_2(error) * unit, {}
+
+
+@pytest.mark.parametrize(("wrong", "sentence"), [(_Careless(-0.5), "first-order"), (_Bare(-0.5), "gradient|value")])
+def test_conformance_finds_faults(wrong: Deformation, sentence: str) -> None:
+    """The laws are worth running: a wrong gain and an unguarded 0/0 are found, in words."""
+    with pytest.raises(AssertionError, match=sentence):
+        check_deformation(wrong, seed=1)
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda: Sigmoid(gain=0.0),
+        lambda: Sigmoid(gain=math.nan),
+        lambda: Sigmoid(gain=-0.5, shift=9.0),
+        lambda: Sigmoid(gain=-0.5, shift=math.nan),
+        lambda: Sigmoid(gain=-0.5, scale=0.0),
+        lambda: Sigmoid(gain=-0.5, scale=math.inf),
+        lambda: Rfpt(offset=1e5, sign=2, gain=1e-5),
+        lambda: Rfpt(offset=0.0, sign=-1, gain=1e-5),
+        lambda: RfptVector(offset=1e5, sign=0, gain=1e-5),
+        lambda: RfptVector(offset=1e5, sign=-1, gain=math.inf),
+        lambda: Rotation(fraction=0.0, radius=1.0),
+        lambda: Rotation(fraction=0.5, radius=-1.0),
+        lambda: Affine(gain="strong"),  # type: ignore[arg-type]
+    ],
+)
+def test_bad_settings_raise(build: Any) -> None:
+    """A setting that cannot work is refused when the map is made, not in the loop."""
+    with pytest.raises(InvalidValue, match="expected"):
+        build()
+
+
+def test_scale_must_be_chosen() -> None:
+    """A sigmoid without scale has no step; the message says how to give it one."""
+    open_scale = Sigmoid(gain=-0.5)
+    with pytest.raises(InvalidValue, match=r"with_scale\(S\)"):
+        open_scale.step(ca.SX.sym("r"), ca.SX.sym("f"), ca.SX.sym("d"), {})
+    with pytest.raises(InvalidValue, match="scale"):
+        open_scale.largest_step()
+    assert open_scale.with_scale(3.0) == Sigmoid(gain=-0.5, scale=3.0)
+    assert open_scale.effective_gain() == Sigmoid(gain=-0.5, scale=3.0).effective_gain()
+
+
+# shift D, x*, zeta'(x*), largest step for A_c < 0 and for A_c > 0, steepest secant for A_c < 0
+CONSTANTS = (
+    (0.1, 0.098076, 0.485525, 0.6474, 0.4512, 0.496355),
+    (0.2, 0.186129, 0.447431, 0.7354, 0.3632, 0.486488),
+    (0.3, 0.259456, 0.396737, 0.8088, 0.2899, 0.472649),
+    (0.5, 0.364681, 0.291509, 0.9140, 0.1846, 0.440438),
+    (1.0, 0.486365, 0.116297, 1.0357, 0.0629, 0.365290),
+)
+
+
+@pytest.mark.parametrize("row", CONSTANTS, ids=lambda row: f"D={row[0]}")
+def test_sigmoid_constants(row: tuple[float, ...]) -> None:
+    """The closed forms give the tabulated fixed point, slope, bounds and secant."""
+    shift, fixed_point, slope, down, up, secant = row
+    sigmoid = Sigmoid(gain=-1.0, shift=shift, scale=1.0)
+    assert sigmoid.fixed_point == pytest.approx(fixed_point, abs=1e-6)
+    assert sigmoid.fixed_point == pytest.approx(math.atanh(0.5 * math.tanh(sigmoid.fixed_point + shift)), abs=1e-14)
+    assert sigmoid.slope == pytest.approx(slope, abs=1e-6)
+    assert sigmoid.largest_step() == pytest.approx(down, abs=1e-4)
+    assert replace(sigmoid, gain=1.0).largest_step() == pytest.approx(up, abs=1e-4)
+    assert sigmoid.steepest_secant == pytest.approx(secant, abs=1e-6)
+
+
+@settings(deadline=None, derandomize=True, max_examples=50)
+@given(
+    st.floats(-3, 3),
+    st.floats(-3, 3).filter(lambda gain: abs(gain) > 1e-3),
+    st.lists(st.floats(1e-6, 100), min_size=1, max_size=20),
+)
+def test_steepest_secant_is_a_bound(shift: float, gain: float, sizes: list[float]) -> None:
+    """Slope <= steepest secant <= 1/2 for any shift and sign, and no sampled secant is steeper."""
+    sigmoid = Sigmoid(gain=gain, shift=shift, scale=1.0)
+    assert sigmoid.slope <= sigmoid.steepest_secant * (1 + 1e-12) <= 0.5 * (1 + 1e-12)
+    for size in sizes:
+        step = abs(float(advance(sigmoid, 0.0, size, 0.0)[0]))
+        assert step <= abs(sigmoid.secant_gain()) * size * (1 + 1e-9)
+        assert step <= sigmoid.largest_step() * (1 + 1e-9)
+
+
+def test_steepest_secant_is_attained() -> None:
+    """The secant bound is the supremum, not merely a bound: some error reaches it."""
+    sigmoid = Sigmoid(gain=-1.0, scale=1.0)
+    sizes = np.linspace(0.5, 1.5, 2001)
+    steps = [-float(advance(sigmoid, 0.0, size, 0.0)[0]) / size for size in sizes[::20]]
+    assert max(steps) == pytest.approx(sigmoid.steepest_secant, abs=1e-4)
+
+
+def exact_sigmoid_step(gain: float, shift: float, size: float) -> float:
+    """zeta(gain size + x*) - x* as printed, in 60 digits, so that cancellation does no harm."""
+    getcontext().prec = 60
+
+    def tanh(x: Decimal) -> Decimal:
+        e = (2 * x).exp()
+        return (e - 1) / (e + 1)
+
+    def atanh(y: Decimal) -> Decimal:
+        return ((1 + y) / (1 - y)).ln() / 2
+
+    t = tanh(Decimal(shift))
+    fixed = atanh(((1 + 8 * t * t).sqrt() - 1) / (4 * t))
+    return float(atanh(tanh(Decimal(gain) * Decimal(size) + fixed + Decimal(shift)) / 2) - fixed)
+
+
+@pytest.mark.parametrize("size", [10.0**k for k in range(-15, 4)])
+@pytest.mark.parametrize(("gain", "shift"), [(-0.5, 0.3), (0.5, 0.3), (-3.0, 1.0), (-1.0, -0.2)])
+def test_sigmoid_keeps_its_digits(gain: float, shift: float, size: float) -> None:
+    """The step agrees with the printed formula in 60 digits at every size; directly it is 40 % wrong at 1e-15."""
+    step = float(advance(Sigmoid(gain=gain, shift=shift, scale=1.0), 0.0, size, 0.0)[0])
+    rounded_off = 1e-9 / math.hypot(size, 1e-9)  # the norm's floor changes the step where the error is near 1e-9
+    assert step == pytest.approx(exact_sigmoid_step(gain, shift, size), rel=1e-13 + 1e-8 * rounded_off)
+
+
+def test_sigmoid_scale_changes_only_the_saturation() -> None:
+    """Error and step in units of S: r+ - r is homogeneous in (h, S)."""
+    error = np.array([0.7, -1.9])
+    unit = advance(Sigmoid(gain=-0.8, scale=1.0), [0.0, 0.0], error, [0.0, 0.0])
+    scaled = advance(Sigmoid(gain=-0.8, scale=30.0), [0.0, 0.0], 30 * error, [0.0, 0.0])
+    assert scaled == pytest.approx(30 * unit, rel=1e-12)
+
+
+def test_sigmoid_mirror() -> None:
+    """zeta with -D is the mirror image of zeta with D, so (A_c, D) -> (-A_c, -D) reverses the step exactly."""
+    error = [0.7, -1.9]
+    one = advance(Sigmoid(gain=-0.8, shift=0.3, scale=1.0), [0.0, 0.0], error, [0.0, 0.0])
+    other = advance(Sigmoid(gain=0.8, shift=-0.3, scale=1.0), [0.0, 0.0], error, [0.0, 0.0])
+    assert other == pytest.approx(-one, rel=1e-14)
+
+
+def test_huge_errors_saturate() -> None:
+    """An error beyond the square root of the largest number gives a bounded step, not an overflow."""
+    step = advance(Sigmoid(gain=-0.5, scale=1.0), [0.0, 0.0], [1e150, 0.0], [0.0, 0.0])
+    assert np.linalg.norm(step) == pytest.approx(Sigmoid(gain=-0.5, scale=1.0).largest_step(), rel=1e-9)
+
+
+@pytest.mark.parametrize("slope", [1.5, 1.9, 2.1])
+def test_rfpt_factor(slope: float) -> None:
+    """K_c A_c = 1: the factor per cycle is 1 + (K_c + r*) B_c A_c f', also where it is a divergence."""
+    offset, desired = 1e5, 30.0
+    fixed = desired / slope
+    requests = [fixed + 1e-3]
+    for _ in range(4):
+        requests.append(float(advance(Rfpt(offset, -1, 1e-5), requests[-1], slope * requests[-1], desired)[0]))
+    errors = np.array(requests) - fixed
+    assert errors[1:] / errors[:-1] == pytest.approx(1 - (offset + fixed) * 1e-5 * slope, abs=1e-4)
+
+
+@pytest.mark.parametrize("slope", [0.5, 1.0, 1.5])
+def test_false_fixed_point_repels(slope: float) -> None:
+    """The second fixed point r = -K_c has G' = 1 + tanh(f' - d / K_c) > 1 for B_c = -1 and f' > 0 (1.76 for f' = 1)."""
+    r = ca.SX.sym("r")
+    deformed = Rfpt(1e5, -1, 1e-5).step(r, slope * r, ca.SX(0), {})[0]
+    value, derivative = ca.Function("g", [r], [deformed, ca.jacobian(deformed, r)])(-1e5)
+    assert float(value) == -1e5
+    assert float(derivative) == pytest.approx(1 + math.tanh(slope), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("jacobian", "gain"),
+    [(np.diag([1.5, 1.3]), g) for g in (-0.5, -1.0, -2.0, -3.0)]
+    + [(np.array([[0.95, -0.811], [0.811, 0.95]]), g) for g in (-0.5, -1.0, -2.0, -3.0)],
+)
+def test_sigmoid_rate_equals_prediction(jacobian: np.ndarray, gain: float) -> None:
+    """Real and complex spectra: the measured factor is max|1 - a lambda|, near the fixed point."""
+    sigmoid = Sigmoid(gain=gain, scale=1.0)
+    predicted = np.abs(1 - sigmoid.effective_gain() * np.linalg.eigvals(jacobian)).max()
+    slowest = np.eye(2)[np.argmax(np.abs(1 - sigmoid.effective_gain() * np.diag(jacobian)))]
+    requests = iterate(sigmoid, jacobian, 1e-5 * slowest, 12)
+    assert rate(requests, 4, 12) == pytest.approx(predicted, abs=1e-3)
+
+
+@pytest.mark.parametrize("gain", [-2.0, -0.5, -0.1, 0.1, 0.5, 2.0])
+def test_indefinite_jacobian_never_converges(gain: float) -> None:
+    """Eigenvalues of both signs: no gain of either sign brings the error down."""
+    requests = iterate(Sigmoid(gain=gain, scale=1.0), np.diag([1.0, -1.0]), np.array([1e-3, 1e-3]), 400)
+    assert np.linalg.norm(requests[-1]) > 1.0
+
+
+def test_equivalence_at_equal_gain() -> None:
+    """All maps converge at the same rate when their effective gains are equal, whatever their formula."""
+    jacobian = np.array([[1.5, 0.2], [0.1, 1.3]])
+    rates = []
+    for deformation in NEARLY_LINEAR:
+        requests = iterate(deformation.with_effective_gain(0.3), jacobian, np.array([5.0, -3.0]), 30)
+        rates.append(rate(requests, 10, 30))
+    assert rates == pytest.approx([rates[0]] * len(rates), rel=0.01)
+
+
+LIMIT_GAINS = (-4.2, -4.3, -4.9)  # unit plant: sector limit 4.2315, linear limit 5.0411
+
+
+@pytest.mark.parametrize("gain", LIMIT_GAINS)
+def test_sector_and_linear_limit(gain: float) -> None:
+    """Between the sector and the linear limit large errors end in a bounded 2-cycle, small ones die out.
+
+    Local analysis cannot see the 2-cycle. Below the sector limit errors of any size die out.
+    """
+    sigmoid, plant = Sigmoid(gain=gain, scale=1.0), np.eye(1)
+    small = np.abs(iterate(sigmoid, plant, np.array([1e-3]), 3000)[-1, 0])
+    large = iterate(sigmoid, plant, np.array([5.0]), 3000)[-2:, 0]
+    assert small < 1e-6
+    if sigmoid.secant_gain() < 2:
+        assert np.abs(large).max() < 1e-6
+    else:
+        assert large[0] == pytest.approx(-large[1], rel=1e-6)
+        assert 0.01 < np.abs(large[0]) < 1.0
+    assert sigmoid.effective_gain() < 2
+
+
+def test_beyond_the_linear_limit_oscillates_from_any_error() -> None:
+    """Above the linear limit even a small error grows, into a bounded 2-cycle because the step saturates."""
+    last = iterate(Sigmoid(gain=-5.2, scale=1.0), np.eye(1), np.array([1e-3]), 3000)[-2:, 0]
+    assert last[0] == pytest.approx(-last[1], rel=1e-6)
+    assert np.abs(last[0]) > 0.01
+
+
+def reference_rotation(fraction: float, radius: float, r: np.ndarray, f: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """The rotation as usually written, with unit vectors e1 along f and e2 across it."""
+    r_, f_, d_ = (np.append(v, math.sqrt(radius**2 - v @ v)) for v in (r, f, d))
+    e1 = f_ / radius
+    across = d_ - (e1 @ d_) * e1
+    angle = fraction * math.atan2(float(np.linalg.norm(across)), float(e1 @ d_))
+    e2 = across / np.linalg.norm(across)
+    along, beside = e1 @ r_, e2 @ r_
+    turned = r_ + ((math.cos(angle) - 1) * along - math.sin(angle) * beside) * e1
+    turned += (math.sin(angle) * along + (math.cos(angle) - 1) * beside) * e2
+    return np.asarray(turned[:-1])
+
+
+@settings(deadline=None, derandomize=True, max_examples=50)
+@given(st.floats(0.05, 1.5), st.integers(0, 10**6))
+def test_rotation_is_the_rotation(fraction: float, seed: int) -> None:
+    """The form without unit vectors equals the usual one wherever that one is defined."""
+    r, f, d = np.random.default_rng(seed).uniform(-5, 5, size=(3, 3))
+    assert advance(Rotation(fraction, 20.0), r, f, d) == pytest.approx(
+        reference_rotation(fraction, 20.0, r, f, d), abs=1e-10
+    )
+
+
+@pytest.mark.parametrize(("radius", "tolerance"), [(1e3, 1e-3), (100.0, 0.02)])
+def test_rotation_is_nearly_linear(radius: float, tolerance: float) -> None:
+    """r+ = r - fraction h up to third order: the deviation falls with the square of size over radius."""
+    r, f, d = np.array([6.0, -3.0]), np.array([4.0, 5.0]), np.array([7.0, 2.0])
+    moved = advance(Rotation(0.4, radius), r, f, d) - r
+    assert moved == pytest.approx(-0.4 * (f - d), abs=tolerance)
+
+
+def test_rotation_outgrows_its_radius() -> None:
+    """Vectors longer than the radius still give a finite request nearer to the desired response."""
+    requests = iterate(Rotation(0.4, 1.0), np.diag([1.5, 1.3]), np.array([80.0, -50.0]), 60)
+    assert np.linalg.norm(requests[-1]) < 1e-6
+    assert np.all(np.isfinite(requests))
+
+
+@pytest.mark.parametrize("deformation", ITERATING, ids=name_of)
+def test_maps_serve_an_optimiser(deformation: Deformation) -> None:
+    """step(request=U, response=gradient, desired=0) minimises a quadratic cost, by the same contraction."""
+    hessian = np.diag([1.5, 1.3])
+    changed = deformation.with_effective_gain(0.6)
+    assert np.linalg.norm(iterate(changed, hessian, np.array([0.4, -0.2]), 200)[-1]) < 1e-6

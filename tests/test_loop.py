@@ -1,0 +1,246 @@
+"""The closed loop: laws of adaptation, clipping, finiteness, disturbances, and running in several ways."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import fpirhc as fp
+import numpy as np
+import pytest
+from fpirhc.errors import InvalidName, InvalidProblem
+from plants import linear, pendulum
+
+TRACK = fp.Exponential(rate=6.0)
+
+
+def swing(plant=None, **changes) -> fp.Problem:
+    """A pendulum along a sine."""
+    settings = {
+        "plant": plant or pendulum(),
+        "reference": fp.Trajectory(lambda t: {"angle": 0.5 * ca.sin(2 * t)}),
+        "start": {"angle": 0.0},
+        "period": 1e-3,
+        "duration": 3.0,
+        "measure_from": 1.0,
+    }
+    return fp.Problem(**{**settings, **changes})
+
+
+def line(gain, believed, **changes) -> fp.Problem:
+    """A linear plant that holds still."""
+    settings = {
+        "plant": linear(gain, believed),
+        "reference": fp.Trajectory(lambda t: {"y": 1 + 0 * t}),
+        "start": {"y": 0.0},
+        "period": 1e-3,
+        "duration": 0.5,
+    }
+    return fp.Problem(**{**settings, **changes})
+
+
+def run(problem, deformation=None, *, seed=0, compiled=False):
+    """Computed torque in the virtual machine."""
+    controller = fp.ComputedTorque(TRACK, deformation or fp.Identity())
+    return fp.simulate(problem, controller, seed=seed, compiled=compiled)
+
+
+def test_exact_model_needs_no_deformation():
+    """When model and plant agree the request is realised, so nothing is deformed beyond the drift within one cycle."""
+    problem = swing(pendulum(mass=1.4, believed=1.4))
+    exact = replace(
+        problem.plant, parameters={n: replace(p, exact=p.approximate) for n, p in problem.plant.parameters.items()}
+    )
+    found = run(replace(problem, plant=exact), fp.Sigmoid(gain=-0.5, scale=10.0))
+    difference = np.abs(found["deformed.angle"] - found["desired.angle"])
+    slew = np.abs(np.diff(found["desired.angle"])).max()
+    assert difference.max() < 20 * slew
+    assert np.abs(found["error.angle"][-1000:]).max() < 1e-3
+
+
+def test_wrong_model_is_cured_by_deformation():
+    """The law of the method: the realised response becomes the desired one, so tracking improves by far."""
+    plain, adaptive = run(swing()), run(swing(), fp.Sigmoid(gain=-0.5, scale=10.0))
+    late = fp.measure(swing(measure_from=2.0), plain), fp.measure(swing(measure_from=2.0), adaptive)
+    assert late[1].rms_error["angle"] < 0.1 * late[0].rms_error["angle"]
+
+
+def test_identity_asks_for_what_is_desired():
+    """No adaptation is q^Def = q^Des in every cycle."""
+    found = run(swing())
+    assert np.array_equal(found["deformed"], found["desired"])
+
+
+def test_adaptation_waits_for_a_valid_pair():
+    """In the first cycle nothing has been realised yet, so the request is the desired response."""
+    found = run(swing(), fp.Sigmoid(gain=-0.5, scale=10.0))
+    assert found["deformed.angle"][0] == found["desired.angle"][0]
+    assert found["deformed.angle"][5] != found["desired.angle"][5]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_in_loop_contraction_equals_prediction(seed):
+    """On a linear plant with constant desired response, |h| shrinks by |1 - a lambda| per cycle."""
+    gain = np.random.default_rng(seed).uniform(0.5, 1.8)
+    deformation = fp.Sigmoid(gain=-0.5, scale=1e6)
+    still = fp.Exponential(rate=1e-3, integral=False)
+    found = fp.simulate(line(gain, 1.0, duration=0.05), fp.ComputedTorque(still, deformation), seed=0, compiled=False)
+    error = found["realised.y"][1:] - found["desired.y"][1:]
+    ratios = error[5:15] / error[4:14]
+    np.testing.assert_allclose(ratios, 1 - deformation.effective_gain() * gain, atol=1e-3, equal_nan=False)
+
+
+def test_clipped_command_defines_the_stored_request():
+    """Anti-windup: while clipped, the stored request is what the clipped command means to the model."""
+    problem = line(1.0, 1.3, limits=fp.Limits(inputs={"u": (-2.0, 2.0)}), duration=0.2)
+    found = run(problem, fp.Sigmoid(gain=-0.5, scale=10.0))
+    clipped = found["clipped"][:, 0] > 0
+    assert clipped.any()
+    np.testing.assert_allclose(
+        found["deformed.y"][clipped], 1.3 * found["command.u"][clipped], rtol=1e-12, equal_nan=False
+    )
+    assert np.abs(found["command.u"]).max() <= 2.0
+
+
+def test_anti_windup_settles_where_windup_would_not():
+    """A step of 2 m with |u| <= 20: the request stays within the reachable set and the plant settles."""
+    problem = line(1.0, 1.3, reference=fp.Trajectory(lambda t: {"y": 2 + 0 * t}), duration=4.0)
+    problem = replace(problem, limits=fp.Limits(inputs={"u": (-20.0, 20.0)}))
+    controller = fp.ComputedTorque(fp.Exponential(6.0, bumpless=False), fp.Sigmoid(gain=-0.5, scale=10.0))
+    found = fp.simulate(problem, controller, seed=0, compiled=False)
+    assert np.abs(found["deformed.y"]).max() <= 26.0 + 1e-9
+    assert -found["error.y"].min() < 1.5
+    assert np.abs(found["error.y"][-200:]).max() < 0.02
+
+
+def test_over_gained_iteration_stays_bounded():
+    """Beyond the sector bound eq (6) ends in a bounded oscillation, not in an explosion."""
+    found = run(line(1.0, 1.0, duration=1.0), fp.Sigmoid(gain=-6.0, scale=1.0))
+    assert found.stop is None
+    late = np.diff(found["deformed.y"][-50:])
+    assert 0.01 < np.abs(late).max() <= 2 * fp.Sigmoid(gain=-6.0, scale=1.0).largest_step()
+
+
+def test_disturbances_act_by_name():
+    """A force step of 1 N on y'' = 2 u shows as 2 m/s^2 in the realised response, one cycle later."""
+    quiet = run(line(2.0, 2.0))
+    pushed = run(line(2.0, 2.0, disturbances={"u": fp.Step(at=0.1, size=1.0), "y": fp.Step(at=0.3, size=-3.0)}))
+    difference = pushed["realised.y"] - quiet["realised.y"]
+    assert np.all(difference[:101] == 0)
+    assert difference[101] == pytest.approx(2.0)
+    before, after = pushed["realised.y"][300], pushed["realised.y"][301]
+    assert after - before == pytest.approx(-3.0, abs=0.2)
+
+
+def test_noise_follows_the_seed():
+    """Runs are reproducible bit for bit, and seeds differ."""
+    noisy = swing(disturbances={"torque": fp.Noise(0.1)}, duration=1.5)
+    first, again, other = run(noisy, seed=1), run(noisy, seed=1), run(noisy, seed=2)
+    assert np.array_equal(first.log, again.log)
+    assert not np.array_equal(first.log, other.log)
+
+
+def test_compiled_and_virtual_machine_agree():
+    """One symbolic step: C and the virtual machine give the same run up to rounding."""
+    in_vm, in_c = run(swing()), run(swing(), compiled=True)
+    np.testing.assert_allclose(in_c.log, in_vm.log, rtol=1e-9, atol=1e-9, equal_nan=False)
+
+
+def test_stepping_by_hand_repeats_the_run():
+    """The controller's own Function, fed with the run's measurements, gives the run's commands."""
+    problem, controller = (
+        swing(duration=0.2, measure_from=0.0),
+        fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5, scale=10.0)),
+    )
+    found = fp.simulate(problem, controller, seed=0, compiled=False)
+    stepper = fp.Stepper(problem, controller, compiled=False)
+    memory = stepper.start()
+    for k in range(found.cycles):
+        command, memory = stepper.step(found.time[k], found["state"][k], found["realised"][k], memory)
+        np.testing.assert_allclose(command, found["command"][k], rtol=1e-12, atol=1e-12, equal_nan=False)
+
+
+def test_nan_measurement_never_reaches_the_plant():
+    """A measurement that is not finite holds the last command, and the controller recovers with the next good one."""
+    problem = swing(limits=fp.Limits(inputs={"torque": (-50.0, 50.0)}))
+    stepper = fp.Stepper(problem, fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5, scale=10.0)), compiled=False)
+    memory = stepper.start()
+    good, memory = stepper.step(0.0, np.array([0.1, 0.0]), np.zeros(1), memory)
+    held, memory = stepper.step(1e-3, np.array([np.nan, 0.0]), np.zeros(1), memory)
+    assert np.array_equal(held, good)
+    assert stepper.trace()["status"][0] == fp.Status.NON_FINITE
+    after, memory = stepper.step(2e-3, np.array([0.1, 0.0]), np.zeros(1), memory)
+    assert np.isfinite(after).all()
+
+
+def test_run_stops_where_a_signal_is_not_finite():
+    """The run keeps its finite part and names the signal and the time."""
+    bomb = fp.Plant(
+        {"y": "m"},
+        {"u": "N"},
+        {},
+        lambda q, v, u, p: {"y": u.u + 1e-9 * ca.sqrt(1 - q.y)},
+        inverse=lambda q, v, r, p: {"u": r.y},
+    )
+    problem = line(1.0, 1.0, plant=bomb, reference=fp.Trajectory(lambda t: {"y": 3 * t}), duration=2.0)
+    found = run(problem)
+    assert found.stop is not None
+    assert "not finite at t = 0." in found.stop
+    assert 0 < found.cycles < problem.cycles
+    assert np.isfinite(found.log).all()
+    metrics = fp.measure(problem, found)
+    assert metrics.worst_status == "NON_FINITE"
+    assert np.isnan(metrics.rms_error["y"])
+
+
+def test_save_and_load(tmp_path):
+    """A run survives the disk; a damaged file is refused."""
+    found = run(swing(duration=0.1, measure_from=0.0))
+    found.save(tmp_path / "run.npz")
+    again = fp.load_run(tmp_path / "run.npz")
+    assert np.array_equal(again.log, found.log)
+    assert again.layout.columns == found.layout.columns
+    assert again.settings["controller"]["is"] == "ComputedTorque"
+    (tmp_path / "bad.npz").write_bytes((tmp_path / "run.npz").read_bytes()[:200])
+    with pytest.raises(fp.FpirhcError, match="cannot read"):
+        fp.load_run(tmp_path / "bad.npz")
+    with pytest.raises(fp.FpirhcError, match="cannot write"):
+        found.save(tmp_path / "no" / "run.npz")
+
+
+def test_signals_by_name():
+    """By signal, by column, as a table; a misspelt name gets the nearest."""
+    found = run(swing(duration=0.1, measure_from=0.0))
+    assert found["state"].shape == (100, 2)
+    assert found["state.angle'"].shape == (100,)
+    assert "error.angle" in found.to_dataframe().columns
+    with pytest.raises(InvalidName, match="Did you mean 'desired'"):
+        found["desird"]
+
+
+BAD = {
+    "'angel' is unknown. Did you mean 'angle'": {"start": {"angel": 0.0}},
+    "coordinate 'angle' has no first value": {"start": {}},
+    "must be a finite number, got nan": {"start": {"angle": float("nan")}},
+    "period must be a positive": {"period": 0.0},
+    "lower 2.0 above upper 1.0": {"limits": fp.Limits(inputs={"torque": (2.0, 1.0)})},
+    "input 'torqe' is unknown": {"limits": fp.Limits(inputs={"torqe": (0.0, 1.0)})},
+    "has no nominal motion": {"reference": fp.Trajectory(lambda t: {})},
+    "shorter than one period": {"duration": 1e-4},
+    "disturbances: input or coordinate 'x' is unknown": {"disturbances": {"x": fp.Noise(1.0)}},
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_mistakes_of_a_problem(message):
+    """Each mistake says what, where, and how to mend it."""
+    with pytest.raises(InvalidProblem, match=message):
+        swing(**BAD[message])
+
+
+def test_response_not_invertible_at_the_start():
+    """The input and the state are named."""
+    weak = fp.Plant({"y": "m"}, {"u": "N"}, {}, lambda q, v, u, p: {"y": q.y * u.u})
+    with pytest.raises(InvalidProblem, match="(?s)not invertible at the start \\(y = 0, y' = 0\\).*'u'"):
+        line(1.0, 1.0, plant=weak)
+    assert line(1.0, 1.0, plant=weak, start={"y": 1.0}).cycles == 500
