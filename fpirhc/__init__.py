@@ -42,6 +42,8 @@ _HOMES = {
     "fpirhc.controllers.nominal": ("Restart", "RestartAndTrack", "OpenPlan"),
     "fpirhc.controllers.on_failure": ("HoldPlan", "Feedforward", "StopRun"),
     "fpirhc.controllers.informed": ("Informed",),
+    "fpirhc.contraction": ("assess_gain", "check_gain", "response_jacobian", "spectrum_over_box", "spectrum_over_run"),
+    "fpirhc.testing": ("check_deformation",),
     "fpirhc.simulation": ("simulate",),
     "fpirhc.stepper": ("Stepper",),
     "fpirhc.run": ("Run", "load_run"),

@@ -52,6 +52,18 @@ class RungeKutta4(Integrator):
 
 
 @dataclass(frozen=True)
+class Euler(Integrator):
+    """Explicit Euler in one step: x+ = x + h f(x, u). First order, for horizons in the manner of the original papers."""
+
+    def step(self, plant: Plant, period: float) -> ca.Function:
+        """Function (state, input, parameters, forcing) -> state after `period` seconds."""
+        rate = plant.forced_derivative_function
+        x, u, p, w = (ca.SX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))
+        following = x + period * rate(x, u, p, w)
+        return ca.Function("fpirhc_euler", [x, u, p, w], [following], ["x", "u", "p", "w"], ["x_next"])
+
+
+@dataclass(frozen=True)
 class Cvodes(Integrator):
     """SUNDIALS CVODES with the given relative and absolute tolerance."""
 

@@ -1,0 +1,108 @@
+"""The contract of optimisers, and how every plan is judged.
+
+A plan's stationarity is measured by our own adjoint gradient g, never by a solver's word:
+
+    stationarity = max |U - clip(U - g / step, lower, upper)|,
+
+the distance that a projected gradient step would move, with g/step the gradient of the cost rate. It is zero exactly at points
+that satisfy the first-order conditions, bounds active or not. Feasibility is the largest violation of a state bound by the rolled
+out plan (inputs are inside their box by construction).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import casadi as ca
+
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.rollout import reduced_gradient
+from fpirhc.status import Status
+from fpirhc.symbolic.layout import Expression, Layout
+
+FINITE = 1e300  # |v| <= FINITE is false for NaN and infinity
+FEASIBLE = 1e-4  # largest violation of a state bound that still counts as kept
+UNKNOWN_ITERATIONS = -1.0  # solver call-outs do not tell their iterations inside a graph
+
+
+class Optimiser(ABC):
+    """Contract: one improvement of a warm-started plan as a Function, with a fixed amount of work where possible."""
+
+    @property
+    def exportable(self) -> bool:
+        """Whether the step can leave CasADi's virtual machine as C code."""
+        return True
+
+    def check(self, ocp: OptimalControl) -> None:  # noqa: B027 -- most optimisers serve every problem
+        """Raise NotSupported when the problem has something this optimiser cannot keep."""
+
+    @abstractmethod
+    def memory(self, ocp: OptimalControl) -> Layout:
+        """What is kept for the next call: at least the plan, shifted by one stage."""
+
+    @abstractmethod
+    def step(self, ocp: OptimalControl) -> ca.Function:
+        """Function (s0, data, lower, upper, memory) -> (U (nu, N), diagnostics, memory for the next call).
+
+        diagnostics: cost, stationarity, feasibility, iterations, status. A plan that is not finite is never returned: the
+        remembered one is, with status NON_FINITE.
+        """
+
+
+def shift(columns: Expression) -> Expression:
+    """Drop the first stage and repeat the last: the warm start of the next call."""
+    return columns if columns.shape[1] == 1 else ca.horzcat(columns[:, 1:], columns[:, -1])
+
+
+def clip(columns: Expression, lower: Expression, upper: Expression) -> Expression:
+    """Clip every stage's input to its box."""
+    stages = columns.shape[1]
+    return ca.fmin(ca.fmax(columns, ca.repmat(lower, 1, stages)), ca.repmat(upper, 1, stages))
+
+
+def is_finite(value: Expression) -> Expression:
+    """1 when every entry is finite, 0 otherwise (NaN included, which fmax and fmin would hide)."""
+    return ca.mmin(ca.fabs(ca.vec(value)) <= FINITE)
+
+
+def largest(value: Expression) -> Expression:
+    """Largest absolute entry."""
+    return ca.norm_inf(ca.vec(value))
+
+
+def stationarity(ocp: OptimalControl, inputs: Expression, gradient: Expression, lower: Expression, upper: Expression) -> Expression:
+    """Return the projected residual of a plan (see the module's docstring)."""
+    return largest(inputs - clip(inputs - gradient / ocp.step, lower, upper))
+
+
+def state_violation(ocp: OptimalControl, states: Expression) -> Expression:
+    """Largest violation of a state bound by s_1 ... s_N; zero without bounds."""
+    worst: Expression = ca.MX(0)
+    for k in range(ocp.state.size):
+        row = states[k, 1:]
+        if ocp.state_lower[k] > -FINITE:
+            worst = ca.fmax(worst, ca.mmax(ocp.state_lower[k] - row))
+        if ocp.state_upper[k] < FINITE:
+            worst = ca.fmax(worst, ca.mmax(row - ocp.state_upper[k]))
+    return worst
+
+
+def judge(ocp: OptimalControl) -> ca.Function:
+    """Function (U, s0, data, lower, upper, M) -> (cost, stationarity, feasibility), by our own sweeps.
+
+    M (ns, N) are the multipliers of the state bounds; zero without them.
+    """
+    gradient = reduced_gradient(ocp)
+    inputs, data = ca.MX.sym("U", ocp.input.size, ocp.stages), ca.MX.sym("data", ocp.data.size, ocp.stages + 1)
+    s0, lower, upper = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("l", ocp.input.size), ca.MX.sym("u", ocp.input.size)
+    multipliers = ca.MX.sym("M", ocp.state.size, ocp.stages)
+    value, slope, states, _ = gradient(s0, inputs, data, multipliers)
+    results = [value, stationarity(ocp, inputs, slope, lower, upper), state_violation(ocp, states)]
+    return ca.Function("fpirhc_judge", [inputs, s0, data, lower, upper, multipliers], results)
+
+
+def status_of(finite: Expression, residual: Expression, violation: Expression, tolerance: float) -> Expression:
+    """Return the status number of a plan."""
+    converged = ca.if_else(residual <= tolerance, int(Status.OK), int(Status.NOT_CONVERGED))
+    feasible = ca.if_else(violation <= FEASIBLE, converged, int(Status.INFEASIBLE))
+    return ca.if_else(finite, feasible, int(Status.NON_FINITE))

@@ -1,0 +1,91 @@
+"""Open-loop solves: a plan as numbers, which can verify itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.rollout import rollout
+from fpirhc.optimisers.base import Optimiser, judge
+from fpirhc.status import Status
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A solved horizon.
+
+    inputs (nu, N), states (ns, N + 1). cost, stationarity, feasibility as defined in `fpirhc.optimisers.base`; iterations as far as
+    the optimiser tells (-1: it does not); calls of its step; status.
+    """
+
+    inputs: np.ndarray
+    states: np.ndarray
+    cost: float
+    stationarity: float
+    feasibility: float
+    iterations: float
+    calls: int
+    status: Status
+    _ocp: OptimalControl
+    _data: np.ndarray
+    _bounds: tuple[np.ndarray, np.ndarray]
+
+    def verify(self) -> tuple[float, float, float]:
+        """Recompute (cost, stationarity, feasibility) from the problem's own functions, without state multipliers."""
+        ocp = self._ocp
+        none = np.zeros((ocp.state.size, ocp.stages))
+        found = judge(ocp)(self.inputs, self.states[:, 0], self._data, *self._bounds, none)
+        cost, stationarity, feasibility = (float(v) for v in found)
+        return cost, stationarity, feasibility
+
+
+def solve(
+    ocp: OptimalControl,
+    optimiser: Optimiser,
+    state: np.ndarray,
+    data: np.ndarray,
+    *,
+    calls: int = 50,
+    start: np.ndarray | None = None,
+) -> Plan:
+    """Solve one horizon open loop: call the optimiser's step until its status is OK, at most `calls` times.
+
+    Parameters: `state` s_0 (ns,), `data` (ntheta, N + 1), `start` a first plan (nu, N), zero when not given.
+
+    Raises:
+        NotSupported: the optimiser cannot serve the problem.
+    """
+    optimiser.check(ocp)
+    step, layout = optimiser.step(ocp), optimiser.memory(ocp)
+    memory = layout.start()
+    bounds = (ocp.input_lower, ocp.input_upper)
+    place = layout.slice("plan_inputs")
+    inputs = np.zeros((ocp.input.size, ocp.stages)) if start is None else np.asarray(start, dtype=float)
+    status, count = Status.NOT_CONVERGED, 0
+    diagnostics = np.zeros(5)
+    iterations = 0.0
+    while status == Status.NOT_CONVERGED and count < calls:
+        # The memory comes back shifted for the next cycle; the same horizon is solved again, so the plan is put back.
+        memory[place] = inputs.ravel(order="F")
+        given = step(state, data, *bounds, memory)
+        inputs, diagnostics, memory = (np.asarray(v.full()) for v in given)
+        diagnostics, memory = diagnostics.ravel(), memory.ravel()
+        iterations += diagnostics[3]
+        status, count = Status(int(diagnostics[4])), count + 1
+    states = np.asarray(rollout(ocp)(state, inputs, data)[0].full())
+    return Plan(
+        inputs,
+        states,
+        float(diagnostics[0]),
+        float(diagnostics[1]),
+        float(diagnostics[2]),
+        iterations if diagnostics[3] >= 0 else -1.0,
+        count,
+        status,
+        ocp,
+        np.asarray(ca.DM(data).full()),
+        bounds,
+    )

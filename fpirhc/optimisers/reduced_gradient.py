@@ -1,0 +1,174 @@
+"""The reduced-gradient method: what the fixed-point optimisers replace.
+
+Lagrange's reduced gradient, found by one adjoint sweep, with projection on the input box and a line search. The step length is
+the spectral one of Barzilai and Borwein, the line search non-monotone over the last values (Birgin, Martinez and Raydan's
+spectral projected gradient): U+ = U + t (clip(U - gamma g) - U), t the first of 1, 1/2, 1/8, 1/64 that decreases enough.
+
+Every call does the same amount of work: `iterations` gradients and four trial rollouts each.
+
+References: E. G. Birgin, J. M. Martinez, M. Raydan, SIAM J. Optim. 10(4), 2000.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.rollout import reduced_gradient, rollout
+from fpirhc.optimisers.base import Optimiser, clip, is_finite, judge, shift, status_of
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+
+_TRIALS = (1.0, 0.5, 0.125, 1 / 64)
+_HISTORY = 5  # values that the non-monotone line search compares with
+_DECREASE = 1e-4
+_SHORTEST, _LONGEST = 1e-10, 1e10  # bounds of the spectral step length
+
+
+@dataclass(frozen=True)
+class ReducedGradient(Optimiser):
+    """Projected spectral gradient with a fixed number of iterations per call.
+
+    Parameters:
+        iterations: per call. tolerance: of the stationarity below which a plan counts as converged.
+
+    Raises:
+        InvalidValue: fewer than one iteration, or a tolerance that is not positive.
+    """
+
+    iterations: int
+    tolerance: float
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise InvalidValue(f"ReducedGradient needs at least 1 iteration, got {self.iterations}")
+        if not self.tolerance > 0:
+            raise InvalidValue(f"ReducedGradient needs a positive tolerance, got {self.tolerance}")
+
+    def check(self, ocp: OptimalControl) -> None:
+        """Raise if states are bounded.
+
+        Raises:
+            NotSupported: projection keeps bounds of inputs only.
+        """
+        if ocp.bounds_states:
+            raise NotSupported(
+                "ReducedGradient keeps input limits only; for state limits use InteriorPoint(), Fatrop() or "
+                "SequentialQuadratic(), or remove them from Problem(limits=...)"
+            )
+
+    def memory(self, ocp: OptimalControl) -> Layout:
+        """The plan and the spectral step length."""
+        plan = Signal("plan_inputs", tuple(f"{i}@{k}" for k in range(ocp.stages) for i in ocp.input.elements))
+        return Layout((plan, scalar("plan_step_length", start=0.0)))
+
+    def step(self, ocp: OptimalControl) -> ca.Function:
+        """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
+        nu, n = ocp.input.size, ocp.stages
+        s0, data = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size, n + 1)
+        lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
+        memory = ca.MX.sym("memory", nu * n + 1)
+        start = clip(ca.reshape(memory[: nu * n], nu, n), lower, upper)
+        none = ca.MX.zeros(ocp.state.size, n)
+        value, slope, _, _ = reduced_gradient(ocp)(s0, start, data, none)
+        length = ca.if_else(memory[-1] > 0, memory[-1], _first_length(start, slope, lower, upper))
+        begin = (start, ca.repmat(value, _HISTORY, 1), length, start, value, slope)
+        state = ca.vertcat(*(ca.vec(v) for v in begin))
+        iterate = self._iteration(ocp).fold(self.iterations)
+        repeated = [ca.repmat(v, 1, self.iterations) for v in (s0, ca.vec(data), lower, upper)]
+        final = iterate(state, *repeated)
+        best, length = ca.reshape(_part(ocp, final, 3), nu, n), _part(ocp, final, 2)
+        return self._finish(ocp, (s0, data, lower, upper, memory), start, best, length)
+
+    def _finish(
+        self, ocp: OptimalControl, arguments: tuple[ca.MX, ...], start: ca.MX, best: ca.MX, length: ca.MX
+    ) -> ca.Function:
+        s0, data, lower, upper, memory = arguments
+        none = ca.MX.zeros(ocp.state.size, ocp.stages)
+        cost, residual, violation = judge(ocp)(best, s0, data, lower, upper, none)
+        finite = is_finite(ca.vertcat(ca.vec(best), cost, residual))
+        plan = _choose(finite, best, start)
+        iterations = ca.MX(self.iterations)
+        status = status_of(finite, residual, violation, self.tolerance)
+        told = _choose(finite, ca.vertcat(cost, residual, violation), ca.MX.zeros(3))
+        diagnostics = ca.vertcat(told, iterations, status)
+        kept = ca.vertcat(ca.vec(shift(plan)), ca.if_else(finite, length, 0))
+        return ca.Function("fpirhc_reduced_gradient", [s0, data, lower, upper, memory], [plan, diagnostics, kept])
+
+    def _iteration(self, ocp: OptimalControl) -> ca.Function:
+        """One iteration on the column (U, last values, step length, best U, best value, gradient at U)."""
+        nu, n = ocp.input.size, ocp.stages
+        state = ca.MX.sym("z", 3 * nu * n + _HISTORY + 2)
+        s0, flat = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size * (n + 1))
+        lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
+        data = ca.reshape(flat, ocp.data.size, n + 1)
+        inputs, slope = (ca.reshape(_part(ocp, state, k), nu, n) for k in (0, 5))
+        values, length = _part(ocp, state, 1), _part(ocp, state, 2)
+        best, lowest = ca.reshape(_part(ocp, state, 3), nu, n), _part(ocp, state, 4)
+        direction = clip(inputs - length * slope, lower, upper) - inputs
+        taken, shorter = _line_search(ocp, s0, data, inputs, direction, slope, values)
+        following = inputs + taken * direction
+        value, new_slope, _, _ = reduced_gradient(ocp)(s0, following, data, ca.MX.zeros(ocp.state.size, n))
+        spectral = _spectral_length(following - inputs, new_slope - slope, length)
+        better = ca.logic_and(value <= lowest, is_finite(value))
+        good = is_finite(ca.vertcat(value, ca.vec(new_slope)))
+        result = ca.vertcat(
+            ca.vec(_choose(good, following, inputs)),
+            ca.vertcat(values[1:], ca.if_else(good, value, values[-1])),
+            ca.if_else(ca.logic_and(good, shorter < 0.5), spectral, 0.1 * length),
+            ca.vec(_choose(better, following, best)),
+            ca.if_else(better, value, lowest),
+            ca.vec(_choose(good, new_slope, slope)),
+        )
+        return ca.Function("fpirhc_gradient_iteration", [state, s0, flat, lower, upper], [result])
+
+
+def _part(ocp: OptimalControl, state: ca.MX, k: int) -> ca.MX:
+    size = ocp.input.size * ocp.stages
+    ends = [0]
+    for width in (size, _HISTORY, 1, size, 1, size):
+        ends.append(ends[-1] + width)
+    return state[ends[k] : ends[k + 1]]
+
+
+def _choose(condition: ca.MX, yes: ca.MX, no: ca.MX) -> ca.MX:
+    """Entry-wise choice that keeps NaN of the branch not taken out of the result."""
+    return ca.if_else(condition, yes, no)
+
+
+def _first_length(inputs: ca.MX, slope: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
+    """A step length whose largest projected move is of the size of the largest gradient entry's inverse."""
+    move = clip(inputs - slope, lower, upper) - inputs
+    return 1 / ca.fmax(ca.norm_inf(ca.vec(move)), 1e-8)
+
+
+def _line_search(
+    ocp: OptimalControl,
+    s0: ca.MX,
+    data: ca.MX,
+    inputs: ca.MX,
+    direction: ca.MX,
+    slope: ca.MX,
+    values: ca.MX,
+) -> tuple[Expression, Expression]:
+    """Return (t, whether even the last trial failed); trial rollouts run side by side."""
+    descent, reference = ca.dot(slope, direction), ca.mmax(values)
+    predict = rollout(ocp)
+    taken: Expression = ca.MX(0)
+    for t in reversed(_TRIALS):
+        _, value, _ = predict(s0, inputs + t * direction, data)
+        enough = ca.logic_and(value <= reference + _DECREASE * t * descent, is_finite(value))
+        taken = ca.if_else(enough, t, taken)
+    return taken, taken < _TRIALS[-1] / 2
+
+
+def _spectral_length(move: ca.MX, change: ca.MX, before: ca.MX) -> ca.MX:
+    """Barzilai-Borwein: <move, move> / <move, change>, kept where the curvature is not positive."""
+    curvature, size = ca.dot(move, change), ca.dot(move, move)
+    usable = ca.logic_and(curvature > 1e-300, size > 0)
+    length = size / ca.if_else(usable, curvature, 1)
+    return ca.if_else(usable, ca.fmin(ca.fmax(length, _SHORTEST), _LONGEST), before)
+
+

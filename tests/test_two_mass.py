@@ -1,0 +1,141 @@
+"""The shipped two-mass problem reproduces what the method promises on it.
+
+Reference numbers: the nominal motion (2.2, 5.4) + 0.3 (sin 2t, sin 3t) m with rate 6 1/s, D = 0.3, A_c = -0.5, 1 ms,
+computed independently with numpy and scipy from the corrected equations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import fpirhc as fp
+import numpy as np
+import pytest
+from fpirhc.studies.compare import compare
+
+TASK = fp.load_problem("two_mass")
+PROBLEM = TASK.problem
+
+
+def late_error(controller, problem=PROBLEM, since=3.0):
+    """(max |e|, rms e, rms response error) per coordinate from `since` on."""
+    run = fp.simulate(problem, controller, seed=0)
+    assert run.stop is None
+    late = run.time >= since
+    error = run["error"][late]
+    response = (run["realised"][1:] - run["desired"][:-1])[late[1:]]
+    return np.abs(error).max(axis=0), np.sqrt((error**2).mean(axis=0)), np.sqrt((response**2).mean(axis=0))
+
+
+def sigmoid(gain, scale=1.0):
+    """Computed torque with eq (6)."""
+    return fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=gain, shift=0.3, scale=scale))
+
+
+def test_without_adaptation_the_wrong_model_fails():
+    """Computed torque alone: 0.63 / 0.27 m."""
+    largest, _, response = late_error(TASK.controllers["CTC"])
+    np.testing.assert_allclose(largest, [0.630, 0.271], rtol=0.01, equal_nan=False)
+    np.testing.assert_allclose(response, [39.0, 17.0], rtol=0.02, equal_nan=False)
+
+
+def test_equation_six_makes_it_precise():
+    """With A_c = -0.5: 6 / 3 mm, and the response error falls by a factor of a hundred."""
+    largest, _, response = late_error(TASK.controllers["CTC+FPI (eq 6)"])
+    np.testing.assert_allclose(largest, [0.0061, 0.0033], rtol=0.08, equal_nan=False)
+    np.testing.assert_allclose(response, [0.35, 0.19], rtol=0.05, equal_nan=False)
+
+
+def test_equation_three_does_as_well():
+    """The other map with the same effective gain leaves the same error."""
+    six = late_error(sigmoid(-0.5, scale=20.0))[1]
+    three = late_error(TASK.controllers["CTC+FPI (eq 3)"])[1]
+    np.testing.assert_allclose(three, six, rtol=0.05, equal_nan=False)
+
+
+def test_response_error_times_gain_over_period_is_constant():
+    """First-order law of a slowly varying task: |h| |A_c| / period = const, within 10 %."""
+    constants = []
+    for period in (2e-3, 1e-3, 5e-4):
+        for gain in (-0.25, -0.5, -1.0):
+            problem = replace(PROBLEM, period=period, horizon=None, cost=None)
+            response = np.linalg.norm(late_error(sigmoid(gain), problem)[2])
+            constants.append(response * abs(gain) / period)
+    constants = np.array(constants)
+    assert np.abs(constants / constants.mean() - 1).max() < 0.10
+
+
+def test_sector_bound():
+    """rms |h| falls up to the sector bound |A_c| = 2.82, and a bounded two-cycle appears above it."""
+    below, above = (np.linalg.norm(late_error(sigmoid(gain))[2]) for gain in (-2.8, -2.95))
+    assert below < 0.075
+    assert above > 0.2
+
+
+def test_wrong_sign_diverges():
+    """A positive gain on a plant whose eigenvalues are 1.5 and 1.3 pushes the wrong way."""
+    run = fp.simulate(PROBLEM, sigmoid(0.1), seed=0)
+    assert run.stop is not None or np.abs(run["error"]).max() > 1.0
+
+
+@pytest.fixture(scope="module")
+def comparison():
+    """All shipped controllers."""
+    return compare(TASK, seed=0)
+
+
+def rms(entry, since=2.0):
+    """rms error per coordinate after `since`."""
+    late = entry.run.time >= since
+    return np.sqrt((entry.run["error"][late] ** 2).mean(axis=0))
+
+
+def test_receding_horizon_with_a_wrong_model_fails_and_adaptation_cures_it(comparison):
+    """RHC 58 / 42 mm; RHC+FPI below 0.6 mm; the exact model 0.1 mm."""
+    np.testing.assert_allclose(rms(comparison["RHC"]), [0.0584, 0.0415], rtol=0.05, equal_nan=False)
+    assert rms(comparison["RHC+FPI"]).max() <= 6e-4
+    assert rms(comparison["RHC exact model"]).max() <= 2e-4
+
+
+def test_real_plant_under_adaptation_moves_like_the_model(comparison):
+    """The law behind it: RHC+FPI on the exact plant follows RHC on the approximate model taken as the plant."""
+    model = replace(
+        PROBLEM.plant,
+        parameters={n: replace(p, exact=p.approximate) for n, p in PROBLEM.plant.parameters.items()},
+    )
+    ideal = fp.simulate(replace(PROBLEM, plant=model), TASK.controllers["RHC"], seed=0)
+    real = comparison["RHC+FPI"].run
+    late = real.time >= 1.0
+    difference = (real["state"] - ideal["state"])[late][:, :2]
+    assert np.abs(difference).max() < 2e-3
+    wrong = (comparison["RHC"].run["state"] - ideal["state"])[late][:, :2]
+    assert np.abs(difference).max() < 0.05 * np.abs(wrong).max()
+
+
+def test_cases_that_do_not_work_are_explained(comparison):
+    """Absolute effort, and a scale below the slew of the desired response: the verdict gives the reason."""
+    said = {s.split(" ")[0] + s: s for s in comparison.verdict}
+    effort = next(s for s in comparison.verdict if s.startswith("RHC+FPI, absolute effort"))
+    assert "absolute effort" in effort
+    assert "feedforward" in effort
+    slew = next(s for s in comparison.verdict if s.startswith("RHC+FPI, stiff, small S"))
+    assert "raise its scale S" in slew
+    assert said
+
+
+def test_headline_is_about_the_named_pair(comparison):
+    """The first sentence compares RHC with RHC+FPI."""
+    assert comparison.verdict[0].startswith("RHC+FPI lowers the rms error of q1 from")
+
+
+def test_predicted_and_measured_contraction_agree(comparison):
+    """|1 - a lambda| with lambda = 1.5, 1.3: 0.7421 predicted from the symbols, and found in the run."""
+    for name in ("CTC+FPI (eq 6)", "RHC+FPI"):
+        contraction = comparison[name].contraction
+        assert contraction.predicted == pytest.approx(0.7421, abs=1e-3)
+        assert contraction.measured == pytest.approx(contraction.predicted, abs=0.02)
+
+
+def test_nobody_beats_the_exact_model(comparison):
+    """The informed controller is a bound for its own kind."""
+    assert rms(comparison["RHC exact model"]).max() <= rms(comparison["RHC+FPI"]).max() + 1e-6
