@@ -108,13 +108,13 @@ def compose(
         InvalidShape: a reader and a writer disagree on a size.
     """
     memory = Layout(tuple(d.now for d in delays) + tuple(s for b in blocks for s in b.memory.signals))
-    trace = Layout(tuple(s for b in blocks for s in b.writes.signals if not s.name.startswith("_")))
     inputs = {s.name: ca.MX.sym(s.name, s.size) for s in reads.signals}
     remembered = ca.MX.sym("memory", memory.size)
     known: dict[str, Expression] = {**memory.split(remembered), **inputs}
     following: dict[str, Expression] = {}
     for block in blocks:
         _call(block, known, following)
+    trace = Layout(tuple(s for b in blocks for s in b.writes.signals if not s.name.startswith("_")))
     for delay in delays:
         following[delay.now.name] = _lookup(f"delay '{delay.now.name}'", delay.now, delay.source, known)
     returned = [memory.join(following), trace.join(known), *(known[o] for o in outputs)]

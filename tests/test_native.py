@@ -1,0 +1,179 @@
+"""Compiled code: same numbers, a cache that is never wrong, and a fallback that says why."""
+
+from __future__ import annotations
+
+import multiprocessing
+import stat
+
+import casadi as ca
+import numpy as np
+import pytest
+from fpirhc.symbolic import native as module
+from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.native import find_compiler, native
+
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """An empty cache, on disk and in memory."""
+    monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(module, "_loaded", {})
+    return tmp_path / "cache"
+
+
+def model(factor: float, size: int = 3) -> ca.Function:
+    """A small Function whose code depends on `factor`."""
+    x = ca.SX.sym("x", size)
+    return ca.Function("fpirhc_model", [x], [factor * ca.sin(x) + x**2])
+
+
+def _libraries(cache):
+    return sorted(p for p in cache.iterdir() if p.suffix in {".so", ".dylib", ".dll"})
+
+
+@needs_compiler
+def test_same_numbers_as_the_virtual_machine(cache):
+    """Contraction of multiply-add is off, so both round alike."""
+    x = np.linspace(-3, 3, 3)
+    found = native(model(2.0))
+    assert found.compiled
+    np.testing.assert_array_equal(found.function(x).full(), model(2.0)(x).full())
+
+
+@needs_compiler
+def test_accumulated_functions_are_compiled_under_a_fixed_name(cache):
+    """mapaccum names its results itself; the library's name does not depend on it."""
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    step = ca.Function("fpirhc_step", [x, u], [0.5 * x + u, x - u])
+    many = step.mapaccum("fpirhc_many", 37)
+    values = np.arange(37.0)
+    for found, expected in zip(native(many).function(1.0, values), many(1.0, values), strict=True):
+        np.testing.assert_array_equal(found.full(), expected.full())
+
+
+@needs_compiler
+def test_cache_is_by_content(cache, monkeypatch):
+    """The same model compiles once, another model gets another library."""
+    native(model(2.0))
+    monkeypatch.setattr(module, "_loaded", {})
+    native(model(2.0))
+    assert len(_libraries(cache)) == 1
+    native(model(3.0))
+    assert len(_libraries(cache)) == 2
+    assert not [p for p in cache.iterdir() if p.name.startswith("building-")]
+
+
+@needs_compiler
+@pytest.mark.parametrize("damage", [b"", b"not a library", None])
+def test_damaged_library_is_built_again(cache, damage):
+    """Truncated, overwritten, or with a lost checksum: the answer is right and the cache is whole again."""
+    source = module.generate(model(4.0))
+    compiler = find_compiler()
+    module._library(source, compiler)
+    (path,) = _libraries(cache)
+    checksum = path.with_suffix(".sha256")
+    if damage is None:
+        checksum.unlink()
+    else:
+        # A new file, as a crash leaves it: the old library is still mapped into this process.
+        path.unlink()
+        path.write_bytes(damage)
+    assert not module._is_intact(path)
+    module._loaded.clear()
+    np.testing.assert_array_equal(native(model(4.0)).function(np.ones(3)).full(), model(4.0)(np.ones(3)).full())
+    assert module._is_intact(path)
+
+
+def _work(arguments):
+    factor, folder = arguments
+    import os
+
+    os.environ["FPIRHC_CACHE"] = folder
+    found = native(model(factor))
+    return found.compiled, found.function(np.ones(3)).full().ravel().tolist()
+
+
+@needs_compiler
+def test_processes_may_compile_at_once(cache):
+    """Eight compilations of four models in four processes: every process gets its own model's numbers."""
+    factors = [1.5, 2.5, 3.5, 4.5] * 2
+    with multiprocessing.get_context("spawn").Pool(4) as pool:
+        results = pool.map(_work, [(f, str(cache)) for f in factors], chunksize=1)
+    for factor, (compiled, values) in zip(factors, results, strict=True):
+        assert compiled
+        assert values == pytest.approx((factor * np.sin(np.ones(3)) + 1).tolist(), rel=1e-15)
+    assert len(_libraries(cache)) == 4
+
+
+def test_no_compiler_is_announced(cache, monkeypatch):
+    """Turned off, the Function itself comes back with the reason."""
+    monkeypatch.setenv("FPIRHC_CC", "none")
+    function = model(2.0)
+    found = native(function)
+    assert not found.compiled
+    assert found.function is function
+    assert "no C compiler" in found.reason
+
+
+def test_failing_compiler_falls_back_with_its_message(cache, monkeypatch, tmp_path):
+    """A compiler that fails is no reason to stop."""
+    broken = tmp_path / "cc"
+    broken.write_text("#!/bin/sh\necho 'no space left' >&2\nexit 1\n")
+    broken.chmod(broken.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("FPIRHC_CC", str(broken))
+    found = native(model(2.0))
+    assert not found.compiled
+    assert "no space left" in found.reason
+    assert float(found.function(0.0)[0]) == 0.0
+
+
+@needs_compiler
+def test_hostile_folder_names_are_only_names(tmp_path, monkeypatch):
+    """Nothing in a path is read as a command."""
+    monkeypatch.setattr(module, "_loaded", {})
+    monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path / "a; touch owned; $(touch owned) b"))
+    assert native(model(2.0)).compiled
+    assert not list(tmp_path.rglob("owned"))
+
+
+@needs_compiler
+def test_folder_that_cannot_be_written_is_replaced(tmp_path, monkeypatch):
+    """Without a place for the cache, a temporary one is used."""
+    (tmp_path / "taken").write_text("")
+    monkeypatch.setattr(module, "_loaded", {})
+    monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path / "taken" / "cache"))
+    assert native(model(6.0)).compiled
+
+
+def test_solver_calls_stay_in_the_virtual_machine(cache):
+    """IPOPT cannot be written as C; the reason says so."""
+    x, p = ca.MX.sym("x"), ca.MX.sym("p")
+    options = {"ipopt.sb": "yes", "ipopt.print_level": 0, "print_time": False}
+    solver = ca.nlpsol("solver", "ipopt", {"x": x, "p": p, "f": (x - p) ** 2}, options)
+    given = ca.MX.sym("given")
+    found = native(ca.Function("fpirhc_solve", [given], [solver(p=given)["x"]]))
+    assert not found.compiled
+    assert float(found.function(3.0)) == pytest.approx(3.0)
+
+
+def test_evaluator_speaks_column_major():
+    """A (2, 3) matrix is an array of shape (3, 2), a column a flat one."""
+    m, v = ca.SX.sym("m", 2, 3), ca.SX.sym("v", 3)
+    evaluator = Evaluator(ca.Function("fpirhc_product", [m, v], [ca.mtimes(m, v), m.T]))
+    matrix, column = np.arange(6.0).reshape(2, 3), np.array([1.0, -1.0, 2.0])
+    product, transposed = evaluator(matrix.T, column)
+    np.testing.assert_array_equal(product, matrix @ column)
+    np.testing.assert_array_equal(transposed.T, matrix.T)
+
+
+def test_evaluator_densifies_and_checks_shapes():
+    """Structural zeros come back as zeros; a wrong number of entries names the argument."""
+    x = ca.SX.sym("x", 2)
+    evaluator = Evaluator(ca.Function("fpirhc_diagonal", [x], [ca.diag(x)], ["x"], ["d"]))
+    np.testing.assert_array_equal(evaluator(np.array([1.0, 2.0]))[0], np.diag([1.0, 2.0]))
+    with pytest.raises(ValueError, match="argument 'x' has 2 entries"):
+        evaluator(np.ones(3))
+    with pytest.raises(ValueError, match="takes 1 arguments, got 2"):
+        evaluator(np.ones(2), 1.0)
