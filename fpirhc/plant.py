@@ -241,11 +241,7 @@ class Plant:
         return ca.Function("fpirhc_inverse", [xm, rm, pm], [ca.if_else(good, found, math.nan)], ["x", "r", "p"], ["u"])
 
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
-        return (
-            ca.SX.sym("x", self.state.size),
-            ca.SX.sym("u", len(self.inputs)),
-            ca.SX.sym("p", len(self.parameters)),
-        )
+        return (ca.SX.sym("x", self.state.size), ca.SX.sym("u", len(self.inputs)), ca.SX.sym("p", len(self.parameters)))
 
     def _derivatives(self, x: Expression) -> list[Named]:
         views = []

@@ -76,12 +76,7 @@ def disturbance_table(problem: Problem, seed: int, cycles: int) -> np.ndarray:
 
 
 def _run_chunks(
-    problem: Problem,
-    memory: Layout,
-    trace: Layout,
-    evaluator: Evaluator,
-    seed: int,
-    progress: Progress | None,
+    problem: Problem, memory: Layout, trace: Layout, evaluator: Evaluator, seed: int, progress: Progress | None
 ) -> tuple[np.ndarray, str | None]:
     cycles = problem.cycles
     padded = -(-cycles // CHUNK) * CHUNK

@@ -123,7 +123,9 @@ def test_wiring_mistakes():
         every(double(), 0)
 
 
-LAYOUT = Layout((scalar("t", "s", 1.5), vector("q", ("q1", "q2"), "m"), Signal("v", ("a", "b", "c"), ("m",), (1.0, 2.0, 3.0))))
+LAYOUT = Layout(
+    (scalar("t", "s", 1.5), vector("q", ("q1", "q2"), "m"), Signal("v", ("a", "b", "c"), ("m",), (1.0, 2.0, 3.0)))
+)
 
 
 def test_layout_names_every_entry():

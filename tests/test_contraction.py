@@ -47,10 +47,7 @@ def masses() -> Plant:
 
     def response(q, v, u, p):  # type: ignore[no-untyped-def]
         spring = p.k * (q.q2 - q.q1)
-        return {
-            "q1": (u.Q1 + spring - p.b * v.q1) / p.m1,
-            "q2": (u.Q2 - spring - p.b * v.q2) / p.m2,
-        }
+        return {"q1": (u.Q1 + spring - p.b * v.q1) / p.m1, "q2": (u.Q2 - spring - p.b * v.q2) / p.m2}
 
     return Plant(
         coordinates={"q1": "m", "q2": "m"},

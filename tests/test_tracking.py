@@ -25,10 +25,7 @@ def _run(order, tracking, *, start, period=1e-3, duration=3.0, limits=None):
     return fp.simulate(problem, fp.ComputedTorque(tracking), seed=0, compiled=False)
 
 
-@pytest.mark.parametrize(
-    ("order", "gains"),
-    [(1, (36, 12)), (2, (216, 108, 18)), (4, (7776, 6480, 2160, 360, 30))],
-)
+@pytest.mark.parametrize(("order", "gains"), [(1, (36, 12)), (2, (216, 108, 18)), (4, (7776, 6480, 2160, 360, 30))])
 def test_gains_are_binomials(order, gains):
     """(d/dt + 6)^(n+1) e_int expanded."""
     assert fp.Exponential(rate=6.0).gains(order) == pytest.approx(gains)

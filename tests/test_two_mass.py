@@ -100,8 +100,7 @@ def test_receding_horizon_with_a_wrong_model_fails_and_adaptation_cures_it(compa
 def test_real_plant_under_adaptation_moves_like_the_model(comparison):
     """The law behind it: RHC+FPI on the exact plant follows RHC on the approximate model taken as the plant."""
     model = replace(
-        PROBLEM.plant,
-        parameters={n: replace(p, exact=p.approximate) for n, p in PROBLEM.plant.parameters.items()},
+        PROBLEM.plant, parameters={n: replace(p, exact=p.approximate) for n, p in PROBLEM.plant.parameters.items()}
     )
     ideal = fp.simulate(replace(PROBLEM, plant=model), TASK.controllers["RHC"], seed=0)
     real = comparison["RHC+FPI"].run

@@ -59,9 +59,16 @@ def test_no_difference_is_said():
 def test_controller_that_cannot_serve_is_skipped_with_its_reason():
     """A receding horizon without a horizon is not run, and the verdict says so."""
     problem = fp.Problem(
-        plant=linear(1.0, 1.0), reference=fp.Trajectory(lambda t: {"y": 0 * t}), start={"y": 0.0}, period=1e-3, duration=0.1
+        plant=linear(1.0, 1.0),
+        reference=fp.Trajectory(lambda t: {"y": 0 * t}),
+        start={"y": 0.0},
+        period=1e-3,
+        duration=0.1,
     )
-    controllers = {"CTC": fp.ComputedTorque(TRACK), "RHC": fp.RecedingHorizon(fp.ReducedGradient(iterations=5, tolerance=1e-6))}
+    controllers = {
+        "CTC": fp.ComputedTorque(TRACK),
+        "RHC": fp.RecedingHorizon(fp.ReducedGradient(iterations=5, tolerance=1e-6)),
+    }
     found = compare(Task("case", Path("case.py"), "", "", problem, controllers), seed=0, compiled=False)
     assert "needs Problem(horizon=...)" in found.skipped["RHC"]
     assert found.verdict[-1].startswith("Not run: RHC")

@@ -76,11 +76,7 @@ def reference_block(problem: Problem) -> Block:
 
     def step(s: Any) -> dict[str, Expression]:
         state, response = function(s.time)
-        return {
-            "reference": state,
-            "_reference_response": response[chosen],
-            "error": state[places] - s.state[places],
-        }
+        return {"reference": state, "_reference_response": response[chosen], "error": state[places] - s.state[places]}
 
     reads = Layout((scalar("time", "s"), plant.state))
     writes = (
@@ -101,12 +97,7 @@ def closing_blocks(
 ) -> tuple[list[Block], list[Delay]]:
     """Return the blocks deform, invert, limit and judge with what they remember; `judged` are solver statuses."""
     plant = problem.plant
-    blocks = [
-        deform_block(plant, deformation),
-        _invert_block(plant),
-        _limit_block(problem),
-        _judge_block(judged),
-    ]
+    blocks = [deform_block(plant, deformation), _invert_block(plant), _limit_block(problem), _judge_block(judged)]
     delays = [
         Delay(scalar("started"), "_running"),
         Delay(plant.response_signal("_request_before"), "deformed"),
@@ -157,13 +148,7 @@ def _limit_block(problem: Problem) -> Block:
         plant.parameter,
         like(plant.input, "_command_before"),
     )
-    writes = (
-        plant.input,
-        plant.response_signal("deformed"),
-        scalar("clipped"),
-        scalar("_held"),
-        scalar("_running"),
-    )
+    writes = (plant.input, plant.response_signal("deformed"), scalar("clipped"), scalar("_held"), scalar("_running"))
 
     def step(s: Any) -> dict[str, Expression]:
         # Finiteness is asked before the clamp: fmin and fmax turn NaN into a full-scale command.

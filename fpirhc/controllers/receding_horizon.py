@@ -106,10 +106,7 @@ def _due_block(cycles: int) -> Block:
 
     def step(s: Any) -> dict[str, Expression]:
         following = s.plan_count + 1
-        return {
-            "_due": s.plan_count < 0.5,
-            "plan_count_next": ca.if_else(following > cycles - 0.5, 0, following),
-        }
+        return {"_due": s.plan_count < 0.5, "plan_count_next": ca.if_else(following > cycles - 0.5, 0, following)}
 
     return Block("due", Layout(), Layout((scalar("_due"),)), step, Layout((count,)))
 

@@ -125,7 +125,9 @@ class Quadratic(Cost):
             mistakes.unknown(f"{what}:", weights, valid)
             for name, weight in weights.items():
                 if not isinstance(weight, int | float) or not math.isfinite(weight) or weight < 0:
-                    mistakes.add(f"{what}: the weight of '{name}' must be a finite number of at least 0, got {weight!r}")
+                    mistakes.add(
+                        f"{what}: the weight of '{name}' must be a finite number of at least 0, got {weight!r}"
+                    )
         if not any(w for weights, _ in groups.values() for w in weights.values()):
             mistakes.add("every weight is zero, so every plan is optimal; weigh at least one state")
         mistakes.raise_if_any()

@@ -104,9 +104,7 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
     try:
         terms = {name: ca.SX(value) for name, value in cost.stage(view).items()}
         advance = _advance(plant, horizon)
-        final = ca.SX(
-            cost.terminal(view, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.step)
-        )
+        final = ca.SX(cost.terminal(view, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.step))
     except InvalidName as error:
         raise InvalidProblem(f"cost: {error}") from None
     moved = advance(s[:nx], u, view.parameters.vector)

@@ -40,9 +40,7 @@ def reduced_gradient(ocp: OptimalControl) -> ca.Function:
     stage_multipliers = ca.horzcat(ca.MX.zeros(ocp.state.size, 1), multipliers[:, : n - 1])
     order = list(range(n - 1, -1, -1))
     sweep = _backward(ocp).mapaccum("fpirhc_adjoint_stages", n)
-    costates, gradient = sweep(
-        last, states[:, order], inputs[:, order], data[:, order], stage_multipliers[:, order]
-    )
+    costates, gradient = sweep(last, states[:, order], inputs[:, order], data[:, order], stage_multipliers[:, order])
     results = [total, gradient[:, order], states, ca.horzcat(costates[:, order], last)]
     names = ["V", "g", "S", "costates"]
     return ca.Function("fpirhc_gradient", [s0, inputs, data, multipliers], results, ["s0", "U", "data", "M"], names)

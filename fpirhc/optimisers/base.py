@@ -70,7 +70,9 @@ def largest(value: Expression) -> Expression:
     return ca.norm_inf(ca.vec(value))
 
 
-def stationarity(ocp: OptimalControl, inputs: Expression, gradient: Expression, lower: Expression, upper: Expression) -> Expression:
+def stationarity(
+    ocp: OptimalControl, inputs: Expression, gradient: Expression, lower: Expression, upper: Expression
+) -> Expression:
     """Return the projected residual of a plan (see the module's docstring)."""
     return largest(inputs - clip(inputs - gradient / ocp.step, lower, upper))
 

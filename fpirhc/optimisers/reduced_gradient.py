@@ -145,13 +145,7 @@ def _first_length(inputs: ca.MX, slope: ca.MX, lower: ca.MX, upper: ca.MX) -> ca
 
 
 def _line_search(
-    ocp: OptimalControl,
-    s0: ca.MX,
-    data: ca.MX,
-    inputs: ca.MX,
-    direction: ca.MX,
-    slope: ca.MX,
-    values: ca.MX,
+    ocp: OptimalControl, s0: ca.MX, data: ca.MX, inputs: ca.MX, direction: ca.MX, slope: ca.MX, values: ca.MX
 ) -> tuple[Expression, Expression]:
     """Return (t, whether even the last trial failed); trial rollouts run side by side."""
     descent, reference = ca.dot(slope, direction), ca.mmax(values)
@@ -170,5 +164,3 @@ def _spectral_length(move: ca.MX, change: ca.MX, before: ca.MX) -> ca.MX:
     usable = ca.logic_and(curvature > 1e-300, size > 0)
     length = size / ca.if_else(usable, curvature, 1)
     return ca.if_else(usable, ca.fmin(ca.fmax(length, _SHORTEST), _LONGEST), before)
-
-

@@ -46,7 +46,9 @@ class Evaluator:
             given = np.asarray(value, dtype=float)
             if given.size != array.size:
                 name = self.function.name_in(k)
-                raise InvalidShape(f"argument '{name}' has {array.size} entries (shape {array.shape}), got {given.size}")
+                raise InvalidShape(
+                    f"argument '{name}' has {array.size} entries (shape {array.shape}), got {given.size}"
+                )
             array[...] = given.reshape(array.shape)
         self.evaluate()
         return tuple(result.copy() for result in self.results)

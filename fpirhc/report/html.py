@@ -1,0 +1,214 @@
+"""One self-contained HTML file for a comparison: verdict first, then the table, linked charts, pictures, settings."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import json
+import math
+import tempfile
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fpirhc.errors import OutputError
+from fpirhc.report.figures import PALETTE, contraction_figure, pair_figures
+from fpirhc.report.series import chart_data
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from fpirhc.studies.compare import Comparison, Entry
+
+_CAPTIONS = {
+    "Trajectory tracking": "Nominal (dashed) and realised motion over time.",
+    "Phase trajectories": "Velocity against position.",
+    "Tracking error": "Nominal minus realised. Mind the different scales.",
+    "Command": "After clipping.",
+    "Second derivatives": "With adaptation the realised acceleration lies on the desired one, although the deformed request "
+    "is far from both: the request is what the wrong model must be asked for.",
+}
+
+
+def write_report(comparison: Comparison, path: Path) -> None:
+    """Write the report, atomically: the file is complete or not there.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    page = render(comparison)
+    try:
+        with tempfile.NamedTemporaryFile("w", encoding="utf-8", dir=path.parent, suffix=".part", delete=False) as file:
+            file.write(page)
+        Path(file.name).replace(path)
+        path.chmod(0o644)
+    except OSError as error:
+        raise OutputError(f"cannot write the report to '{path}': {error.strerror}") from None
+
+
+def render(comparison: Comparison) -> str:
+    """Return the page's text."""
+    head = "\n".join(f"<style>{_asset(name)}</style>" for name in ("uPlot.min.css", "report.css"))
+    pair = headline_pair(comparison)
+    series = {**chart_data(comparison, PALETTE), "begin": [e.name for e in pair] if pair else []}
+    data = json.dumps(series, separators=(",", ":")).replace("<", "\\u003c")
+    parts = [
+        f"<header><h1>{_text(comparison.title)}</h1></header>",
+        _verdict(comparison),
+        _table(comparison),
+        _charts(),
+        *_pictures(comparison),
+        _contraction(comparison),
+        _settings(comparison),
+    ]
+    scripts = (
+        f"<script>{_asset('uPlot.iife.min.js')}</script>\n<script>const DATA={data};\n{_asset('report.js')}</script>"
+    )
+    body = "\n".join(parts)
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{_text(comparison.title)}</title>\n{head}</head>\n<body><main>{body}</main>\n{scripts}</body></html>\n"
+    )
+
+
+def _asset(name: str) -> str:
+    return files("fpirhc.report").joinpath("assets", name).read_text(encoding="utf-8")
+
+
+def _text(value: object) -> str:
+    return html.escape(str(value), quote=True)
+
+
+def _verdict(comparison: Comparison) -> str:
+    first, *others = comparison.verdict
+    rest = "".join(f"<li>{_text(s)}</li>" for s in others)
+    about = f"<p class='about'>{_text(comparison.description)}</p>" if comparison.description else ""
+    return f"<section id='verdict'><p class='headline'>{_text(first)}</p><ul>{rest}</ul>{about}</section>"
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    if value is None:
+        return "&ndash;"
+    if math.isnan(value):
+        return "<span class='none'>none</span>"
+    return f"{value:.{digits}g}"
+
+
+def _table(comparison: Comparison) -> str:
+    entries = comparison.entries
+    if not entries:
+        return "<section><p>No controller finished.</p></section>"
+    names = list(entries[0].metrics.rms_error)
+    inputs = list(entries[0].metrics.effort)
+    run = entries[0].run
+    heads = ["controller"]
+    heads += [f"rms error {c} [{run.unit(f'error.{c}')}]" for c in names]
+    heads += [f"max error {c} [{run.unit(f'error.{c}')}]" for c in names]
+    heads += [f"settled {c} [s]" for c in names]
+    heads += [f"rms {i} [{run.unit(f'command.{i}')}]" for i in inputs]
+    heads += ["clipped", "cost", "cycle median [us]", "p99", "max", "first", "contraction predicted", "measured"]
+    heads += ["solve: iterations", "worst residual", "statuses (cycles)"]
+    best = {c: min((e.metrics.rms_error[c] for e in entries if e.run.stop is None), default=math.nan) for c in names}
+    rows = "".join(_row(e, names, inputs, best) for e in entries)
+    skipped = "".join(
+        f"<tr><th scope='row'>{_text(n)}</th><td class='words' colspan='{len(heads) - 1}'>not run: {_text(w)}</td></tr>"
+        for n, w in comparison.skipped.items()
+    )
+    columns = "".join(f"<th scope='col'>{_text(h)}</th>" for h in heads)
+    caption = f"Errors, effort and cost from t = {comparison.measure_from:g} s on; seed {comparison.seed}."
+    return (
+        f"<section><h2>Controllers</h2><p>{caption} The best rms error is marked.</p><div class='scroll'><table><thead><tr>"
+        f"{columns}</tr></thead><tbody>{rows}{skipped}</tbody></table></div></section>"
+    )
+
+
+def _row(entry: Entry, names: Sequence[str], inputs: Sequence[str], best: dict[str, float]) -> str:
+    metrics, cycle, contraction = entry.metrics, entry.cycle, entry.contraction
+    cells = [
+        f"<td class='{'best' if metrics.rms_error[c] == best[c] else ''}'>{_number(metrics.rms_error[c])}</td>"
+        for c in names
+    ]
+    plain = [metrics.max_error[c] for c in names] + [metrics.settling[c] for c in names]
+    plain += [metrics.effort[i] for i in inputs]
+    values = [_number(v) for v in plain]
+    values.append(f"{100 * metrics.clipped_share:.3g} %")
+    values.append(_number(metrics.cost.get("total")))
+    values += [_number(v) for v in ((cycle.median, cycle.p99, cycle.maximum, cycle.first) if cycle else (None,) * 4)]
+    values += [_number(v) for v in ((contraction.predicted, contraction.measured) if contraction else (None, None))]
+    values += [_number(metrics.solve.get("median_iterations")), _number(metrics.solve.get("worst_stationarity"))]
+    cells += [f"<td>{v}</td>" for v in values]
+    words = ", ".join(f"{k.lower().replace('_', ' ')} {v}" for k, v in metrics.statuses.items())
+    if entry.run.stop:
+        words = f"ended early: {entry.run.stop}"
+    notes = "".join(f"<br><small>{_text(n)}</small>" for n in entry.notes)
+    return (
+        f"<tr><th scope='row'>{_text(entry.name)}{notes}</th>{''.join(cells)}<td class='words'>{_text(words)}</td></tr>"
+    )
+
+
+def _charts() -> str:
+    return (
+        "<section><h2>Signals over time</h2><p>Drag across a chart to zoom all of them, double-click to return. Lines show "
+        "the extremes of each short interval, so no peak is lost.</p>"
+        "<div id='controllers' role='group' aria-label='controllers shown'></div><div id='charts'></div></section>"
+    )
+
+
+def _pictures(comparison: Comparison) -> list[str]:
+    pair = headline_pair(comparison)
+    if pair is None:
+        return []
+    blocks = []
+    for title, figure in pair_figures(*pair).items():
+        alt = f"{title}: {pair[0].name} on the left, {pair[1].name} on the right"
+        blocks.append(_picture(figure, alt, f"{title}. {_CAPTIONS.get(title, '')}"))
+    return [f"<section><h2>Without | with adaptivity</h2>{''.join(blocks)}</section>"]
+
+
+def headline_pair(comparison: Comparison) -> tuple[Entry, Entry] | None:
+    """The pair that the verdict begins with; None when there is none."""
+    by_name = {e.name: e for e in comparison.entries}
+    pairs = [(by_name[e.pair], e) for e in comparison.entries if e.pair in by_name]
+    usable = [p for p in pairs if p[0].run.cycles > 1 and p[1].run.cycles > 1]
+    named = [p for p in usable if comparison.verdict[0].startswith(p[1].name + " ")]
+    return (named or usable or [None])[0]
+
+
+def _contraction(comparison: Comparison) -> str:
+    figure = contraction_figure(comparison)
+    if figure is None:
+        return ""
+    texts = "".join(
+        f"<li><b>{_text(e.name)}</b>: {_text(e.contraction.report.text)}</li>"
+        for e in comparison.entries
+        if e.contraction
+    )
+    picture = _picture(figure, "Predicted contraction factor against the gain, and the response error's decay", "")
+    return f"<section><h2>Contraction</h2>{picture}<ul>{texts}</ul></section>"
+
+
+def _picture(figure: Figure, alt: str, caption: str) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=88)
+    code = base64.b64encode(buffer.getvalue()).decode("ascii")
+    note = f"<figcaption>{_text(caption)}</figcaption>" if caption else ""
+    return f"<figure><img alt='{_text(alt)}' src='data:image/png;base64,{code}'>{note}</figure>"
+
+
+def _settings(comparison: Comparison) -> str:
+    versions = ", ".join(f"{k} {v}" for k, v in comparison.versions.items())
+    dumps = "".join(
+        f"<details><summary>{_text(name)}</summary><pre>{_text(json.dumps(settings, indent=1))}</pre></details>"
+        for name, settings in [
+            ("problem", comparison.settings),
+            *((e.name, {k: v for k, v in e.run.settings.items() if k != "problem"}) for e in comparison.entries),
+        ]
+    )
+    command = f"<pre class='command'>{_text(comparison.command)}</pre>" if comparison.command else ""
+    return (
+        f"<section><h2>Settings</h2>{dumps}<p>{_text(versions)}; took {comparison.elapsed:.1f} s.</p>"
+        f"<p>This report is reproduced by</p>{command}</section>"
+    )

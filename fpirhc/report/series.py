@@ -1,0 +1,78 @@
+"""Time series small enough for a page: extremes of equal intervals, with few digits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from fpirhc.run import Run
+    from fpirhc.studies.compare import Comparison
+
+INTERVALS = 300
+_RESPONSES = ("nominal", "desired", "deformed", "realised")
+
+
+def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]:
+    """Return what the page's charts draw: controllers with their colours, and charts with one series per controller."""
+    entries = [e for e in comparison.entries if e.run.cycles > 1]
+    if not entries:
+        return {"controllers": [], "charts": [], "time": []}
+    longest = max(entries, key=lambda e: e.run.cycles).run
+    edges = _edges(longest.cycles)
+    first = entries[0].run
+    names = first.layout["error"].elements
+    charts = [
+        _chart(f"error of {c}", first.unit(f"error.{c}"), [(e.name, e.run, f"error.{c}") for e in entries], edges)
+        for c in names
+    ]
+    for c in names:
+        lines = [("reference", longest, f"reference.{c}")] + [(e.name, e.run, f"state.{c}") for e in entries]
+        charts.append(_chart(c, first.unit(f"state.{c}"), lines, edges))
+    for i in first.layout["command"].elements:
+        lines = [(e.name, e.run, f"command.{i}") for e in entries]
+        charts.append(_chart(f"command {i}", first.unit(f"command.{i}"), lines, edges))
+    for e in entries:
+        for c in names:
+            lines = [(signal, e.run, f"{signal}.{c}") for signal in _RESPONSES]
+            chart = _chart(f"{e.name}: responses of {c}", e.run.unit(f"desired.{c}"), lines, edges)
+            charts.append({**chart, "only": e.name})
+    return {
+        "controllers": [{"name": e.name, "color": palette[k % len(palette)]} for k, e in enumerate(entries)],
+        "time": _round(np.repeat(longest.time[edges[:-1]], 2) + _halves(longest, edges)),
+        "charts": charts,
+    }
+
+
+def _edges(cycles: int) -> np.ndarray:
+    return np.unique(np.linspace(0, cycles, min(INTERVALS, cycles) + 1).astype(int))
+
+
+def _halves(run: Run, edges: np.ndarray) -> np.ndarray:
+    """Offsets of the two points of every interval: its start and its middle."""
+    middle = 0.5 * np.diff(edges) * run.period
+    return np.column_stack([np.zeros_like(middle), middle]).ravel()
+
+
+def _chart(title: str, unit: str, lines: Sequence[tuple[str, Run, str]], edges: np.ndarray) -> dict[str, Any]:
+    series = [{"name": name, "values": _extremes(run[column], edges)} for name, run, column in lines]
+    return {"title": title, "unit": unit, "series": series}
+
+
+def _extremes(values: np.ndarray, edges: np.ndarray) -> list[float | None]:
+    """Two values per interval: its extremes in the order in which they occur; None where the run had ended."""
+    found: list[float | None] = []
+    for begin, end in zip(edges[:-1], edges[1:], strict=True):
+        part = values[begin:end]
+        if part.size == 0:
+            found += [None, None]
+            continue
+        low, high = int(np.argmin(part)), int(np.argmax(part))
+        found += _round(part[[min(low, high), max(low, high)]])
+    return found
+
+
+def _round(values: np.ndarray) -> list[float]:
+    return [float(f"{v:.5g}") for v in values]
