@@ -2,9 +2,10 @@
 
 Lagrange's reduced gradient, found by one adjoint sweep, with projection on the input box and a line search. The step length is
 the spectral one of Barzilai and Borwein, the line search non-monotone over the last values (Birgin, Martinez and Raydan's
-spectral projected gradient): U+ = U + t (clip(U - gamma g) - U), t the first of 1, 1/2, 1/8, 1/64 that decreases enough.
+spectral projected gradient): U+ = clip(U - gamma g) if it decreases enough, else gamma is divided by four and the next iteration
+tries again from the same plan.
 
-Every call does the same amount of work: `iterations` gradients and four trial rollouts each.
+Every call does the same amount of work: one gradient per iteration.
 
 References: E. G. Birgin, J. M. Martinez, M. Raydan, SIAM J. Optim. 10(4), 2000.
 """
@@ -17,13 +18,13 @@ import casadi as ca
 
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.rollout import reduced_gradient, rollout
+from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.base import Optimiser, clip, is_finite, judge, shift, status_of
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Layout, Signal, scalar
 
-_TRIALS = (1.0, 0.5, 0.125, 1 / 64)
 _HISTORY = 5  # values that the non-monotone line search compares with
 _DECREASE = 1e-4
+_SHORTER = 0.25  # factor of the step length after a rejected step
 _SHORTEST, _LONGEST = 1e-10, 1e10  # bounds of the spectral step length
 
 
@@ -107,20 +108,21 @@ class ReducedGradient(Optimiser):
         inputs, slope = (ca.reshape(_part(ocp, state, k), nu, n) for k in (0, 5))
         values, length = _part(ocp, state, 1), _part(ocp, state, 2)
         best, lowest = ca.reshape(_part(ocp, state, 3), nu, n), _part(ocp, state, 4)
-        direction = clip(inputs - length * slope, lower, upper) - inputs
-        taken, shorter = _line_search(ocp, s0, data, inputs, direction, slope, values)
-        following = inputs + taken * direction
+        following = clip(inputs - length * slope, lower, upper)
+        move = following - inputs
         value, new_slope, _, _ = reduced_gradient(ocp)(s0, following, data, ca.MX.zeros(ocp.state.size, n))
-        spectral = _spectral_length(following - inputs, new_slope - slope, length)
-        better = ca.logic_and(value <= lowest, is_finite(value))
-        good = is_finite(ca.vertcat(value, ca.vec(new_slope)))
+        # NaN compares false, so a rollout that overflows is rejected like one that does not decrease enough.
+        enough = value <= ca.mmax(values) + _DECREASE * ca.dot(slope, move)
+        accepted = ca.logic_and(enough, is_finite(ca.vertcat(value, ca.vec(new_slope))))
+        spectral = _spectral_length(move, new_slope - slope, length)
+        better = ca.logic_and(accepted, value <= lowest)
         result = ca.vertcat(
-            ca.vec(_choose(good, following, inputs)),
-            ca.vertcat(values[1:], ca.if_else(good, value, values[-1])),
-            ca.if_else(ca.logic_and(good, shorter < 0.5), spectral, 0.1 * length),
+            ca.vec(_choose(accepted, following, inputs)),
+            _choose(accepted, ca.vertcat(values[1:], value), values),
+            _choose(accepted, spectral, _SHORTER * length),
             ca.vec(_choose(better, following, best)),
-            ca.if_else(better, value, lowest),
-            ca.vec(_choose(good, new_slope, slope)),
+            _choose(better, value, lowest),
+            ca.vec(_choose(accepted, new_slope, slope)),
         )
         return ca.Function("fpirhc_gradient_iteration", [state, s0, flat, lower, upper], [result])
 
@@ -142,20 +144,6 @@ def _first_length(inputs: ca.MX, slope: ca.MX, lower: ca.MX, upper: ca.MX) -> ca
     """A step length whose largest projected move is of the size of the largest gradient entry's inverse."""
     move = clip(inputs - slope, lower, upper) - inputs
     return 1 / ca.fmax(ca.norm_inf(ca.vec(move)), 1e-8)
-
-
-def _line_search(
-    ocp: OptimalControl, s0: ca.MX, data: ca.MX, inputs: ca.MX, direction: ca.MX, slope: ca.MX, values: ca.MX
-) -> tuple[Expression, Expression]:
-    """Return (t, whether even the last trial failed); trial rollouts run side by side."""
-    descent, reference = ca.dot(slope, direction), ca.mmax(values)
-    predict = rollout(ocp)
-    taken: Expression = ca.MX(0)
-    for t in reversed(_TRIALS):
-        _, value, _ = predict(s0, inputs + t * direction, data)
-        enough = ca.logic_and(value <= reference + _DECREASE * t * descent, is_finite(value))
-        taken = ca.if_else(enough, t, taken)
-    return taken, taken < _TRIALS[-1] / 2
 
 
 def _spectral_length(move: ca.MX, change: ca.MX, before: ca.MX) -> ca.MX:

@@ -75,9 +75,10 @@ def _table(comparison: Comparison) -> Table:
     names = list(first.metrics.rms_error) if first else []
     for name in names:
         unit = first.run.unit(f"error.{name}") if first else ""
-        table.add_column(f"rms / max error {name} [{unit}]".replace("[", "\\["), justify="right")
-    for head in ("cycle us", "p99", "clipped", "contraction", "status"):
+        table.add_column(f"rms {name} \\[{unit}]", justify="right")
+    for head in ("cycle us", "p99", "clipped", "contraction"):
         table.add_column(head, justify="right")
+    table.add_column("status")
     for entry in comparison.entries:
         table.add_row(*_row(entry, names))
     return table
@@ -85,9 +86,9 @@ def _table(comparison: Comparison) -> Table:
 
 def _row(entry: Entry, names: list[str]) -> list[str]:
     metrics, cycle, contraction = entry.metrics, entry.cycle, entry.contraction
-    errors = [f"{_number(metrics.rms_error[n])} / {_number(metrics.max_error[n])}" for n in names]
+    errors = [_number(metrics.rms_error[n]) for n in names]
     times = [f"{cycle.median:.2g}", f"{cycle.p99:.3g}"] if cycle else ["", ""]
-    factor = f"{contraction.predicted:.3f} / {contraction.measured:.3f}" if contraction else ""
+    factor = f"{contraction.predicted:.3f}" if contraction else ""
     status = "ended early" if entry.run.stop else metrics.worst_status.lower().replace("_", " ")
     return [entry.name.replace("[", "\\["), *errors, *times, f"{100 * metrics.clipped_share:.2g} %", factor, status]
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 HELPS = 0.9  # an rms error below this share of the pair's counts as lower
 HURTS = 1.1
-SLEW_SHARE = 1e-3  # share of cycles in which the desired response outruns the step limit, from which it is a cause
+MANY_CYCLES = 3  # from which a run says something about the slew of its desired response
 
 
 def verdict(entries: Sequence[Entry], skipped: Mapping[str, str], headline: tuple[str, str] | None) -> tuple[str, ...]:
@@ -53,7 +53,7 @@ def _worst_rms(entry: Entry) -> float:
 
 def _sentence(plain: Entry, adaptive: Entry) -> str:
     if adaptive.run.stop is not None:
-        return f"{adaptive.name} does not finish: {adaptive.run.stop}.{_causes(adaptive)}"
+        return f"{adaptive.name} does not finish: {adaptive.run.stop}.{_causes(plain, adaptive)}"
     if plain.run.stop is not None:
         return f"{adaptive.name} finishes where {plain.name} does not ({plain.run.stop})."
     before, after = plain.metrics.rms_error, adaptive.metrics.rms_error
@@ -65,8 +65,8 @@ def _sentence(plain: Entry, adaptive: Entry) -> str:
         factor = f"{1 / ratios[main]:.3g} times less for {main}"
         return f"{adaptive.name} lowers the rms error of {numbers} ({factor}){_price(plain, adaptive)}."
     if min(ratios.values()) > HURTS:
-        return f"{adaptive.name} does not help: it raises the rms error of {numbers}.{_causes(adaptive)}"
-    return f"{adaptive.name} makes no clear difference: the rms error of {numbers}.{_causes(adaptive)}"
+        return f"{adaptive.name} does not help: it raises the rms error of {numbers}.{_causes(plain, adaptive)}"
+    return f"{adaptive.name} makes no clear difference: the rms error of {numbers}.{_causes(plain, adaptive)}"
 
 
 def _unit(entry: Entry, coordinate: str) -> str:
@@ -82,8 +82,8 @@ def _price(plain: Entry, adaptive: Entry) -> str:
     return f" at {more:.2g} more microseconds per cycle"
 
 
-def _causes(entry: Entry) -> str:
-    found = [c for c in (_gain_cause(entry), _slew_cause(entry), _effort_cause(entry)) if c]
+def _causes(plain: Entry, adaptive: Entry) -> str:
+    found = [c for c in (_gain_cause(adaptive), _slew_cause(plain, adaptive), _effort_cause(adaptive)) if c]
     return " " + " ".join(found) if found else ""
 
 
@@ -93,18 +93,17 @@ def _gain_cause(entry: Entry) -> str:
     return f"Its iteration is no contraction (predicted factor {entry.contraction.predicted:.3g}): {entry.contraction.report.text}"
 
 
-def _slew_cause(entry: Entry) -> str:
-    limit = entry.run.settings["step_limit"]
-    if limit is None or entry.run.cycles < 3:
+def _slew_cause(plain: Entry, adaptive: Entry) -> str:
+    """The step limit is judged by what the same controller asks for without adaptation, before anything diverges."""
+    limit = adaptive.run.settings["step_limit"]
+    if limit is None or plain.run.cycles < MANY_CYCLES:
         return ""
-    changes = np.linalg.norm(np.diff(entry.run["desired"], axis=0), axis=1)
-    share = float(np.mean(changes > limit))
-    if share < SLEW_SHARE:
+    largest = float(np.linalg.norm(np.diff(plain.run["desired"], axis=0), axis=1).max())
+    if largest < limit:
         return ""
-    needed = float(np.quantile(changes, 0.999)) / limit
     return (
-        f"The desired response changes by more than the map's largest step ({limit:.3g} per cycle) in {100 * share:.2g} % "
-        f"of the cycles: raise its scale S, about {needed:.2g} times, or leave it out to have it chosen."
+        f"The desired response changes by up to {largest:.3g} in one cycle, more than the map's largest step of {limit:.3g}: "
+        f"raise its scale S at least {1.25 * largest / limit:.2g} times, or leave S out to have it chosen."
     )
 
 

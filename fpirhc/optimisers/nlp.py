@@ -1,0 +1,290 @@
+"""Nonlinear programming through CasADi by direct multiple shooting: IPOPT, fatrop, and SQP with OSQP or qrqp.
+
+    variables    w = (s_0, u_0, s_1, ..., u_{N-1}, s_N),    constraints  s_{i+1} - F(s_i, u_i) = 0,
+
+warm-started with the shifted last plan, its rolled-out states, and its multipliers. A solver's own word of success is not used: the
+plan is judged by our adjoint gradient, with the solver's multipliers of state bounds, and by rolling it out.
+
+References: J. A. E. Andersson et al., CasADi, Math. Program. Comput. 11, 2019.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+
+from fpirhc.errors import InvalidValue, NotSupported, nearest
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.rollout import rollout
+from fpirhc.optimisers.base import UNKNOWN_ITERATIONS, Optimiser, clip, is_finite, judge, shift, status_of
+from fpirhc.symbolic.layout import Expression, Layout, Signal
+
+Options = dict[str, Any]
+_QUIET: Options = {"print_time": False, "error_on_fail": False}
+
+
+@dataclass(frozen=True)
+class QuadraticSolver(ABC):
+    """Contract: a solver of the quadratic programs inside SequentialQuadratic."""
+
+    @property
+    @abstractmethod
+    def plugin(self) -> str:
+        """CasADi's name of the solver."""
+
+    @abstractmethod
+    def options(self) -> Options:
+        """CasADi's options of the solver."""
+
+
+@dataclass(frozen=True)
+class Qrqp(QuadraticSolver):
+    """CasADi's own active-set solver on a sparse QR factorisation."""
+
+    iterations: int = 200
+
+    @property
+    def plugin(self) -> str:
+        """CasADi's name of the solver."""
+        return "qrqp"
+
+    def options(self) -> Options:
+        """Quiet, with an iteration limit."""
+        quiet = {"print_iter": False, "print_header": False, "print_info": False, "print_lincomb": False}
+        return {**quiet, "max_iter": self.iterations, "error_on_fail": False}
+
+
+@dataclass(frozen=True)
+class Osqp(QuadraticSolver):
+    """OSQP, an operator-splitting method."""
+
+    accuracy: float = 1e-8
+
+    @property
+    def plugin(self) -> str:
+        """CasADi's name of the solver."""
+        return "osqp"
+
+    def options(self) -> Options:
+        """Quiet, with the accuracy for both residuals and without polishing."""
+        inner = {"verbose": False, "eps_abs": self.accuracy, "eps_rel": self.accuracy, "max_iter": 20000}
+        return {"osqp": inner, "error_on_fail": False}
+
+
+def quadratic_solver(name: str) -> QuadraticSolver:
+    """Return the named quadratic solver, for names that come from a command line.
+
+    Raises:
+        NotSupported: CasADi has the solver, but it returns wrong answers here (the reason is given).
+        InvalidValue: an unknown name.
+    """
+    if name in _REFUSED:
+        raise NotSupported(f"quadratic solver '{name}' is refused: {_REFUSED[name]}. Use qrqp or osqp")
+    known: dict[str, QuadraticSolver] = {"qrqp": Qrqp(), "osqp": Osqp()}
+    if name not in known:
+        raise InvalidValue(f"quadratic solver '{name}' is unknown.{nearest(name, known)}")
+    return known[name]
+
+
+_REFUSED = {
+    "fatrop": "CasADi's conic interface to it has returned infeasible points marked as solved",
+    "hpipm": "it needs finite bounds on everything",
+}
+
+
+@dataclass(frozen=True)
+class _MultipleShooting(Optimiser):
+    """What all backends share: the program, the warm start, and the judgement."""
+
+    tolerance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if not self.tolerance > 0:
+            raise InvalidValue(f"{type(self).__name__} needs a positive tolerance, got {self.tolerance}")
+
+    @abstractmethod
+    def solver(self, ocp: OptimalControl, program: Mapping[str, ca.MX]) -> ca.Function:
+        """Return CasADi's solver Function of the program."""
+
+    @property
+    def exportable(self) -> bool:
+        """Solver libraries are called, not written out."""
+        return False
+
+    def memory(self, ocp: OptimalControl) -> Layout:
+        """The plan, and the multipliers of variables and constraints."""
+        variables, constraints = _sizes(ocp)
+        plan = tuple(f"{i}@{k}" for k in range(ocp.stages) for i in ocp.input.elements)
+        return Layout(
+            (
+                Signal("plan_inputs", plan),
+                Signal("plan_variable_multipliers", tuple(map(str, range(variables)))),
+                Signal("plan_dynamics_multipliers", tuple(map(str, range(constraints)))),
+            )
+        )
+
+    def step(self, ocp: OptimalControl) -> ca.Function:
+        """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
+        ns, nu, n = ocp.state.size, ocp.input.size, ocp.stages
+        s0, data = ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
+        lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
+        layout = self.memory(ocp)
+        memory = ca.MX.sym("memory", layout.size)
+        kept = layout.split(memory)
+        start = clip(ca.reshape(kept["plan_inputs"], nu, n), lower, upper)
+        states, _, _ = rollout(ocp)(s0, start, data)
+        solution = self.solver(ocp, _program(ocp))(
+            x0=_interleave(states, start),
+            p=ca.vec(data),
+            lbx=_interleave(_bound(ocp, s0, ocp.state_lower), ca.repmat(lower, 1, n)),
+            ubx=_interleave(_bound(ocp, s0, ocp.state_upper), ca.repmat(upper, 1, n)),
+            lbg=0,
+            ubg=0,
+            lam_x0=kept["plan_variable_multipliers"],
+            lam_g0=kept["plan_dynamics_multipliers"],
+        )
+        found = clip(_separate(ocp, solution["x"])[1], lower, upper)
+        bound_multipliers = _separate(ocp, solution["lam_x"])[0][:, 1:]
+        if not ocp.bounds_states:
+            bound_multipliers = ca.MX.zeros(ns, n)
+        cost, residual, violation = judge(ocp)(found, s0, data, lower, upper, bound_multipliers)
+        finite = is_finite(ca.vertcat(ca.vec(found), cost, residual, violation, solution["lam_x"], solution["lam_g"]))
+        plan = ca.if_else(finite, found, start)
+        told = ca.if_else(finite, ca.vertcat(cost, residual, violation), ca.MX.zeros(3))
+        status = status_of(finite, residual, violation, self.tolerance)
+        diagnostics = ca.vertcat(told, UNKNOWN_ITERATIONS, status)
+        following = {
+            "plan_inputs": ca.vec(shift(plan)),
+            # A solve that was not finite must not poison the next warm start.
+            "plan_variable_multipliers": ca.if_else(finite, _shift_variables(ocp, solution["lam_x"]), 0),
+            "plan_dynamics_multipliers": ca.if_else(finite, _shift_dynamics(ocp, solution["lam_g"]), 0),
+        }
+        arguments = [s0, data, lower, upper, memory]
+        return ca.Function("fpirhc_shooting", arguments, [plan, diagnostics, layout.join(following)])
+
+
+@dataclass(frozen=True)
+class InteriorPoint(_MultipleShooting):
+    """IPOPT: the interior-point method that most tools use by default.
+
+    Parameters: tolerance of our stationarity; accuracy that IPOPT is asked for; iterations it may use.
+    """
+
+    accuracy: float = 1e-8
+    iterations: int = 200
+
+    def solver(self, ocp: OptimalControl, program: Mapping[str, ca.MX]) -> ca.Function:  # noqa: ARG002
+        """Quiet IPOPT with a warm start."""
+        options = {
+            **_QUIET,
+            "ipopt.sb": "yes",
+            "ipopt.print_level": 0,
+            "ipopt.tol": self.accuracy,
+            "ipopt.max_iter": self.iterations,
+            "ipopt.warm_start_init_point": "yes",
+            "ipopt.warm_start_bound_push": 1e-9,
+            "ipopt.warm_start_mult_bound_push": 1e-9,
+            "ipopt.mu_init": 1e-4,
+        }
+        return ca.nlpsol("fpirhc_ipopt", "ipopt", dict(program), options)
+
+
+@dataclass(frozen=True)
+class Fatrop(_MultipleShooting):
+    """fatrop: an interior-point method that exploits the stages of the horizon."""
+
+    accuracy: float = 1e-8
+    iterations: int = 200
+
+    def solver(self, ocp: OptimalControl, program: Mapping[str, ca.MX]) -> ca.Function:
+        """Quiet fatrop that detects the stages."""
+        options = {
+            **_QUIET,
+            "structure_detection": "auto",
+            "equality": [True] * (ocp.stages * ocp.state.size),
+            "fatrop": {"print_level": 0, "tol": self.accuracy, "max_iter": self.iterations, "mu_init": 1e-2},
+        }
+        return ca.nlpsol("fpirhc_fatrop", "fatrop", dict(program), options)
+
+
+@dataclass(frozen=True)
+class SequentialQuadratic(_MultipleShooting):
+    """Gauss-Newton SQP: the cost's own second derivatives, the dynamics linearised.
+
+    Parameters: `quadratic` solves the programs inside; `iterations` of SQP per call (1 is a real-time iteration).
+    """
+
+    quadratic: QuadraticSolver = field(default_factory=Qrqp)
+    iterations: int = 20
+
+    def solver(self, ocp: OptimalControl, program: Mapping[str, ca.MX]) -> ca.Function:
+        """CasADi's SQP with the Gauss-Newton Hessian, which is positive semi-definite for convex stage costs."""
+        options = {
+            **_QUIET,
+            "print_header": False,
+            "print_iteration": False,
+            "print_status": False,
+            "qpsol": self.quadratic.plugin,
+            "qpsol_options": self.quadratic.options(),
+            "max_iter": self.iterations,
+            "tol_pr": 1e-8,
+            "tol_du": 1e-8,
+            "min_step_size": 1e-12,
+            "hess_lag": _gauss_newton(ocp, program),
+        }
+        return ca.nlpsol("fpirhc_sqp", "sqpmethod", dict(program), options)
+
+
+def _sizes(ocp: OptimalControl) -> tuple[int, int]:
+    return ocp.stages * (ocp.state.size + ocp.input.size) + ocp.state.size, ocp.stages * ocp.state.size
+
+
+def _interleave(states: Expression, inputs: Expression) -> Expression:
+    """(ns, N + 1), (nu, N) -> column (s_0, u_0, s_1, ..., s_N)."""
+    n = inputs.shape[1]
+    return ca.vertcat(ca.vec(ca.vertcat(states[:, :n], inputs)), states[:, n])
+
+
+def _separate(ocp: OptimalControl, column: Expression) -> tuple[Expression, Expression]:
+    """Inverse of `_interleave`."""
+    ns, nu, n = ocp.state.size, ocp.input.size, ocp.stages
+    stages = ca.reshape(column[: n * (ns + nu)], ns + nu, n)
+    return ca.horzcat(stages[:ns, :], column[n * (ns + nu) :]), stages[ns:, :]
+
+
+def _bound(ocp: OptimalControl, s0: ca.MX, bound: Any) -> ca.MX:
+    """Bounds of s_0 ... s_N: the first state is given."""
+    return ca.horzcat(s0, ca.repmat(ca.DM(bound), 1, ocp.stages))
+
+
+def _shift_variables(ocp: OptimalControl, column: ca.MX) -> ca.MX:
+    states, inputs = _separate(ocp, column)
+    return _interleave(shift(states), shift(inputs))
+
+
+def _shift_dynamics(ocp: OptimalControl, column: ca.MX) -> ca.MX:
+    return ca.vec(shift(ca.reshape(column, ocp.state.size, ocp.stages)))
+
+
+def _program(ocp: OptimalControl) -> dict[str, ca.MX]:
+    n = ocp.stages
+    w, flat = ca.MX.sym("w", _sizes(ocp)[0]), ca.MX.sym("p", ocp.data.size * (n + 1))
+    states, inputs = _separate(ocp, w)
+    data = ca.reshape(flat, ocp.data.size, n + 1)
+    costs, _ = ocp.stage_cost.map(n)(states[:, :n], inputs, data[:, :n])
+    value = ca.sum2(costs) + ocp.terminal_cost(states[:, n], data[:, n])
+    following = ocp.dynamics.map(n)(states[:, :n], inputs, data[:, :n])
+    return {"x": w, "p": flat, "f": value, "g": ca.vec(states[:, 1:] - following)}
+
+
+def _gauss_newton(ocp: OptimalControl, program: Mapping[str, ca.MX]) -> ca.Function:
+    """Function (x, p, lam_f, lam_g) -> Hessian of the cost alone, block by block."""
+    hessian, _ = ca.hessian(program["f"], program["x"])
+    weight, multipliers = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", _sizes(ocp)[1])
+    inputs = [program["x"], program["p"], weight, multipliers]
+    names = ["x", "p", "lam_f", "lam_g"]
+    return ca.Function("nlp_hess_l", inputs, [ca.triu(weight * hessian)], names, ["triu_hess_gamma_x_x"])
