@@ -1,0 +1,166 @@
+"""The horizon: auxiliary function, adjoint gradient, costs and their mistakes."""
+
+from __future__ import annotations
+
+import casadi as ca
+import control
+import fpirhc as fp
+import numpy as np
+import pytest
+from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
+from fpirhc.horizon.auxiliary import auxiliary_gradient, auxiliary_hessian
+from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.horizon.rollout import reduced_gradient, rollout
+from plants import chain, pendulum
+
+TASK = fp.load_problem("two_mass")
+PENDULUM_REFERENCE = fp.Trajectory(lambda t: {"angle": 0.5 * ca.sin(2 * t)})
+COSTS = {
+    "correction": fp.Quadratic(states={"angle": 10.0, "angle'": 1.0}, correction={"torque": 0.1}),
+    "rate": fp.Quadratic(states={"angle": 10.0}, effort={"torque": 0.1}, rate={"torque": 0.3}),
+    "terminal": fp.Quadratic(states={"angle": 1.0}, effort={"torque": 0.1}, terminal_cost={"angle": 50.0}),
+    "lqr": fp.Quadratic(states={"angle": 1.0}, effort={"torque": 0.1}, terminal_cost=fp.LqrTerminal()),
+    "general": fp.General(
+        terms=lambda v: {
+            "angle": ca.sqrt((v.state.angle - v.reference.angle) ** 2 + 1e-2),
+            "torque": 0.1 * v.input.torque**4 + 0.01 * (v.input.torque - v.input_before.torque) ** 2,
+        },
+        final=lambda v: 5 * v.state.angle**2,
+        rate=True,
+    ),
+}
+
+
+def built(cost, horizon=None, plant=None, limits=None):
+    """(ocp, data) of a pendulum's horizon."""
+    chosen, steps = plant or pendulum(), horizon or fp.Horizon(stages=8, step=0.05)
+    ocp = transcribe(chosen, PENDULUM_REFERENCE, steps, cost, limits or fp.Limits())
+    return ocp, stage_data(chosen, PENDULUM_REFERENCE, steps, cost)(0.2, chosen.approximate)
+
+
+def point(ocp, seed=0):
+    """A random first state and plan."""
+    random = np.random.default_rng(seed)
+    return random.normal(size=ocp.state.size), random.normal(size=(ocp.input.size, ocp.stages))
+
+
+@pytest.mark.parametrize("name", COSTS)
+@pytest.mark.parametrize("discretisation", [fp.RungeKutta4(), fp.Euler()])
+def test_adjoint_gradient_is_the_gradient_of_the_auxiliary_function(name, discretisation):
+    """With the multipliers that make grad_S Psi vanish, grad_U Psi is the reduced gradient, and the states are feasible."""
+    ocp, data = built(COSTS[name], fp.Horizon(stages=8, step=0.05, discretisation=discretisation))
+    s0, inputs = point(ocp)
+    _, slope, states, costates = reduced_gradient(ocp)(s0, inputs, data, np.zeros((ocp.state.size, ocp.stages)))
+    by_state, by_input, by_multiplier = auxiliary_gradient(ocp)(states[:, 1:], inputs, -costates[:, 1:], s0, data)
+    assert float(ca.norm_inf(ca.vec(by_state))) < 1e-10
+    assert float(ca.norm_inf(ca.vec(by_input - slope))) < 1e-10
+    assert float(ca.norm_inf(ca.vec(by_multiplier))) < 1e-12
+
+
+@pytest.mark.parametrize("name", COSTS)
+def test_adjoint_gradient_agrees_with_finite_differences(name):
+    """An independent check, by central differences of the rolled-out cost."""
+    ocp, data = built(COSTS[name])
+    s0, inputs = point(ocp, 1)
+    slope = reduced_gradient(ocp)(s0, inputs, data, np.zeros((ocp.state.size, ocp.stages)))[1].full()
+    value = rollout(ocp)
+    for k in (0, 3, ocp.stages - 1):
+        moved = np.zeros_like(inputs)
+        moved[0, k] = 1e-5
+        high, low = (float(value(s0, inputs + sign * moved, data)[1]) for sign in (1, -1))
+        assert slope[0, k] == pytest.approx((high - low) / 2e-5, rel=1e-5, abs=1e-7)
+
+
+def test_kkt_matrix_is_symmetric_and_indefinite():
+    """The Hessian of Psi has N (nx + nu) positive and N nx negative eigenvalues at a convex point."""
+    ocp, data = built(COSTS["correction"])
+    s0, inputs = point(ocp)
+    n = ocp.stages
+    states = rollout(ocp)(s0, inputs, data)[0][:, 1:]
+    hessian = auxiliary_hessian(ocp)(states, inputs, np.zeros((ocp.state.size, n)), s0, data).full()
+    np.testing.assert_allclose(hessian, hessian.T, atol=1e-12)
+    eigenvalues = np.linalg.eigvalsh(hessian)
+    assert (eigenvalues > 0).sum() == n * (ocp.state.size + ocp.input.size)
+    assert (eigenvalues < 0).sum() == n * ocp.state.size
+
+
+def test_terms_add_up_to_the_cost():
+    """V is the sum of the stage terms and the terminal cost."""
+    ocp, data = built(COSTS["rate"])
+    s0, inputs = point(ocp)
+    states, value, terms = rollout(ocp)(s0, inputs, data)
+    final = ocp.terminal_cost(states[:, -1], data[:, -1])
+    assert ocp.terms == ("states", "effort", "rate")
+    assert float(value) == pytest.approx(float(ca.sum1(terms) + final))
+
+
+def test_rate_cost_counts_the_change_from_the_last_command():
+    """The previous input is part of the stage's state; holding it costs nothing."""
+    ocp, data = built(fp.Quadratic(states={"angle": 0.0}, rate={"torque": 2.0}))
+    first = np.array([0.1, 0.0, 0.7])
+    held = rollout(ocp)(first, np.full((1, ocp.stages), 0.7), data)
+    jump = rollout(ocp)(first, np.full((1, ocp.stages), 1.7), data)
+    assert float(held[1]) == 0.0
+    assert float(jump[1]) == pytest.approx(2.0 * ocp.step)
+
+
+def test_lqr_terminal_makes_a_short_horizon_endless():
+    """On a linear plant at rest the planned first input is the infinite-horizon LQR input, however short the horizon."""
+    plant, reference = chain(2), fp.Trajectory(lambda t: {"y": 0 * t})
+    cost = fp.Quadratic(states={"y": 3.0, "y'": 0.5}, effort={"u": 0.2}, terminal_cost=fp.LqrTerminal())
+    horizon = fp.Horizon(stages=3, step=0.1)
+    ocp = transcribe(plant, reference, horizon, cost, fp.Limits())
+    data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
+    plan = fp.solve(ocp, fp.ReducedGradient(iterations=100, tolerance=1e-9), np.array([1.0, -0.3]), data)
+    a, b = np.array([[1, 0.1], [0, 1]]), np.array([[0.005], [0.1]])
+    gain, _, _ = control.dlqr(a, b, np.diag([3.0, 0.5]), np.array([[0.2]]))
+    assert plan.status == fp.Status.OK
+    np.testing.assert_allclose(plan.inputs[:, 0], -np.asarray(gain) @ [1.0, -0.3], rtol=1e-6)
+
+
+def test_feedforward_makes_the_reference_free():
+    """On the reference, with the model's own input, a cost of corrections is zero."""
+    ocp, data = built(COSTS["correction"])
+    given = ocp.data.split(data[:, 0])
+    value, _ = ocp.stage_cost(given["reference"], given["feedforward"], data[:, 0])
+    assert float(value) == pytest.approx(0.0, abs=1e-20)
+
+
+BAD_COSTS = {
+    "state": (fp.Quadratic(states={"angel": 1.0}), "'angel' is unknown. Did you mean 'angle'"),
+    "input": (fp.Quadratic(states={"angle": 1.0}, effort={"torqe": 1.0}), "Did you mean 'torque'"),
+    "negative": (fp.Quadratic(states={"angle": -1.0}), "finite number of at least 0, got -1.0"),
+    "zero": (fp.Quadratic(states={"angle": 0.0}), "every weight is zero"),
+    "term": (fp.General(terms=lambda v: {"log": ca.log(v.state.angle)}), "term 'log' is -inf"),
+    "name": (fp.General(terms=lambda v: {"a": v.state.angel}), "state 'angel' is unknown"),
+    "before": (fp.General(terms=lambda v: {"a": v.input_before.torque}), "say General\\(rate=True\\)"),
+    "lqr": (fp.Quadratic(states={"angle": 1.0}, terminal_cost=fp.LqrTerminal()), "needs a positive effort"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_COSTS)
+def test_mistakes_of_a_cost(case):
+    """What, where, the nearest valid name."""
+    cost, message = BAD_COSTS[case]
+    horizon = fp.Horizon(stages=3, step=0.1)
+    with pytest.raises(InvalidProblem, match=message):
+        transcribe(pendulum(), fp.Trajectory(lambda t: {"angle": 0 * t}), horizon, cost, fp.Limits())
+
+
+def test_mistakes_of_a_horizon():
+    """No stages, no step, an integrator that a horizon cannot hold."""
+    with pytest.raises(InvalidValue, match="at least 1 stage"):
+        fp.Horizon(stages=0, step=0.1)
+    with pytest.raises(InvalidValue, match="positive"):
+        fp.Horizon(stages=3, step=0.0)
+    with pytest.raises(NotSupported, match="RungeKutta4"):
+        fp.Horizon(stages=3, step=0.1, discretisation=fp.Cvodes())
+    with pytest.raises(InvalidProblem, match=r"does not divide the horizon step 0.01 s; use a step of 0.009 s"):
+        fp.Problem(
+            plant=TASK.problem.plant,
+            reference=TASK.problem.reference,
+            start=TASK.problem.start,
+            period=3e-3,
+            duration=1.0,
+            horizon=fp.Horizon(stages=5, step=1e-2),
+        )
