@@ -15,9 +15,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import casadi as ca
-import fpirhc as fp
 import numpy as np
+
+import fpirhc as fp
 from fpirhc.loop import close_loop
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import native

@@ -271,12 +271,12 @@ def structural_order(plant: Plant, coordinate: str) -> int | None:
     rate = plant.derivative_function(x, u, p)
     on_state = np.array(ca.DM(ca.jacobian_sparsity(rate, x), 1).full(), dtype=bool)
     on_input = np.array(ca.DM(ca.jacobian_sparsity(rate, u), 1).full(), dtype=bool).any(axis=1)
-    reached = np.zeros(plant.state.size, dtype=bool)
+    reached: np.ndarray = np.zeros(plant.state.size, dtype=bool)
     reached[plant.state.elements.index(coordinate)] = True
     for order in range(1, plant.state.size + 1):
         if bool((reached & on_input).any()):
             return order
-        reached = on_state[reached].any(axis=0)
+        reached = np.asarray(on_state[reached].any(axis=0))
     return None
 
 
@@ -292,6 +292,17 @@ def _check_names(plant: Plant, mistakes: Mistakes) -> None:
     every = [*plant.coordinates, *plant.inputs]
     for name in sorted({n for n in every if every.count(n) > 1}):
         mistakes.add(f"'{name}' names both a coordinate and an input; rename one")
+    _check_order_numbers(plant, mistakes)
+    if plant.controlled is not None:
+        mistakes.unknown("controlled: coordinate", plant.controlled, plant.coordinates)
+        if len(plant.controlled) != len(plant.inputs):
+            mistakes.add(
+                f"controlled names {len(plant.controlled)} coordinate(s), but {len(plant.inputs)} input(s) "
+                "can prescribe exactly as many"
+            )
+
+
+def _check_order_numbers(plant: Plant, mistakes: Mistakes) -> None:
     if isinstance(plant.order, Mapping):
         mistakes.unknown("order: coordinate", plant.order, plant.coordinates)
         for c in plant.coordinates:
@@ -301,13 +312,6 @@ def _check_names(plant: Plant, mistakes: Mistakes) -> None:
     for order in orders:
         if not isinstance(order, int) or isinstance(order, bool) or order < 1:
             mistakes.add(f"order must be a whole number of at least 1, got {order!r}")
-    if plant.controlled is not None:
-        mistakes.unknown("controlled: coordinate", plant.controlled, plant.coordinates)
-        if len(plant.controlled) != len(plant.inputs):
-            mistakes.add(
-                f"controlled names {len(plant.controlled)} coordinate(s), but {len(plant.inputs)} input(s) "
-                "can prescribe exactly as many"
-            )
 
 
 def _check_parameters(parameters: Mapping[str, Parameter], mistakes: Mistakes) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -36,7 +37,7 @@ class Reference(ABC):
         Raises:
             InvalidProblem: a coordinate is missing, unknown, or not a scalar.
         """
-        kind = ca.MX if self.opaque else ca.SX
+        kind: Any = ca.MX if self.opaque else ca.SX
         t = kind.sym("t")
         given = {name: kind(value) for name, value in self.coordinates(t).items()}
         _check(plant, given)

@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.describe import describe
-from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
 from fpirhc.loop import close_loop
 from fpirhc.problem import Problem
 from fpirhc.run import Run
@@ -144,9 +145,8 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
     return Signal("cost", tuple(ocp.terms)), found
 
 
-def _cost_function(ocp, data_of, count):
-    import casadi as ca
-
+def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int) -> ca.Function:
+    """Function (times, states, inputs, parameters) -> cost terms of `count` cycles."""
     t, s = ca.MX.sym("t"), ca.MX.sym("s", ocp.state.size)
     u, p = ca.MX.sym("u", ocp.input.size), ca.MX.sym("p", data_of.size1_in(1))
     one = ca.Function("fpirhc_cost", [t, s, u, p], [ocp.stage_cost(s, u, data_of(t, p)[:, 0])[1]])

@@ -12,6 +12,7 @@ below stays in the range that the figures show.
 """
 
 import casadi as ca
+
 import fpirhc as fp
 
 

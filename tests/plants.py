@@ -6,7 +6,7 @@ import fpirhc as fp
 
 
 def linear(gain: float, believed: float) -> fp.Plant:
-    """y'' = gain u with a wrong gain: the response Jacobian is gain / believed."""
+    """Y'' = gain u with a wrong gain: the response Jacobian is gain / believed."""
     return fp.Plant(
         coordinates={"y": "m"},
         inputs={"u": "N"},

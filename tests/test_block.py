@@ -5,17 +5,18 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue
 from fpirhc.symbolic.block import Block, Delay, compose, every
 from fpirhc.symbolic.layout import Layout, Named, Signal, scalar, vector
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 U, Y = scalar("u"), scalar("y")
 
 
 def double() -> Block:
-    """y = 2 u."""
+    """Y = 2 u."""
     return Block("double", Layout((U,)), Layout((Y,)), lambda s: {"y": 2 * s.u})
 
 
@@ -62,7 +63,7 @@ def test_delay_carries_a_late_signal_to_the_next_cycle():
 @settings(deadline=None, derandomize=True, max_examples=25)
 @given(cycles=st.integers(1, 7), inputs=st.lists(st.integers(-5, 5), min_size=1, max_size=20))
 def test_every_runs_in_every_nth_cycle_and_holds(cycles, inputs):
-    """y is the sum of the inputs of the cycles that ran, held in between."""
+    """Y is the sum of the inputs of the cycles that ran, held in between."""
     composite = compose("slow", Layout((U,)), [every(summing(), cycles)])
     expected, total = [], 0
     for k, u in enumerate(inputs):

@@ -6,8 +6,9 @@ import json
 import os
 from pathlib import Path
 
-import fpirhc as fp
 import pytest
+
+import fpirhc as fp
 from fpirhc.cli import main
 
 GOOD = '''"""A mass on a line with a wrong gain."""
@@ -23,7 +24,7 @@ plant = fp.Plant(
 problem = fp.Problem(
     plant=plant,
     reference=fp.Trajectory(lambda t: {"y": ca.sin(2 * t)}),
-    start={"y": 0.0, "y'": 2.0},
+    start={"y": 0.5},
     period=1e-3,
     duration=2.0,
     measure_from=1.0,
@@ -66,7 +67,7 @@ def test_json_is_one_object_on_standard_output(folder, capsys):
     assert found["seed"] == 3
     assert set(found["versions"]) >= {"fpirhc", "casadi"}
     plain, adaptive = found["controllers"]["CTC"], found["controllers"]["CTC+FPI"]
-    assert adaptive["rms_error"]["y"] < 0.1 * plain["rms_error"]["y"]
+    assert adaptive["rms_error"]["y"] < 0.2 * plain["rms_error"]["y"]
     assert plain["contraction"] is None
     assert adaptive["contraction"]["predicted"] == pytest.approx(1 - 0.5 * 0.396737 * 1.6, abs=1e-3)
     assert adaptive["contraction"]["measured"] == pytest.approx(adaptive["contraction"]["predicted"], abs=0.02)
@@ -107,10 +108,10 @@ BAD = {
     "misspelt input": (("u.u", "u.v"), "input 'v' is unknown"),
     "approximate None": (("approximate=1.0", "approximate=None"), "approximate must be a finite number, got None"),
     "misspelt public name": (("fp.Sigmoid", "fp.Sigmod"), "Did you mean 'Sigmoid'"),
-    "raises on import": (("tracking =", "1 / 0\ntracking ="), "line.py, line 20: 1 / 0"),
+    "raises on import": (("tracking =", "1 / 0\ntracking ="), "line.py, line 19: 1 / 0"),
     "syntax error": (("problem = fp", "problem = = fp"), "line.py, line 11"),
     "no controllers": (("controllers =", "others ="), "it must define controllers"),
-    "start not finite": (('"y": 0.0', '"y": float("nan")'), "must be a finite number, got nan"),
+    "start not finite": (('"y": 0.5', '"y": float("nan")'), "must be a finite number, got nan"),
     "unknown field": (("measure_from", "measure_form"), "measure_form"),
 }
 

@@ -249,7 +249,7 @@ def test_sigmoid_scale_changes_only_the_saturation() -> None:
 
 
 def test_sigmoid_mirror() -> None:
-    """zeta with -D is the mirror image of zeta with D, so (A_c, D) -> (-A_c, -D) reverses the step exactly."""
+    """Zeta with -D is the mirror image of zeta with D, so (A_c, D) -> (-A_c, -D) reverses the step exactly."""
     error = [0.7, -1.9]
     one = advance(Sigmoid(gain=-0.8, shift=0.3, scale=1.0), [0.0, 0.0], error, [0.0, 0.0])
     other = advance(Sigmoid(gain=0.8, shift=-0.3, scale=1.0), [0.0, 0.0], error, [0.0, 0.0])

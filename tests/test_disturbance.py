@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import casadi as ca
-import fpirhc as fp
 import numpy as np
 import pytest
+
+import fpirhc as fp
 from fpirhc.errors import InvalidValue
 
 TIMES = np.linspace(0, 2, 21)

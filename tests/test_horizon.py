@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import casadi as ca
 import control
-import fpirhc as fp
 import numpy as np
 import pytest
+from plants import chain, pendulum
+
+import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.horizon.auxiliary import auxiliary_gradient, auxiliary_hessian
 from fpirhc.horizon.problem import stage_data, transcribe
 from fpirhc.horizon.rollout import reduced_gradient, rollout
-from plants import chain, pendulum
 
 TASK = fp.load_problem("two_mass")
 PENDULUM_REFERENCE = fp.Trajectory(lambda t: {"angle": 0.5 * ca.sin(2 * t)})

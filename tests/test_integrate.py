@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import fpirhc as fp
 import numpy as np
 from plants import pendulum
+
+import fpirhc as fp
 
 
 def _after(integrator, period, cycles):

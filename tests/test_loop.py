@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import casadi as ca
-import fpirhc as fp
 import numpy as np
 import pytest
-from fpirhc.errors import InvalidName, InvalidProblem
 from plants import linear, pendulum
+
+import fpirhc as fp
+from fpirhc.errors import InvalidName, InvalidProblem
 
 TRACK = fp.Exponential(rate=6.0)
 
@@ -241,6 +242,6 @@ def test_mistakes_of_a_problem(message):
 def test_response_not_invertible_at_the_start():
     """The input and the state are named."""
     weak = fp.Plant({"y": "m"}, {"u": "N"}, {}, lambda q, v, u, p: {"y": q.y * u.u})
-    with pytest.raises(InvalidProblem, match="(?s)not invertible at the start \\(y = 0, y' = 0\\).*'u'"):
+    with pytest.raises(InvalidProblem, match=r"(?s)not invertible at the start \(y = 0, y' = 0\).*'u'"):
         line(1.0, 1.0, plant=weak)
     assert line(1.0, 1.0, plant=weak, start={"y": 1.0}).cycles == 500

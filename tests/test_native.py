@@ -8,6 +8,7 @@ import stat
 import casadi as ca
 import numpy as np
 import pytest
+
 from fpirhc.symbolic import native as module
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import find_compiler, native
@@ -44,7 +45,7 @@ def test_same_numbers_as_the_virtual_machine(cache):
 
 @needs_compiler
 def test_accumulated_functions_are_compiled_under_a_fixed_name(cache):
-    """mapaccum names its results itself; the library's name does not depend on it."""
+    """Mapaccum names its results itself; the library's name does not depend on it."""
     x, u = ca.SX.sym("x"), ca.SX.sym("u")
     step = ca.Function("fpirhc_step", [x, u], [0.5 * x + u, x - u])
     many = step.mapaccum("fpirhc_many", 37)

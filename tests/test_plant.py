@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import casadi as ca
-import fpirhc as fp
 import numpy as np
 import pytest
-from fpirhc.errors import InvalidProblem, NotInvertible
 from plants import chain, linear, pendulum
+
+import fpirhc as fp
+from fpirhc.errors import InvalidProblem, NotInvertible
 
 TWO = {"m": fp.Parameter(1.5, 1.0, "kg"), "k": fp.Parameter(3.0, 2.0, "N/m")}
 
@@ -53,7 +54,7 @@ def test_mixed_orders():
 
 
 def test_non_affine_response_is_inverted_numerically():
-    """u + u^3 = r has one real root; Newton finds it, and a missing root is NaN, never a wrong number."""
+    """U + u^3 = r has one real root; Newton finds it, and a missing root is NaN, never a wrong number."""
     cubic = fp.Plant({"y": "1"}, {"u": "1"}, {}, lambda q, u, p: {"y": u.u + u.u**3 - q.y}, order=1)
     assert not cubic.affine
     assert float(cubic.inverse_function([0.0], [2.0], [])) == pytest.approx(1.0, abs=1e-9)
@@ -116,11 +117,11 @@ def test_mistakes_are_named(message):
         "parameters": TWO,
         "response": lambda q, v, u, p: {"y": u.u / p.m},
     }
-    with pytest.raises(InvalidProblem, match="(?s)" + message.replace("(", r"\(")):
+    with pytest.raises(InvalidProblem, match=r"(?s)" + message.replace("(", r"\(")):
         fp.Plant(**{**good, **BAD[message]})
 
 
 def test_all_mistakes_come_at_once():
     """A user sees every mistake of the parameters in one error."""
-    with pytest.raises(InvalidProblem, match="(?s)2 mistakes.*approximate.*unit"):
+    with pytest.raises(InvalidProblem, match=r"(?s)2 mistakes.*approximate.*unit"):
         fp.Plant({"y": "m"}, {"u": "N"}, {"m": fp.Parameter(None, 1.0, "")}, lambda q, v, u, p: {"y": u.u})

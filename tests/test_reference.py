@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import casadi as ca
-import fpirhc as fp
 import numpy as np
 import pytest
-from fpirhc.errors import InvalidProblem, InvalidShape, InvalidValue
 from plants import chain
+
+import fpirhc as fp
+from fpirhc.errors import InvalidProblem, InvalidShape, InvalidValue
 
 
 def test_derivatives_up_to_the_order():
@@ -38,7 +39,7 @@ def test_table_is_held_outside():
 
 def test_missing_and_unknown_coordinates():
     """Both mistakes at once."""
-    with pytest.raises(InvalidProblem, match="(?s)'z' is unknown.*'y' has no nominal motion"):
+    with pytest.raises(InvalidProblem, match=r"(?s)'z' is unknown.*'y' has no nominal motion"):
         fp.Trajectory(lambda t: {"z": t}).function(chain(2))
 
 

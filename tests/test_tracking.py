@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 
-import fpirhc as fp
 import numpy as np
 import pytest
-from fpirhc.errors import InvalidValue
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import chain
+
+import fpirhc as fp
+from fpirhc.errors import InvalidValue
 
 
 def _run(order, tracking, *, start, period=1e-3, duration=3.0, limits=None):

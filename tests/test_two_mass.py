@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import fpirhc as fp
 import numpy as np
 import pytest
+
+import fpirhc as fp
 from fpirhc.studies.compare import compare
 
 TASK = fp.load_problem("two_mass")
@@ -66,7 +67,7 @@ def test_response_error_times_gain_over_period_is_constant():
 
 
 def test_sector_bound():
-    """rms |h| falls up to the sector bound |A_c| = 2.82, and a bounded two-cycle appears above it."""
+    """Rms |h| falls up to the sector bound |A_c| = 2.82, and a bounded two-cycle appears above it."""
     below, above = (np.linalg.norm(late_error(sigmoid(gain))[2]) for gain in (-2.8, -2.95))
     assert below < 0.075
     assert above > 0.2
@@ -85,7 +86,7 @@ def comparison():
 
 
 def rms(entry, since=2.0):
-    """rms error per coordinate after `since`."""
+    """Rms error per coordinate after `since`."""
     late = entry.run.time >= since
     return np.sqrt((entry.run["error"][late] ** 2).mean(axis=0))
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import casadi as ca
-import fpirhc as fp
 import pytest
+from plants import linear
+
+import fpirhc as fp
 from fpirhc.studies.compare import compare
 from fpirhc.studies.problem_file import Task
-from pathlib import Path
-from plants import linear
 
 TRACK = fp.Exponential(rate=6.0)
 

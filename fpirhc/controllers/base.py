@@ -176,10 +176,8 @@ def _meaning(plant: Plant) -> ca.Function:
     x, u, p = plant._symbols()
     wanted, r = ca.SX.sym("wanted", u.numel()), ca.SX.sym("r", len(plant.controlled_names))
     response = plant.controlled_response_function(x, u, p)
-    if plant.affine:
-        means = r + ca.mtimes(ca.jacobian(response, u), u - wanted)
-    else:
-        means = ca.if_else(ca.mmax(u != wanted), response, r)
+    moved = r + ca.mtimes(ca.jacobian(response, u), u - wanted)
+    means = moved if plant.affine else ca.if_else(ca.mmax(u != wanted), response, r)
     return ca.Function("fpirhc_meaning", [x, u, wanted, r, p], [ca.densify(means)])
 
 

@@ -30,13 +30,10 @@ class HoldPlan(OnFailure):
     """Keep using the last good plan, shifted."""
 
     def choose(
-        self,
-        failed: Expression,
-        planned: Expression,
-        feedforward: Expression,
-        status: Expression,  # noqa: ARG002
+        self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
     ) -> tuple[Expression, Expression]:
         """The optimiser already returns its last good plan when it fails."""
+        del feedforward
         return planned, ca.if_else(failed, int(Status.HELD), status)
 
 
@@ -56,11 +53,8 @@ class StopRun(OnFailure):
     """Stop: the planned input becomes NaN, which holds the last command and ends the run with this status."""
 
     def choose(
-        self,
-        failed: Expression,
-        planned: Expression,
-        feedforward: Expression,
-        status: Expression,  # noqa: ARG002
+        self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
     ) -> tuple[Expression, Expression]:
         """Make the failure visible as NaN."""
+        del feedforward
         return ca.if_else(failed, math.nan, planned), status

@@ -39,7 +39,7 @@ class Affine(Deformation):
         return request + 0.5 * self.gain * (response - desired), {}
 
     def effective_gain(self) -> float:
-        """a = -A_c / 2."""
+        """A = -A_c / 2."""
         return -0.5 * self.gain
 
     def secant_gain(self) -> float:

@@ -53,7 +53,7 @@ class Rfpt(Deformation):
         return request + (self.offset + request) * bent, {}
 
     def effective_gain(self) -> float:
-        """a = -K_c B_c A_c."""
+        """A = -K_c B_c A_c."""
         return -self.offset * self.sign * self.gain
 
     def secant_gain(self) -> float:

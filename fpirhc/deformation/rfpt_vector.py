@@ -58,7 +58,7 @@ class RfptVector(Deformation):
         return request + bent * (vanishing * request + self.offset * error), {}
 
     def effective_gain(self) -> float:
-        """a = -K_c B_c A_c."""
+        """A = -K_c B_c A_c."""
         return -self.offset * self.sign * self.gain
 
     def secant_gain(self) -> float:

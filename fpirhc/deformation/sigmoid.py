@@ -67,7 +67,7 @@ class Sigmoid(Deformation):
 
     @cached_property
     def _tanh_fixed_point(self) -> float:
-        """y = tanh(x*), the root of 2 t y^2 + y = t with t = tanh(D), in the form that has no 0/0 at D = 0."""
+        """Y = tanh(x*), the root of 2 t y^2 + y = t with t = tanh(D), in the form that has no 0/0 at D = 0."""
         t = math.tanh(self.shift)
         return 2 * t / (1 + math.sqrt(1 + 8 * t**2))
 
@@ -118,7 +118,7 @@ class Sigmoid(Deformation):
         return request + (scale * growth / size) * error, {}
 
     def effective_gain(self) -> float:
-        """a = -A_c zeta'(x*)."""
+        """A = -A_c zeta'(x*)."""
         return -self.gain * self.slope
 
     def secant_gain(self) -> float:

@@ -94,7 +94,7 @@ class Quadratic(Cost):
     effort: Mapping[str, float] = field(default_factory=dict)
     correction: Mapping[str, float] = field(default_factory=dict)
     rate: Mapping[str, float] = field(default_factory=dict)
-    terminal_cost: None | Mapping[str, float] | Terminal = None
+    terminal_cost: Mapping[str, float] | Terminal | None = None
 
     @property
     def uses_rate(self) -> bool:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -133,7 +134,7 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
 
 def stage_data(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost) -> ca.Function:
     """Function (time, parameters) -> data of all stages, shape (ntheta, N + 1)."""
-    kind = ca.MX if reference.opaque or plant.inverse_opaque else ca.SX
+    kind: Any = ca.MX if reference.opaque or plant.inverse_opaque else ca.SX
     t, p = kind.sym("t"), kind.sym("p", plant.parameter.size)
     state, response = reference.function(plant)(t)
     if cost.uses_feedforward:
@@ -188,7 +189,8 @@ def _linearise(plant: Plant, reference: Reference, horizon: Horizon, advance: ca
 
 
 def _check_finite(ocp: OptimalControl, plant: Plant, reference: Reference, horizon: Horizon, cost: Cost) -> None:
-    data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)[:, 0]
+    table: Any = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
+    data = table[:, 0]
     given = ocp.data.split(data)
     first = ca.vertcat(given["reference"], given["feedforward"])[: ocp.state.size]
     _, terms = ocp.stage_cost(first, given["feedforward"], data)

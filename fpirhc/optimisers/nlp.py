@@ -21,10 +21,11 @@ from fpirhc.errors import InvalidValue, NotSupported, nearest
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.base import UNKNOWN_ITERATIONS, Optimiser, clip, is_finite, judge, shift, status_of
+from fpirhc.status import Status
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 Options = dict[str, Any]
-_QUIET: Options = {"print_time": False, "error_on_fail": False}
+_QUIET: Options = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
 
 
 @dataclass(frozen=True)
@@ -128,17 +129,42 @@ class _MultipleShooting(Optimiser):
         )
 
     def step(self, ocp: OptimalControl) -> ca.Function:
-        """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
-        ns, nu, n = ocp.state.size, ocp.input.size, ocp.stages
-        s0, data = ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
-        lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
+        """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory).
+
+        Solvers misbehave on arguments that are not finite, so they are not called then.
+        """
+        s0, data, lower, upper, memory = arguments = self._arguments(ocp)
+        sane = is_finite(ca.vertcat(s0, ca.vec(data)))
+        run, skip = self._solve(ocp, "fpirhc_shooting"), self._skip(ocp)
+        results = ca.Function.if_else("fpirhc_guarded_shooting", run, skip)(sane, s0, data, lower, upper, memory)
+        return ca.Function("fpirhc_shooting_step", arguments, list(results))
+
+    def _arguments(self, ocp: OptimalControl) -> list[ca.MX]:
+        ns, nu = ocp.state.size, ocp.input.size
+        shapes = {"s0": (ns, 1), "data": (ocp.data.size, ocp.stages + 1), "lower": (nu, 1), "upper": (nu, 1)}
+        symbols = [ca.MX.sym(name, *shape) for name, shape in shapes.items()]
+        return [*symbols, ca.MX.sym("memory", self.memory(ocp).size)]
+
+    def _skip(self, ocp: OptimalControl) -> ca.Function:
+        """The remembered plan, with status NON_FINITE and forgotten multipliers."""
         layout = self.memory(ocp)
-        memory = ca.MX.sym("memory", layout.size)
+        arguments = self._arguments(ocp)
+        start = _remembered(ocp, layout, arguments[-1], arguments[2], arguments[3])
+        diagnostics = ca.vertcat(ca.MX.zeros(3), UNKNOWN_ITERATIONS, int(Status.NON_FINITE))
+        forgotten = {name: ca.MX.zeros(layout[name].size) for name in layout.names}
+        kept = layout.join({**forgotten, "plan_inputs": ca.vec(shift(start))})
+        return ca.Function("fpirhc_shooting_skip", arguments, [start, diagnostics, kept])
+
+    def _solve(self, ocp: OptimalControl, name: str) -> ca.Function:
+        n, layout = ocp.stages, self.memory(ocp)
+        s0, data, lower, upper, memory = arguments = self._arguments(ocp)
         kept = layout.split(memory)
-        start = clip(ca.reshape(kept["plan_inputs"], nu, n), lower, upper)
+        start = _remembered(ocp, layout, memory, lower, upper)
         states, _, _ = rollout(ocp)(s0, start, data)
+        # An unstable model may overflow under the old plan; standing still is then the better first guess.
+        guess = ca.if_else(is_finite(states), states, ca.repmat(s0, 1, n + 1))
         solution = self.solver(ocp, _program(ocp))(
-            x0=_interleave(states, start),
+            x0=_interleave(guess, start),
             p=ca.vec(data),
             lbx=_interleave(_bound(ocp, s0, ocp.state_lower), ca.repmat(lower, 1, n)),
             ubx=_interleave(_bound(ocp, s0, ocp.state_upper), ca.repmat(upper, 1, n)),
@@ -148,23 +174,20 @@ class _MultipleShooting(Optimiser):
             lam_g0=kept["plan_dynamics_multipliers"],
         )
         found = clip(_separate(ocp, solution["x"])[1], lower, upper)
-        bound_multipliers = _separate(ocp, solution["lam_x"])[0][:, 1:]
-        if not ocp.bounds_states:
-            bound_multipliers = ca.MX.zeros(ns, n)
-        cost, residual, violation = judge(ocp)(found, s0, data, lower, upper, bound_multipliers)
+        multipliers = _separate(ocp, solution["lam_x"])[0][:, 1:] * int(ocp.bounds_states)
+        cost, residual, violation = judge(ocp)(found, s0, data, lower, upper, multipliers)
         finite = is_finite(ca.vertcat(ca.vec(found), cost, residual, violation, solution["lam_x"], solution["lam_g"]))
         plan = ca.if_else(finite, found, start)
         told = ca.if_else(finite, ca.vertcat(cost, residual, violation), ca.MX.zeros(3))
         status = status_of(finite, residual, violation, self.tolerance)
-        diagnostics = ca.vertcat(told, UNKNOWN_ITERATIONS, status)
         following = {
             "plan_inputs": ca.vec(shift(plan)),
             # A solve that was not finite must not poison the next warm start.
             "plan_variable_multipliers": ca.if_else(finite, _shift_variables(ocp, solution["lam_x"]), 0),
             "plan_dynamics_multipliers": ca.if_else(finite, _shift_dynamics(ocp, solution["lam_g"]), 0),
         }
-        arguments = [s0, data, lower, upper, memory]
-        return ca.Function("fpirhc_shooting", arguments, [plan, diagnostics, layout.join(following)])
+        diagnostics = ca.vertcat(told, UNKNOWN_ITERATIONS, status)
+        return ca.Function(name, arguments, [plan, diagnostics, layout.join(following)])
 
 
 @dataclass(frozen=True)
@@ -239,6 +262,12 @@ class SequentialQuadratic(_MultipleShooting):
         return ca.nlpsol("fpirhc_sqp", "sqpmethod", dict(program), options)
 
 
+def _remembered(ocp: OptimalControl, layout: Layout, memory: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
+    """The plan to start from, inside today's box."""
+    plan = ca.reshape(layout.split(memory)["plan_inputs"], ocp.input.size, ocp.stages)
+    return clip(plan, lower, upper)
+
+
 def _sizes(ocp: OptimalControl) -> tuple[int, int]:
     return ocp.stages * (ocp.state.size + ocp.input.size) + ocp.state.size, ocp.stages * ocp.state.size
 
@@ -266,8 +295,9 @@ def _shift_variables(ocp: OptimalControl, column: ca.MX) -> ca.MX:
     return _interleave(shift(states), shift(inputs))
 
 
-def _shift_dynamics(ocp: OptimalControl, column: ca.MX) -> ca.MX:
-    return ca.vec(shift(ca.reshape(column, ocp.state.size, ocp.stages)))
+def _shift_dynamics(ocp: OptimalControl, column: ca.MX) -> Expression:
+    stages: Expression = ca.reshape(column, ocp.state.size, ocp.stages)
+    return ca.vec(shift(stages))
 
 
 def _program(ocp: OptimalControl) -> dict[str, ca.MX]:

@@ -174,7 +174,8 @@ def headline_pair(comparison: Comparison) -> tuple[Entry, Entry] | None:
     pairs = [(by_name[e.pair], e) for e in comparison.entries if e.pair in by_name]
     usable = [p for p in pairs if p[0].run.cycles > 1 and p[1].run.cycles > 1]
     named = [p for p in usable if comparison.verdict[0].startswith(p[1].name + " ")]
-    return (named or usable or [None])[0]
+    chosen = named or usable
+    return chosen[0] if chosen else None
 
 
 def _contraction(comparison: Comparison) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -64,7 +65,7 @@ def _chart(title: str, unit: str, lines: Sequence[tuple[str, Run, str]], edges: 
 def _extremes(values: np.ndarray, edges: np.ndarray) -> list[float | None]:
     """Two values per interval: its extremes in the order in which they occur; None where the run had ended."""
     found: list[float | None] = []
-    for begin, end in zip(edges[:-1], edges[1:], strict=True):
+    for begin, end in pairwise(edges):
         part = values[begin:end]
         if part.size == 0:
             found += [None, None]

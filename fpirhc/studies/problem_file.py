@@ -101,6 +101,7 @@ def load_problem(name_or_path: str) -> Task:
         mistakes.raise_if_any()
     except FpirhcError as error:
         raise ProblemFileError(str(error)) from None
+    assert isinstance(problem, Problem)
     title, _, description = (module.__doc__ or path.stem).strip().partition("\n")
     return Task(path.stem, path, title, description.strip(), problem, controllers, headline)
 

@@ -10,7 +10,7 @@ begins with '_' are wires between blocks and stay out of the trace.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from types import SimpleNamespace
 from typing import Any
@@ -37,7 +37,7 @@ class Block:
     reads: Layout
     writes: Layout
     step: Step
-    memory: Layout = Layout()
+    memory: Layout = field(default_factory=Layout)
     opaque: bool = False
 
     @cached_property
@@ -47,7 +47,7 @@ class Block:
         Raises:
             InvalidName: the step forgot a signal. InvalidShape: a signal has the wrong size.
         """
-        kind = ca.MX if self.opaque else ca.SX
+        kind: Any = ca.MX if self.opaque else ca.SX
         taken = [*self.reads.signals, *self.memory.signals]
         symbols = {s.name: kind.sym(s.name, s.size) for s in taken}
         given = self.step(SimpleNamespace(**symbols))

@@ -25,14 +25,15 @@ class Evaluator:
         """Allocate the arrays and bind them; sparse arguments and results become dense."""
         self.function = _dense(function)
         # The buffer must live as long as the evaluation handle: the handle alone points into freed memory.
+        self._buffer: Any
         self._buffer, evaluate = self.function.buffer()
         self.evaluate: Callable[[], Any] = evaluate
         self.arguments = tuple(_array(self.function.size_in(k)) for k in range(self.function.n_in()))
         self.results = tuple(_array(self.function.size_out(k)) for k in range(self.function.n_out()))
         for k, array in enumerate(self.arguments):
-            self._buffer.set_arg(k, memoryview(array))
+            self._buffer.set_arg(k, array.data)
         for k, array in enumerate(self.results):
-            self._buffer.set_res(k, memoryview(array))
+            self._buffer.set_res(k, array.data)
 
     def __call__(self, *values: np.ndarray | float) -> tuple[np.ndarray, ...]:
         """Evaluate with these arguments and return copies of the results.

@@ -1,0 +1,104 @@
+"""The public names; `__init__.py` imports each when it is first used."""
+
+from .contraction import assess_gain, check_gain, response_jacobian, spectrum_over_box, spectrum_over_run
+from .controllers.computed_torque import ComputedTorque
+from .controllers.informed import Informed
+from .controllers.nominal import OpenPlan, Restart, RestartAndTrack
+from .controllers.on_failure import Feedforward, HoldPlan, StopRun
+from .controllers.receding_horizon import RecedingHorizon
+from .deformation.affine import Affine
+from .deformation.identity import Identity
+from .deformation.rfpt import Rfpt
+from .deformation.rfpt_vector import RfptVector
+from .deformation.rotation import Rotation
+from .deformation.sigmoid import Sigmoid
+from .disturbance import Formula, Noise, Pulse, Sine, Step
+from .errors import FpirhcError
+from .horizon.cost import General, LqrTerminal, Quadratic
+from .horizon.problem import Horizon
+from .integrate import Cvodes, Euler, RungeKutta4
+from .limits import Limits
+from .metrics import Metrics, measure
+from .optimisers.nlp import Fatrop, InteriorPoint, Osqp, Qrqp, SequentialQuadratic
+from .optimisers.plan import Plan, solve
+from .optimisers.reduced_gradient import ReducedGradient
+from .plant import Parameter, Plant, structural_order
+from .problem import Problem
+from .reference import Table, Trajectory
+from .report.html import write_report
+from .run import Run, load_run
+from .simulation import simulate
+from .status import Status
+from .stepper import Stepper
+from .studies.compare import Comparison, compare
+from .studies.problem_file import load_problem
+from .symbolic.functions import signed_power
+from .testing import check_deformation
+from .tracking.exponential import Exponential
+
+__all__ = [
+    "Affine",
+    "Comparison",
+    "ComputedTorque",
+    "Cvodes",
+    "Euler",
+    "Exponential",
+    "Fatrop",
+    "Feedforward",
+    "Formula",
+    "FpirhcError",
+    "General",
+    "HoldPlan",
+    "Horizon",
+    "Identity",
+    "Informed",
+    "InteriorPoint",
+    "Limits",
+    "LqrTerminal",
+    "Metrics",
+    "Noise",
+    "OpenPlan",
+    "Osqp",
+    "Parameter",
+    "Plan",
+    "Plant",
+    "Problem",
+    "Pulse",
+    "Qrqp",
+    "Quadratic",
+    "RecedingHorizon",
+    "ReducedGradient",
+    "Restart",
+    "RestartAndTrack",
+    "Rfpt",
+    "RfptVector",
+    "Rotation",
+    "Run",
+    "RungeKutta4",
+    "SequentialQuadratic",
+    "Sigmoid",
+    "Sine",
+    "Status",
+    "Step",
+    "Stepper",
+    "StopRun",
+    "Table",
+    "Trajectory",
+    "assess_gain",
+    "check_deformation",
+    "check_gain",
+    "compare",
+    "load_problem",
+    "load_run",
+    "measure",
+    "response_jacobian",
+    "signed_power",
+    "simulate",
+    "solve",
+    "spectrum_over_box",
+    "spectrum_over_run",
+    "structural_order",
+    "write_report",
+]
+
+__version__: str
