@@ -192,7 +192,8 @@ def _check_finite(ocp: OptimalControl, plant: Plant, reference: Reference, horiz
     table: Any = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
     data = table[:, 0]
     given = ocp.data.split(data)
-    first = ca.vertcat(given["reference"], given["feedforward"])[: ocp.state.size]
+    both: Any = ca.vertcat(given["reference"], given["feedforward"])
+    first = both[: ocp.state.size]
     _, terms = ocp.stage_cost(first, given["feedforward"], data)
     for name, value in zip(ocp.terms, terms.full().ravel(), strict=True):
         if not np.isfinite(value):
