@@ -10,6 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from numbers import Real
 
 import casadi as ca
 import numpy as np
@@ -124,7 +125,7 @@ class Quadratic(Cost):
         for what, (weights, valid) in groups.items():
             mistakes.unknown(f"{what}:", weights, valid)
             for name, weight in weights.items():
-                if not isinstance(weight, int | float) or not math.isfinite(weight) or weight < 0:
+                if not isinstance(weight, Real) or not math.isfinite(weight) or weight < 0:
                     mistakes.add(
                         f"{what}: the weight of '{name}' must be a finite number of at least 0, got {weight!r}"
                     )

@@ -9,14 +9,16 @@ theta_i is what stage i is given: its time, the reference, the feedforward and t
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, NotSupported
+from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, Mistakes, NotSupported
 from fpirhc.horizon.cost import Cost, Linearisation, View
+from fpirhc.horizon.curvature import input_curvature
 from fpirhc.integrate import Integrator, RungeKutta4
 from fpirhc.limits import Limits
 from fpirhc.plant import Plant
@@ -54,7 +56,8 @@ class OptimalControl:
     """The standard form; sizes: ns = state.size, nu = input.size, ntheta = data.size.
 
     dynamics: (s, u, theta) -> s_next. stage_cost: (s, u, theta) -> (l, terms). terminal_cost: (s, theta) -> T.
-    Bounds are infinite where free; an optimiser may be given other input bounds from call to call.
+    Bounds are infinite where free; an optimiser may be given other input bounds from call to call. `curvature` (nu) is the second
+    derivative of the cost rate along each input near the reference: it turns gradients into the units of the inputs.
     """
 
     stages: int
@@ -70,6 +73,7 @@ class OptimalControl:
     state_upper: np.ndarray
     input_lower: np.ndarray
     input_upper: np.ndarray
+    curvature: np.ndarray
 
     @property
     def bounds_states(self) -> bool:
@@ -101,11 +105,12 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
     state = _stage_state(plant, cost)
     s, u = ca.SX.sym("s", state.size), ca.SX.sym("u", plant.input.size)
     theta = ca.SX.sym("theta", data_layout(plant).size)
-    view = _view(plant, s, u, theta)
+    view = _view(plant, s, u, theta, cost)
     try:
-        terms = {name: ca.SX(value) for name, value in cost.stage(view).items()}
+        terms = _scalar_terms(cost.stage(view))
         advance = _advance(plant, horizon)
-        final = ca.SX(cost.terminal(view, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.step))
+        given = cost.terminal(view, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.step)
+        final = _scalar_terms({"terminal": given})["terminal"]
     except InvalidName as error:
         raise InvalidProblem(f"cost: {error}") from None
     moved = advance(s[:nx], u, view.parameters.vector)
@@ -113,23 +118,27 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
     column = horizon.step * ca.vertcat(*terms.values())
     lower, upper = limits.state_bounds(plant)
     free = np.full(state.size - nx, np.inf)
-    ocp = OptimalControl(
+    dynamics = ca.Function("fpirhc_dynamics", [s, u, theta], [ca.densify(following)])
+    stage_cost = ca.Function("fpirhc_stage_cost", [s, u, theta], [ca.sum1(column), ca.densify(column)])
+    terminal_cost = ca.Function("fpirhc_terminal_cost", [s, theta], [ca.densify(final)])
+    nodes = _nodes(plant, reference, horizon, cost, state.size)
+    _check_finite(tuple(terms), stage_cost, terminal_cost, nodes, cost)
+    return OptimalControl(
         stages=horizon.stages,
         step=horizon.step,
         state=state,
         input=plant.input,
         data=data_layout(plant),
-        dynamics=ca.Function("fpirhc_dynamics", [s, u, theta], [ca.densify(following)]),
-        stage_cost=ca.Function("fpirhc_stage_cost", [s, u, theta], [ca.sum1(column), ca.densify(column)]),
-        terminal_cost=ca.Function("fpirhc_terminal_cost", [s, theta], [ca.densify(final)]),
+        dynamics=dynamics,
+        stage_cost=stage_cost,
+        terminal_cost=terminal_cost,
         terms=tuple(terms),
         state_lower=np.append(lower, -free),
         state_upper=np.append(upper, free),
         input_lower=limits.input_bounds(plant)[0],
         input_upper=limits.input_bounds(plant)[1],
+        curvature=input_curvature(dynamics, stage_cost, terminal_cost, horizon.step, nodes),
     )
-    _check_finite(ocp, plant, reference, horizon, cost)
-    return ocp
 
 
 def stage_data(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost) -> ca.Function:
@@ -156,16 +165,18 @@ def _stage_state(plant: Plant, cost: Cost) -> Signal:
     return Signal("state", plant.state.elements + before, plant.state.units + plant.input.units)
 
 
-def _view(plant: Plant, s: Expression, u: Expression, theta: Expression) -> View:
+def _view(plant: Plant, s: Expression, u: Expression, theta: Expression, cost: Cost) -> View:
     given = data_layout(plant).split(theta)
     nx, inputs = plant.state.size, plant.input.elements
-    before = s[nx:] if s.numel() > nx else ca.SX.nan(len(inputs))
+    # What the cost does not ask for is NaN, so that using it anyway is found at once.
+    before = s[nx:] if cost.uses_rate else ca.SX.nan(len(inputs))
+    feedforward = given["feedforward"] if cost.uses_feedforward else ca.SX.nan(len(inputs))
     return View(
         state=Named(plant.state.elements, s[:nx], "state"),
         reference=Named(plant.state.elements, given["reference"], "state"),
         input=Named(inputs, u, "input"),
         input_before=Named(inputs, before, "input"),
-        feedforward=Named(inputs, given["feedforward"], "input"),
+        feedforward=Named(inputs, feedforward, "input"),
         parameters=Named(plant.parameter.elements, given["parameters"], "parameter"),
         time=given["time"],
     )
@@ -188,14 +199,46 @@ def _linearise(plant: Plant, reference: Reference, horizon: Horizon, advance: ca
     return Linearisation(np.asarray(a.full()), np.asarray(b.full()), horizon.step)
 
 
-def _check_finite(ocp: OptimalControl, plant: Plant, reference: Reference, horizon: Horizon, cost: Cost) -> None:
+def _scalar_terms(given: Any) -> dict[str, Expression]:
+    """Terms as scalar expressions, or all that is wrong with them."""
+    mistakes = Mistakes("cost")
+    if not isinstance(given, Mapping) or not given:
+        mistakes.add(f"the terms must be {{name: expression}} with at least one entry, got {given!r}")
+        mistakes.raise_if_any()
+    terms = {str(name): ca.SX(value) for name, value in given.items()}
+    for name, value in terms.items():
+        if value.numel() != 1:
+            mistakes.add(f"term '{name}' must be one scalar, got shape {value.shape}; sum its entries with ca.sum1")
+    mistakes.raise_if_any()
+    return terms
+
+
+def _nodes(
+    plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, size: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States (of this size), inputs and data along the reference from t = 0."""
     table: Any = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
-    data = table[:, 0]
-    given = ocp.data.split(data)
-    both: Any = ca.vertcat(given["reference"], given["feedforward"])
-    first = both[: ocp.state.size]
-    _, terms = ocp.stage_cost(first, given["feedforward"], data)
-    for name, value in zip(ocp.terms, terms.full().ravel(), strict=True):
+    data = np.asarray(table.full())
+    given = {name: data[place] for name, place in ((n, data_layout(plant).slice(n)) for n in ("reference", "feedforward"))}
+    states = np.vstack([given["reference"], given["feedforward"]])[:size]
+    return states, given["feedforward"][:, : horizon.stages], data
+
+
+def _check_finite(
+    names: tuple[str, ...],
+    stage_cost: ca.Function,
+    terminal_cost: ca.Function,
+    nodes: tuple[np.ndarray, np.ndarray, np.ndarray],
+    cost: Cost,
+) -> None:
+    states, inputs, data = nodes
+    values = stage_cost(states[:, 0], inputs[:, 0], data[:, 0])[1].full().ravel()
+    final = float(terminal_cost(states[:, -1], data[:, -1]))
+    told = [(name, value, "at t = 0") for name, value in zip(names, values, strict=True)]
+    mistakes = Mistakes("cost")
+    for name, value, where in [*told, ("terminal", final, "at the end of the horizon")]:
         if not np.isfinite(value):
-            hint = "; say General(rate=True) if it uses input_before" if ocp.state.size == plant.state.size else ""
-            raise InvalidProblem(f"cost: term '{name}' is {value} on the reference at t = 0{hint}")
+            hint = "" if cost.uses_rate else "; say General(rate=True) if it uses input_before"
+            hint += "" if cost.uses_feedforward else "; say General(feedforward=True) if it uses feedforward"
+            mistakes.add(f"term '{name}' is {value} on the reference {where}{hint}")
+    mistakes.raise_if_any()

@@ -191,6 +191,7 @@ def _draw_factor(axis: Axes, entries: list[Entry]) -> None:
     axis.plot(gains, np.abs(1 - gains[:, None] * eigenvalues[None, :]).max(axis=1), color="#444444", lw=1.2)
     axis.axhline(1.0, color="#aa0000", lw=0.8)
     axis.axvline(limit * np.sign(gains[-1]), color="#aa0000", lw=0.8, ls="--", label="linear limit")
+    sectors: dict[float, str] = {}
     for k, entry in enumerate(entries):
         assert entry.contraction is not None
         report = entry.contraction.report
@@ -199,9 +200,10 @@ def _draw_factor(axis: Axes, entries: list[Entry]) -> None:
         )
         if np.isfinite(entry.contraction.measured):
             axis.plot(report.effective_gain, entry.contraction.measured, "x", color=PALETTE[k], ms=8)
-        if report.sector_limit != report.linear_limit:
-            sector = max(report.sector_limit, key=abs)
-            axis.axvline(sector, color=PALETTE[k], lw=0.8, ls=":", label=f"sector limit of {entry.name}")
+        sectors.setdefault(round(max(report.sector_limit, key=abs), 3), PALETTE[k])
+    for sector, color in sectors.items():
+        if sector and abs(sector) < 0.999 * limit:
+            axis.axvline(sector, color=color, lw=0.8, ls=":", label="sector limit")
     axis.set_ylim(0, 1.6)
     axis.set_xlabel("effective gain a")
     axis.set_ylabel("contraction factor max|1 - a lambda|")

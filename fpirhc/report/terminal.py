@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -69,14 +70,18 @@ def show_run(problem: Problem, run: Run, saved: Path) -> None:
 
 
 def _table(comparison: Comparison) -> Table:
-    table = Table(title=f"{comparison.problem}, from t = {comparison.measure_from:g} s, seed {comparison.seed}")
-    table.add_column("controller")
+    table = Table(
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        title=f"{comparison.problem}, from t = {comparison.measure_from:g} s, seed {comparison.seed}",
+    )
+    table.add_column("controller", min_width=16)
     first = comparison.entries[0] if comparison.entries else None
     names = list(first.metrics.rms_error) if first else []
     for name in names:
         unit = first.run.unit(f"error.{name}") if first else ""
         table.add_column(f"rms {name} \\[{unit}]", justify="right")
-    for head in ("cycle us", "p99", "clipped", "contraction"):
+    for head in ("cycle us", "p99 us", "clipped", "factor"):
         table.add_column(head, justify="right")
     table.add_column("status")
     for entry in comparison.entries:
