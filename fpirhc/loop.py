@@ -11,7 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, like
+from fpirhc.controllers.base import Controller, like, prepared
 from fpirhc.plant import Plant
 from fpirhc.problem import Problem
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
@@ -25,8 +25,7 @@ def close_loop(problem: Problem, controller: Controller) -> Composite:
     input exists only when the problem has disturbances.
     """
     plant = problem.plant
-    chosen = controller.resolved(problem)
-    chosen.check(problem)
+    chosen = prepared(problem, controller)
     blocks, delays = chosen.blocks(problem)
     disturbed = disturbance_signals(problem)
     around = [_clock_block(problem.period), _sense_block(plant), *blocks, _advance_block(problem, disturbed)]

@@ -127,12 +127,14 @@ def test_bad_problem_files(case, folder, capsys):
 
 
 def test_wrong_sign_of_the_gain_is_explained(folder, capsys):
-    """The comparison runs and the verdict says which sign is right."""
+    """It is refused before anything runs, naming the controller, the right sign and the admissible gains."""
     _write(folder, "gain=-0.5", "gain=0.5, scale=1.0")
-    main(["compare", "line.py", "--no-compile"])
-    printed = capsys.readouterr().out.replace("\n", " ")
+    assert main(["compare", "line.py", "--no-compile"]) == 2
+    printed = capsys.readouterr().err
+    assert "controller 'CTC+FPI'" in printed
     assert "wrong sign" in printed
     assert "negative gain" in printed
+    assert not list(folder.rglob("report.html"))
 
 
 @pytest.mark.parametrize(

@@ -136,6 +136,12 @@ BAD_COSTS = {
     "name": (fp.General(terms=lambda v: {"a": v.state.angel}), "state 'angel' is unknown"),
     "before": (fp.General(terms=lambda v: {"a": v.input_before.torque}), "say General\\(rate=True\\)"),
     "lqr": (fp.Quadratic(states={"angle": 1.0}, terminal_cost=fp.LqrTerminal()), "needs a positive effort"),
+    "feedforward": (fp.General(terms=lambda v: {"a": v.feedforward.torque}), "say General\\(feedforward=True\\)"),
+    "final": (fp.General(terms=lambda v: {"a": v.input.torque**2}, final=lambda v: 1 / v.state.angle), "term 'terminal' is inf"),
+    "shape": (fp.General(terms=lambda v: {"a": v.state.vector}), r"term 'a' must be one scalar, got shape \(2, 1\)"),
+    "empty": (fp.General(terms=lambda v: {}), "at least one entry"),
+    "kind": (fp.General(terms=lambda v: v.input.torque**2), "must be {name: expression}"),
+    "many": (fp.Quadratic(states={"angel": 1.0, "angle": -1.0}, effort={"torqe": np.nan}), "4 mistakes"),
 }
 
 
@@ -165,3 +171,35 @@ def test_mistakes_of_a_horizon():
             duration=1.0,
             horizon=fp.Horizon(stages=5, step=1e-2),
         )
+
+
+def test_curvature_is_the_bend_of_the_cost_along_the_first_input():
+    """On a linear plant it is the second derivative of V, and it scales with the weights."""
+    plant, reference = chain(2), fp.Trajectory(lambda t: {"y": ca.sin(t)})
+    horizon = fp.Horizon(stages=6, step=0.1)
+    for factor in (1.0, 1e-7):
+        cost = fp.Quadratic(
+            states={"y": 3.0 * factor}, effort={"u": 0.2 * factor}, rate={"u": factor}, terminal_cost={"y'": 5.0 * factor}
+        )
+        ocp = transcribe(plant, reference, horizon, cost, fp.Limits())
+        data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
+        s0, inputs = point(ocp)
+        value = [float(rollout(ocp)(s0, inputs + k * np.eye(1, 6), data)[1]) for k in (-1, 0, 1)]
+        assert ocp.curvature[0] == pytest.approx((value[0] - 2 * value[1] + value[2]) / ocp.step, rel=1e-6)
+
+
+def test_curvature_of_a_flat_cost_is_positive():
+    """|e|^4 has no curvature on the reference; the scale must still be usable."""
+    cost = fp.General(terms=lambda v: {"a": (v.state.angle - v.reference.angle) ** 4})
+    assert built(cost)[0].curvature == pytest.approx([1.0])
+
+
+def test_a_table_serves_as_a_reference():
+    """A sampled reference gives the same stage data as the expression that it was sampled from."""
+    times = np.linspace(0.0, 2.0, 201)
+    table = fp.Table(times, {"angle": 0.5 * np.sin(2 * times)})
+    horizon, plant = fp.Horizon(stages=8, step=0.05), pendulum()
+    _, expected = built(COSTS["correction"])
+    given = stage_data(plant, table, horizon, COSTS["correction"])(0.2, plant.approximate)
+    np.testing.assert_allclose(given.full(), expected.full(), atol=1e-5)
+    transcribe(plant, table, horizon, COSTS["correction"], fp.Limits())

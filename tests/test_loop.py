@@ -245,3 +245,15 @@ def test_response_not_invertible_at_the_start():
     with pytest.raises(InvalidProblem, match=r"(?s)not invertible at the start \(y = 0, y' = 0\).*'u'"):
         line(1.0, 1.0, plant=weak)
     assert line(1.0, 1.0, plant=weak, start={"y": 1.0}).cycles == 500
+
+
+def test_eigenvalues_of_both_signs_are_refused():
+    """Two inputs of which the model has one sign wrong: no gain converges, and the error says what to check."""
+    parameters = {"a": fp.Parameter(1.0, 1.0, "1"), "b": fp.Parameter(1.0, -1.0, "1")}
+    crossed = fp.Plant(
+        {"y": "m", "z": "m"}, {"u": "N", "w": "N"}, parameters, lambda q, v, u, p: {"y": p.a * u.u, "z": p.b * u.w}
+    )
+    reference = fp.Trajectory(lambda t: {"y": 0 * t, "z": 0 * t})
+    problem = line(1.0, 1.0, plant=crossed, reference=reference, start={"y": 0.0, "z": 0.0})
+    with pytest.raises(fp.FpirhcError, match="both signs"):
+        run(problem, fp.Sigmoid(gain=-0.5, scale=1.0))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cache
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -12,7 +15,10 @@ from plants import chain, pendulum
 import fpirhc as fp
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.horizon.rollout import rollout
+from fpirhc.optimisers.base import judge
 from fpirhc.optimisers.nlp import quadratic_solver
+from fpirhc.symbolic.native import generate, native
 
 TASK = fp.load_problem("two_mass")
 GRADIENT = fp.ReducedGradient(iterations=60, tolerance=1e-4)
@@ -87,8 +93,6 @@ def test_random_box_constrained_problems_are_solved_or_honestly_not(seed, low, h
     memory = GRADIENT.memory(ocp).start()
     first = random.normal(size=2)
     inputs, diagnostics, _ = step(first, data, *ocp_bounds, memory)
-    from fpirhc.optimisers.base import judge
-
     _, residual, _ = judge(ocp)(inputs, first, data, *ocp_bounds, np.zeros((2, ocp.stages)))
     told = diagnostics.full().ravel()
     assert told[1] == pytest.approx(float(residual), rel=1e-9, abs=1e-12)
@@ -145,8 +149,6 @@ def test_settings_are_checked():
 
 def receding(optimiser, deformation=None, **settings):
     """A short closed loop of two_mass."""
-    from dataclasses import replace
-
     problem = replace(TASK.problem, duration=0.3, measure_from=0.1)
     return problem, fp.RecedingHorizon(optimiser, deformation or fp.Identity(), **settings)
 
@@ -170,8 +172,6 @@ def test_all_backends_drive_the_same_loop(optimiser):
 )
 def test_every_variant_is_cured_by_adaptation(nominal):
     """Restart, restart with tracking, and a propagated plan that is tracked: each follows the reference with FPI."""
-    from dataclasses import replace
-
     problem = replace(TASK.problem, duration=4.0, measure_from=2.0)
     errors = {}
     for name, deformation in (("plain", fp.Identity()), ("adaptive", fp.Sigmoid(gain=-0.5, scale=20.0))):
@@ -183,8 +183,6 @@ def test_every_variant_is_cured_by_adaptation(nominal):
 
 def test_bounds_of_the_plan_are_shifted_by_the_correction():
     """The deformation takes part of the actuator, so the plan gets the rest: planned + correction stays inside."""
-    from dataclasses import replace
-
     tight = replace(
         TASK.problem,
         limits=fp.Limits(inputs={"Q1": (-60.0, 10.0), "Q2": (-60.0, 40.0)}),
@@ -207,8 +205,6 @@ def test_failed_solves_are_counted_and_follow_the_policy(policy):
     """An infeasible limit from the start: the policy acts, the run goes on, the status counts it."""
     chosen, status = POLICIES[policy]
     problem, controller = receding(fp.InteriorPoint(iterations=30), on_failure=chosen)
-    from dataclasses import replace
-
     problem = replace(
         problem,
         limits=fp.Limits(inputs={"Q1": (-5.0, 5.0)}, states={"q1": (3.0, 4.0)}),
@@ -222,8 +218,6 @@ def test_failed_solves_are_counted_and_follow_the_policy(policy):
 
 def test_stop_run_ends_with_the_reason():
     """StopRun makes the failed plan visible at once."""
-    from dataclasses import replace
-
     problem, controller = receding(fp.InteriorPoint(iterations=30), on_failure=fp.StopRun())
     problem = replace(
         problem,
@@ -238,8 +232,6 @@ def test_stop_run_ends_with_the_reason():
 
 def test_scale_is_chosen_from_the_input_limits():
     """S covers a jump of the command from limit to limit; without limits it must be given."""
-    from dataclasses import replace
-
     controller = fp.RecedingHorizon(GRADIENT, fp.Sigmoid(gain=-0.5)).resolved(TASK.problem)
     jump = np.linalg.norm([600 / 1.5, 600 / 2.6])
     assert controller.deformation.largest_step() == pytest.approx(jump, rel=0.01)
@@ -249,8 +241,6 @@ def test_scale_is_chosen_from_the_input_limits():
 
 def test_chain_of_order_four_under_receding_horizon():
     """Any relative order works: a chain of four integrators with a wrong mass."""
-    from dataclasses import replace
-
     plant = chain(4)
     wrong = replace(plant, parameters={"m": fp.Parameter(1.5, 1.0, "kg")})
     problem = fp.Problem(
@@ -269,3 +259,190 @@ def test_chain_of_order_four_under_receding_horizon():
         fp.simulate(problem, fp.RecedingHorizon(optimiser, d), seed=0) for d in (fp.Identity(), fp.Sigmoid(gain=-0.8))
     )
     assert fp.measure(problem, adaptive).rms_error["y"] < 0.5 * fp.measure(problem, plain).rms_error["y"]
+
+
+def scaled(factor):
+    """The shipped problem with every weight times `factor`."""
+    cost = TASK.problem.cost
+    return replace(
+        TASK.problem,
+        cost=fp.Quadratic(
+            states={n: factor * w for n, w in cost.states.items()},
+            correction={n: factor * w for n, w in cost.correction.items()},
+        ),
+    )
+
+
+@pytest.mark.parametrize("factor", [1e-9, 1e-3, 1e6])
+@pytest.mark.parametrize("iterations", [1, 40])
+def test_the_size_of_the_weights_changes_neither_plan_nor_status(factor, iterations):
+    """A cost in other units is the same problem: tiny weights must not make every plan look converged."""
+    told = {}
+    for name, problem in (("one", TASK.problem), ("scaled", scaled(factor))):
+        ocp = transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, BOXES["active"])
+        data = stage_data(problem.plant, problem.reference, problem.horizon, problem.cost)(0.0, problem.plant.approximate)
+        optimiser = fp.ReducedGradient(iterations=iterations, tolerance=1e-3)
+        told[name] = fp.solve(ocp, optimiser, problem.start_state, data, calls=1)
+    one, other = told.values()
+    assert other.status == one.status == (fp.Status.NOT_CONVERGED if iterations == 1 else fp.Status.OK)
+    np.testing.assert_allclose(other.inputs, one.inputs, atol=1e-4)
+    assert other.cost == pytest.approx(factor * one.cost, rel=1e-8)
+
+
+COUPLED = {
+    "rate": fp.Quadratic(states={"q1": 1e3, "q2": 1e3}, effort={"Q1": 1e-3}, rate={"Q1": 1e-3, "Q2": 1e-2}),
+    "lqr": fp.Quadratic(
+        states={"q1": 1e3, "q2": 1e3}, correction={"Q1": 1e-3, "Q2": 1e-3}, terminal_cost=fp.LqrTerminal()
+    ),
+    "general": fp.General(
+        terms=lambda v: {
+            "error": 1e3 * ca.sqrt((v.state.q1 - v.reference.q1) ** 2 + (v.state.q2 - v.reference.q2) ** 2 + 1e-2),
+            "input": 1e-3 * (v.input.Q1 - v.input.Q2) ** 2 + 1e-3 * v.input.Q1**2,
+        }
+    ),
+}
+
+
+@pytest.mark.parametrize("cost", COUPLED.values(), ids=COUPLED)
+@pytest.mark.parametrize("optimiser", BACKENDS, ids=ids[1:])
+def test_costs_that_couple_states_and_inputs(optimiser, cost):
+    """Hessians with entries off the diagonal, the stage state augmented by the last command: all backends agree."""
+    p = TASK.problem
+    ocp = transcribe(p.plant, p.reference, p.horizon, cost, BOXES["active"])
+    data = stage_data(p.plant, p.reference, p.horizon, cost)(0.0, p.plant.approximate)
+    first = np.concatenate([p.start_state, np.zeros(ocp.state.size - p.plant.state.size)])
+    plan = fp.solve(ocp, optimiser, first, data)
+    best = fp.solve(ocp, fp.ReducedGradient(iterations=1000, tolerance=1e-6), first, data)
+    assert plan.status == best.status == fp.Status.OK
+    assert plan.cost == pytest.approx(best.cost, rel=1e-6)
+
+
+def broken(ocp, data, first):
+    """Arguments that no optimiser can serve, and the status that says why."""
+    lower, upper = ocp.input_lower, ocp.input_upper
+    massless = np.asarray(ca.DM(data).full()).copy()
+    massless[ocp.data.slice("parameters").start] = 0.0
+    return {
+        "state is NaN": ((first * np.nan, data, lower, upper), fp.Status.NON_FINITE),
+        "state overflows": ((first + 1e200, data, lower, upper), fp.Status.NON_FINITE),
+        "data is NaN": ((first, data * np.nan, lower, upper), fp.Status.NON_FINITE),
+        "model divides by zero": ((first, massless, lower, upper), fp.Status.NON_FINITE),
+        "bound is NaN": ((first, data, lower * np.nan, upper), fp.Status.NON_FINITE),
+        "box is empty": ((first, data, upper + 1.0, upper), fp.Status.INFEASIBLE),
+    }
+
+
+@pytest.mark.parametrize("optimiser", EVERY, ids=ids)
+def test_broken_problems_are_statuses_and_leave_no_trace(optimiser, capfd):
+    """Nothing raises, nothing is printed, nothing that is not finite is returned; the next good problem is solved."""
+    ocp, data, first = two_mass(BOXES["active"])
+    step, start = optimiser.step(ocp), optimiser.memory(ocp).start()
+    bounds = (ocp.input_lower, ocp.input_upper)
+    _, _, warm = step(first, data, *bounds, start)
+    for name, (arguments, status) in broken(ocp, data, first).items():
+        inputs, told, memory = step(*arguments, warm)
+        assert int(told[4]) == status, name
+        assert np.isfinite(inputs.full()).all(), name
+        assert np.isfinite(memory.full()).all(), name
+        for _ in range(3):
+            _, told, memory = step(first, data, *bounds, memory)
+        assert int(told[4]) == fp.Status.OK, name
+    printed = capfd.readouterr()
+    assert printed.out == ""
+
+
+@pytest.mark.parametrize("poison", [np.nan, np.inf, 1e200])
+@pytest.mark.parametrize("limits", [BOXES["free"], BOXES["active"]], ids=["free", "active"])
+@pytest.mark.parametrize("optimiser", EVERY, ids=ids)
+def test_poisoned_warm_start_is_forgotten(optimiser, limits, poison):
+    """A memory of nonsense costs at most one failed call, and never a plan that is not finite."""
+    ocp, data, first = two_mass(limits)
+    step, memory = optimiser.step(ocp), np.full(optimiser.memory(ocp).size, poison)
+    for _ in range(3):
+        inputs, told, memory = step(first, data, ocp.input_lower, ocp.input_upper, memory)
+        assert np.isfinite(inputs.full()).all()
+    assert int(told[4]) == fp.Status.OK
+
+
+RIDING = fp.Limits(inputs={"Q1": (-40.0, 60.0)}, states={"q1'": (-0.3, 0.6), "q1": (2.1, 2.4)})
+
+
+@pytest.mark.parametrize("optimiser", BACKENDS[:3], ids=ids[1:4])
+def test_multipliers_of_state_limits_are_verified_without_the_solver(optimiser):
+    """verify() fits its own multipliers of the right signs and finds the plan stationary; without them it is not."""
+    ocp, data, _ = two_mass(RIDING)
+    plan = fp.solve(ocp, optimiser, np.array([2.25, 5.6, 0.2, -0.1]), data)
+    assert plan.status == fp.Status.OK
+    assert plan.verify()[1] < 1e-3
+    multipliers = plan.state_multipliers
+    assert np.abs(multipliers).max() > 1e-3
+    assert (plan.states[:, 1:][multipliers > 0] >= np.tile(ocp.state_upper[:, None], ocp.stages)[multipliers > 0] - 1e-4).all()
+    bounds = (ocp.input_lower, ocp.input_upper)
+    for wrong in (0.0, -1.0):
+        _, residual, _ = judge(ocp)(plan.inputs, plan.states[:, 0], data, *bounds, wrong * multipliers)
+        assert float(residual) > 1.0
+
+
+def test_multipliers_away_from_a_limit_do_not_count():
+    """A solver cannot buy stationarity with multipliers of limits that are not active."""
+    ocp, data, first = two_mass(RIDING)
+    inputs, bounds = np.zeros((2, ocp.stages)), (ocp.input_lower, ocp.input_upper)
+    invented = np.random.default_rng(0).normal(size=(4, ocp.stages))
+    states = rollout(ocp)(first, inputs, data)[0].full()[:, 1:]
+    inside = (states < ocp.state_upper[:, None] - 1e-3) & (states > ocp.state_lower[:, None] + 1e-3)
+    without = judge(ocp)(inputs, first, data, *bounds, np.zeros_like(invented))[1]
+    assert float(judge(ocp)(inputs, first, data, *bounds, invented * inside)[1]) == float(without)
+
+
+def test_a_first_state_outside_its_limits_is_infeasible():
+    """Too far out to come back within one stage."""
+    ocp, data, _ = two_mass(RIDING)
+    plan = fp.solve(ocp, fp.InteriorPoint(), np.array([2.6, 5.6, 0.2, -0.1]), data)
+    assert plan.status == fp.Status.INFEASIBLE
+    assert plan.feasibility > 1e-2
+    assert plan.verify()[2] == pytest.approx(plan.feasibility)
+
+
+@settings(deadline=None, derandomize=True, max_examples=25)
+@given(seed=st.integers(0, 10**6), width=st.floats(0.0, 20.0), centre=st.floats(-10.0, 10.0))
+def test_random_boxes_have_the_same_optimum_by_two_methods(seed, width, centre):
+    """Linear plant, quadratic cost, any box (also a single point): where both say OK they are the same, and both do."""
+    ocp, data, gradient, exact = _linear_quadratic()
+    first = np.random.default_rng(seed).normal(size=2)
+    box = (np.array([centre - width]), np.array([centre + width]))
+    plans = []
+    for step, memory in (gradient, exact):
+        inputs, told, _ = step(first, data, *box, memory)
+        assert int(told[4]) == fp.Status.OK
+        plans.append((inputs.full(), float(told[0])))
+    assert plans[0][1] == pytest.approx(plans[1][1], rel=1e-7, abs=1e-10)
+    np.testing.assert_allclose(plans[0][0], plans[1][0], atol=1e-3)
+
+
+@cache
+def _linear_quadratic():
+    plant, reference = chain(2), fp.Trajectory(lambda t: {"y": 0 * t})
+    horizon = fp.Horizon(stages=10, step=0.1)
+    cost = fp.Quadratic(states={"y": 3.0, "y'": 0.5}, effort={"u": 0.2})
+    ocp = transcribe(plant, reference, horizon, cost, fp.Limits())
+    data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
+    pair = (fp.ReducedGradient(iterations=300, tolerance=1e-4), fp.SequentialQuadratic(tolerance=1e-4))
+    return ocp, data, *((o.step(ocp), o.memory(ocp).start()) for o in pair)
+
+
+def test_compiled_and_interpreted_steps_are_the_same():
+    """The generated C has one copy of the stage however many stages and iterations there are."""
+    sizes = {}
+    for stages, iterations in ((20, 10), (20, 40), (80, 10)):
+        p = replace(TASK.problem, horizon=fp.Horizon(stages=stages, step=1e-2))
+        ocp = transcribe(p.plant, p.reference, p.horizon, p.cost, p.limits)
+        step = fp.ReducedGradient(iterations=iterations, tolerance=1e-3).step(ocp)
+        sizes[stages, iterations] = len(generate(step))
+    assert sizes[20, 40] < 1.1 * sizes[20, 10]
+    assert sizes[80, 10] < 2 * sizes[20, 10]
+    p = TASK.problem
+    ocp, data, first = two_mass(BOXES["active"])
+    step, memory = GRADIENT.step(ocp), GRADIENT.memory(ocp).start()
+    arguments = (first, data, ocp.input_lower, ocp.input_upper, memory)
+    for one, other in zip(step(*arguments), native(step).function(*arguments), strict=True):
+        np.testing.assert_allclose(one.full(), other.full(), rtol=1e-12, atol=1e-12)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.errors import NotContractive
 from fpirhc.studies.compare import compare
 
 TASK = fp.load_problem("two_mass")
@@ -73,10 +74,10 @@ def test_sector_bound():
     assert above > 0.2
 
 
-def test_wrong_sign_diverges():
-    """A positive gain on a plant whose eigenvalues are 1.5 and 1.3 pushes the wrong way."""
-    run = fp.simulate(PROBLEM, sigmoid(0.1), seed=0)
-    assert run.stop is not None or np.abs(run["error"]).max() > 1.0
+def test_wrong_sign_is_refused():
+    """A positive gain on a plant whose eigenvalues are 1.5 and 1.3 is refused with the admissible gains."""
+    with pytest.raises(NotContractive, match=r"wrong sign.*negative gain, 0 < \|gain\| < 3.36 .*< 2.82"):
+        fp.simulate(PROBLEM, sigmoid(0.1), seed=0)
 
 
 @pytest.fixture(scope="module")

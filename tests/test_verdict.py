@@ -45,10 +45,10 @@ def test_too_small_a_scale_is_recognised():
     assert "raise its scale S" in found.verdict[0]
 
 
-def test_wrong_sign_is_recognised():
-    """Every cycle enlarges the error; the verdict says which sign is right."""
-    found = judged(fp.Sigmoid(gain=0.5, scale=1.0))
-    assert "wrong sign" in found.verdict[0]
+def test_too_large_a_gain_is_recognised():
+    """Beyond the linear limit the iteration is no contraction; the verdict says so and gives admissible gains."""
+    found = judged(fp.Rotation(fraction=1.4, radius=1e4))
+    assert "is too large" in found.verdict[0]
     assert found["adaptive"].contraction.predicted > 1
 
 

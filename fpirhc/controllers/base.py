@@ -19,6 +19,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from fpirhc.controllers.gain_check import check_gain_sign
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant import Plant
 from fpirhc.problem import Problem
@@ -53,6 +54,18 @@ class Controller(ABC):
         """Raise if the controller cannot serve the problem."""
 
 
+def prepared(problem: Problem, controller: Controller) -> Controller:
+    """Return the controller with its automatic settings chosen, checked against the problem.
+
+    Raises:
+        NotContractive: a deformation with a gain of the wrong sign. And what the controller's own check raises.
+    """
+    chosen = controller.resolved(problem)
+    chosen.check(problem)
+    check_gain_sign(problem, chosen.adaptive)
+    return chosen
+
+
 def controller_reads(plant: Plant) -> Layout:
     """What every controller is given each cycle."""
     return Layout((scalar("time", "s"), plant.state, plant.response_signal("realised"), plant.parameter))
@@ -60,9 +73,7 @@ def controller_reads(plant: Plant) -> Layout:
 
 def compose_controller(problem: Problem, controller: Controller) -> Composite:
     """Return the controller as one step: (memory, time, state, realised, parameters) -> (memory, trace, command)."""
-    chosen = controller.resolved(problem)
-    chosen.check(problem)
-    blocks, delays = chosen.blocks(problem)
+    blocks, delays = prepared(problem, controller).blocks(problem)
     return compose("controller", controller_reads(problem.plant), blocks, delays, outputs=("command",))
 
 

@@ -200,7 +200,8 @@ def _draw_factor(axis: Axes, entries: list[Entry]) -> None:
         )
         if np.isfinite(entry.contraction.measured):
             axis.plot(report.effective_gain, entry.contraction.measured, "x", color=PALETTE[k], ms=8)
-        sectors.setdefault(round(max(report.sector_limit, key=abs), 3), PALETTE[k])
+        low, high = report.sector_limit
+        sectors.setdefault(round(high if high > 0 else low, 3), PALETTE[k])
     for sector, color in sectors.items():
         if sector and abs(sector) < 0.999 * limit:
             axis.axvline(sector, color=color, lw=0.8, ls=":", label="sector limit")

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from fpirhc.contraction import ContractionReport, Spectrum, assess_gain, identified_factor, spectrum_over_run
-from fpirhc.controllers.base import Controller
+from fpirhc.controllers.base import Controller, prepared
 from fpirhc.deformation.identity import Identity
 from fpirhc.describe import describe
-from fpirhc.errors import FpirhcError, InvalidName, Mistakes, nearest
+from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, nearest
 from fpirhc.metrics import Metrics, measure
 from fpirhc.problem import Problem
 from fpirhc.run import Run
@@ -102,8 +102,12 @@ def compare(
     """Run the task's controllers with the same disturbances and return what they achieved.
 
     A controller that cannot serve the problem is skipped with its reason. Ctrl-C keeps what is finished.
+
+    Raises:
+        InvalidProblem: unknown controllers, or deformations with a gain of the wrong sign.
     """
     begin = time.perf_counter()
+    _check_gains(task, select(task, controllers))
     chosen, skipped = select(task, controllers), {}
     entries: list[Entry] = []
     for name, controller in chosen.items():
@@ -129,6 +133,19 @@ def compare(
         settings=describe(task.problem),
         elapsed=time.perf_counter() - begin,
     )
+
+
+def _check_gains(task: Task, chosen: Mapping[str, Controller]) -> None:
+    """A gain of the wrong sign is a mistake in the file, not a result: it is refused before anything runs."""
+    mistakes = Mistakes(f"problem '{task.name}'")
+    for name, controller in chosen.items():
+        try:
+            prepared(task.problem, controller)
+        except NotContractive as error:
+            mistakes.add(f"controller '{name}': {error}")
+        except FpirhcError:
+            continue  # said later, as the reason why the controller is skipped
+    mistakes.raise_if_any()
 
 
 def versions() -> dict[str, str]:

@@ -1,0 +1,122 @@
+"""The report: one file, safe, complete, or not there."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from plants import linear
+
+import fpirhc as fp
+from fpirhc.errors import OutputError
+from fpirhc.report.html import render, write_report
+from fpirhc.report.series import INTERVALS, chart_data
+from fpirhc.studies.compare import compare
+from fpirhc.studies.problem_file import Task
+
+HOSTILE = "<script>alert('x')</script> \"& </script>"
+
+
+@pytest.fixture(scope="module")
+def comparison():
+    """A pair, and a third controller that ends early."""
+    plant = linear(1.6, 1.0)
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}),
+        start={"y": 0.3},
+        period=1e-3,
+        duration=1.0,
+        disturbances={"u": fp.Noise(0.01)},
+    )
+    track = fp.Exponential(rate=6.0)
+    controllers = {
+        "plain": fp.ComputedTorque(track),
+        HOSTILE: fp.ComputedTorque(track, fp.Sigmoid(gain=-0.5, scale=5.0)),
+    }
+    return compare(Task("case", Path("case.py"), HOSTILE, HOSTILE, problem, controllers), seed=0, compiled=False)
+
+
+def test_report_is_self_contained_and_small(comparison, tmp_path):
+    """It opens offline: nothing is fetched, and everything is inside."""
+    path = tmp_path / "report.html"
+    write_report(comparison, path)
+    page = path.read_text(encoding="utf-8")
+    assert len(page) < 3_000_000
+    assert not re.search(r"""(src|href)\s*=\s*['"](?!data:)""", page)
+    assert "@import" not in page
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_verdict_comes_first_then_table_charts_and_pictures(comparison):
+    """The order in which a reader asks."""
+    page = render(comparison)
+    marks = [
+        "id='verdict'",
+        "<h2>Controllers",
+        "<h2>Signals over time",
+        "<h2>Without | with",
+        "<h2>Contraction",
+        "<h2>Settings",
+    ]
+    places = [page.index(m) for m in marks]
+    assert places == sorted(places)
+    assert page.count("<img alt='") == 6
+
+
+def test_hostile_names_are_only_text(comparison):
+    """Names from a problem file never become markup or code."""
+    page = render(comparison)
+    assert "<script>alert" not in page
+    assert page.count("</script>") == 2
+    assert "&lt;script&gt;alert" in page
+
+
+def test_data_of_the_charts_is_complete(comparison):
+    """Every controller, every signal of a coordinate, and no peak lost."""
+    data = chart_data(comparison, ["#000000"])
+    assert [c["name"] for c in data["controllers"]] == ["plain", HOSTILE]
+    error = next(c for c in data["charts"] if c["title"] == "error of y")
+    run = comparison["plain"].run
+    drawn = error["series"][0]["values"]
+    assert len(drawn) == len(data["time"]) == 2 * INTERVALS
+    assert max(drawn) == pytest.approx(run["error.y"].max(), rel=1e-4)
+    assert min(drawn) == pytest.approx(run["error.y"].min(), rel=1e-4)
+    json.dumps(data, allow_nan=False)
+
+
+def test_run_that_ended_early_is_told_in_words(comparison):
+    """Its numbers are 'none', its reason is in the table, and its lines stop."""
+    entry = comparison["plain"]
+    short = replace(entry.run, log=entry.run.log[:300], stop="signal 'x' is not finite at t = 0.3 s")
+    nan = dict.fromkeys(entry.metrics.rms_error, float("nan"))
+    ended = replace(entry, run=short, metrics=replace(entry.metrics, rms_error=nan, max_error=nan))
+    page = render(replace(comparison, entries=(ended, *comparison.entries[1:])))
+    assert "ended early: signal &#x27;x&#x27; is not finite" in page
+    assert "<span class='none'>none</span>" in page
+
+
+def test_comparison_without_a_pair_has_no_pair_pictures(comparison):
+    """One controller alone is still a report."""
+    alone = replace(comparison, entries=comparison.entries[:1])
+    assert "Without | with" not in render(alone)
+    empty = replace(comparison, entries=(), skipped={"x": "because"})
+    assert "No controller finished" in render(empty)
+
+
+def test_folder_that_cannot_be_written(comparison, tmp_path):
+    """One error, nothing half-written."""
+    with pytest.raises(OutputError, match="cannot write the report"):
+        write_report(comparison, tmp_path / "missing" / "report.html")
+
+
+def test_run_draws_itself(comparison):
+    """plot() returns a figure with its four panels."""
+    figure = comparison["plain"].run.plot()
+    assert [a.get_ylabel() for a in figure.axes] == ["error", "position", "command", "responses of y"]
+    assert np.isfinite(figure.axes[0].get_ylim()).all()
