@@ -96,14 +96,14 @@ class Table(Reference):
 
     def coordinates(self, t: Expression) -> Mapping[str, Expression]:
         """Return {coordinate: spline of t}."""
+        return {name: self._spline(name, np.asarray(v, dtype=float), t) for name, v in self.values.items()}
+
+    def _spline(self, name: str, samples: np.ndarray, t: Expression) -> Expression:
         times = np.asarray(self.times, dtype=float)
-        inside = ca.fmin(ca.fmax(t, times[0]), times[-1])
-        return {
-            name: ca.interpolant(
-                f"fpirhc_table_{name}", "bspline", [times], np.asarray(v, float), {"degree": [self.degree]}
-            )(inside)
-            for name, v in self.values.items()
-        }
+        spline = ca.interpolant(f"fpirhc_table_{name}", "bspline", [times], samples, {"degree": [self.degree]})
+        # A choice, not a clamped argument: fmin and fmax have half a derivative at the table's own first and last time.
+        held = ca.if_else(t < times[0], spline(times[0]), spline(times[-1]))
+        return ca.if_else(ca.logic_or(t < times[0], t > times[-1]), held, spline(t))
 
 
 def _differentiate(value: Expression, t: Expression, order: int) -> list[Expression]:

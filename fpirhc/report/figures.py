@@ -129,7 +129,7 @@ def _line(axis: Axes, run: Run, column: str, label: str, color: str, style: str 
 
 def _legend(axis: Axes) -> None:
     if axis.get_legend_handles_labels()[0]:
-        axis.legend(fontsize=7, loc="upper right", framealpha=0.8)
+        axis.legend(fontsize=7, loc="best", framealpha=0.8)
 
 
 def _is_second_order(run: Run) -> bool:

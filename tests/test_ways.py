@@ -1,0 +1,123 @@
+"""Every kind of plant, reference and integrator runs in a loop, compiled where it can be."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import casadi as ca
+import fpirhc as fp
+import numpy as np
+import pytest
+from fpirhc.symbolic.native import find_compiler
+from plants import pendulum
+
+TRACK = fp.Exponential(rate=6.0)
+MAPS = (
+    fp.Sigmoid(gain=-0.5, scale=10.0),
+    fp.Rfpt(offset=1e4, sign=-1.0, gain=2e-5),
+    fp.RfptVector(offset=1e4, sign=-1.0, gain=2e-5),
+    fp.Rotation(fraction=0.2, radius=1e3),
+    fp.Affine(gain=-0.4),
+)
+
+
+def swing(**changes):
+    """A pendulum along a sine."""
+    settings = {
+        "plant": pendulum(),
+        "reference": fp.Trajectory(lambda t: {"angle": 0.5 * ca.sin(2 * t)}),
+        "start": {"angle": 0.1},
+        "period": 1e-3,
+        "duration": 3.0,
+        "measure_from": 2.0,
+    }
+    return fp.Problem(**{**settings, **changes})
+
+
+@pytest.mark.parametrize("deformation", MAPS, ids=lambda m: type(m).__name__)
+def test_every_map_cures_the_wrong_model(deformation):
+    """With the same effective gain all maps leave about the same error."""
+    problem = swing()
+    errors = [
+        fp.measure(problem, fp.simulate(problem, fp.ComputedTorque(TRACK, d), seed=0)).rms_error["angle"]
+        for d in (fp.Identity(), deformation, MAPS[0])
+    ]
+    assert errors[1] < 0.1 * errors[0]
+    assert errors[1] == pytest.approx(errors[2], rel=0.05)
+
+
+def test_table_reference_is_tracked_like_the_expression_it_samples():
+    """A table goes through the same loop; its look-up keeps the loop an MX graph, which still compiles."""
+    times = np.linspace(0, 3, 601)
+    table = swing(reference=fp.Table(times, {"angle": 0.5 * np.sin(2 * times)}))
+    runs = [fp.simulate(p, fp.ComputedTorque(TRACK, MAPS[0]), seed=0) for p in (swing(), table)]
+    assert runs[1].compiled == (find_compiler() is not None)
+    np.testing.assert_allclose(runs[1]["state.angle"], runs[0]["state.angle"], atol=1e-6)
+
+
+def test_reference_integrator_gives_the_same_run():
+    """CVODES against Runge-Kutta: the same closed loop within its tolerance; it stays in the virtual machine and says so."""
+    short = {"duration": 0.5, "measure_from": 0.0}
+    controller = fp.ComputedTorque(TRACK, MAPS[0])
+    reference = fp.simulate(swing(integrator=fp.Cvodes(1e-10), **short), controller, seed=0)
+    ordinary = fp.simulate(swing(integrator=fp.RungeKutta4(2), **short), controller, seed=0)
+    assert not reference.compiled
+    np.testing.assert_allclose(ordinary["state"], reference["state"], atol=1e-7)
+
+
+def test_plant_that_is_not_affine_in_its_input():
+    """A valve with a quadratic characteristic: the inverse is found numerically, and adaptation works on it."""
+    tank = fp.Plant(
+        {"level": "m"},
+        {"valve": "1"},
+        {"c": fp.Parameter(approximate=0.7, exact=1.0, unit="m/s"), "k": fp.Parameter(0.3, 0.5, "1/s")},
+        lambda q, u, p: {"level": p.c * (u.valve + 0.5 * u.valve**3) - p.k * q.level},
+        order=1,
+    )
+    problem = fp.Problem(
+        tank, fp.Trajectory(lambda t: {"level": 1 + 0.3 * ca.sin(t)}), {"level": 1.0}, 1e-2, 10.0, measure_from=5.0
+    )
+    assert not tank.affine
+    # rate x period = 0.02; the response error falls by about half per cycle
+    controllers = [fp.ComputedTorque(fp.Exponential(2.0), d) for d in (fp.Identity(), fp.Sigmoid(gain=-1.0, scale=5.0))]
+    plain, adaptive = (fp.measure(problem, fp.simulate(problem, c, seed=0)).rms_error["level"] for c in controllers)
+    assert adaptive < 0.1 * plain
+
+
+def test_parameters_are_not_compiled_in():
+    """Other exact values give another run with the same Function."""
+    from fpirhc.loop import close_loop
+
+    problem = swing()
+    heavier = replace(
+        problem.plant, parameters={**problem.plant.parameters, "m": fp.Parameter(approximate=1.4, exact=1.2, unit="kg")}
+    )
+    controller = fp.ComputedTorque(TRACK)
+    loops = [close_loop(replace(problem, plant=p), controller) for p in (problem.plant, heavier)]
+    assert loops[0].function.n_instructions() == loops[1].function.n_instructions()
+    memories = [loop.memory.start() for loop in loops]
+    given = [loops[0].function(m)[0].full() for m in memories]
+    other = loops[1].function(memories[1])[0].full()
+    assert not np.array_equal(given[0], given[1])
+    np.testing.assert_array_equal(given[1], other)
+
+
+LONG = """
+import resource
+from dataclasses import replace
+import fpirhc as fp
+task = fp.load_problem("two_mass")
+run = fp.simulate(replace(task.problem, duration=600.0), task.controllers["CTC+FPI (eq 6)"], seed=0)
+assert run.cycles == 600_000 and run.stop is None
+fp.measure(task.problem, run)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the unit of ru_maxrss is kilobytes on Linux only")
+def test_memory_of_a_long_run():
+    """Ten minutes at 1 kHz with every signal stay under 1 GB."""
+    done = subprocess.run([sys.executable, "-c", LONG], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 1_000_000
