@@ -102,6 +102,10 @@ def _run_chunks(
 
 def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:
     """Row and column of the first value that is not finite."""
+    # A sum is finite only if every summand is, and is found much faster; a sum that overflows is looked at closely.
+    with np.errstate(all="ignore"):
+        if np.isfinite(np.sum(rows)):
+            return None
     finite = np.isfinite(rows)
     if finite.all():
         return None
