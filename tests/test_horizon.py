@@ -137,7 +137,10 @@ BAD_COSTS = {
     "before": (fp.General(terms=lambda v: {"a": v.input_before.torque}), "say General\\(rate=True\\)"),
     "lqr": (fp.Quadratic(states={"angle": 1.0}, terminal_cost=fp.LqrTerminal()), "needs a positive effort"),
     "feedforward": (fp.General(terms=lambda v: {"a": v.feedforward.torque}), "say General\\(feedforward=True\\)"),
-    "final": (fp.General(terms=lambda v: {"a": v.input.torque**2}, final=lambda v: 1 / v.state.angle), "term 'terminal' is inf"),
+    "final": (
+        fp.General(terms=lambda v: {"a": v.input.torque**2}, final=lambda v: 1 / v.state.angle),
+        "term 'terminal' is inf",
+    ),
     "shape": (fp.General(terms=lambda v: {"a": v.state.vector}), r"term 'a' must be one scalar, got shape \(2, 1\)"),
     "empty": (fp.General(terms=lambda v: {}), "at least one entry"),
     "kind": (fp.General(terms=lambda v: v.input.torque**2), "must be {name: expression}"),
@@ -179,7 +182,10 @@ def test_curvature_is_the_bend_of_the_cost_along_the_first_input():
     horizon = fp.Horizon(stages=6, step=0.1)
     for factor in (1.0, 1e-7):
         cost = fp.Quadratic(
-            states={"y": 3.0 * factor}, effort={"u": 0.2 * factor}, rate={"u": factor}, terminal_cost={"y'": 5.0 * factor}
+            states={"y": 3.0 * factor},
+            effort={"u": 0.2 * factor},
+            rate={"u": factor},
+            terminal_cost={"y'": 5.0 * factor},
         )
         ocp = transcribe(plant, reference, horizon, cost, fp.Limits())
         data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)

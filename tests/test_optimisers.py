@@ -280,7 +280,9 @@ def test_the_size_of_the_weights_changes_neither_plan_nor_status(factor, iterati
     told = {}
     for name, problem in (("one", TASK.problem), ("scaled", scaled(factor))):
         ocp = transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, BOXES["active"])
-        data = stage_data(problem.plant, problem.reference, problem.horizon, problem.cost)(0.0, problem.plant.approximate)
+        data = stage_data(problem.plant, problem.reference, problem.horizon, problem.cost)(
+            0.0, problem.plant.approximate
+        )
         optimiser = fp.ReducedGradient(iterations=iterations, tolerance=1e-3)
         told[name] = fp.solve(ocp, optimiser, problem.start_state, data, calls=1)
     one, other = told.values()
@@ -364,28 +366,35 @@ def test_poisoned_warm_start_is_forgotten(optimiser, limits, poison):
     assert int(told[4]) == fp.Status.OK
 
 
-RIDING = fp.Limits(inputs={"Q1": (-40.0, 60.0)}, states={"q1'": (-0.3, 0.6), "q1": (2.1, 2.4)})
+RIDING = {
+    "upper": fp.Limits(inputs={"Q1": (-40.0, 60.0)}, states={"q1'": (-0.3, 0.4), "q1": (2.1, 2.4)}),
+    "lower": fp.Limits(inputs={"Q1": (-40.0, 60.0)}, states={"q2'": (-0.3, 2.0)}),
+}
 
 
+@pytest.mark.parametrize("side", RIDING)
 @pytest.mark.parametrize("optimiser", BACKENDS[:3], ids=ids[1:4])
-def test_multipliers_of_state_limits_are_verified_without_the_solver(optimiser):
-    """verify() fits its own multipliers of the right signs and finds the plan stationary; without them it is not."""
-    ocp, data, _ = two_mass(RIDING)
+def test_multipliers_of_state_limits_are_verified_without_the_solver(optimiser, side):
+    """verify() fits its own multipliers of the right sign and finds the plan stationary; without them it is not."""
+    ocp, data, _ = two_mass(RIDING[side])
     plan = fp.solve(ocp, optimiser, np.array([2.25, 5.6, 0.2, -0.1]), data)
     assert plan.status == fp.Status.OK
     assert plan.verify()[1] < 1e-3
-    multipliers = plan.state_multipliers
-    assert np.abs(multipliers).max() > 1e-3
-    assert (plan.states[:, 1:][multipliers > 0] >= np.tile(ocp.state_upper[:, None], ocp.stages)[multipliers > 0] - 1e-4).all()
-    bounds = (ocp.input_lower, ocp.input_upper)
+    multipliers = plan.state_multipliers if side == "upper" else -plan.state_multipliers
+    bound = ocp.state_upper if side == "upper" else ocp.state_lower
+    active = multipliers != 0
+    assert active.any()
+    assert multipliers.min() >= 0
+    np.testing.assert_allclose(plan.states[:, 1:][active], np.tile(bound[:, None], ocp.stages)[active], atol=1e-4)
     for wrong in (0.0, -1.0):
-        _, residual, _ = judge(ocp)(plan.inputs, plan.states[:, 0], data, *bounds, wrong * multipliers)
+        given = wrong * plan.state_multipliers
+        _, residual, _ = judge(ocp)(plan.inputs, plan.states[:, 0], data, ocp.input_lower, ocp.input_upper, given)
         assert float(residual) > 1.0
 
 
 def test_multipliers_away_from_a_limit_do_not_count():
     """A solver cannot buy stationarity with multipliers of limits that are not active."""
-    ocp, data, first = two_mass(RIDING)
+    ocp, data, first = two_mass(RIDING["upper"])
     inputs, bounds = np.zeros((2, ocp.stages)), (ocp.input_lower, ocp.input_upper)
     invented = np.random.default_rng(0).normal(size=(4, ocp.stages))
     states = rollout(ocp)(first, inputs, data)[0].full()[:, 1:]
@@ -396,7 +405,7 @@ def test_multipliers_away_from_a_limit_do_not_count():
 
 def test_a_first_state_outside_its_limits_is_infeasible():
     """Too far out to come back within one stage."""
-    ocp, data, _ = two_mass(RIDING)
+    ocp, data, _ = two_mass(RIDING["upper"])
     plan = fp.solve(ocp, fp.InteriorPoint(), np.array([2.6, 5.6, 0.2, -0.1]), data)
     assert plan.status == fp.Status.INFEASIBLE
     assert plan.feasibility > 1e-2
@@ -407,7 +416,7 @@ def test_a_first_state_outside_its_limits_is_infeasible():
 @given(seed=st.integers(0, 10**6), width=st.floats(0.0, 20.0), centre=st.floats(-10.0, 10.0))
 def test_random_boxes_have_the_same_optimum_by_two_methods(seed, width, centre):
     """Linear plant, quadratic cost, any box (also a single point): where both say OK they are the same, and both do."""
-    ocp, data, gradient, exact = _linear_quadratic()
+    data, gradient, exact = _linear_quadratic()
     first = np.random.default_rng(seed).normal(size=2)
     box = (np.array([centre - width]), np.array([centre + width]))
     plans = []
@@ -427,7 +436,7 @@ def _linear_quadratic():
     ocp = transcribe(plant, reference, horizon, cost, fp.Limits())
     data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
     pair = (fp.ReducedGradient(iterations=300, tolerance=1e-4), fp.SequentialQuadratic(tolerance=1e-4))
-    return ocp, data, *((o.step(ocp), o.memory(ocp).start()) for o in pair)
+    return data, *((o.step(ocp), o.memory(ocp).start()) for o in pair)
 
 
 def test_compiled_and_interpreted_steps_are_the_same():

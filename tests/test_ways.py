@@ -7,11 +7,12 @@ import sys
 from dataclasses import replace
 
 import casadi as ca
-import fpirhc as fp
 import numpy as np
 import pytest
-from fpirhc.symbolic.native import find_compiler
 from plants import pendulum
+
+import fpirhc as fp
+from fpirhc.symbolic.native import find_compiler
 
 TRACK = fp.Exponential(rate=6.0)
 MAPS = (

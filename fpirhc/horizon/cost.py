@@ -68,7 +68,7 @@ class Cost(ABC):
         """Raise InvalidProblem with all mistakes of the cost for this plant."""
 
     @abstractmethod
-    def stage(self, view: View) -> dict[str, Expression]:
+    def stage(self, view: View) -> Mapping[str, Expression]:
         """Return the stage cost's terms, each as cost per second."""
 
     @abstractmethod
@@ -210,9 +210,9 @@ class General(Cost):
     def check(self, plant: Plant) -> None:
         """Nothing can be said before the terms are built."""
 
-    def stage(self, view: View) -> dict[str, Expression]:
+    def stage(self, view: View) -> Mapping[str, Expression]:
         """Return the user's terms."""
-        return dict(self.terms(view))
+        return self.terms(view)
 
     def terminal(self, view: View, plant: Plant, linearise: Callable[[], Linearisation], step: float) -> Expression:  # noqa: ARG002
         """Return the user's terminal cost, or zero."""

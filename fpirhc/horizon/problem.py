@@ -115,7 +115,8 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
         raise InvalidProblem(f"cost: {error}") from None
     moved = advance(s[:nx], u, view.parameters.vector)
     following = ca.vertcat(moved, u) if state.size > nx else moved
-    column = horizon.step * ca.vertcat(*terms.values())
+    stacked: Any = ca.vertcat(*terms.values())
+    column = horizon.step * stacked
     lower, upper = limits.state_bounds(plant)
     free = np.full(state.size - nx, np.inf)
     dynamics = ca.Function("fpirhc_dynamics", [s, u, theta], [ca.densify(following)])
@@ -219,7 +220,9 @@ def _nodes(
     """States (of this size), inputs and data along the reference from t = 0."""
     table: Any = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
     data = np.asarray(table.full())
-    given = {name: data[place] for name, place in ((n, data_layout(plant).slice(n)) for n in ("reference", "feedforward"))}
+    given = {
+        name: data[place] for name, place in ((n, data_layout(plant).slice(n)) for n in ("reference", "feedforward"))
+    }
     states = np.vstack([given["reference"], given["feedforward"]])[:size]
     return states, given["feedforward"][:, : horizon.stages], data
 

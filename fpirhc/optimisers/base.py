@@ -2,10 +2,12 @@
 
 A plan's stationarity is measured by our own adjoint gradient g, never by a solver's word:
 
-    stationarity = max |U - clip(U - g / step, lower, upper)|,
+    stationarity = max |U - clip(U - g / (step c), lower, upper)|,
 
-the distance that a projected gradient step would move, with g/step the gradient of the cost rate. It is zero exactly at points
-that satisfy the first-order conditions, bounds active or not. Feasibility is the largest violation of a state bound by the rolled
+how far, in the units of the inputs, a scaled projected gradient step would move some input. c is the curvature of the cost
+rate along each input (`OptimalControl.curvature`), so that the number does not depend on the units of the cost. It is zero
+exactly at points that satisfy the first-order conditions, bounds active or not. A multiplier of a state bound counts only where
+the state is at that bound and with the sign of that bound. Feasibility is the largest violation of a state bound by the rolled
 out plan (inputs are inside their box by construction).
 """
 
@@ -16,7 +18,7 @@ from abc import ABC, abstractmethod
 import casadi as ca
 
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.rollout import reduced_gradient
+from fpirhc.horizon.rollout import reduced_gradient, rollout
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Expression, Layout
 
@@ -74,7 +76,8 @@ def stationarity(
     ocp: OptimalControl, inputs: Expression, gradient: Expression, lower: Expression, upper: Expression
 ) -> Expression:
     """Return the projected residual of a plan (see the module's docstring)."""
-    return largest(inputs - clip(inputs - gradient / ocp.step, lower, upper))
+    scale = ca.repmat(ca.DM(1 / (ocp.step * ocp.curvature)), 1, ocp.stages)
+    return largest(inputs - clip(inputs - scale * gradient, lower, upper))
 
 
 def state_violation(ocp: OptimalControl, states: Expression) -> Expression:
@@ -94,13 +97,40 @@ def judge(ocp: OptimalControl) -> ca.Function:
 
     M (ns, N) are the multipliers of the state bounds; zero without them.
     """
-    gradient = reduced_gradient(ocp)
     inputs, data = ca.MX.sym("U", ocp.input.size, ocp.stages), ca.MX.sym("data", ocp.data.size, ocp.stages + 1)
     s0, lower, upper = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("l", ocp.input.size), ca.MX.sym("u", ocp.input.size)
     multipliers = ca.MX.sym("M", ocp.state.size, ocp.stages)
-    value, slope, states, _ = gradient(s0, inputs, data, multipliers)
+    valid = multipliers
+    if ocp.bounds_states:
+        valid = _valid_multipliers(ocp, rollout(ocp)(s0, inputs, data)[0], multipliers)
+    value, slope, states, _ = reduced_gradient(ocp)(s0, inputs, data, valid)
     results = [value, stationarity(ocp, inputs, slope, lower, upper), state_violation(ocp, states)]
     return ca.Function("fpirhc_judge", [inputs, s0, data, lower, upper, multipliers], results)
+
+
+def _valid_multipliers(ocp: OptimalControl, states: Expression, multipliers: Expression) -> Expression:
+    """Keep what can be a multiplier: positive at the upper bound, negative at the lower one, zero elsewhere."""
+    rows = []
+    for k in range(ocp.state.size):
+        row, given = states[k, 1:], multipliers[k, :]
+        at_upper = row >= ocp.state_upper[k] - FEASIBLE if ocp.state_upper[k] < FINITE else ca.MX.zeros(1, ocp.stages)
+        at_lower = row <= ocp.state_lower[k] + FEASIBLE if ocp.state_lower[k] > -FINITE else ca.MX.zeros(1, ocp.stages)
+        kept = ca.if_else(at_upper, ca.fmax(given, 0), 0) + ca.if_else(at_lower, ca.fmin(given, 0), 0)
+        # fmax and fmin would hide NaN.
+        rows.append(kept + ca.if_else(ca.fabs(given) <= FINITE, 0, given))
+    return ca.vertcat(*rows)
+
+
+def sane(s0: Expression, data: Expression, lower: Expression, upper: Expression) -> Expression:
+    """1 when a problem can be posed: finite first state and data, and a box that is not empty; 0 otherwise (NaN included)."""
+    ordered = ca.logic_and(ca.mmin(lower <= upper), ca.logic_and(ca.mmin(lower <= FINITE), ca.mmin(upper >= -FINITE)))
+    return ca.logic_and(is_finite(ca.vertcat(s0, ca.vec(data))), ordered)
+
+
+def remembered_plan(column: Expression, size: int, lower: Expression, upper: Expression) -> Expression:
+    """The remembered plan (size, N) inside its box; a poisoned memory is forgotten, for zero inputs."""
+    usable = ca.if_else(is_finite(column), column, 0)
+    return clip(ca.reshape(usable, size, column.numel() // size), lower, upper)
 
 
 def status_of(finite: Expression, residual: Expression, violation: Expression, tolerance: float) -> Expression:

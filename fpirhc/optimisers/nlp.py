@@ -20,12 +20,23 @@ import casadi as ca
 from fpirhc.errors import InvalidValue, NotSupported, nearest
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
-from fpirhc.optimisers.base import UNKNOWN_ITERATIONS, Optimiser, clip, is_finite, judge, shift, status_of
+from fpirhc.optimisers.base import (
+    UNKNOWN_ITERATIONS,
+    Optimiser,
+    clip,
+    is_finite,
+    judge,
+    remembered_plan,
+    sane,
+    shift,
+    status_of,
+)
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 Options = dict[str, Any]
 _QUIET: Options = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
+_LARGEST_MULTIPLIER = 1e12
 
 
 @dataclass(frozen=True)
@@ -131,12 +142,15 @@ class _MultipleShooting(Optimiser):
     def step(self, ocp: OptimalControl) -> ca.Function:
         """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory).
 
-        Solvers misbehave on arguments that are not finite, so they are not called then.
+        Solvers misbehave on numbers that are not finite, so they are not called when the arguments, or the program at its
+        first guess, are not.
         """
-        s0, data, lower, upper, memory = arguments = self._arguments(ocp)
-        sane = is_finite(ca.vertcat(s0, ca.vec(data)))
+        s0, data, lower, upper, _ = arguments = self._arguments(ocp)
+        start, states = self._guess(ocp)(*arguments)
+        begin = _program_values(ocp)(_interleave(states, start), ca.vec(data))
+        usable = ca.logic_and(sane(s0, data, lower, upper), is_finite(begin))
         run, skip = self._solve(ocp, "fpirhc_shooting"), self._skip(ocp)
-        results = ca.Function.if_else("fpirhc_guarded_shooting", run, skip)(sane, s0, data, lower, upper, memory)
+        results = ca.Function.if_else("fpirhc_guarded_shooting", run, skip)(usable, *arguments)
         return ca.Function("fpirhc_shooting_step", arguments, list(results))
 
     def _arguments(self, ocp: OptimalControl) -> list[ca.MX]:
@@ -146,32 +160,42 @@ class _MultipleShooting(Optimiser):
         return [*symbols, ca.MX.sym("memory", self.memory(ocp).size)]
 
     def _skip(self, ocp: OptimalControl) -> ca.Function:
-        """The remembered plan, with status NON_FINITE and forgotten multipliers."""
+        """The remembered plan, with status NON_FINITE (INFEASIBLE for an empty box) and forgotten multipliers."""
         layout = self.memory(ocp)
-        arguments = self._arguments(ocp)
-        start = _remembered(ocp, layout, arguments[-1], arguments[2], arguments[3])
-        diagnostics = ca.vertcat(ca.MX.zeros(3), UNKNOWN_ITERATIONS, int(Status.NON_FINITE))
+        _, _, lower, upper, memory = arguments = self._arguments(ocp)
+        start = remembered_plan(layout.split(memory)["plan_inputs"], ocp.input.size, lower, upper)
+        status = ca.if_else(ca.mmax(lower - upper) > 0, int(Status.INFEASIBLE), int(Status.NON_FINITE))
+        diagnostics = ca.vertcat(ca.MX.zeros(3), UNKNOWN_ITERATIONS, status)
         forgotten = {name: ca.MX.zeros(layout[name].size) for name in layout.names}
         kept = layout.join({**forgotten, "plan_inputs": ca.vec(shift(start))})
         return ca.Function("fpirhc_shooting_skip", arguments, [start, diagnostics, kept])
+
+    def _guess(self, ocp: OptimalControl) -> ca.Function:
+        """Function of the step's arguments -> (U, S): the remembered plan, or one that the model survives."""
+        s0, data, lower, upper, memory = arguments = self._arguments(ocp)
+        plan = remembered_plan(self.memory(ocp).split(memory)["plan_inputs"], ocp.input.size, lower, upper)
+        still = clip(ca.MX.zeros(ocp.input.size, ocp.stages), lower, upper)
+        survives = is_finite(rollout(ocp)(s0, plan, data)[0])
+        start = ca.if_else(survives, plan, still)
+        states, _, _ = rollout(ocp)(s0, start, data)
+        # An unstable model may overflow under any open-loop plan; standing still is then the better first guess.
+        guess = ca.if_else(is_finite(states), states, ca.repmat(s0, 1, ocp.stages + 1))
+        return ca.Function("fpirhc_shooting_guess", arguments, [start, guess])
 
     def _solve(self, ocp: OptimalControl, name: str) -> ca.Function:
         n, layout = ocp.stages, self.memory(ocp)
         s0, data, lower, upper, memory = arguments = self._arguments(ocp)
         kept = layout.split(memory)
-        start = _remembered(ocp, layout, memory, lower, upper)
-        states, _, _ = rollout(ocp)(s0, start, data)
-        # An unstable model may overflow under the old plan; standing still is then the better first guess.
-        guess = ca.if_else(is_finite(states), states, ca.repmat(s0, 1, n + 1))
+        start, states = self._guess(ocp)(*arguments)
         solution = self.solver(ocp, _program(ocp))(
-            x0=_interleave(guess, start),
+            x0=_interleave(states, start),
             p=ca.vec(data),
             lbx=_interleave(_bound(ocp, s0, ocp.state_lower), ca.repmat(lower, 1, n)),
             ubx=_interleave(_bound(ocp, s0, ocp.state_upper), ca.repmat(upper, 1, n)),
             lbg=0,
             ubg=0,
-            lam_x0=kept["plan_variable_multipliers"],
-            lam_g0=kept["plan_dynamics_multipliers"],
+            lam_x0=_usable(kept["plan_variable_multipliers"]),
+            lam_g0=_usable(kept["plan_dynamics_multipliers"]),
         )
         found = clip(_separate(ocp, solution["x"])[1], lower, upper)
         multipliers = _separate(ocp, solution["lam_x"])[0][:, 1:] * int(ocp.bounds_states)
@@ -194,7 +218,7 @@ class _MultipleShooting(Optimiser):
 class InteriorPoint(_MultipleShooting):
     """IPOPT: the interior-point method that most tools use by default.
 
-    Parameters: tolerance of our stationarity; accuracy that IPOPT is asked for; iterations it may use.
+    Parameters: tolerance of our stationarity, in the unit of the inputs; accuracy that IPOPT is asked for; iterations it may use.
     """
 
     accuracy: float = 1e-8
@@ -262,10 +286,17 @@ class SequentialQuadratic(_MultipleShooting):
         return ca.nlpsol("fpirhc_sqp", "sqpmethod", dict(program), options)
 
 
-def _remembered(ocp: OptimalControl, layout: Layout, memory: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
-    """The plan to start from, inside today's box."""
-    plan = ca.reshape(layout.split(memory)["plan_inputs"], ocp.input.size, ocp.stages)
-    return clip(plan, lower, upper)
+def _usable(multipliers: Expression) -> Expression:
+    """Forget multipliers that are not finite or absurdly large: they would poison a warm start."""
+    return ca.if_else(ca.fabs(multipliers) <= _LARGEST_MULTIPLIER, multipliers, 0)
+
+
+def _program_values(ocp: OptimalControl) -> ca.Function:
+    """Function (w, p) -> cost, constraints and their first derivatives in one column."""
+    program = _program(ocp)
+    slopes = ca.gradient(program["f"], program["x"]), ca.jacobian(program["g"], program["x"])
+    column = ca.vertcat(program["f"], program["g"], ca.densify(slopes[0]), slopes[1].nz[:])
+    return ca.Function("fpirhc_program_values", [program["x"], program["p"]], [column])
 
 
 def _sizes(ocp: OptimalControl) -> tuple[int, int]:
@@ -312,9 +343,9 @@ def _program(ocp: OptimalControl) -> dict[str, ca.MX]:
 
 
 def _gauss_newton(ocp: OptimalControl, program: Mapping[str, ca.MX]) -> ca.Function:
-    """Function (x, p, lam_f, lam_g) -> Hessian of the cost alone, block by block."""
+    """Function (x, p, lam_f, lam_g) -> Hessian of the cost alone, block by block (both triangles, as SQP wants it)."""
     hessian, _ = ca.hessian(program["f"], program["x"])
     weight, multipliers = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", _sizes(ocp)[1])
     inputs = [program["x"], program["p"], weight, multipliers]
     names = ["x", "p", "lam_f", "lam_g"]
-    return ca.Function("nlp_hess_l", inputs, [ca.triu(weight * hessian)], names, ["triu_hess_gamma_x_x"])
+    return ca.Function("nlp_hess_l", inputs, [weight * hessian], names, ["hess_gamma_x_x"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -10,7 +11,10 @@ import numpy as np
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.base import Optimiser, judge
+from fpirhc.optimisers.multipliers import fit_multipliers
 from fpirhc.status import Status
+
+_SHRINKING = 0.9  # a violation counts as shrinking below this share of the last one
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +37,15 @@ class Plan:
     _data: np.ndarray
     _bounds: tuple[np.ndarray, np.ndarray]
 
+    @cached_property
+    def state_multipliers(self) -> np.ndarray:
+        """Multipliers of the state bounds, shape (ns, N), fitted to the plan itself: the optimiser is not asked."""
+        return fit_multipliers(self._ocp, self.inputs, self.states[:, 0], self._data, self._bounds)
+
     def verify(self) -> tuple[float, float, float]:
-        """Recompute (cost, stationarity, feasibility) from the problem's own functions, without state multipliers."""
+        """Recompute (cost, stationarity, feasibility) from the problem's own functions."""
         ocp = self._ocp
-        none = np.zeros((ocp.state.size, ocp.stages))
-        found = judge(ocp)(self.inputs, self.states[:, 0], self._data, *self._bounds, none)
+        found = judge(ocp)(self.inputs, self.states[:, 0], self._data, *self._bounds, self.state_multipliers)
         cost, stationarity, feasibility = (float(v) for v in found)
         return cost, stationarity, feasibility
 
@@ -53,6 +61,8 @@ def solve(
 ) -> Plan:
     """Solve one horizon open loop: call the optimiser's step until its status is OK, at most `calls` times.
 
+    A plan that violates a state bound is improved further as long as the violation shrinks.
+
     Parameters: `state` s_0 (ns,), `data` (ntheta, N + 1), `start` a first plan (nu, N), zero when not given.
 
     Raises:
@@ -67,7 +77,8 @@ def solve(
     status, count = Status.NOT_CONVERGED, 0
     diagnostics = np.zeros(5)
     iterations = 0.0
-    while status == Status.NOT_CONVERGED and count < calls:
+    violation, better = np.inf, True
+    while status in (Status.NOT_CONVERGED, Status.INFEASIBLE) and better and count < calls:
         # The memory comes back shifted for the next cycle; the same horizon is solved again, so the plan is put back.
         memory[place] = inputs.ravel(order="F")
         given = step(state, data, *bounds, memory)
@@ -75,6 +86,8 @@ def solve(
         diagnostics, memory = diagnostics.ravel(), memory.ravel()
         iterations += diagnostics[3]
         status, count = Status(int(diagnostics[4])), count + 1
+        better = status == Status.NOT_CONVERGED or diagnostics[2] < _SHRINKING * violation
+        violation = diagnostics[2]
     states = np.asarray(rollout(ocp)(state, inputs, data)[0].full())
     return Plan(
         inputs,

@@ -2,8 +2,10 @@
 
 Lagrange's reduced gradient, found by one adjoint sweep, with projection on the input box and a line search. The step length is
 the spectral one of Barzilai and Borwein, the line search non-monotone over the last values (Birgin, Martinez and Raydan's
-spectral projected gradient): U+ = clip(U - gamma g) if it decreases enough, else gamma is divided by four and the next iteration
-tries again from the same plan.
+spectral projected gradient): U+ = clip(U - gamma D g) if it decreases enough, else gamma is divided by four and the next
+iteration tries again from the same plan. D = 1 / (step c) scales by the curvature c along each input
+(`OptimalControl.curvature`), so that gamma is a number near 1 and neither the units of the inputs nor the size of the weights
+matter.
 
 Every call does the same amount of work: one gradient per iteration.
 
@@ -19,13 +21,16 @@ import casadi as ca
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient
-from fpirhc.optimisers.base import Optimiser, clip, is_finite, judge, shift, status_of
-from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.optimisers.base import Optimiser, clip, is_finite, judge, remembered_plan, sane, shift, status_of
+from fpirhc.status import Status
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 _HISTORY = 5  # values that the non-monotone line search compares with
 _DECREASE = 1e-4
 _SHORTER = 0.25  # factor of the step length after a rejected step
-_SHORTEST, _LONGEST = 1e-10, 1e10  # bounds of the spectral step length
+_SHORTEST, _LONGEST = 1e-6, 1e6  # bounds of the spectral step length
+_FIRST = 0.25  # below 1, because inputs of neighbouring stages add up
+_TINY = 1e-300
 
 
 @dataclass(frozen=True)
@@ -33,7 +38,7 @@ class ReducedGradient(Optimiser):
     """Projected spectral gradient with a fixed number of iterations per call.
 
     Parameters:
-        iterations: per call. tolerance: of the stationarity below which a plan counts as converged.
+        iterations: per call. tolerance: of the stationarity (in the unit of the inputs), below which a plan is converged.
 
     Raises:
         InvalidValue: fewer than one iteration, or a tolerance that is not positive.
@@ -71,31 +76,44 @@ class ReducedGradient(Optimiser):
         s0, data = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size, n + 1)
         lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
         memory = ca.MX.sym("memory", nu * n + 1)
-        start = clip(ca.reshape(memory[: nu * n], nu, n), lower, upper)
+        start = remembered_plan(memory[: nu * n], nu, lower, upper)
         none = ca.MX.zeros(ocp.state.size, n)
         value, slope, _, _ = reduced_gradient(ocp)(s0, start, data, none)
-        length = ca.if_else(memory[-1] > 0, memory[-1], _first_length(start, slope, lower, upper))
+        known = ca.logic_and(memory[-1] >= _SHORTEST, memory[-1] <= _LONGEST)
+        length = ca.if_else(known, memory[-1], _FIRST)
         begin = (start, ca.repmat(value, _HISTORY, 1), length, start, value, slope)
         state = ca.vertcat(*(ca.vec(v) for v in begin))
         iterate = self._iteration(ocp).fold(self.iterations)
         repeated = [ca.repmat(v, 1, self.iterations) for v in (s0, ca.vec(data), lower, upper)]
         final = iterate(state, *repeated)
         best, length = ca.reshape(_part(ocp, final, 3), nu, n), _part(ocp, final, 2)
-        return self._finish(ocp, (s0, data, lower, upper, memory), start, best, length)
+        survives = is_finite(ca.vertcat(value, ca.vec(slope)))
+        return self._finish(ocp, (s0, data, lower, upper, memory), start, survives, best, length)
 
     def _finish(
-        self, ocp: OptimalControl, arguments: tuple[ca.MX, ...], start: ca.MX, best: ca.MX, length: ca.MX
+        self,
+        ocp: OptimalControl,
+        arguments: tuple[ca.MX, ...],
+        start: Expression,
+        survives: Expression,
+        best: ca.MX,
+        length: ca.MX,
     ) -> ca.Function:
         s0, data, lower, upper, memory = arguments
+        posed = sane(s0, data, lower, upper)
         none = ca.MX.zeros(ocp.state.size, ocp.stages)
         cost, residual, violation = judge(ocp)(best, s0, data, lower, upper, none)
-        finite = is_finite(ca.vertcat(ca.vec(best), cost, residual))
+        finite = ca.logic_and(posed, is_finite(ca.vertcat(ca.vec(best), cost, residual)))
         plan = _choose(finite, best, start)
         iterations = ca.MX(self.iterations)
-        status = status_of(finite, residual, violation, self.tolerance)
+        empty = ca.mmax(lower - upper) > 0
+        status = ca.if_else(empty, int(Status.INFEASIBLE), status_of(finite, residual, violation, self.tolerance))
         told = _choose(finite, ca.vertcat(cost, residual, violation), ca.MX.zeros(3))
         diagnostics = ca.vertcat(told, iterations, status)
-        kept = ca.vertcat(ca.vec(shift(plan)), ca.if_else(finite, length, 0))
+        # A remembered plan under which a well-posed problem overflows is given up, so that the next call can succeed.
+        lost = ca.logic_and(posed, ca.logic_not(ca.logic_or(finite, survives)))
+        following = ca.if_else(lost, clip(0 * plan, lower, upper), shift(plan))
+        kept = ca.vertcat(ca.vec(following), ca.if_else(finite, length, 0))
         return ca.Function("fpirhc_reduced_gradient", [s0, data, lower, upper, memory], [plan, diagnostics, kept])
 
     def _iteration(self, ocp: OptimalControl) -> ca.Function:
@@ -108,13 +126,14 @@ class ReducedGradient(Optimiser):
         inputs, slope = (ca.reshape(_part(ocp, state, k), nu, n) for k in (0, 5))
         values, length = _part(ocp, state, 1), _part(ocp, state, 2)
         best, lowest = ca.reshape(_part(ocp, state, 3), nu, n), _part(ocp, state, 4)
-        following = clip(inputs - length * slope, lower, upper)
+        scale = _scale(ocp)
+        following = clip(inputs - length * scale * slope, lower, upper)
         move = following - inputs
         value, new_slope, _, _ = reduced_gradient(ocp)(s0, following, data, ca.MX.zeros(ocp.state.size, n))
         # NaN compares false, so a rollout that overflows is rejected like one that does not decrease enough.
         enough = value <= ca.mmax(values) + _DECREASE * ca.dot(slope, move)
         accepted = ca.logic_and(enough, is_finite(ca.vertcat(value, ca.vec(new_slope))))
-        spectral = _spectral_length(move, new_slope - slope, length)
+        spectral = _spectral_length(move, scale, new_slope - slope, length)
         better = ca.logic_and(accepted, value <= lowest)
         result = ca.vertcat(
             ca.vec(_choose(accepted, following, inputs)),
@@ -135,20 +154,19 @@ def _part(ocp: OptimalControl, state: ca.MX, k: int) -> ca.MX:
     return state[ends[k] : ends[k + 1]]
 
 
-def _choose(condition: ca.MX, yes: ca.MX, no: ca.MX) -> ca.MX:
+def _choose(condition: Expression, yes: Expression, no: Expression) -> Expression:
     """Entry-wise choice that keeps NaN of the branch not taken out of the result."""
     return ca.if_else(condition, yes, no)
 
 
-def _first_length(inputs: ca.MX, slope: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
-    """A step length whose largest projected move is of the size of the largest gradient entry's inverse."""
-    move = clip(inputs - slope, lower, upper) - inputs
-    return 1 / ca.fmax(ca.norm_inf(ca.vec(move)), 1e-8)
+def _scale(ocp: OptimalControl) -> ca.DM:
+    """D for every entry of a plan, shape (nu, N)."""
+    return ca.repmat(ca.DM(1 / (ocp.step * ocp.curvature)), 1, ocp.stages)
 
 
-def _spectral_length(move: ca.MX, change: ca.MX, before: ca.MX) -> ca.MX:
-    """Barzilai-Borwein: <move, move> / <move, change>, kept where the curvature is not positive."""
-    curvature, size = ca.dot(move, change), ca.dot(move, move)
-    usable = ca.logic_and(curvature > 1e-300, size > 0)
+def _spectral_length(move: ca.MX, scale: ca.DM, change: ca.MX, before: ca.MX) -> ca.MX:
+    """Barzilai-Borwein: <move, move / D> / <move, change>, kept where the curvature is not positive."""
+    curvature, size = ca.dot(move, change), ca.dot(move, move / scale)
+    usable = ca.logic_and(curvature > _TINY, size > _TINY)
     length = size / ca.if_else(usable, curvature, 1)
     return ca.if_else(usable, ca.fmin(ca.fmax(length, _SHORTEST), _LONGEST), before)
