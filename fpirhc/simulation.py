@@ -7,19 +7,17 @@ so Python is entered once per chunk: to fill in disturbances, to check that all 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.describe import describe
-from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
+from fpirhc.judgement import judgements
 from fpirhc.loop import close_loop
 from fpirhc.problem import Problem
 from fpirhc.run import Run
 from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.layout import Layout, Signal
+from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native
 
 CHUNK = 500  # cycles per call: long enough to hide Python, short enough for progress and Ctrl-C
@@ -48,10 +46,9 @@ def simulate(
     backend = native(chunked) if compiled else None
     evaluator = Evaluator(backend.function if backend else chunked)
     log, stop = _run_chunks(problem, loop.memory, loop.trace, evaluator, seed, progress)
-    layout = loop.trace
-    if problem.cost is not None and problem.horizon is not None:
-        costs = _costs(problem, layout, log)
-        layout, log = layout + Layout((costs[0],)), np.hstack([log, costs[1]])
+    found = judgements(problem, chosen, loop.trace, log)
+    layout = loop.trace + Layout(tuple(signal for signal, _ in found))
+    log = np.hstack([log, *(values for _, values in found)])
     log.setflags(write=False)
     step_limit = chosen.adaptive.largest_step()
     settings = {
@@ -118,43 +115,3 @@ def _why(trace: Layout, cycle: int, column: int, period: float) -> str:
         f"signal '{trace.columns[column]}' is not finite at t = {cycle * period:g} s (cycle {cycle}); "
         "the run keeps what came before"
     )
-
-
-def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, np.ndarray]:
-    """The stage cost of every cycle by term, at the actual state and command, with the exact parameters.
-
-    All controllers of a problem are judged by the same cost, whatever they believe: effort relative to a feedforward
-    means the plant's own.
-    """
-    assert problem.horizon is not None
-    assert problem.cost is not None
-    plant = problem.plant
-    one_cycle = replace(problem.horizon, stages=1, step=problem.period)
-    ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits)
-    data_of = stage_data(plant, problem.reference, one_cycle, problem.cost)
-    states, commands = log[:, layout.slice("state")], log[:, layout.slice("command")]
-    if ocp.state.size > plant.state.size:
-        states = np.hstack([states, np.vstack([commands[:1], commands[:-1]])])
-    times = log[:, layout.slice("time")]
-    function = _cost_function(ocp, data_of, CHUNK)
-    evaluator = Evaluator(function)
-    found = np.empty((log.shape[0], len(ocp.terms)))
-    evaluator.arguments[3][:] = plant.exact
-    for at in range(0, log.shape[0], CHUNK):
-        size = min(CHUNK, log.shape[0] - at)
-        for argument, source in zip(evaluator.arguments, (times, states, commands), strict=False):
-            argument.reshape(CHUNK, -1)[:size] = source[at : at + size]
-        evaluator.evaluate()
-        found[at : at + size] = evaluator.results[0].reshape(CHUNK, -1)[:size]
-    return Signal("cost", tuple(ocp.terms)), found
-
-
-def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int) -> ca.Function:
-    """Function (times, states, inputs, parameters) -> cost terms of `count` cycles."""
-    t, s = ca.MX.sym("t"), ca.MX.sym("s", ocp.state.size)
-    u, p = ca.MX.sym("u", ocp.input.size), ca.MX.sym("p", data_of.size1_in(1))
-    one = ca.Function("fpirhc_cost", [t, s, u, p], [ocp.stage_cost(s, u, data_of(t, p)[:, 0])[1]])
-    times, states = ca.MX.sym("t", 1, count), ca.MX.sym("s", ocp.state.size, count)
-    inputs = ca.MX.sym("u", ocp.input.size, count)
-    given = one.map(count)(times, states, inputs, ca.repmat(p, 1, count))
-    return ca.Function("fpirhc_costs", [times, states, inputs, p], [given])

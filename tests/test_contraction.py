@@ -281,3 +281,15 @@ def test_identified_factor_needs_excitation() -> None:
     assert math.isnan(identified_factor(along, along, 0.5))
     assert math.isnan(identified_factor(along[:3], along[:3], 0.5))
     assert math.isnan(identified_factor(along[:0], along[:0], 0.5))
+
+
+def test_contraction_along_a_run_is_logged_per_cycle():
+    """The signal is the predicted factor at each cycle's own state and request: constant on two_mass, 1 - a lambda_min."""
+    import fpirhc as fp
+
+    task = fp.load_problem("two_mass")
+    run = fp.simulate(task.problem, task.controllers["CTC+FPI (eq 6)"], seed=0)
+    assert run["contraction"].shape == (run.cycles, 1)
+    gain = task.controllers["CTC+FPI (eq 6)"].deformation.effective_gain()
+    np.testing.assert_allclose(run["contraction"], 1 - gain * 1.3, rtol=1e-9)
+    assert "contraction" not in fp.simulate(task.problem, task.controllers["CTC"], seed=0).layout

@@ -8,13 +8,20 @@ multiplied by I - a J in every cycle, so the iteration converges when |1 - a lam
 from fpirhc.contraction.gains import linear_limit, optimal_gain, predicted_factor, sector_limit
 from fpirhc.contraction.identified import identified_factor
 from fpirhc.contraction.report import ContractionReport, assess_gain, check_gain
-from fpirhc.contraction.spectrum import Spectrum, response_jacobian, spectrum_over_box, spectrum_over_run
+from fpirhc.contraction.spectrum import (
+    Spectrum,
+    contraction_along,
+    response_jacobian,
+    spectrum_over_box,
+    spectrum_over_run,
+)
 
 __all__ = [
     "ContractionReport",
     "Spectrum",
     "assess_gain",
     "check_gain",
+    "contraction_along",
     "identified_factor",
     "linear_limit",
     "optimal_gain",

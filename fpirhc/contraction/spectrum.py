@@ -119,12 +119,38 @@ def spectrum_over_box(
     return _spectrum(plant, states[rows], deformed[rows], parameters, None)
 
 
-def _spectrum(plant: Plant, states: Array, deformed: Array, exact: Array, approximate: Array | None) -> Spectrum:
+def contraction_along(
+    plant: Plant, states: Array, deformed: Array, effective_gain: float, *, approximate: Array | None = None
+) -> Array:
+    """Return the predicted factor max|1 - a lambda| of every cycle of a run, shape (cycles,); NaN-free.
+
+    Long runs are evaluated at `LARGEST_SAMPLE` cycles, and in between the last value holds. Where J is singular or not
+    finite nothing contracts: the factor is 1.
+
+    Raises:
+        InvalidShape: arrays that do not fit the plant or each other.
+    """
+    states, deformed = _checked_rows(plant, states, deformed)
+    rows = np.unique(np.linspace(0, len(states) - 1, min(len(states), LARGEST_SAMPLE)).astype(int))
+    exact = np.repeat(plant.exact[None, :], len(rows), axis=0)
+    jacobians = _jacobians(plant, states[rows], deformed[rows], exact, approximate)
+    finite = np.isfinite(jacobians).all(axis=(1, 2))
+    factors = np.ones(len(rows))
+    factors[finite] = np.abs(1 - effective_gain * np.linalg.eigvals(jacobians[finite])).max(axis=1)
+    return factors[np.searchsorted(rows, np.arange(len(states)), side="right") - 1]
+
+
+def _jacobians(plant: Plant, states: Array, deformed: Array, exact: Array, approximate: Array | None) -> Array:
+    """J of every row, shape (rows, n, n)."""
     model = plant.approximate if approximate is None else np.asarray(approximate, dtype=float)
     function, n = response_jacobian(plant), deformed.shape[1]
     count = len(states)
     stacked = function.map(count)(states.T, deformed.T, exact.T, np.repeat(model[:, None], count, axis=1))
-    jacobians = np.asarray(stacked.full()).reshape((n, count, n)).transpose(1, 0, 2)
+    return np.asarray(stacked.full()).reshape((n, count, n)).transpose(1, 0, 2)
+
+
+def _spectrum(plant: Plant, states: Array, deformed: Array, exact: Array, approximate: Array | None) -> Spectrum:
+    jacobians = _jacobians(plant, states, deformed, exact, approximate)
     finite = jacobians[np.isfinite(jacobians).all(axis=(1, 2))]
     return Spectrum(np.linalg.eigvals(finite))
 
