@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any
 
 import casadi as ca
-import numpy as np
 
 from fpirhc.controllers.base import Controller, like, prepared
 from fpirhc.plant import Plant
@@ -44,14 +43,18 @@ def _plant_delays(problem: Problem, controller: Controller) -> list[Delay]:
     start = tuple(float(v) for v in problem.start_state)
     approximate = tuple(float(v) for v in controller.parameters(plant))
     exact = tuple(float(v) for v in plant.exact)
-    realised = plant.response_signal("_realised_before")
-    resting = plant.controlled_response_function(start, np.zeros(plant.input.size), exact).full().ravel()
     return [
         Delay(Signal("_state_before", plant.state.elements, plant.state.units, start), "_state_after"),
-        Delay(Signal(realised.name, realised.elements, realised.units, tuple(map(float, resting))), "_realised_after"),
+        Delay(like(plant.input, "_acting_before"), "_acting"),
+        Delay(_forcing(plant, "_forcing_before"), "_forcing"),
         Delay(Signal("parameters", plant.parameter.elements, plant.parameter.units, approximate), "parameters"),
         Delay(Signal("_exact", plant.parameter.elements, plant.parameter.units, exact), "_exact"),
     ]
+
+
+def _forcing(plant: Plant, name: str) -> Signal:
+    """What disturbances add to the response of every coordinate."""
+    return Signal(name, plant.names, plant.response_units)
 
 
 def _clock_block(period: float) -> Block:
@@ -64,32 +67,39 @@ def _clock_block(period: float) -> Block:
 
 
 def _sense_block(plant: Plant) -> Block:
-    """What the controller measures: the true state and the true response just before this cycle's command."""
-    before = like(plant.state, "_state_before"), plant.response_signal("_realised_before")
-    after = plant.state, plant.response_signal("realised")
+    """What the controller measures: the true state, and the true response just before this cycle's command.
+
+    The response is computed here and not at the end of the last cycle, because it shares its costly terms with the first
+    Runge-Kutta evaluation of this cycle.
+    """
+    response = plant.controlled_response_function
+    reads = (
+        like(plant.state, "_state_before"),
+        like(plant.input, "_acting_before"),
+        _forcing(plant, "_forcing_before"),
+        like(plant.parameter, "_exact"),
+    )
 
     def step(s: Any) -> dict[str, Expression]:
-        return {"state": s._state_before, "realised": s._realised_before}
+        forcing = s._forcing_before[list(plant.controlled_indices)]
+        return {"state": s._state_before, "realised": response(s._state_before, s._acting_before, s._exact) + forcing}
 
-    return Block("sense", Layout(before), Layout(after), step)
+    return Block("sense", Layout(reads), Layout((plant.state, plant.response_signal("realised"))), step)
 
 
 def _advance_block(problem: Problem, disturbed: tuple[Signal, ...]) -> Block:
-    """The exact plant over one period with the command held, and the response at its end."""
+    """The exact plant over one period with the command held."""
     plant = problem.plant
     advance = problem.integrator.step(plant, problem.period)
-    response = plant.controlled_response_function
     reads = (plant.state, plant.input, like(plant.parameter, "_exact"), *disturbed)
-    writes = (like(plant.state, "_state_after"), plant.response_signal("_realised_after"))
+    writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
 
     def step(s: Any) -> dict[str, Expression]:
         u, w = s.command, ca.DM.zeros(len(plant.names))
         if disturbed:
-            acting = dict(zip(problem.disturbances, ca.vertsplit(s.disturbance), strict=True))
-            u = u + ca.vertcat(*(acting.get(name, 0) for name in plant.inputs))
-            w = ca.vertcat(*(acting.get(name, 0) for name in plant.names))
-        following = advance(s.state, u, s._exact, w)
-        realised = response(following, u, s._exact) + w[list(plant.controlled_indices)]
-        return {"_state_after": following, "_realised_after": realised}
+            added = dict(zip(problem.disturbances, ca.vertsplit(s.disturbance), strict=True))
+            u = u + ca.vertcat(*(added.get(name, 0) for name in plant.inputs))
+            w = ca.vertcat(*(added.get(name, 0) for name in plant.names))
+        return {"_state_after": advance(s.state, u, s._exact, w), "_acting": u, "_forcing": w}
 
     return Block("advance", Layout(reads), Layout(writes), step, opaque=problem.integrator.opaque)

@@ -79,14 +79,14 @@ def _run_chunks(
     cycles = problem.cycles
     padded = -(-cycles // CHUNK) * CHUNK
     table = disturbance_table(problem, seed, padded)
-    log = np.empty((cycles, trace.size))
+    log = np.empty((padded, trace.size))
     evaluator.arguments[0][:] = memory.start()
     for at in range(0, cycles, CHUNK):
         if table.shape[1]:
             evaluator.arguments[1].reshape(CHUNK, -1)[:] = table[at : at + CHUNK]
+        evaluator.redirect(1, log[at : at + CHUNK])
         evaluator.evaluate()
-        rows = evaluator.results[1].reshape(CHUNK, trace.size)[: cycles - at]
-        log[at : at + rows.shape[0]] = rows
+        rows = log[at : min(at + CHUNK, cycles)]
         bad = _first_bad(rows)
         if bad is not None:
             row, column = bad
@@ -94,7 +94,7 @@ def _run_chunks(
         evaluator.arguments[0][:] = evaluator.results[0].reshape(CHUNK, memory.size)[-1]
         if progress:
             progress(at + rows.shape[0], cycles)
-    return log, None
+    return log[:cycles], None
 
 
 def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import pickle
 import stat
 
 import casadi as ca
@@ -115,7 +116,7 @@ def test_no_compiler_is_announced(cache, monkeypatch):
     found = native(function)
     assert not found.compiled
     assert found.function is function
-    assert "no C compiler" in found.reason
+    assert "FPIRHC_CC=none" in found.reason
 
 
 def test_failing_compiler_falls_back_with_its_message(cache, monkeypatch, tmp_path):
@@ -176,5 +177,57 @@ def test_evaluator_densifies_and_checks_shapes():
     np.testing.assert_array_equal(evaluator(np.array([1.0, 2.0]))[0], np.diag([1.0, 2.0]))
     with pytest.raises(ValueError, match="argument 'x' has 2 entries"):
         evaluator(np.ones(3))
-    with pytest.raises(ValueError, match="takes 1 arguments, got 2"):
+    with pytest.raises(ValueError, match=r"expected 1 arguments \(x\), got 2"):
         evaluator(np.ones(2), 1.0)
+
+
+def test_results_can_be_redirected_into_a_log():
+    """The log is filled in place; an array that does not fit is refused, because only its address is kept."""
+    evaluator = Evaluator(model(2.0))
+    log = np.zeros((2, 3))
+    for k in range(2):
+        evaluator.arguments[0][:] = k
+        evaluator.redirect(0, log[k])
+        evaluator.evaluate()
+    np.testing.assert_array_equal(log, [model(2.0)(k).full().ravel() for k in (np.zeros(3), np.ones(3))])
+    for wrong in (np.zeros(2), np.zeros(3, dtype=np.float32), np.zeros((3, 2))[:, 0]):
+        with pytest.raises(ValueError, match="contiguous float64"):
+            evaluator.redirect(0, wrong)
+
+
+def test_a_matrix_is_given_transposed_and_a_refused_call_changes_nothing():
+    """A (2, 3) matrix that is not transposed would be scrambled without a word."""
+    a, b = ca.SX.sym("a", 2, 3), ca.SX.sym("b")
+    evaluator = Evaluator(ca.Function("fpirhc_scaled", [b, a], [b * a], ["b", "a"], ["c"]))
+    matrix = np.arange(6.0).reshape(2, 3)
+    np.testing.assert_array_equal(evaluator(2.0, matrix.T)[0], 2 * matrix.T)
+    with pytest.raises(ValueError, match="given transposed"):
+        evaluator(7.0, matrix)
+    with pytest.raises(ValueError, match="not made of numbers"):
+        evaluator(7.0, "matrix")
+    assert evaluator.arguments[0] == 2.0
+
+
+def test_an_evaluator_stays_in_its_process():
+    """Its arrays are bound by address: a copy would write into the memory of another."""
+    with pytest.raises(TypeError, match="cannot be copied"):
+        pickle.dumps(Evaluator(model(1.0)))
+
+
+@needs_compiler
+def test_a_compiled_function_cannot_be_written_as_c_again():
+    """It is kept as it is; inside another Function the reason says what to do."""
+    compiled = native(model(2.0)).function
+    assert native(compiled).compiled
+    x = ca.MX.sym("x", 3)
+    found = native(ca.Function("fpirhc_outer", [x], [compiled(x)]))
+    assert not found.compiled
+    assert "compile the whole instead" in found.reason
+
+
+def test_a_compiler_asked_for_is_never_replaced(monkeypatch):
+    """A missing FPIRHC_CC is announced by name, and no other compiler is taken."""
+    monkeypatch.setenv("FPIRHC_CC", "no-such-compiler")
+    found = native(model(3.0))
+    assert not found.compiled
+    assert "'no-such-compiler', asked for by FPIRHC_CC, was not found" in found.reason

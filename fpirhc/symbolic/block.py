@@ -126,7 +126,7 @@ def compose(
         ["memory_next", "trace", *outputs],
     )
     if not any(b.opaque for b in blocks):
-        function = function.expand(PREFIX + name)
+        function = _scalar_code(function)
     return Composite(name, tuple(blocks), tuple(delays), reads, memory, trace, function)
 
 
@@ -190,6 +190,13 @@ def _call(block: Block, known: dict[str, Expression], following: dict[str, Expre
             raise InvalidName(f"block '{block.name}' writes '{name}', which is already written")
         known[name] = results[name]
     following.update({m: results[f"{m}_next"] for m in block.memory.names})
+
+
+def _scalar_code(function: ca.Function) -> ca.Function:
+    """Write all calls out as scalar expressions and compute what blocks have in common once."""
+    inputs = [ca.SX.sym(function.name_in(k), function.size1_in(k)) for k in range(function.n_in())]
+    shared = ca.cse([ca.SX(v) for v in function.call(inputs)])
+    return ca.Function(function.name(), inputs, shared, function.name_in(), function.name_out())
 
 
 def _lookup(reader: str, signal: Signal, source: str, known: Mapping[str, Expression]) -> Expression:

@@ -4,18 +4,19 @@ An ordinary call of a Function from Python costs tens of microseconds; through f
 `Evaluator` owns numpy arrays for all arguments and results: write into `arguments`, call `evaluate`, read `results`.
 
 CasADi matrices are column-major, so a (rows, columns) matrix appears as an array of shape (columns, rows); a column as (rows,).
-Not for threads: a Function must not run in two threads at once. Use processes.
+Not for threads: a Function must not run in two threads at once. Use processes, each with an Evaluator of its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, NoReturn
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidShape
+from fpirhc.errors import InvalidShape, InvalidValue
 
 
 class Evaluator:
@@ -24,35 +25,83 @@ class Evaluator:
     def __init__(self, function: ca.Function) -> None:
         """Allocate the arrays and bind them; sparse arguments and results become dense."""
         self.function = _dense(function)
-        # The buffer must live as long as the evaluation handle: the handle alone points into freed memory.
         self._buffer: Any
-        self._buffer, evaluate = self.function.buffer()
-        self.evaluate: Callable[[], Any] = evaluate
+        self._buffer, handle = self.function.buffer()
         self.arguments = tuple(_array(self.function.size_in(k)) for k in range(self.function.n_in()))
         self.results = tuple(_array(self.function.size_out(k)) for k in range(self.function.n_out()))
         for k, array in enumerate(self.arguments):
             self._buffer.set_arg(k, array.data)
         for k, array in enumerate(self.results):
             self._buffer.set_res(k, array.data)
+        self._redirected: dict[int, np.ndarray] = {}
+        evaluate: Any = partial(handle)
+        # The handle alone points into memory that the buffer and the arrays own: it must keep them alive.
+        evaluate.owners = (self._buffer, self.arguments, self.results, self._redirected)
+        self.evaluate: Callable[[], Any] = evaluate
 
-    def __call__(self, *values: np.ndarray | float) -> tuple[np.ndarray, ...]:
+    def redirect(self, k: int, array: np.ndarray) -> None:
+        """Write result `k` into `array` from now on, such as a slice of a log, and no longer into `results[k]`.
+
+        Raises:
+            InvalidShape: `array` is not a contiguous array of float64 with as many entries as the result.
+        """
+        if array.size != self.results[k].size or array.dtype != np.float64 or not array.flags.c_contiguous:
+            name, size = self.function.name_out(k), self.results[k].size
+            raise InvalidShape(f"result '{name}' needs a contiguous float64 array of {size} entries")
+        self._redirected[k] = array
+        self._buffer.set_res(k, array.data)
+
+    @property
+    def failed(self) -> bool:
+        """Whether the last evaluation failed; `results` then still hold what was there before.
+
+        In the virtual machine a failure raises as well; compiled code only says so here.
+        """
+        return bool(self._buffer.ret() != 0)
+
+    def __call__(self, *values: Any) -> tuple[np.ndarray, ...]:
         """Evaluate with these arguments and return copies of the results.
 
         Raises:
-            InvalidShape: a wrong number of arguments, or of entries of one.
+            InvalidShape: a wrong number of arguments, or a wrong shape of one.
+            InvalidValue: an argument that is not made of numbers, or arguments that the Function refuses.
         """
         if len(values) != len(self.arguments):
-            raise InvalidShape(f"{self.function.name()} takes {len(self.arguments)} arguments, got {len(values)}")
-        for k, (array, value) in enumerate(zip(self.arguments, values, strict=True)):
-            given = np.asarray(value, dtype=float)
-            if given.size != array.size:
-                name = self.function.name_in(k)
-                raise InvalidShape(
-                    f"argument '{name}' has {array.size} entries (shape {array.shape}), got {given.size}"
-                )
-            array[...] = given.reshape(array.shape)
+            names = ", ".join(self.function.name_in())
+            raise InvalidShape(f"expected {len(self.arguments)} arguments ({names}), got {len(values)}")
+        # All are looked at before one is written: a refused call leaves the arguments as they were.
+        checked = [self._checked(k, value) for k, value in enumerate(values)]
+        for array, value in zip(self.arguments, checked, strict=True):
+            array[...] = value
         self.evaluate()
+        if self.failed:
+            raise InvalidValue(f"'{self.function.name()}' fails for these arguments: {values}")
         return tuple(result.copy() for result in self.results)
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse to be copied or pickled: the buffers belong to this process.
+
+        Raises:
+            TypeError: always.
+        """
+        raise TypeError("an Evaluator cannot be copied or pickled; build one from its Function in each process")
+
+    def _checked(self, k: int, value: Any) -> np.ndarray:
+        array, name = self.arguments[k], self.function.name_in(k)
+        try:
+            given = np.asarray(value, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InvalidValue(f"argument '{name}' is not made of numbers: {error}") from None
+        # The entries of a vector have one order however it lies; a matrix that is not transposed would be scrambled.
+        is_vector = array.ndim == 1 or 1 in array.shape
+        fits = sum(n != 1 for n in given.shape) <= 1 if is_vector else given.ndim == 1 or given.shape == array.shape
+        if given.size != array.size or not fits:
+            rows, columns = self.function.size_in(k)
+            hint = "" if is_vector else f"; a ({rows}, {columns}) matrix is given transposed"
+            raise InvalidShape(
+                f"argument '{name}' has {array.size} entries (shape {array.shape}{hint}), got shape {given.shape}"
+            )
+        return given.reshape(array.shape)
 
 
 def _array(size: tuple[int, int]) -> np.ndarray:

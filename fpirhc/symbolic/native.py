@@ -1,17 +1,22 @@
 """Compiles Functions to C, once: the compiled library is kept in a content-addressed cache.
 
-The key of a library is a hash of the generated C, the compiler and its version, the flags and CasADi's version, so a library can
-never be another model's. It is compiled under a temporary name, its checksum is stored, and both are renamed into
+The key of a library is a hash of the generated C, the compiler and its version, the flags, the machine and CasADi's version, so
+a library can never be another model's. It is compiled in a folder of its own, its checksum is stored, and both are renamed into
 place atomically: any number of processes may compile the same or different Functions at once. A library whose checksum does not
 fit is compiled again.
 
 FPIRHC_CC names the compiler ('none' turns compilation off); FPIRHC_CACHE names the cache folder.
+A compiled Function has no derivatives: differentiate first, compile last.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import io
 import os
+import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -23,13 +28,15 @@ from pathlib import Path
 
 import casadi as ca
 
-from fpirhc.errors import CompileError
+from fpirhc.errors import CompileError, NotSupported
 
 # -ffp-contract=off: no fused multiply-add, so that C and the virtual machine round alike.
-_FLAGS = ("-O3", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
-_LARGE = 4_000_000  # bytes of C above which optimising takes longer than it saves
+# -z defs: what is missing must fail here and not end the process at the first call.
+_LINK = ("-Wl,-z,defs",) if sys.platform == "linux" else ()
+_FLAGS = ("-O3", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared", *_LINK)
+_LARGE = 500_000  # bytes of C above which optimising takes longer than it saves: at 1.2 MB -O3 took 52 s and -O1 21 s
 _LARGE_FLAGS = ("-O1", *_FLAGS[1:])
-_NAME = "fpirhc_native"
+_NAME = "fpirhc_native"  # stands for the exported name, which is made of the key
 _loaded: dict[str, ca.Function] = {}
 
 
@@ -43,11 +50,14 @@ class Native:
 
 
 def find_compiler() -> str | None:
-    """Path of the C compiler: FPIRHC_CC, then CC, then cc, gcc or clang; None when there is none or it is turned off."""
+    """Path of the C compiler: FPIRHC_CC, else CC, cc, gcc or clang; None when FPIRHC_CC is 'none' or nothing is found.
+
+    A compiler asked for by FPIRHC_CC is never replaced by another one.
+    """
     wished = os.environ.get("FPIRHC_CC", "")
-    if wished.lower() == "none":
-        return None
-    for name in (wished, os.environ.get("CC", ""), "cc", "gcc", "clang"):
+    if wished:
+        return None if wished.lower() == "none" else shutil.which(wished)
+    for name in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
         found = shutil.which(name) if name else None
         if found:
             return found
@@ -56,67 +66,108 @@ def find_compiler() -> str | None:
 
 def native(function: ca.Function) -> Native:
     """Return `function` compiled, or itself with the reason why not."""
+    if function.is_a("External"):
+        return Native(function, True, "")
     compiler = find_compiler()
     if compiler is None:
-        return Native(function, False, "no C compiler was found")
-    source = generate(function)
-    if source is None:
-        return Native(function, False, "it calls a solver that cannot be written as C")
+        return Native(function, False, _why_no_compiler())
     try:
-        return Native(_library(source, compiler), True, "")
-    except CompileError as error:
+        return Native(_library(generate(function), compiler), True, "")
+    except (NotSupported, CompileError) as error:
         return Native(function, False, str(error))
 
 
-def generate(function: ca.Function) -> str | None:
-    """Return the C source of `function` under a fixed name, None when some part of it cannot be written as C."""
+def generate(function: ca.Function) -> str:
+    """Return the C source of `function` under a fixed name.
+
+    Raises:
+        NotSupported: some part of it cannot be written as C.
+    """
+    if any(f.is_a("External") for f in function.find_functions()):
+        raise NotSupported("it calls a Function that is already compiled; compile the whole instead")
     inputs = [ca.MX.sym(function.name_in(k), function.sparsity_in(k)) for k in range(function.n_in())]
     names = (function.name_in(), function.name_out())
     # One call wrapped under a fixed name: the name of a mapaccum is CasADi's own, and must not decide the cache key.
     wrapped = ca.Function(_NAME, inputs, function.call(inputs, False, True), *names)
     generator = ca.CodeGenerator(_NAME, {"with_header": False})
     try:
-        generator.add(wrapped)
-        return str(generator.dump())
+        # CasADi warns on stderr of what it cannot write; the source says it too, and the caller announces it once.
+        with contextlib.redirect_stderr(io.StringIO()):
+            generator.add(wrapped)
+            source = str(generator.dump())
     except RuntimeError as error:
-        if "codegen" in str(error).lower() or "not defined" in str(error) or "generat" in str(error).lower():
-            return None
-        raise
+        raise NotSupported(f"CasADi cannot write it as C: {str(error).strip().splitlines()[-1]}") from None
+    _check_self_contained(source)
+    return source
 
 
 def cache_folder() -> Path:
     """Folder of compiled libraries: FPIRHC_CACHE, or fpirhc in the user's cache; a temporary one if not writable."""
     wished = os.environ.get("FPIRHC_CACHE")
-    base = Path(wished) if wished else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fpirhc"
     try:
+        base = Path(wished) if wished else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fpirhc"
+        base = base.absolute()  # a bare file name would be looked for in the system's library folders
         base.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=base):
             return base
-    except OSError:
-        return _temporary_folder()
+    except (OSError, RuntimeError):  # RuntimeError: there is no home folder
+        return Path(_temporary_folder().name)
 
 
 @cache
-def _temporary_folder() -> Path:
-    return Path(tempfile.mkdtemp(prefix="fpirhc-"))
+def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
+    """One for this process, removed when it ends."""
+    return tempfile.TemporaryDirectory(prefix="fpirhc-", ignore_cleanup_errors=True)
+
+
+def _why_no_compiler() -> str:
+    wished = os.environ.get("FPIRHC_CC", "")
+    if wished.lower() == "none":
+        return "compilation is turned off (FPIRHC_CC=none)"
+    if wished:
+        return f"the C compiler '{wished}', asked for by FPIRHC_CC, was not found"
+    return "no C compiler was found (looked for CC, cc, gcc, clang)"
+
+
+def _check_self_contained(source: str) -> None:
+    unwritten = re.search(r"^\s*#error (?:Code generation not supported for )?(\w+)", source, re.MULTILINE)
+    if unwritten:
+        raise NotSupported(f"it calls '{unwritten[1]}', which CasADi cannot write as C")
+    # Not tried even where the header is installed: its library would have to be found and linked too.
+    foreign = re.search(r"^#include <(.+/.+)>", source, re.MULTILINE)
+    if foreign:
+        raise NotSupported(f"it calls a solver that cannot be written as C: its own library is needed ({foreign[1]})")
 
 
 @cache
 def _version(compiler: str) -> str:
-    done = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False)
+    done = _run([compiler, "--version"])
     return done.stdout + done.stderr
+
+
+def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    """Run a compiler, whose messages are to be in plain English.
+
+    Raises:
+        CompileError: it cannot be started.
+    """
+    plain = {**os.environ, "LC_ALL": "C"}
+    try:
+        # A list instead of a shell line: folder names are never read as commands.
+        return subprocess.run(command, capture_output=True, text=True, errors="replace", check=False, env=plain)
+    except OSError as error:
+        raise CompileError(f"the C compiler '{command[0]}' cannot be started: {error}") from None
 
 
 def _library(source: str, compiler: str) -> ca.Function:
     """Return the external Function of the library for this source, compiling it when needed."""
     flags = _FLAGS if len(source) < _LARGE else _LARGE_FLAGS
-    facts = "\0".join((source, compiler, _version(compiler), *flags, ca.CasadiMeta.version()))
+    facts = "\0".join((source, compiler, _version(compiler), *flags, platform.machine(), ca.CasadiMeta.version()))
     key = hashlib.sha256(facts.encode()).hexdigest()[:32]
     if key not in _loaded:
         path = cache_folder() / f"{key}{_suffix()}"
-        if not _is_intact(path):
-            _compile(source, compiler, flags, path)
-        _loaded[key] = _load(path, source, compiler, flags)
+        name = f"fpirhc_{key}"
+        _loaded[key] = _load(path, name, source.replace(_NAME, name), [compiler, *flags])
     return _loaded[key]
 
 
@@ -124,15 +175,18 @@ def _suffix() -> str:
     return {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
 
 
-def _load(path: Path, source: str, compiler: str, flags: Sequence[str]) -> ca.Function:
+def _load(path: Path, name: str, source: str, command: Sequence[str]) -> ca.Function:
+    if _is_intact(path):
+        # One that fits its checksum and still does not load was made on another system: compile it here.
+        with contextlib.suppress(RuntimeError):
+            return ca.external(name, str(path))
     try:
-        return ca.external(_NAME, str(path))
-    except RuntimeError:
-        _compile(source, compiler, flags, path)
-    try:
-        return ca.external(_NAME, str(path))
-    except RuntimeError as error:
-        raise CompileError(f"the compiled library cannot be loaded: {error}") from None
+        _compile(source, command, path)
+        return ca.external(name, str(path))
+    except (OSError, RuntimeError) as error:
+        if isinstance(error, CompileError):
+            raise
+        raise CompileError(f"the compiled library cannot be kept in '{path.parent}' or loaded: {error}") from None
 
 
 def _checksum_file(path: Path) -> Path:
@@ -147,17 +201,21 @@ def _is_intact(path: Path) -> bool:
         return False
 
 
-def _compile(source: str, compiler: str, flags: Sequence[str], path: Path) -> None:
+def _compile(source: str, command: Sequence[str], path: Path) -> None:
     """Compile into a folder of its own beside the cache entry, then rename library and checksum into place."""
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix="building-") as work:
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix="building-", ignore_cleanup_errors=True) as work:
         text, library, checksum = (Path(work) / f for f in ("model.c", f"model{_suffix()}", "model.sha256"))
         text.write_text(source, encoding="utf-8")
-        # -o before the source, and a list instead of a shell line: folder names are never read as commands.
-        command = [compiler, *flags, "-o", str(library), str(text), "-lm"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = _run([*command, "-o", str(library), str(text), "-lm"])
         if done.returncode != 0 or not library.is_file():
-            first = (done.stderr.strip() or f"exit code {done.returncode}").splitlines()[0]
-            raise CompileError(f"the C compiler '{compiler}' failed: {first}")
+            message = _first_error(done.stderr.replace(work + os.sep, "")) or f"exit code {done.returncode}"
+            raise CompileError(f"the C compiler '{command[0]}' failed: {message}")
         checksum.write_text(hashlib.sha256(library.read_bytes()).hexdigest(), encoding="ascii")
         library.replace(path)
         checksum.replace(_checksum_file(path))
+
+
+def _first_error(messages: str) -> str:
+    """The line that names the error, not the one that says in which function it is."""
+    lines = messages.strip().splitlines()
+    return next((line for line in lines if "error" in line or "undefined" in line), lines[0] if lines else "")
