@@ -15,10 +15,12 @@ from .deformation.sigmoid import Sigmoid
 from .disturbance import Formula, Noise, Pulse, Sine, Step
 from .errors import FpirhcError
 from .horizon.cost import General, LqrTerminal, Quadratic
+from .horizon.expansion import ExactHessian, GaussNewton
 from .horizon.problem import Horizon
 from .integrate import Cvodes, Euler, RungeKutta4
 from .limits import Limits
 from .metrics import Metrics, measure
+from .optimisers.fixed_point import FixedPoint
 from .optimisers.nlp import Fatrop, InteriorPoint, Osqp, Qrqp, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.reduced_gradient import ReducedGradient
@@ -42,11 +44,14 @@ __all__ = [
     "ComputedTorque",
     "Cvodes",
     "Euler",
+    "ExactHessian",
     "Exponential",
     "Fatrop",
     "Feedforward",
+    "FixedPoint",
     "Formula",
     "FpirhcError",
+    "GaussNewton",
     "General",
     "HoldPlan",
     "Horizon",

@@ -71,9 +71,9 @@ def test_cache_is_by_content(cache, monkeypatch):
 @pytest.mark.parametrize("damage", [b"", b"not a library", None])
 def test_damaged_library_is_built_again(cache, damage):
     """Truncated, overwritten, or with a lost checksum: the answer is right and the cache is whole again."""
-    source = module.generate(model(4.0))
+    sources = module.generate(model(4.0))
     compiler = find_compiler()
-    module._library(source, compiler)
+    module._library(sources, compiler)
     (path,) = _libraries(cache)
     checksum = path.with_suffix(".sha256")
     if damage is None:

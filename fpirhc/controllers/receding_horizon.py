@@ -140,7 +140,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         if ocp.state.size > plant.state.size:
             first = ca.vertcat(first, s._command_before)
         lower, upper = ocp.input_lower - s._correction_before, ocp.input_upper - s._correction_before
-        remembered = memory.join({m: getattr(s, m) for m in memory.names})
+        remembered = optimiser.shifted(ocp, memory.join({m: getattr(s, m) for m in memory.names}))
         inputs, diagnostics, following = solve(first, data, lower, upper, remembered)
         _, _, terms = predict(first, inputs, data)
         status = diagnostics[_SOLVE.index("status")]

@@ -18,7 +18,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, Mistakes, NotSupported
 from fpirhc.horizon.cost import Cost, Linearisation, View
-from fpirhc.horizon.curvature import input_curvature
+from fpirhc.horizon.curvature import Along, expand_along, input_curvature
 from fpirhc.integrate import Integrator, RungeKutta4
 from fpirhc.limits import Limits
 from fpirhc.plant import Plant
@@ -57,7 +57,8 @@ class OptimalControl:
 
     dynamics: (s, u, theta) -> s_next. stage_cost: (s, u, theta) -> (l, terms). terminal_cost: (s, theta) -> T.
     Bounds are infinite where free; an optimiser may be given other input bounds from call to call. `curvature` (nu) is the second
-    derivative of the cost rate along each input near the reference: it turns gradients into the units of the inputs.
+    derivative of the cost rate along each input near the reference: it turns gradients into the units of the inputs. `along` is the
+    quadratic model of the cost along the reference.
     """
 
     stages: int
@@ -74,6 +75,7 @@ class OptimalControl:
     input_lower: np.ndarray
     input_upper: np.ndarray
     curvature: np.ndarray
+    along: Along
 
     @property
     def bounds_states(self) -> bool:
@@ -124,6 +126,7 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
     terminal_cost = ca.Function("fpirhc_terminal_cost", [s, theta], [ca.densify(final)])
     nodes = _nodes(plant, reference, horizon, cost, state.size)
     _check_finite(tuple(terms), stage_cost, terminal_cost, nodes, cost)
+    along = expand_along(dynamics, stage_cost, terminal_cost, nodes)
     return OptimalControl(
         stages=horizon.stages,
         step=horizon.step,
@@ -138,7 +141,8 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
         state_upper=np.append(upper, free),
         input_lower=limits.input_bounds(plant)[0],
         input_upper=limits.input_bounds(plant)[1],
-        curvature=input_curvature(dynamics, stage_cost, terminal_cost, horizon.step, nodes),
+        curvature=input_curvature(along, horizon.step),
+        along=along,
     )
 
 

@@ -40,7 +40,11 @@ class Optimiser(ABC):
 
     @abstractmethod
     def memory(self, ocp: OptimalControl) -> Layout:
-        """What is kept for the next call: at least the plan, shifted by one stage."""
+        """What is kept for the next call: at least the plan, in `plan_inputs`."""
+
+    @abstractmethod
+    def shifted(self, ocp: OptimalControl, memory: Expression) -> Expression:
+        """The memory for a horizon that starts one stage later."""
 
     @abstractmethod
     def step(self, ocp: OptimalControl) -> ca.Function:
@@ -49,6 +53,10 @@ class Optimiser(ABC):
         diagnostics: cost, stationarity, feasibility, iterations, status. A plan that is not finite is never returned: the
         remembered one is, with status NON_FINITE.
         """
+
+    def converging(self, ocp: OptimalControl) -> ca.Function:
+        """Like `step`, but may stop as soon as the plan is converged, and may work longer: for open-loop solves."""
+        return self.step(ocp)
 
 
 def shift(columns: Expression) -> Expression:

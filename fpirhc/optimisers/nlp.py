@@ -139,6 +139,16 @@ class _MultipleShooting(Optimiser):
             )
         )
 
+    def shifted(self, ocp: OptimalControl, memory: Expression) -> Expression:
+        """The plan and the multipliers one stage later."""
+        kept = self.memory(ocp).split(memory)
+        moved = {
+            "plan_inputs": ca.vec(shift(ca.reshape(kept["plan_inputs"], ocp.input.size, ocp.stages))),
+            "plan_variable_multipliers": _shift_variables(ocp, kept["plan_variable_multipliers"]),
+            "plan_dynamics_multipliers": _shift_dynamics(ocp, kept["plan_dynamics_multipliers"]),
+        }
+        return self.memory(ocp).join(moved)
+
     def step(self, ocp: OptimalControl) -> ca.Function:
         """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory).
 
@@ -167,7 +177,7 @@ class _MultipleShooting(Optimiser):
         status = ca.if_else(ca.mmax(lower - upper) > 0, int(Status.INFEASIBLE), int(Status.NON_FINITE))
         diagnostics = ca.vertcat(ca.MX.zeros(3), UNKNOWN_ITERATIONS, status)
         forgotten = {name: ca.MX.zeros(layout[name].size) for name in layout.names}
-        kept = layout.join({**forgotten, "plan_inputs": ca.vec(shift(start))})
+        kept = layout.join({**forgotten, "plan_inputs": ca.vec(start)})
         return ca.Function("fpirhc_shooting_skip", arguments, [start, diagnostics, kept])
 
     def _guess(self, ocp: OptimalControl) -> ca.Function:
@@ -205,10 +215,10 @@ class _MultipleShooting(Optimiser):
         told = ca.if_else(finite, ca.vertcat(cost, residual, violation), ca.MX.zeros(3))
         status = status_of(finite, residual, violation, self.tolerance)
         following = {
-            "plan_inputs": ca.vec(shift(plan)),
+            "plan_inputs": ca.vec(plan),
             # A solve that was not finite must not poison the next warm start.
-            "plan_variable_multipliers": ca.if_else(finite, _shift_variables(ocp, solution["lam_x"]), 0),
-            "plan_dynamics_multipliers": ca.if_else(finite, _shift_dynamics(ocp, solution["lam_g"]), 0),
+            "plan_variable_multipliers": ca.if_else(finite, solution["lam_x"], 0),
+            "plan_dynamics_multipliers": ca.if_else(finite, solution["lam_g"], 0),
         }
         diagnostics = ca.vertcat(told, UNKNOWN_ITERATIONS, status)
         return ca.Function(name, arguments, [plan, diagnostics, layout.join(following)])

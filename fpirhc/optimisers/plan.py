@@ -69,18 +69,16 @@ def solve(
         NotSupported: the optimiser cannot serve the problem.
     """
     optimiser.check(ocp)
-    step, layout = optimiser.step(ocp), optimiser.memory(ocp)
+    step, layout = optimiser.converging(ocp), optimiser.memory(ocp)
     memory = layout.start()
     bounds = (ocp.input_lower, ocp.input_upper)
-    place = layout.slice("plan_inputs")
     inputs = np.zeros((ocp.input.size, ocp.stages)) if start is None else np.asarray(start, dtype=float)
+    memory[layout.slice("plan_inputs")] = inputs.ravel(order="F")
     status, count = Status.NOT_CONVERGED, 0
     diagnostics = np.zeros(5)
     iterations = 0.0
     violation, better = np.inf, True
     while status in (Status.NOT_CONVERGED, Status.INFEASIBLE) and better and count < calls:
-        # The memory comes back shifted for the next cycle; the same horizon is solved again, so the plan is put back.
-        memory[place] = inputs.ravel(order="F")
         given = step(state, data, *bounds, memory)
         inputs, diagnostics, memory = (np.asarray(v.full()) for v in given)
         diagnostics, memory = diagnostics.ravel(), memory.ravel()

@@ -70,6 +70,11 @@ class ReducedGradient(Optimiser):
         plan = Signal("plan_inputs", tuple(f"{i}@{k}" for k in range(ocp.stages) for i in ocp.input.elements))
         return Layout((plan, scalar("plan_step_length", start=0.0)))
 
+    def shifted(self, ocp: OptimalControl, memory: Expression) -> Expression:
+        """The plan one stage later, and the same step length."""
+        plan = ca.reshape(memory[:-1], ocp.input.size, ocp.stages)
+        return ca.vertcat(ca.vec(shift(plan)), memory[-1])
+
     def step(self, ocp: OptimalControl) -> ca.Function:
         """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
         nu, n = ocp.input.size, ocp.stages
@@ -112,7 +117,7 @@ class ReducedGradient(Optimiser):
         diagnostics = ca.vertcat(told, iterations, status)
         # A remembered plan under which a well-posed problem overflows is given up, so that the next call can succeed.
         lost = ca.logic_and(posed, ca.logic_not(ca.logic_or(finite, survives)))
-        following = ca.if_else(lost, clip(0 * plan, lower, upper), shift(plan))
+        following = ca.if_else(lost, clip(0 * plan, lower, upper), plan)
         kept = ca.vertcat(ca.vec(following), ca.if_else(finite, length, 0))
         return ca.Function("fpirhc_reduced_gradient", [s0, data, lower, upper, memory], [plan, diagnostics, kept])
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import casadi as ca
+
 from fpirhc.symbolic.layout import Expression
 
 SMOOTHING = 1e-6  # in the unit of the argument: where the power is rounded off around zero
@@ -12,4 +14,4 @@ def signed_power(d: Expression, exponent: Expression) -> Expression:
 
     Computed as d (d^2 + 1e-12)^((exponent - 1)/2).
     """
-    return d * (d * d + SMOOTHING**2) ** ((exponent - 1) / 2)
+    return d * ca.exp((exponent - 1) / 2 * ca.log(d * d + SMOOTHING**2))

@@ -29,6 +29,7 @@ from pathlib import Path
 import casadi as ca
 
 from fpirhc.errors import CompileError, NotSupported
+from fpirhc.symbolic.driver import substitute
 
 # -ffp-contract=off: no fused multiply-add, so that C and the virtual machine round alike.
 # -z defs: what is missing must fail here and not end the process at the first call.
@@ -77,8 +78,8 @@ def native(function: ca.Function) -> Native:
         return Native(function, False, str(error))
 
 
-def generate(function: ca.Function) -> str:
-    """Return the C source of `function` under a fixed name.
+def generate(function: ca.Function) -> tuple[str, ...]:
+    """Return the C files of `function`: its own, under a fixed name, and those of the drivers that it calls.
 
     Raises:
         NotSupported: some part of it cannot be written as C.
@@ -98,7 +99,8 @@ def generate(function: ca.Function) -> str:
     except RuntimeError as error:
         raise NotSupported(f"CasADi cannot write it as C: {str(error).strip().splitlines()[-1]}") from None
     _check_self_contained(source)
-    return source
+    source, drivers = substitute(source)
+    return source, *drivers
 
 
 def cache_folder() -> Path:
@@ -159,15 +161,15 @@ def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
         raise CompileError(f"the C compiler '{command[0]}' cannot be started: {error}") from None
 
 
-def _library(source: str, compiler: str) -> ca.Function:
-    """Return the external Function of the library for this source, compiling it when needed."""
-    flags = _FLAGS if len(source) < _LARGE else _LARGE_FLAGS
-    facts = "\0".join((source, compiler, _version(compiler), *flags, platform.machine(), ca.CasadiMeta.version()))
+def _library(sources: Sequence[str], compiler: str) -> ca.Function:
+    """Return the external Function of the library for these files, compiling it when needed."""
+    flags = _FLAGS if max(map(len, sources)) < _LARGE else _LARGE_FLAGS
+    facts = "\0".join((*sources, compiler, _version(compiler), *flags, platform.machine(), ca.CasadiMeta.version()))
     key = hashlib.sha256(facts.encode()).hexdigest()[:32]
     if key not in _loaded:
         path = cache_folder() / f"{key}{_suffix()}"
         name = f"fpirhc_{key}"
-        _loaded[key] = _load(path, name, source.replace(_NAME, name), [compiler, *flags])
+        _loaded[key] = _load(path, name, [source.replace(_NAME, name) for source in sources], [compiler, *flags])
     return _loaded[key]
 
 
@@ -175,13 +177,13 @@ def _suffix() -> str:
     return {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
 
 
-def _load(path: Path, name: str, source: str, command: Sequence[str]) -> ca.Function:
+def _load(path: Path, name: str, sources: Sequence[str], command: Sequence[str]) -> ca.Function:
     if _is_intact(path):
         # One that fits its checksum and still does not load was made on another system: compile it here.
         with contextlib.suppress(RuntimeError):
             return ca.external(name, str(path))
     try:
-        _compile(source, command, path)
+        _compile(sources, command, path)
         return ca.external(name, str(path))
     except (OSError, RuntimeError) as error:
         if isinstance(error, CompileError):
@@ -201,12 +203,14 @@ def _is_intact(path: Path) -> bool:
         return False
 
 
-def _compile(source: str, command: Sequence[str], path: Path) -> None:
+def _compile(sources: Sequence[str], command: Sequence[str], path: Path) -> None:
     """Compile into a folder of its own beside the cache entry, then rename library and checksum into place."""
     with tempfile.TemporaryDirectory(dir=path.parent, prefix="building-", ignore_cleanup_errors=True) as work:
-        text, library, checksum = (Path(work) / f for f in ("model.c", f"model{_suffix()}", "model.sha256"))
-        text.write_text(source, encoding="utf-8")
-        done = _run([*command, "-o", str(library), str(text), "-lm"])
+        library, checksum = (Path(work) / f for f in (f"model{_suffix()}", "model.sha256"))
+        texts = [Path(work) / f"model{k or ''}.c" for k in range(len(sources))]
+        for text, source in zip(texts, sources, strict=True):
+            text.write_text(source, encoding="utf-8")
+        done = _run([*command, "-o", str(library), *map(str, texts), "-lm"])
         if done.returncode != 0 or not library.is_file():
             message = _first_error(done.stderr.replace(work + os.sep, "")) or f"exit code {done.returncode}"
             raise CompileError(f"the C compiler '{command[0]}' failed: {message}")

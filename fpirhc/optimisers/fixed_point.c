@@ -1,0 +1,380 @@
+/* The iteration of FixedPoint as loops around generated stage functions.
+
+   The same mathematics as the composed graph in fixed_point.py and search.py, which is the reference it is tested against:
+   names follow those files. What is generated stands before this text: the stage functions linear, bent, end and deformed, the
+   sizes NS, NU, NT (entries of the data of a stage), N, WORK and INTEGERS (of the stage functions), the constants of the
+   search, and ENTRY, the name of the function. Matrices are column-major, stages follow each other. Nothing is allocated:
+   everything lies on the stack. */
+
+#if defined(__GNUC__)
+#define INLINE static inline __attribute__((always_inline)) /* so that sizes are constants in every loop */
+#else
+#define INLINE static inline
+#endif
+
+typedef const casadi_real* In;
+typedef casadi_real* Out;
+
+typedef struct {
+  casadi_real u[N * NU], x[(N + 1) * NS], g[N * NU], value;
+} Plan;
+
+typedef struct {
+  Plan plans[2];
+  casadi_real v[N * NU], k[N * NU * NS], t[N * NU], planned[N * NS];
+  casadi_real a[N * NS * NS], b[N * NS * NU], ls[N * NS], lu[N * NU], lambda[(N + 1) * NS], final[NS * NS];
+  casadi_real envelope, reach, tau, gamma;
+  casadi_real w[WORK + 1];
+  casadi_int iw[INTEGERS + 1];
+} Search;
+
+static const casadi_real scale[NU] = SCALE;
+
+INLINE int all_finite(In v, int n) {
+  int i, ok = 1;
+  for (i = 0; i < n; ++i) ok &= v[i] <= FINITE && v[i] >= -FINITE; /* false for NaN */
+  return ok;
+}
+
+INLINE casadi_real between(casadi_real v, casadi_real low, casadi_real high) {
+  return fmin(fmax(v, low), high);
+}
+
+/* c (rows, columns) += a (rows, inner) b (inner, columns) */
+INLINE void multiply(Out restrict c, In restrict a, In restrict b, int rows, int inner, int columns) {
+  int i, j, k;
+  for (j = 0; j + 1 < columns; j += 2) {
+    Out c0 = c + j * rows, c1 = c0 + rows;
+    for (k = 0; k < inner; ++k) {
+      casadi_real f0 = b[j * inner + k], f1 = b[(j + 1) * inner + k];
+      In column = a + k * rows;
+      for (i = 0; i < rows; ++i) {
+        c0[i] += f0 * column[i];
+        c1[i] += f1 * column[i];
+      }
+    }
+  }
+  for (; j < columns; ++j)
+    for (k = 0; k < inner; ++k) {
+      casadi_real f = b[j * inner + k];
+      for (i = 0; i < rows; ++i) c[j * rows + i] += f * a[k * rows + i];
+    }
+}
+
+INLINE void transpose(Out restrict to, In restrict from, int rows, int columns) {
+  int i, j;
+  for (j = 0; j < columns; ++j)
+    for (i = 0; i < rows; ++i) to[i * columns + j] = from[j * rows + i];
+}
+
+/* Roll out the next plan, expanded, with its cost and gradient; 0 when something is not finite. */
+INLINE int try_next(Search* s, const Plan* best, Plan* plan, In s0, In data, In lower, In upper) {
+  int i, j, l, bold = s->tau >= SHORTEST;
+  In arg[8];
+  Out res[8];
+  casadi_real cost, slope[NS];
+  plan->value = 0;
+  for (j = 0; j < NS; ++j) plan->x[j] = s0[j];
+  for (i = 0; i < N; ++i) {
+    Out u = plan->u + i * NU, x = plan->x + i * NS;
+    casadi_real apart[NS];
+    for (j = 0; j < NS; ++j) apart[j] = x[j] - s->planned[i * NS + j];
+    for (l = 0; l < NU; ++l) {
+      casadi_real wanted = best->u[i * NU + l] + s->tau * s->v[i * NU + l];
+      for (j = 0; j < NS; ++j) wanted += s->k[(i * NS + j) * NU + l] * apart[j];
+      u[l] = bold ? between(wanted, lower[l], upper[l]) : s->t[i * NU + l];
+    }
+    arg[0] = x, arg[1] = u, arg[2] = data + i * NT;
+    res[0] = x + NS, res[1] = &cost, res[2] = s->a + i * NS * NS, res[3] = s->b + i * NS * NU;
+    res[4] = s->ls + i * NS, res[5] = s->lu + i * NU;
+    if (linear(arg, res, s->iw, s->w, 0)) return 0;
+    plan->value += cost;
+  }
+  arg[0] = plan->x + N * NS, arg[1] = data + N * NT;
+  res[0] = &cost, res[1] = slope, res[2] = s->final;
+  if (end(arg, res, s->iw, s->w, 0)) return 0;
+  plan->value += cost;
+  for (j = 0; j < NS; ++j) s->lambda[N * NS + j] = slope[j];
+  for (i = N - 1; i >= 0; --i) {
+    In after = s->lambda + (i + 1) * NS;
+    for (l = 0; l < NU; ++l) {
+      casadi_real sum = s->lu[i * NU + l];
+      for (j = 0; j < NS; ++j) sum += s->b[(i * NU + l) * NS + j] * after[j];
+      plan->g[i * NU + l] = sum;
+    }
+    for (l = 0; l < NS; ++l) {
+      casadi_real sum = s->ls[i * NS + l];
+      for (j = 0; j < NS; ++j) sum += s->a[(i * NS + l) * NS + j] * after[j];
+      s->lambda[i * NS + l] = sum;
+    }
+  }
+  return all_finite(&plan->value, 1) && all_finite(plan->g, N * NU) && all_finite(plan->x, (N + 1) * NS);
+}
+
+/* The plain fixed-point step T = clip(U - gamma D g); returns g'(T - U), and in reach |T - U|^2 / (2 gamma). */
+INLINE casadi_real plain_step(Search* s, const Plan* plan, In lower, In upper, casadi_real* reach) {
+  int i, l;
+  casadi_real descent = 0, size = 0;
+  for (i = 0; i < N; ++i)
+    for (l = 0; l < NU; ++l) {
+      int k = i * NU + l;
+      casadi_real move;
+      s->t[k] = between(plan->u[k] - s->gamma * scale[l] * plan->g[k], lower[l], upper[l]);
+      move = s->t[k] - plan->u[k];
+      descent += plan->g[k] * move;
+      size += move * move / scale[l];
+    }
+  *reach = size / (2 * s->gamma);
+  return descent;
+}
+
+/* Accept the tried plan and return 1, or draw in and return 0. */
+INLINE int judged(Search* s, Plan* best, Plan* plan, int ok, In lower, In upper) {
+  int i, untried = best->value >= UNTRIED, bold = s->tau >= SHORTEST;
+  casadi_real slack = ROUNDING * (1 + fabs(best->value)), reach, envelope = 0, descent = 0;
+  if (ok && !untried) {
+    if (bold) {
+      casadi_real kept[N * NU];
+      for (i = 0; i < N * NU; ++i) kept[i] = s->t[i];
+      envelope = plan->value + plain_step(s, plan, lower, upper, &reach) + reach;
+      ok = envelope <= s->envelope - SHARE * (1 - SHARE) * s->reach + slack && plan->value <= best->value + slack;
+      if (!ok) for (i = 0; i < N * NU; ++i) s->t[i] = kept[i];
+    } else {
+      for (i = 0; i < N * NU; ++i) descent += best->g[i] * (s->t[i] - best->u[i]);
+      ok = plan->value <= best->value + descent + SHARE * s->reach + slack;
+    }
+  }
+  if (ok) {
+    s->envelope = plan->value + plain_step(s, plan, lower, upper, &s->reach) + s->reach;
+    for (i = 0; i < N * NS; ++i) s->planned[i] = plan->x[i];
+    if (!untried) s->tau = 1;
+    return 1;
+  }
+  if (!untried && !bold) {
+    s->gamma *= 0.5;
+    s->envelope = best->value + plain_step(s, best, lower, upper, &s->reach) + s->reach;
+  }
+  s->tau = untried ? SHORTEST * SHORTER : SHORTER * s->tau;
+  return 0;
+}
+
+/* L D L' on the free rows; what is not free is a unit row. Pivots that are not positive are replaced. */
+INLINE void factorise(In bend, const int* free, Out lower, Out pivots) {
+  int i, j, k;
+  for (j = 0; j < NU; ++j) {
+    casadi_real size = fabs(bend[j * NU + j]) + 1e-300, pivot = bend[j * NU + j];
+    for (k = 0; k < j; ++k) pivot -= lower[k * NU + j] * lower[k * NU + j] * pivots[k];
+    if (!free[j]) pivot = 1;
+    pivots[j] = pivot > PIVOT * size ? pivot : size;
+    for (i = j + 1; i < NU; ++i) {
+      casadi_real sum = bend[j * NU + i];
+      for (k = 0; k < j; ++k) sum -= lower[k * NU + i] * lower[k * NU + j] * pivots[k];
+      lower[j * NU + i] = free[i] && free[j] ? sum / pivots[j] : 0;
+    }
+  }
+}
+
+INLINE void substitute(const int* free, In lower, In pivots, Out column) {
+  int i, k;
+  for (i = 0; i < NU; ++i) {
+    if (!free[i]) column[i] = 0;
+    for (k = 0; k < i; ++k) column[i] -= lower[k * NU + i] * column[k];
+  }
+  for (i = 0; i < NU; ++i) column[i] /= pivots[i];
+  for (i = NU - 1; i >= 0; --i)
+    for (k = i + 1; k < NU; ++k) column[i] -= lower[i * NU + k] * column[k];
+}
+
+/* The stage's box QP; returns in v the best move, and in free, lower, pivots the factors of the feedback. */
+INLINE void box_policy(In slope, In bend, In low, In high, Out v, int* free, Out lower, Out pivots) {
+  int i, j, round, same, held[NU];
+  casadi_real move[NU], grown[NU], lowest = 0;
+  for (i = 0; i < NU; ++i) move[i] = v[i] = 0;
+  for (round = 0; round <= ROUNDS; ++round) {
+    In at = round < ROUNDS ? move : v; /* the last round only finds what is free at the best move */
+    for (i = 0; i < NU; ++i) {
+      casadi_real rate = slope[i];
+      for (j = 0; j < NU; ++j) rate += bend[j * NU + i] * at[j];
+      held[i] = (at[i] <= low[i] && rate > 0) || (at[i] >= high[i] && rate < 0);
+      grown[i] = rate;
+    }
+    for (same = round > 0, i = 0; i < NU; ++i) same &= free[i] == !held[i];
+    for (i = 0; i < NU; ++i) free[i] = !held[i];
+    if (!same) factorise(bend, free, lower, pivots);
+    if (round == ROUNDS) return;
+    if (same) continue; /* the same system has the same solution */
+    {
+      casadi_real target[NU], value = 0;
+      for (i = 0; i < NU; ++i) {
+        target[i] = -slope[i];
+        for (j = 0; j < NU; ++j) target[i] -= free[j] ? 0 : bend[j * NU + i] * move[j];
+      }
+      substitute(free, lower, pivots, target);
+      for (i = 0; i < NU; ++i) move[i] = between(free[i] ? target[i] : move[i], low[i], high[i]);
+      for (i = 0; i < NU; ++i) {
+        casadi_real half = 0;
+        for (j = 0; j < NU; ++j) half += bend[j * NU + i] * move[j];
+        value += (slope[i] + 0.5 * half) * move[i];
+      }
+      if (value < lowest) {
+        lowest = value;
+        for (i = 0; i < NU; ++i) v[i] = move[i];
+      }
+    }
+  }
+}
+
+/* One Riccati sweep around the accepted plan: feedforward v, deformed, and feedback K. */
+INLINE int direct(Search* s, const Plan* plan, In data, In lower, In upper) {
+  int i, j, l, m;
+  In arg[8];
+  Out res[8];
+  casadi_real p[NS * NS], lean[NS], wanted[N * NU];
+  for (j = 0; j < NS * NS; ++j) p[j] = s->final[j];
+  for (j = 0; j < NS; ++j) lean[j] = s->lambda[N * NS + j];
+  for (i = N - 1; i >= 0; --i) {
+    In a = s->a + i * NS * NS, b = s->b + i * NS * NU;
+    casadi_real q[NS * NS], cross[NU * NS], r[NU * NU], ahead[NS * NS], along[NS * NU], turned[NS * NS], flat[NU * NS];
+    casadi_real steep[NU], low[NU], high[NU], factor[NU * NU], pivots[NU], *v = wanted + i * NU, *k = s->k + i * NU * NS;
+    casadi_real next[NS], pull[NU], gap[NU];
+    int free[NU];
+    arg[0] = plan->x + i * NS, arg[1] = plan->u + i * NU, arg[2] = data + i * NT, arg[3] = s->lambda + (i + 1) * NS;
+    res[0] = q, res[1] = cross, res[2] = r;
+    if (bent(arg, res, s->iw, s->w, 0)) return 1;
+    for (j = 0; j < NS * NS; ++j) ahead[j] = 0;
+    for (j = 0; j < NS * NU; ++j) along[j] = 0;
+    multiply(ahead, p, a, NS, NS, NS);
+    multiply(along, p, b, NS, NS, NU);
+    transpose(turned, a, NS, NS);
+    transpose(flat, b, NS, NU);
+    multiply(q, turned, ahead, NS, NS, NS);
+    multiply(cross, flat, ahead, NU, NS, NS);
+    multiply(r, flat, along, NU, NS, NU);
+    for (l = 0; l < NU; ++l) {
+      r[l * NU + l] += DAMPING / scale[l];
+      steep[l] = s->lu[i * NU + l];
+      for (j = 0; j < NS; ++j) steep[l] += b[l * NS + j] * lean[j];
+      low[l] = lower[l] - plan->u[i * NU + l];
+      high[l] = upper[l] - plan->u[i * NU + l];
+    }
+    box_policy(steep, r, low, high, v, free, factor, pivots);
+    for (j = 0; j < NS; ++j) {
+      for (l = 0; l < NU; ++l) k[j * NU + l] = -cross[j * NU + l];
+      substitute(free, factor, pivots, k + j * NU);
+    }
+    for (l = 0; l < NU; ++l) {
+      gap[l] = steep[l];
+      for (m = 0; m < NU; ++m) gap[l] += r[m * NU + l] * v[m];
+      pull[l] = v[l];
+    }
+    for (j = 0; j < NS; ++j) next[j] = s->ls[i * NS + j];
+    for (m = 0; m < NS; ++m)
+      for (j = 0; j < NS; ++j) next[j] += turned[m * NS + j] * lean[m];
+    for (j = 0; j < NS; ++j)
+      for (l = 0; l < NU; ++l) next[j] += cross[j * NU + l] * pull[l] + k[j * NU + l] * gap[l];
+    for (j = 0; j < NS; ++j) lean[j] = next[j];
+    /* P = Q + A'PA + Q_us'K, made symmetric */
+    transpose(flat, cross, NU, NS);
+    multiply(q, flat, k, NS, NU, NS);
+    for (j = 0; j < NS; ++j)
+      for (m = 0; m < NS; ++m) p[j * NS + m] = 0.5 * (q[j * NS + m] + q[m * NS + j]);
+  }
+  arg[0] = wanted, res[0] = s->v;
+  return deformed(arg, res, s->iw, s->w, 0);
+}
+
+/* max |U - clip(U - D g)| */
+INLINE casadi_real residual(const Plan* plan, In lower, In upper) {
+  int k;
+  casadi_real worst = 0;
+  for (k = 0; k < N * NU; ++k) {
+    casadi_real moved = between(plan->u[k] - scale[k % NU] * plan->g[k], lower[k % NU], upper[k % NU]);
+    worst = fmax(worst, fabs(plan->u[k] - moved));
+  }
+  return worst;
+}
+
+INLINE void begin(Search* s, Plan* best, In memory, In lower, In upper) {
+  int i, l, known = all_finite(memory, MEMORY);
+  casadi_real gamma = known ? memory[MEMORY - 2] : 0, tau = known ? memory[MEMORY - 1] : 0;
+  for (i = 0; i < N; ++i)
+    for (l = 0; l < NU; ++l) {
+      best->u[i * NU + l] = between(known ? memory[i * NU + l] : 0, lower[l], upper[l]);
+      s->v[i * NU + l] = known ? memory[N * (NU + NS + NU * NS) + i * NU + l] : 0;
+      best->g[i * NU + l] = 0;
+      s->t[i * NU + l] = between(0, lower[l], upper[l]);
+    }
+  for (i = 0; i < N * NS; ++i) s->planned[i] = known ? memory[N * NU + i] : 0;
+  for (i = 0; i < N * NU * NS; ++i) s->k[i] = known ? memory[N * (NU + NS) + i] : 0;
+  best->value = s->envelope = 10 * UNTRIED;
+  s->reach = 0;
+  s->gamma = gamma > 0 ? fmin(2 * gamma, FIRST_GAMMA) : FIRST_GAMMA;
+  s->tau = tau > 0 ? tau : 1;
+}
+
+INLINE void remember(const Search* s, const Plan* best, Out memory) {
+  int i;
+  for (i = 0; i < N * NU; ++i) memory[i] = best->u[i];
+  for (i = 0; i < N * NS; ++i) memory[N * NU + i] = s->planned[i];
+  for (i = 0; i < N * NU * NS; ++i) memory[N * (NU + NS) + i] = s->k[i];
+  for (i = 0; i < N * NU; ++i) memory[N * (NU + NS + NU * NS) + i] = s->v[i];
+  memory[MEMORY - 2] = s->gamma;
+  memory[MEMORY - 1] = s->tau;
+}
+
+INLINE int sane(In s0, In data, In lower, In upper) {
+  int l, ok = all_finite(s0, NS) && all_finite(data, (N + 1) * NT);
+  for (l = 0; l < NU; ++l) ok &= lower[l] <= upper[l] && lower[l] <= FINITE && upper[l] >= -FINITE;
+  return ok;
+}
+
+INLINE int run(const casadi_real** arg, casadi_real** res) {
+  static const casadi_real nothing[(N + 1) * NT + MEMORY + NS + NU]; /* CasADi passes no address for zeros */
+  In s0 = arg[0] ? arg[0] : nothing, data = arg[1] ? arg[1] : nothing, memory = arg[4] ? arg[4] : nothing;
+  In lower = arg[2] ? arg[2] : nothing, upper = arg[3] ? arg[3] : nothing;
+  Search s;
+  Plan *best = s.plans, *plan = s.plans + 1, *other;
+  int i, posed = sane(s0, data, lower, upper), count = 0, empty = 0, evaluated, status;
+  casadi_real left = 0;
+  begin(&s, best, memory, lower, upper);
+  while (count < ITERATIONS) {
+    int ok = try_next(&s, best, plan, s0, data, lower, upper), accepted = judged(&s, best, plan, ok, lower, upper);
+    if (accepted) other = best, best = plan, plan = other;
+    count += 1;
+    if (STOP_EARLY && best->value < UNTRIED && residual(best, lower, upper) <= TOLERANCE) break;
+    if (accepted && direct(&s, best, data, lower, upper)) return 1;
+  }
+  evaluated = best->value < UNTRIED;
+  left = residual(best, lower, upper);
+  for (i = 0; i < NU; ++i) empty |= lower[i] > upper[i];
+  status = empty ? INFEASIBLE : !(posed && evaluated) ? NON_FINITE : left <= TOLERANCE ? CONVERGED : NOT_CONVERGED;
+  if (res[0]) for (i = 0; i < N * NU; ++i) res[0][i] = best->u[i];
+  if (res[1]) {
+    res[1][0] = posed && evaluated ? best->value : 0;
+    res[1][1] = posed && evaluated ? left : 0;
+    res[1][2] = 0;
+    res[1][3] = count;
+    res[1][4] = status;
+  }
+  if (res[2]) {
+    if (posed && evaluated) remember(&s, best, res[2]);
+    else for (i = 0; i < MEMORY; ++i) res[2][i] = posed ? 0 : memory[i];
+  }
+  return 0;
+}
+
+/* One library runs on every machine of its architecture: wider registers are used where there are some. Without fused
+   multiply-add both round alike. */
+#if defined(__GNUC__) && defined(__x86_64__)
+__attribute__((target("avx2"))) static int run_wide(const casadi_real** arg, casadi_real** res) { return run(arg, res); }
+static int can_run_wide(void) { return __builtin_cpu_supports("avx2"); }
+#else
+static int run_wide(const casadi_real** arg, casadi_real** res) { return 1; }
+static int can_run_wide(void) { return 0; }
+#endif
+static int run_plain(const casadi_real** arg, casadi_real** res) { return run(arg, res); }
+
+int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {
+  (void)iw, (void)w, (void)mem;
+  return can_run_wide() ? run_wide(arg, res) : run_plain(arg, res);
+}

@@ -1,0 +1,214 @@
+"""The line search of `FixedPoint`: tries one plan per iteration and keeps the best so far, the anchor.
+
+Built from Functions of a whole horizon, so that an iteration adds calls and no copies to the graph.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import casadi as ca
+
+from fpirhc.deformation.base import Deformation
+from fpirhc.horizon.curvature import steepest_curvature
+from fpirhc.horizon.expansion import Bend, bent_end, bent_stage, linear_stage, stage_symbols
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.riccati import backward_sweep
+from fpirhc.optimisers.base import clip, is_finite
+from fpirhc.symbolic.layout import Expression
+
+SHARE = 0.95  # gamma L, and the share of the guaranteed decrease that is asked for
+SHORTER = 0.25  # factor of the step after a plan that did not decrease the envelope
+SHORTEST = 0.05  # below it the plain fixed-point step is taken
+ROUNDING = 1e-13  # relative to the cost: differences below it say nothing
+UNTRIED = 1e299  # a cost from which on an anchor counts as not evaluated
+
+
+class Given(NamedTuple):
+    """The arguments of one call."""
+
+    s0: ca.MX
+    data: ca.MX
+    lower: ca.MX
+    upper: ca.MX
+
+
+class Anchor(NamedTuple):
+    """The best plan so far, where to go from it, and how boldly."""
+
+    inputs: Expression  # U (nu, N)
+    states: Expression  # X (ns, N)
+    move: Expression  # v (nu, N)
+    gains: Expression  # K (nu, ns N)
+    plain: Expression  # T (nu, N)
+    slope: Expression  # g (nu, N)
+    value: Expression  # V
+    envelope: Expression  # phi
+    step: Expression  # tau; below SHORTEST the next plan is T
+    gamma: Expression
+
+
+class Expanded(NamedTuple):
+    """A plan that was tried, expanded."""
+
+    inputs: Expression
+    states: Expression  # (ns, N + 1)
+    a: Expression
+    b: Expression
+    by_state: Expression
+    by_input: Expression
+    costates: Expression  # (ns, N), of s_1 ... s_N
+    accepted: Expression
+
+
+def first_gamma(ocp: OptimalControl) -> float:
+    """Gamma that is safe near the reference: SHARE / L in the metric of D."""
+    return SHARE / steepest_curvature(ocp.along, 1 / (ocp.step * ocp.curvature))
+
+
+class Search:
+    """Builds the expressions of the iteration for one problem."""
+
+    def __init__(self, ocp: OptimalControl, bend: Bend, map: Deformation, damping: float) -> None:
+        self._ocp = ocp
+        self._expand, self._try = _expansion(ocp), _trial(ocp)
+        self._judge = _judgement(ocp)
+        self._direct = _direction(ocp, bend, map, damping)
+
+    def tried(self, anchor: Anchor, given: Given) -> tuple[Anchor, Expanded]:
+        """Try the anchor's next plan: the new anchor, and the plan expanded."""
+        tried = self._try(given.s0, given.data, given.lower, given.upper, *anchor[:5], anchor.step)
+        inputs, states, costs, a, b, by_state, by_input = tried
+        value, slope, costates = self._expand(states, inputs, costs, given.data, a, b, by_state, by_input)
+        kept = self._judge(inputs, states, value, slope, given.lower, given.upper, *anchor)
+        *fields, accepted = kept
+        return Anchor(*fields), Expanded(inputs, states, a, b, by_state, by_input, costates, accepted)
+
+    def directed(self, anchor: Anchor, plan: Expanded, given: Given) -> Anchor:
+        """The anchor with the sweep's direction, renewed where the last plan was accepted."""
+        move, gains = self._direct(*plan[:7], given.data, given.lower, given.upper)
+        return anchor._replace(
+            move=ca.if_else(plan.accepted, move, anchor.move), gains=ca.if_else(plan.accepted, gains, anchor.gains)
+        )
+
+
+def _trial(ocp: OptimalControl) -> ca.Function:
+    """Function (s0, data, lower, upper, U, X, v, K, T, tau) -> (U, X (ns, N + 1), costs, A, B, l_s, l_u) of the next plan."""
+    n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
+    s, _, theta = stage_symbols(ocp)
+    inputs, move, plain = (ca.SX.sym(name, nu) for name in ("u", "v", "t"))
+    planned, gain, step = ca.SX.sym("x", ns), ca.SX.sym("K", nu, ns), ca.SX.sym("tau")
+    low, high = ca.SX.sym("low", nu), ca.SX.sym("high", nu)
+    newton = ca.fmin(ca.fmax(inputs + step * move + gain @ (s - planned), low), high)
+    chosen = ca.if_else(step >= SHORTEST, newton, plain)
+    following, cost, *rest = linear_stage(ocp)(s, chosen, theta)
+    stage = ca.Function(
+        "fpirhc_trial_stage",
+        [s, theta, low, high, inputs, planned, move, gain, plain, step],
+        [following, chosen, cost, *rest],
+    )
+    sweep = stage.mapaccum("fpirhc_trial_stages", n)
+    s0, data = ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
+    lower, upper, tau = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu), ca.MX.sym("tau")
+    plans = [ca.MX.sym(f"p{k}", *shape) for k, shape in enumerate([(nu, n), (ns, n), (nu, n), (nu, ns * n), (nu, n)])]
+    repeated = [ca.repmat(v, 1, n) for v in (lower, upper, tau)]
+    u, x, v, k, t = plans
+    states, *results = sweep(s0, data[:, :n], repeated[0], repeated[1], u, x, v, k, t, repeated[2])
+    arguments = [s0, data, lower, upper, *plans, tau]
+    chosen_inputs, *stages = results
+    return ca.Function("fpirhc_trial", arguments, [chosen_inputs, ca.horzcat(s0, states), *stages])
+
+
+def _expansion(ocp: OptimalControl) -> ca.Function:
+    """Function (X, U, costs, data, A, B, l_s, l_u) -> (V, g, costates of s_1 ... s_N)."""
+    n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
+    costate, a, b = ca.SX.sym("lambda", ns), ca.SX.sym("A", ns, ns), ca.SX.sym("B", ns, nu)
+    by_state, by_input = ca.SX.sym("ls", ns), ca.SX.sym("lu", nu)
+    stage = ca.Function(
+        "fpirhc_costate_stage",
+        [costate, a, b, by_state, by_input],
+        [by_state + a.T @ costate, by_input + b.T @ costate, costate],
+    )
+    states, inputs = ca.MX.sym("X", ns, n + 1), ca.MX.sym("U", nu, n)
+    costs, data = ca.MX.sym("l", 1, n), ca.MX.sym("data", ocp.data.size, n + 1)
+    stacked = [ca.MX.sym(f"m{k}", rows, columns * n) for k, (rows, columns) in enumerate(_stage_shapes(ns, nu))]
+    final, last, _ = bent_end(ocp)(states[:, n], data[:, n])
+    turned = [_turned(m, n) for m in stacked]
+    _, slope, costates = stage.mapaccum("fpirhc_costate_stages", n)(last, *turned)
+    results = [ca.sum2(costs) + final, _turned(slope, n), _turned(costates, n)]
+    return ca.Function("fpirhc_expansion", [states, inputs, costs, data, *stacked], results)
+
+
+def _direction(ocp: OptimalControl, bend: Bend, map: Deformation, damping: float) -> ca.Function:
+    """Function (U, X, A, B, l_s, l_u, costates, data, lower, upper) -> (v, K): the deformed feedforward and its feedback."""
+    n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
+    inputs, states = ca.MX.sym("U", nu, n), ca.MX.sym("X", ns, n + 1)
+    stacked = [ca.MX.sym(f"m{k}", rows, columns * n) for k, (rows, columns) in enumerate(_stage_shapes(ns, nu))]
+    costates, data = ca.MX.sym("lambda", ns, n), ca.MX.sym("data", ocp.data.size, n + 1)
+    lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
+    bent = bent_stage(ocp, bend).map(n)(states[:, :n], inputs, data[:, :n], costates)
+    _, slope, value = bent_end(ocp)(states[:, n], data[:, n])
+    bounds = ca.repmat(lower, 1, n), ca.repmat(upper, 1, n)
+    move, gains = backward_sweep(ocp, damping)(*stacked, *bent, inputs, *bounds, value, slope)
+    results = [ca.reshape(deformed_move(map, nu * n)(ca.vec(move)), nu, n), gains]
+    return ca.Function("fpirhc_direction", [inputs, states, *stacked, costates, data, lower, upper], results)
+
+
+def deformed_move(map: Deformation, size: int) -> ca.Function:
+    """Function v -> G(0, -v, 0): the feedforward -h as the map makes it."""
+    column = ca.SX.sym("v", size)
+    deformed, _ = map.step(ca.SX.zeros(size), -column, ca.SX.zeros(size), {})
+    return ca.Function("fpirhc_deformed_move", [column], [ca.densify(deformed)])
+
+
+def _judgement(ocp: OptimalControl) -> ca.Function:
+    """Function (U, X, V, g of the plan tried, lower, upper, anchor) -> (anchor, accepted)."""
+    n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
+    inputs, states = ca.MX.sym("U", nu, n), ca.MX.sym("X", ns, n + 1)
+    value, slope = ca.MX.sym("V"), ca.MX.sym("g", nu, n)
+    lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
+    shapes = [(nu, n), (ns, n), (nu, n), (nu, ns * n), (nu, n), (nu, n), (1, 1), (1, 1), (1, 1), (1, 1)]
+    old = Anchor(*(ca.MX.sym(name, *shape) for name, shape in zip(Anchor._fields, shapes, strict=True)))
+    scale = ca.repmat(ca.DM(1 / (ocp.step * ocp.curvature)), 1, n)
+
+    def plain_step(u: Expression, g: Expression, gamma: Expression) -> Expression:
+        return clip(u - gamma * scale * g, lower, upper)
+
+    def size(difference: Expression) -> Expression:
+        return ca.dot(difference, difference / scale)
+
+    plain = plain_step(inputs, slope, old.gamma)
+    envelope = value + ca.dot(slope, plain - inputs) + size(plain - inputs) / (2 * old.gamma)
+    untried, bold = old.value >= UNTRIED, old.step >= SHORTEST
+    reach = size(old.plain - old.inputs) / (2 * old.gamma)
+    slack = ROUNDING * (1 + ca.fabs(old.value))
+    decreases = envelope <= old.envelope - SHARE * (1 - SHARE) * reach + slack
+    # Far away gamma may be too long for the envelope to bound V from below, so V itself must not rise; it does not at T.
+    decreases = ca.logic_and(decreases, value <= old.value + slack)
+    bounded = value <= old.value + ca.dot(old.slope, old.plain - old.inputs) + SHARE * reach + slack
+    finite = is_finite(ca.vertcat(value, ca.vec(slope), ca.vec(states)))
+    accepted = ca.logic_and(finite, ca.logic_or(untried, ca.if_else(bold, decreases, bounded)))
+    # A rejected T means that gamma was too long; a rejected warm start, that a plan without memory is next.
+    halved = ca.if_else(ca.logic_or(untried, bold), old.gamma, 0.5 * old.gamma)
+    retreat = old._replace(
+        gamma=halved,
+        step=ca.if_else(untried, SHORTEST * SHORTER, SHORTER * old.step),
+        plain=ca.if_else(untried, old.plain, plain_step(old.inputs, old.slope, halved)),
+    )
+    shrunk = size(retreat.plain - old.inputs) / (2 * halved)
+    retreat = retreat._replace(
+        envelope=ca.if_else(untried, old.envelope, old.value + ca.dot(old.slope, retreat.plain - old.inputs) + shrunk)
+    )
+    step = ca.if_else(untried, old.step, 1)
+    advance = Anchor(inputs, states[:, :n], old.move, old.gains, plain, slope, value, envelope, step, old.gamma)
+    kept = [ca.if_else(accepted, new, back) for new, back in zip(advance, retreat, strict=True)]
+    return ca.Function("fpirhc_judgement", [inputs, states, value, slope, lower, upper, *old], [*kept, accepted])
+
+
+def _stage_shapes(ns: int, nu: int) -> tuple[tuple[int, int], ...]:
+    return (ns, ns), (ns, nu), (ns, 1), (nu, 1)
+
+
+def _turned(stacked: Expression, stages: int) -> Expression:
+    """The blocks of the stages in reverse order."""
+    return ca.horzcat(*reversed(ca.horzsplit(stacked, stacked.shape[1] // stages))) if stages > 1 else stacked

@@ -1,0 +1,82 @@
+"""Bodies in C for Functions whose composed graph is slow to run as generated code.
+
+A driver is a hand-written loop around generated leaf functions that computes what a composed Function computes. The composed
+Function stays the definition: the virtual machine runs it, and it is compiled where a driver does not fit. When C is generated
+for a Function that calls it, its body is replaced by a call of the driver.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+
+_drivers: dict[str, str] = {}
+
+
+@dataclass(frozen=True, eq=False)
+class Driver:
+    """The C text of a driver.
+
+    Parameters: `text` defines `int ENTRY(arg, res, iw, w, mem)`, CasADi's C signature, and calls `leaves` by their keys;
+    `constants` become preprocessor definitions. WORK and INTEGERS are defined as the leaves' scratch space.
+    """
+
+    text: str
+    leaves: Mapping[str, ca.Function]
+    constants: Mapping[str, object]
+
+    def source(self) -> str:
+        """Return the whole C file; the name of the entry stands as ENTRY."""
+        generator = ca.CodeGenerator("fpirhc_leaves", {"with_header": False, "with_mem": False})
+        renamed = [_renamed(leaf, f"fpirhc_leaf_{name}") for name, leaf in self.leaves.items()]
+        for leaf in renamed:
+            generator.add(leaf)
+        lines = [f"#define {name} {value}" for name, value in self.constants.items()]
+        lines += [f"#define {name} fpirhc_leaf_{name}" for name in self.leaves]
+        lines += [
+            f"#define WORK {max(f.sz_w() for f in renamed)}",
+            f"#define INTEGERS {max(f.sz_iw() for f in renamed)}",
+        ]
+        # The leaves belong to this file alone: the same names in other drivers must not meet in one library.
+        generated = re.sub(r"^CASADI_SYMBOL_EXPORT ", "static ", generator.dump(), flags=re.MULTILINE)
+        return "\n".join([generated, *lines, self.text])
+
+
+def with_driver(name: str, driver: Driver, build: Callable[[str], ca.Function]) -> ca.Function:
+    """Return `build(unique name)` with this driver as its body in C."""
+    source = driver.source()
+    unique = f"{name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
+    _drivers[unique] = source
+    return build(unique)
+
+
+def substitute(source: str) -> tuple[str, Sequence[str]]:
+    """Return generated C with the bodies of Functions that have a driver replaced, and the drivers' own C files."""
+    files = []
+    for name in dict.fromkeys(re.findall(r"^/\* (fpirhc_\w+):\(", source, re.MULTILINE)):
+        if name not in _drivers:
+            continue
+        body = re.compile(
+            rf"(^/\* {name}:\(.*?\*/\nstatic int \w+\(const casadi_real\*\* arg, casadi_real\*\* res, casadi_int\* iw, "
+            r"casadi_real\* w, int mem\) \{\n).*?^\}$",
+            re.MULTILINE | re.DOTALL,
+        )
+        entry = f"{name}_driver"
+        source, count = body.subn(rf"\1  return {entry}(arg, res, iw, w, mem);\n}}", source)
+        if count:
+            declared = (
+                f"int {entry}(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem);\n"
+            )
+            source = source.replace(f"/* {name}:(", f"{declared}/* {name}:(", 1)
+            files.append(f"#define ENTRY {entry}\n{_drivers[name]}")
+    return source, files
+
+
+def _renamed(leaf: ca.Function, name: str) -> ca.Function:
+    inputs = [ca.SX.sym(f"i{k}", leaf.sparsity_in(k)) for k in range(leaf.n_in())]
+    results = leaf.call(inputs)
+    return ca.Function(name, inputs, results)
