@@ -92,7 +92,7 @@ def test_a_fixed_point_stays_fixed():
 def test_linear_quadratic_problems_need_one_step(optimiser):
     """The Riccati sweep is exact there: from any plan, the next one is the optimum."""
     ocp, data, first = linear_problem()
-    _, told, _ = call(replace(optimiser, iterations=2), ocp, data, first, ocp.input_lower, ocp.input_upper)
+    _, told, _ = call(replace(optimiser, iterations=1), ocp, data, first, ocp.input_lower, ocp.input_upper)
     assert told.ravel()[1] < 1e-10
 
 
@@ -269,9 +269,8 @@ def test_a_saturating_map_limits_the_step():
     ocp, data, first = linear_problem()
     sigmoid = fp.Sigmoid(gain=-2.5, scale=0.2)
     optimiser = fp.FixedPoint(iterations=1, tolerance=1e-8, map=sigmoid)
-    _, _, memory = call(optimiser, ocp, data, first, ocp.input_lower, ocp.input_upper)
-    move = memory.ravel()[optimiser.memory(ocp).slice("plan_moves")]
-    assert np.linalg.norm(move) <= sigmoid.largest_step() + 1e-12
+    inputs, _, _ = call(optimiser, ocp, data, first, ocp.input_lower, ocp.input_upper)
+    assert 0.1 < np.linalg.norm(inputs) <= sigmoid.largest_step() + 1e-12
     limited = fp.solve(ocp, optimiser, first, data, calls=300)
     free = fp.solve(ocp, replace(optimiser, map=fp.Affine(gain=-2.0)), first, data)
     assert limited.status == fp.Status.OK

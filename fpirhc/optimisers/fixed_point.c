@@ -137,7 +137,10 @@ INLINE int judged(Search* s, Plan* best, Plan* plan, int ok, In lower, In upper)
       casadi_real kept[N * NU];
       for (i = 0; i < N * NU; ++i) kept[i] = s->t[i];
       envelope = plan->value + plain_step(s, plan, lower, upper, &reach) + reach;
-      ok = envelope <= s->envelope - SHARE * (1 - SHARE) * s->reach + slack && plan->value <= best->value + slack;
+      for (i = 0; i < N * NU; ++i) descent += best->g[i] * (plan->u[i] - best->u[i]);
+      ok = envelope <= s->envelope - SHARE * (1 - SHARE) * s->reach + slack ||
+           plan->value <= best->value + ARMIJO * fmin(descent, 0) + slack;
+      ok = ok && envelope <= s->envelope + slack && plan->value <= best->value + slack;
       if (!ok) for (i = 0; i < N * NU; ++i) s->t[i] = kept[i];
     } else {
       for (i = 0; i < N * NU; ++i) descent += best->g[i] * (s->t[i] - best->u[i]);
@@ -300,8 +303,7 @@ INLINE void begin(Search* s, Plan* best, In memory, In lower, In upper) {
   for (i = 0; i < N; ++i)
     for (l = 0; l < NU; ++l) {
       best->u[i * NU + l] = between(known ? memory[i * NU + l] : 0, lower[l], upper[l]);
-      s->v[i * NU + l] = known ? memory[N * (NU + NS + NU * NS) + i * NU + l] : 0;
-      best->g[i * NU + l] = 0;
+      s->v[i * NU + l] = best->g[i * NU + l] = 0;
       s->t[i * NU + l] = between(0, lower[l], upper[l]);
     }
   for (i = 0; i < N * NS; ++i) s->planned[i] = known ? memory[N * NU + i] : 0;
@@ -317,7 +319,6 @@ INLINE void remember(const Search* s, const Plan* best, Out memory) {
   for (i = 0; i < N * NU; ++i) memory[i] = best->u[i];
   for (i = 0; i < N * NS; ++i) memory[N * NU + i] = s->planned[i];
   for (i = 0; i < N * NU * NS; ++i) memory[N * (NU + NS) + i] = s->k[i];
-  for (i = 0; i < N * NU; ++i) memory[N * (NU + NS + NU * NS) + i] = s->v[i];
   memory[MEMORY - 2] = s->gamma;
   memory[MEMORY - 1] = s->tau;
 }
@@ -337,10 +338,10 @@ INLINE int run(const casadi_real** arg, casadi_real** res) {
   int i, posed = sane(s0, data, lower, upper), count = 0, empty = 0, evaluated, status;
   casadi_real left = 0;
   begin(&s, best, memory, lower, upper);
-  while (count < ITERATIONS) {
+  for (;; ++count) {
     int ok = try_next(&s, best, plan, s0, data, lower, upper), accepted = judged(&s, best, plan, ok, lower, upper);
     if (accepted) other = best, best = plan, plan = other;
-    count += 1;
+    if (count == ITERATIONS) break;
     if (STOP_EARLY && best->value < UNTRIED && residual(best, lower, upper) <= TOLERANCE) break;
     if (accepted && direct(&s, best, data, lower, upper)) return 1;
   }

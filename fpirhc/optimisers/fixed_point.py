@@ -17,14 +17,13 @@ step and gamma < 1 / L, a new plan must decrease the forward-backward envelope
 
     phi(U) = V + g'(T - U) + 1/(2 gamma) |T - U|^2
 
-by a share of |T - U|^2 and must not raise V; else the step is shortened, and at last T itself is taken, which always decreases
-phi. T is tested for the quadratic upper bound that gamma promises; where it fails gamma is halved. D = 1/(step c) is the scale of
-`OptimalControl`.
+by a share of |T - U|^2 (a short step: V by a share of what it promises), and raise neither phi nor V; else the step is shortened,
+and at last T itself is taken, which always decreases phi. T is tested for the quadratic upper bound that gamma promises; where
+it fails gamma is halved. D = 1/(step c) is the scale of `OptimalControl`.
 
-Each iteration rolls out one plan with its Jacobians, judges it by an adjoint sweep, and finds where to go next by a Riccati
-sweep, whatever happens. What the last sweep of a call found is remembered and rolled out first in the next one, with its feedback,
-so that a plan answers a new initial state at once, and every plan that is returned has been evaluated. With one iteration per call
-that is one step of the fixed-point iteration per control cycle.
+A call evaluates the remembered plan, rolled out with its remembered feedback, which answers to first order for a new initial
+state; an iteration finds a direction by one Riccati sweep and evaluates the plan there: one rollout with Jacobians and one
+adjoint sweep, whatever happens. So every plan that is returned has been evaluated.
 
 References: H. Khan, J. K. Tar, I. J. Rudas on fixed-point iteration in place of the reduced gradient (2017-2018); H. Issa,
 J. K. Tar, Electronics 11, 1243, 2022, for the transition between gradient descent and Newton (`damping`).
@@ -45,6 +44,7 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import PIVOT, rounds
 from fpirhc.optimisers.base import FINITE, Optimiser, clip, is_finite, sane, shift, stationarity, status_of
 from fpirhc.optimisers.search import (
+    ARMIJO,
     ROUNDING,
     SHARE,
     SHORTER,
@@ -100,7 +100,6 @@ class FixedPoint(Optimiser):
                 Signal("plan_inputs", tuple(f"{i}@{k}" for k in range(n) for i in inputs)),
                 Signal("plan_states", tuple(f"{s}@{k}" for k in range(n) for s in state)),
                 Signal("plan_gains", tuple(f"{i}/{s}@{k}" for k in range(n) for s in state for i in inputs)),
-                Signal("plan_moves", tuple(f"{i}@{k}" for k in range(n) for i in inputs)),
                 scalar("plan_gamma", start=0.0),
                 scalar("plan_step", start=0.0),
             )
@@ -115,7 +114,6 @@ class FixedPoint(Optimiser):
             "plan_inputs": ca.vec(shift(ca.reshape(kept["plan_inputs"], nu, n))),
             "plan_states": ca.vec(shift(ca.reshape(kept["plan_states"], ns, n))),
             "plan_gains": gains,
-            "plan_moves": ca.vec(shift(ca.reshape(kept["plan_moves"], nu, n))),
         }
         return self.memory(ocp).join({**kept, **moved})
 
@@ -154,6 +152,7 @@ class FixedPoint(Optimiser):
             "DAMPING": repr(self.damping),
             "FIRST_GAMMA": repr(first_gamma(ocp)),
             "SHARE": SHARE,
+            "ARMIJO": ARMIJO,
             "SHORTER": SHORTER,
             "SHORTEST": SHORTEST,
             "ROUNDING": ROUNDING,
@@ -177,6 +176,7 @@ class FixedPoint(Optimiser):
         for _ in range(self.iterations):
             anchor, plan = search.tried(anchor, given)
             anchor = search.directed(anchor, plan, given)
+        anchor, _ = search.tried(anchor, given)
         return ca.Function(name, [*given, memory], self._finish(ocp, given, memory, anchor, self.iterations))
 
     def _converging_graph(self, ocp: OptimalControl, name: str) -> ca.Function:
@@ -188,11 +188,11 @@ class FixedPoint(Optimiser):
         work = ca.Function("fpirhc_iteration", [*given, *symbols], list(search.directed(tried, plan, given)))
         rest = ca.Function("fpirhc_rest", [*given, *symbols], list(symbols))
         choice = ca.Function.if_else("fpirhc_iteration_if_needed", work, rest)
-        for _ in range(MOST):
+        for _ in range(MOST + 1):
             residual = stationarity(ocp, anchor.inputs, anchor.slope, given.lower, given.upper)
             needed = ca.logic_not(ca.logic_and(anchor.value < UNTRIED, residual <= self.tolerance))
             anchor, count = Anchor(*choice(needed, *given, *anchor)), count + needed
-        return ca.Function(name, [*given, memory], self._finish(ocp, given, memory, anchor, count))
+        return ca.Function(name, [*given, memory], self._finish(ocp, given, memory, anchor, count - 1))
 
     def _arguments(self, ocp: OptimalControl) -> tuple[Given, ca.MX]:
         nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
@@ -212,7 +212,7 @@ class FixedPoint(Optimiser):
         return Anchor(
             inputs=inputs,
             states=ca.reshape(kept["plan_states"], ns, n),
-            move=ca.reshape(kept["plan_moves"], nu, n),
+            move=none,
             gains=ca.reshape(kept["plan_gains"], nu, ns * n),
             plain=clip(none, given.lower, given.upper),
             slope=none,
@@ -239,7 +239,6 @@ class FixedPoint(Optimiser):
                 "plan_inputs": ca.vec(anchor.inputs),
                 "plan_states": ca.vec(anchor.states),
                 "plan_gains": ca.vec(anchor.gains),
-                "plan_moves": ca.vec(anchor.move),
                 "plan_gamma": anchor.gamma,
                 "plan_step": anchor.step,
             }

@@ -18,6 +18,7 @@ from fpirhc.optimisers.base import clip, is_finite
 from fpirhc.symbolic.layout import Expression
 
 SHARE = 0.95  # gamma L, and the share of the guaranteed decrease that is asked for
+ARMIJO = 1e-2  # share of the first-order decrease that is asked of a short step
 SHORTER = 0.25  # factor of the step after a plan that did not decrease the envelope
 SHORTEST = 0.05  # below it the plain fixed-point step is taken
 ROUNDING = 1e-13  # relative to the cost: differences below it say nothing
@@ -182,9 +183,12 @@ def _judgement(ocp: OptimalControl) -> ca.Function:
     untried, bold = old.value >= UNTRIED, old.step >= SHORTEST
     reach = size(old.plain - old.inputs) / (2 * old.gamma)
     slack = ROUNDING * (1 + ca.fabs(old.value))
-    decreases = envelope <= old.envelope - SHARE * (1 - SHARE) * reach + slack
+    enough = envelope <= old.envelope - SHARE * (1 - SHARE) * reach + slack
+    # A step that a saturating map or the search made short decreases by its own measure, not by that of T.
+    fair = value <= old.value + ARMIJO * ca.fmin(ca.dot(old.slope, inputs - old.inputs), 0) + slack
     # Far away gamma may be too long for the envelope to bound V from below, so V itself must not rise; it does not at T.
-    decreases = ca.logic_and(decreases, value <= old.value + slack)
+    falls = ca.logic_and(envelope <= old.envelope + slack, value <= old.value + slack)
+    decreases = ca.logic_and(falls, ca.logic_or(enough, fair))
     bounded = value <= old.value + ca.dot(old.slope, old.plain - old.inputs) + SHARE * reach + slack
     finite = is_finite(ca.vertcat(value, ca.vec(slope), ca.vec(states)))
     accepted = ca.logic_and(finite, ca.logic_or(untried, ca.if_else(bold, decreases, bounded)))
