@@ -25,12 +25,11 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidProblem
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
-from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.problem import Problem, cycles_per_stage
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, every
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 _SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")
 
@@ -112,12 +111,12 @@ def _due_block(cycles: int) -> Block:
 
 
 def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -> Block:
-    """Block (time, plan state, parameters, correction) -> (planned input, solve statistics, cost by term)."""
+    """Block (time, plan state, parameters, correction) -> (planned input, solve statistics)."""
     assert problem.horizon is not None
     assert problem.cost is not None
     plant, ocp = problem.plant, _optimal_control(problem)
     memory = optimiser.memory(ocp)
-    solve, predict = optimiser.step(ocp), rollout(ocp)
+    solve = optimiser.step(ocp)
     data_of = stage_data(plant, problem.reference, problem.horizon, problem.cost)
     feedforward_of = _feedforward(problem)
     reads = (
@@ -127,12 +126,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         like(plant.input, "_correction_before"),
         like(plant.input, "_command_before"),
     )
-    writes = (
-        like(plant.input, "planned"),
-        Signal("solve", _SOLVE),
-        vector("planned_cost", ocp.terms),
-        scalar("_solve_status"),
-    )
+    writes = (like(plant.input, "planned"), Signal("solve", _SOLVE), scalar("_solve_status"))
 
     def step(s: Any) -> dict[str, Expression]:
         data = data_of(s.time, s.parameters)
@@ -142,12 +136,11 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         lower, upper = ocp.input_lower - s._correction_before, ocp.input_upper - s._correction_before
         remembered = optimiser.shifted(ocp, memory.join({m: getattr(s, m) for m in memory.names}))
         inputs, diagnostics, following = solve(first, data, lower, upper, remembered)
-        _, _, terms = predict(first, inputs, data)
         status = diagnostics[_SOLVE.index("status")]
         failed = status > int(Status.NOT_CONVERGED) + 0.5
         planned, judged = on_failure.choose(failed, inputs[:, 0], feedforward_of(s.time, s.parameters), status)
         kept = {f"{m}_next": v for m, v in memory.split(following).items()}
-        return {"planned": planned, "solve": diagnostics, "planned_cost": terms, "_solve_status": judged, **kept}
+        return {"planned": planned, "solve": diagnostics, "_solve_status": judged, **kept}
 
     return Block("plan", Layout(reads), Layout(writes), step, memory, opaque=True)
 

@@ -11,7 +11,6 @@ References: J. A. E. Andersson et al., CasADi, Math. Program. Comput. 11, 2019.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,6 +29,17 @@ from fpirhc.optimisers.base import (
     sane,
     shift,
     status_of,
+)
+from fpirhc.optimisers.shooting import (
+    gauss_newton_hessian,
+    interleave,
+    program,
+    program_values,
+    separate,
+    shift_dynamics,
+    shift_variables,
+    sizes,
+    stage_bounds,
 )
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -118,9 +128,14 @@ class _MultipleShooting(Optimiser):
         if not self.tolerance > 0:
             raise InvalidValue(f"{type(self).__name__} needs a positive tolerance, got {self.tolerance}")
 
+    @property
     @abstractmethod
-    def solver(self, ocp: OptimalControl, program: Mapping[str, ca.MX]) -> ca.Function:
-        """Return CasADi's solver Function of the program."""
+    def plugin(self) -> str:
+        """CasADi's name of the solver."""
+
+    @abstractmethod
+    def options(self, ocp: OptimalControl) -> Options:
+        """CasADi's options of the solver."""
 
     @property
     def exportable(self) -> bool:
@@ -129,7 +144,7 @@ class _MultipleShooting(Optimiser):
 
     def memory(self, ocp: OptimalControl) -> Layout:
         """The plan, and the multipliers of variables and constraints."""
-        variables, constraints = _sizes(ocp)
+        variables, constraints = sizes(ocp)
         plan = tuple(f"{i}@{k}" for k in range(ocp.stages) for i in ocp.input.elements)
         return Layout(
             (
@@ -144,8 +159,8 @@ class _MultipleShooting(Optimiser):
         kept = self.memory(ocp).split(memory)
         moved = {
             "plan_inputs": ca.vec(shift(ca.reshape(kept["plan_inputs"], ocp.input.size, ocp.stages))),
-            "plan_variable_multipliers": _shift_variables(ocp, kept["plan_variable_multipliers"]),
-            "plan_dynamics_multipliers": _shift_dynamics(ocp, kept["plan_dynamics_multipliers"]),
+            "plan_variable_multipliers": shift_variables(ocp, kept["plan_variable_multipliers"]),
+            "plan_dynamics_multipliers": shift_dynamics(ocp, kept["plan_dynamics_multipliers"]),
         }
         return self.memory(ocp).join(moved)
 
@@ -157,7 +172,7 @@ class _MultipleShooting(Optimiser):
         """
         s0, data, lower, upper, _ = arguments = self._arguments(ocp)
         start, states = self._guess(ocp)(*arguments)
-        begin = _program_values(ocp)(_interleave(states, start), ca.vec(data))
+        begin = program_values(ocp)(interleave(states, start), ca.vec(data))
         usable = ca.logic_and(sane(s0, data, lower, upper), is_finite(begin))
         run, skip = self._solve(ocp, "fpirhc_shooting"), self._skip(ocp)
         results = ca.Function.if_else("fpirhc_guarded_shooting", run, skip)(usable, *arguments)
@@ -197,18 +212,18 @@ class _MultipleShooting(Optimiser):
         s0, data, lower, upper, memory = arguments = self._arguments(ocp)
         kept = layout.split(memory)
         start, states = self._guess(ocp)(*arguments)
-        solution = self.solver(ocp, _program(ocp))(
-            x0=_interleave(states, start),
+        solution = ca.nlpsol("fpirhc_shooting_solver", self.plugin, program(ocp), self.options(ocp))(
+            x0=interleave(states, start),
             p=ca.vec(data),
-            lbx=_interleave(_bound(ocp, s0, ocp.state_lower), ca.repmat(lower, 1, n)),
-            ubx=_interleave(_bound(ocp, s0, ocp.state_upper), ca.repmat(upper, 1, n)),
+            lbx=interleave(stage_bounds(ocp, s0, ocp.state_lower), ca.repmat(lower, 1, n)),
+            ubx=interleave(stage_bounds(ocp, s0, ocp.state_upper), ca.repmat(upper, 1, n)),
             lbg=0,
             ubg=0,
             lam_x0=_usable(kept["plan_variable_multipliers"]),
             lam_g0=_usable(kept["plan_dynamics_multipliers"]),
         )
-        found = clip(_separate(ocp, solution["x"])[1], lower, upper)
-        multipliers = _separate(ocp, solution["lam_x"])[0][:, 1:] * int(ocp.bounds_states)
+        found = clip(separate(ocp, solution["x"])[1], lower, upper)
+        multipliers = separate(ocp, solution["lam_x"])[0][:, 1:] * int(ocp.bounds_states)
         cost, residual, violation = judge(ocp)(found, s0, data, lower, upper, multipliers)
         finite = is_finite(ca.vertcat(ca.vec(found), cost, residual, violation, solution["lam_x"], solution["lam_g"]))
         plan = ca.if_else(finite, found, start)
@@ -234,9 +249,14 @@ class InteriorPoint(_MultipleShooting):
     accuracy: float = 1e-8
     iterations: int = 200
 
-    def solver(self, ocp: OptimalControl, program: Mapping[str, ca.MX]) -> ca.Function:  # noqa: ARG002
-        """Quiet IPOPT with a warm start."""
-        options = {
+    @property
+    def plugin(self) -> str:
+        """CasADi's name of the solver."""
+        return "ipopt"
+
+    def options(self, ocp: OptimalControl) -> Options:  # noqa: ARG002
+        """Quiet, with a warm start."""
+        return {
             **_QUIET,
             "ipopt.sb": "yes",
             "ipopt.print_level": 0,
@@ -247,7 +267,6 @@ class InteriorPoint(_MultipleShooting):
             "ipopt.warm_start_mult_bound_push": 1e-9,
             "ipopt.mu_init": 1e-4,
         }
-        return ca.nlpsol("fpirhc_ipopt", "ipopt", dict(program), options)
 
 
 @dataclass(frozen=True)
@@ -257,15 +276,19 @@ class Fatrop(_MultipleShooting):
     accuracy: float = 1e-8
     iterations: int = 200
 
-    def solver(self, ocp: OptimalControl, program: Mapping[str, ca.MX]) -> ca.Function:
-        """Quiet fatrop that detects the stages."""
-        options = {
+    @property
+    def plugin(self) -> str:
+        """CasADi's name of the solver."""
+        return "fatrop"
+
+    def options(self, ocp: OptimalControl) -> Options:
+        """Quiet, with the stages detected."""
+        return {
             **_QUIET,
             "structure_detection": "auto",
             "equality": [True] * (ocp.stages * ocp.state.size),
             "fatrop": {"print_level": 0, "tol": self.accuracy, "max_iter": self.iterations, "mu_init": 1e-2},
         }
-        return ca.nlpsol("fpirhc_fatrop", "fatrop", dict(program), options)
 
 
 @dataclass(frozen=True)
@@ -278,9 +301,14 @@ class SequentialQuadratic(_MultipleShooting):
     quadratic: QuadraticSolver = field(default_factory=Qrqp)
     iterations: int = 20
 
-    def solver(self, ocp: OptimalControl, program: Mapping[str, ca.MX]) -> ca.Function:
-        """CasADi's SQP with the Gauss-Newton Hessian, which is positive semi-definite for convex stage costs."""
-        options = {
+    @property
+    def plugin(self) -> str:
+        """CasADi's name of the solver."""
+        return "sqpmethod"
+
+    def options(self, ocp: OptimalControl) -> Options:
+        """With the Gauss-Newton Hessian, which is positive semi-definite for convex stage costs."""
+        return {
             **_QUIET,
             "print_header": False,
             "print_iteration": False,
@@ -291,71 +319,10 @@ class SequentialQuadratic(_MultipleShooting):
             "tol_pr": 1e-8,
             "tol_du": 1e-8,
             "min_step_size": 1e-12,
-            "hess_lag": _gauss_newton(ocp, program),
+            "hess_lag": gauss_newton_hessian(ocp),
         }
-        return ca.nlpsol("fpirhc_sqp", "sqpmethod", dict(program), options)
 
 
 def _usable(multipliers: Expression) -> Expression:
     """Forget multipliers that are not finite or absurdly large: they would poison a warm start."""
     return ca.if_else(ca.fabs(multipliers) <= _LARGEST_MULTIPLIER, multipliers, 0)
-
-
-def _program_values(ocp: OptimalControl) -> ca.Function:
-    """Function (w, p) -> cost, constraints and their first derivatives in one column."""
-    program = _program(ocp)
-    slopes = ca.gradient(program["f"], program["x"]), ca.jacobian(program["g"], program["x"])
-    column = ca.vertcat(program["f"], program["g"], ca.densify(slopes[0]), slopes[1].nz[:])
-    return ca.Function("fpirhc_program_values", [program["x"], program["p"]], [column])
-
-
-def _sizes(ocp: OptimalControl) -> tuple[int, int]:
-    return ocp.stages * (ocp.state.size + ocp.input.size) + ocp.state.size, ocp.stages * ocp.state.size
-
-
-def _interleave(states: Expression, inputs: Expression) -> Expression:
-    """(ns, N + 1), (nu, N) -> column (s_0, u_0, s_1, ..., s_N)."""
-    n = inputs.shape[1]
-    return ca.vertcat(ca.vec(ca.vertcat(states[:, :n], inputs)), states[:, n])
-
-
-def _separate(ocp: OptimalControl, column: Expression) -> tuple[Expression, Expression]:
-    """Inverse of `_interleave`."""
-    ns, nu, n = ocp.state.size, ocp.input.size, ocp.stages
-    stages = ca.reshape(column[: n * (ns + nu)], ns + nu, n)
-    return ca.horzcat(stages[:ns, :], column[n * (ns + nu) :]), stages[ns:, :]
-
-
-def _bound(ocp: OptimalControl, s0: ca.MX, bound: Any) -> ca.MX:
-    """Bounds of s_0 ... s_N: the first state is given."""
-    return ca.horzcat(s0, ca.repmat(ca.DM(bound), 1, ocp.stages))
-
-
-def _shift_variables(ocp: OptimalControl, column: ca.MX) -> ca.MX:
-    states, inputs = _separate(ocp, column)
-    return _interleave(shift(states), shift(inputs))
-
-
-def _shift_dynamics(ocp: OptimalControl, column: ca.MX) -> Expression:
-    stages: Expression = ca.reshape(column, ocp.state.size, ocp.stages)
-    return ca.vec(shift(stages))
-
-
-def _program(ocp: OptimalControl) -> dict[str, ca.MX]:
-    n = ocp.stages
-    w, flat = ca.MX.sym("w", _sizes(ocp)[0]), ca.MX.sym("p", ocp.data.size * (n + 1))
-    states, inputs = _separate(ocp, w)
-    data = ca.reshape(flat, ocp.data.size, n + 1)
-    costs, _ = ocp.stage_cost.map(n)(states[:, :n], inputs, data[:, :n])
-    value = ca.sum2(costs) + ocp.terminal_cost(states[:, n], data[:, n])
-    following = ocp.dynamics.map(n)(states[:, :n], inputs, data[:, :n])
-    return {"x": w, "p": flat, "f": value, "g": ca.vec(states[:, 1:] - following)}
-
-
-def _gauss_newton(ocp: OptimalControl, program: Mapping[str, ca.MX]) -> ca.Function:
-    """Function (x, p, lam_f, lam_g) -> Hessian of the cost alone, block by block (both triangles, as SQP wants it)."""
-    hessian, _ = ca.hessian(program["f"], program["x"])
-    weight, multipliers = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", _sizes(ocp)[1])
-    inputs = [program["x"], program["p"], weight, multipliers]
-    names = ["x", "p", "lam_f", "lam_g"]
-    return ca.Function("nlp_hess_l", inputs, [weight * hessian], names, ["hess_gamma_x_x"])
