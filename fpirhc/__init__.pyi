@@ -20,7 +20,10 @@ from .horizon.problem import Horizon
 from .integrate import Cvodes, Euler, RungeKutta4
 from .limits import Limits
 from .metrics import Metrics, measure
+from .optimisers.anderson import Anderson
 from .optimisers.fixed_point import FixedPoint
+from .optimisers.full_space import FullSpaceFixedPoint
+from .optimisers.gradient_fixed_point import GradientFixedPoint
 from .optimisers.nlp import Fatrop, InteriorPoint, Osqp, Qrqp, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.reduced_gradient import ReducedGradient
@@ -40,6 +43,7 @@ from .tracking.exponential import Exponential
 
 __all__ = [
     "Affine",
+    "Anderson",
     "Comparison",
     "ComputedTorque",
     "Cvodes",
@@ -51,8 +55,10 @@ __all__ = [
     "FixedPoint",
     "Formula",
     "FpirhcError",
+    "FullSpaceFixedPoint",
     "GaussNewton",
     "General",
+    "GradientFixedPoint",
     "HoldPlan",
     "Horizon",
     "Identity",

@@ -57,8 +57,8 @@ class OptimalControl:
 
     dynamics: (s, u, theta) -> s_next. stage_cost: (s, u, theta) -> (l, terms). terminal_cost: (s, theta) -> T.
     Bounds are infinite where free; an optimiser may be given other input bounds from call to call. `curvature` (nu) is the second
-    derivative of the cost rate along each input near the reference: it turns gradients into the units of the inputs. `along` is the
-    quadratic model of the cost along the reference.
+    derivative of the cost rate along each input near the reference: it turns gradients into the units of the inputs. `nodes` are
+    the states, inputs and data along the reference from t = 0, `along` the quadratic model of the cost there.
     """
 
     stages: int
@@ -75,6 +75,7 @@ class OptimalControl:
     input_lower: np.ndarray
     input_upper: np.ndarray
     curvature: np.ndarray
+    nodes: tuple[np.ndarray, np.ndarray, np.ndarray]
     along: Along
 
     @property
@@ -142,6 +143,7 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
         input_lower=limits.input_bounds(plant)[0],
         input_upper=limits.input_bounds(plant)[1],
         curvature=input_curvature(along, horizon.step),
+        nodes=nodes,
         along=along,
     )
 

@@ -1,0 +1,149 @@
+"""The published fixed-point optimiser: states, inputs and multipliers together, the gradient of the auxiliary function to zero.
+
+    z = (S, U, mu),   g = grad Psi(z),   H = Hessian of Psi (the KKT matrix),   h = H'g,
+    z+ = G(z, h, 0),     for eq. (6)  z + S [zeta(A_c |h|/S + x*) - x*] h/|h|.
+
+H is indefinite, so an iteration on g itself would violate the eigenvalue condition; h has the Jacobian H'H at a solution, which
+satisfies it for 0 < gain < 2 / sigma_max(H)^2. The price is the condition number squared: the rate is
+(kappa^2 - 1)/(kappa^2 + 1), with kappa = cond H between 10^3 and 10^6 on ordinary horizons, and the plan is not feasible before it
+is converged. It is kept as the baseline that `GradientFixedPoint` and `FixedPoint` are measured against. Limits are not served.
+
+References: H. Khan, J. K. Tar, I. J. Rudas, on fixed-point iteration in place of the reduced gradient (2017-2018), the exact
+formula reconstructed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.deformation.affine import Affine
+from fpirhc.deformation.base import Deformation
+from fpirhc.errors import InvalidValue, NotContractive, NotSupported
+from fpirhc.horizon.auxiliary import auxiliary_gradient, auxiliary_hessian
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.rollout import rollout
+from fpirhc.optimisers.anderson import Anderson, iterated
+from fpirhc.optimisers.base import Optimiser, is_finite, judge, sane, shift, status_of
+from fpirhc.status import Status
+from fpirhc.symbolic.layout import Expression, Layout, Signal
+
+_SAFE = 0.95
+_BALANCING = 20  # passes of Ruiz's equilibration
+
+
+@dataclass(frozen=True)
+class FullSpaceFixedPoint(Optimiser):
+    """The faithful baseline: map (6) on z = (S, U, mu) with h = H'g.
+
+    Parameters:
+        iterations: per call; expect 10^4 and more. tolerance: of the stationarity (in the unit of the inputs).
+        map: the deformation; None chooses the affine map with 0.95 of the gain 1/sigma_max(H)^2 along the reference.
+        scaled: iterate on variables that make the rows of H of the same size (Ruiz), which helps by orders of magnitude.
+        acceleration: Anderson(m), or None.
+
+    Raises:
+        InvalidValue: fewer than one iteration, or a tolerance that is not positive.
+    """
+
+    iterations: int
+    tolerance: float
+    map: Deformation | None = None
+    scaled: bool = False
+    acceleration: Anderson | None = None
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise InvalidValue(f"FullSpaceFixedPoint needs at least 1 iteration, got {self.iterations}")
+        if not self.tolerance > 0:
+            raise InvalidValue(f"FullSpaceFixedPoint needs a positive tolerance, got {self.tolerance}")
+
+    def check(self, ocp: OptimalControl) -> None:
+        """Raise if anything is bounded, or the map's gain cannot contract.
+
+        Raises:
+            NotSupported: some input or state has limits. NotContractive: a gain outside (0, 2 / sigma_max(H)^2).
+        """
+        if ocp.bounds_states or np.isfinite(ocp.input_lower).any() or np.isfinite(ocp.input_upper).any():
+            raise NotSupported(
+                "FullSpaceFixedPoint serves problems without limits only (it is a baseline); for limits use FixedPoint()"
+            )
+        if self.map is not None:
+            largest = 2 / _scaling(ocp, self.scaled)[1] ** 2
+            gain = max(self.map.secant_gain(), self.map.effective_gain(), key=abs)
+            if not 0 < gain < largest:
+                raise NotContractive(
+                    f"FullSpaceFixedPoint: the map's gain {gain:.3g} is outside (0, {largest:.3g}); "
+                    f"use map.with_effective_gain({0.5 * largest:.3g})"
+                )
+
+    def memory(self, ocp: OptimalControl) -> Layout:
+        """The plan, its states and multipliers."""
+        n = ocp.stages
+        states = tuple(f"{s}@{k}" for k in range(1, n + 1) for s in ocp.state.elements)
+        plan = tuple(f"{i}@{k}" for k in range(n) for i in ocp.input.elements)
+        return Layout((Signal("plan_states", states), Signal("plan_inputs", plan), Signal("plan_multipliers", states)))
+
+    def shifted(self, ocp: OptimalControl, memory: Expression) -> Expression:
+        """Everything one stage later."""
+        rows = {"plan_states": ocp.state.size, "plan_inputs": ocp.input.size, "plan_multipliers": ocp.state.size}
+        kept = self.memory(ocp).split(memory)
+        return self.memory(ocp).join({k: ca.vec(shift(ca.reshape(v, rows[k], ocp.stages))) for k, v in kept.items()})
+
+    def step(self, ocp: OptimalControl) -> ca.Function:
+        """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
+        nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
+        s0, data = ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
+        lower, upper, memory = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu), ca.MX.sym("memory", n * (2 * ns + nu))
+        kept = self.memory(ocp).split(ca.if_else(is_finite(memory), memory, 0))
+        fresh = ca.logic_not(ca.mmax(ca.fabs(kept["plan_states"])) > 0)
+        rolled = rollout(ocp)(s0, ca.reshape(kept["plan_inputs"], nu, n), data)[0]
+        guess = ca.if_else(is_finite(rolled), rolled[:, 1:], ca.repmat(s0, 1, n))
+        states = ca.if_else(fresh, ca.vec(guess), kept["plan_states"])
+        start = ca.vertcat(states, kept["plan_inputs"], kept["plan_multipliers"])
+        scale = ca.DM(_scaling(ocp, self.scaled)[0])
+        last = scale * iterated(
+            self._transformation(ocp), start / scale, [s0, data], self.iterations, self.acceleration
+        )
+        found = ca.reshape(last[n * ns : n * (ns + nu)], nu, n)
+        cost, residual, _ = judge(ocp)(found, s0, data, lower, upper, ca.MX.zeros(ns, n))
+        posed = sane(s0, data, lower, upper)
+        finite = ca.logic_and(posed, is_finite(ca.vertcat(last, cost, residual)))
+        before = ca.reshape(kept["plan_inputs"], nu, n)
+        status = status_of(finite, residual, 0, self.tolerance)
+        empty = ca.mmax(lower - upper) > 0
+        told = ca.if_else(finite, ca.vertcat(cost, residual), ca.MX.zeros(2))
+        diagnostics = ca.vertcat(told, 0, self.iterations, ca.if_else(empty, int(Status.INFEASIBLE), status))
+        remembered = ca.if_else(finite, last, ca.if_else(posed, 0, memory))
+        results = [ca.if_else(finite, found, before), diagnostics, remembered]
+        return ca.Function("fpirhc_full_space", [s0, data, lower, upper, memory], results)
+
+    def _transformation(self, ocp: OptimalControl) -> ca.Function:
+        """Function (scaled column z, s0, data) -> scaled column z+."""
+        nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
+        column = ca.MX.sym("z", n * (2 * ns + nu))
+        s0, data = ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
+        factors, largest = _scaling(ocp, self.scaled)
+        scale = ca.DM(factors)
+        states, inputs, multipliers = ca.vertsplit(scale * column, [0, n * ns, n * (ns + nu), column.numel()])
+        shaped = ca.reshape(states, ns, n), ca.reshape(inputs, nu, n), ca.reshape(multipliers, ns, n)
+        slope = scale * ca.vertcat(*(ca.vec(v) for v in auxiliary_gradient(ocp)(*shaped, s0, data)))
+        response = ca.jtimes(slope, column, slope, True)
+        chosen = Affine(gain=-2 * _SAFE / largest**2) if self.map is None else self.map
+        following, _ = chosen.step(column, response, ca.MX.zeros(column.numel()), {})
+        return ca.Function("fpirhc_transformed_auxiliary", [column, s0, data], [following])
+
+
+def _scaling(ocp: OptimalControl, scaled: bool) -> tuple[np.ndarray, float]:
+    """Factors W of the variables, and the largest singular value of W H W along the reference."""
+    states, inputs, data = ocp.nodes
+    none = np.zeros((ocp.state.size, ocp.stages))
+    hessian = np.asarray(auxiliary_hessian(ocp)(states[:, 1:], inputs, none, states[:, 0], data).full())
+    factors = np.ones(hessian.shape[0])
+    for _ in range(_BALANCING if scaled else 0):
+        size = np.abs(factors[:, None] * hessian * factors).max(axis=1)
+        factors /= np.sqrt(np.where(size > 0, size, 1.0))
+    largest = float(np.abs(np.linalg.eigvalsh(factors[:, None] * hessian * factors)).max())
+    return factors, largest
