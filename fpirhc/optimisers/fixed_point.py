@@ -39,10 +39,12 @@ import casadi as ca
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue
+from fpirhc.horizon.augmented import augmented
 from fpirhc.horizon.expansion import Bend, GaussNewton, bent_end, bent_stage, linear_stage
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import PIVOT, rounds
 from fpirhc.optimisers.base import FINITE, Optimiser, clip, is_finite, sane, shift, stationarity, status_of
+from fpirhc.optimisers.constrained import MULTIPLIERS, constrained_step, shifted_multipliers, with_multipliers
 from fpirhc.optimisers.search import (
     ARMIJO,
     ROUNDING,
@@ -70,6 +72,7 @@ class FixedPoint(Optimiser):
     Parameters:
         iterations: per call; 1 is the spirit of the method, one step per control cycle.
         tolerance: of the stationarity (in the unit of the inputs), below which a plan is converged.
+        feasible: violation of a state bound (in its unit) below which a plan counts as converged.
         map: the deformation that makes the next plan; Affine(gain=-2.0) is the full step, a Sigmoid's scale limits it.
         bend: GaussNewton() or ExactHessian().
         damping: mu >= 0 added to the input's curvature, in units of it: 0 is Gauss-Newton, large values are gradient descent.
@@ -83,6 +86,7 @@ class FixedPoint(Optimiser):
     map: Deformation = field(default_factory=lambda: Affine(gain=-2.0))
     bend: Bend = field(default_factory=GaussNewton)
     damping: float = 0.0
+    feasible: float = 1e-8
 
     def __post_init__(self) -> None:
         if self.iterations < 1:
@@ -93,9 +97,9 @@ class FixedPoint(Optimiser):
             raise InvalidValue(f"FixedPoint(damping={self.damping!r}): expected a finite number of at least 0")
 
     def memory(self, ocp: OptimalControl) -> Layout:
-        """The plan, its states and feedback, and the line search's step lengths."""
+        """The plan, its states and feedback, the line search's step lengths, and the multipliers of state bounds."""
         n, state, inputs = ocp.stages, ocp.state.elements, ocp.input.elements
-        return Layout(
+        own = Layout(
             (
                 Signal("plan_inputs", tuple(f"{i}@{k}" for k in range(n) for i in inputs)),
                 Signal("plan_states", tuple(f"{s}@{k}" for k in range(n) for s in state)),
@@ -104,6 +108,7 @@ class FixedPoint(Optimiser):
                 scalar("plan_step", start=0.0),
             )
         )
+        return with_multipliers(ocp, own) if ocp.bounds_states else own
 
     def shifted(self, ocp: OptimalControl, memory: Expression) -> Expression:
         """The memory one stage later; the last stage, which is repeated, has no feedback."""
@@ -115,6 +120,8 @@ class FixedPoint(Optimiser):
             "plan_states": ca.vec(shift(ca.reshape(kept["plan_states"], ns, n))),
             "plan_gains": gains,
         }
+        if ocp.bounds_states:
+            moved[MULTIPLIERS] = shifted_multipliers(ocp, kept[MULTIPLIERS])
         return self.memory(ocp).join({**kept, **moved})
 
     def step(self, ocp: OptimalControl) -> ca.Function:
@@ -122,11 +129,15 @@ class FixedPoint(Optimiser):
 
         Every call does the same `iterations`; as C it runs as the loops of fixed_point.c.
         """
+        if ocp.bounds_states:
+            return constrained_step(ocp, self.step, self.memory(augmented(ocp)), self.tolerance, self.feasible)
         driver = self._driver(ocp, iterations=self.iterations, stop_early=0)
         return with_driver("fpirhc_fixed_point", driver, lambda name: self._graph(ocp, name))
 
     def converging(self, ocp: OptimalControl) -> ca.Function:
         """The same, but stops where the tolerance is met, after at most 100 iterations."""
+        if ocp.bounds_states:
+            return constrained_step(ocp, self.converging, self.memory(augmented(ocp)), self.tolerance, self.feasible)
         driver = self._driver(ocp, iterations=MOST, stop_early=1)
         return with_driver("fpirhc_fixed_point_converging", driver, lambda name: self._converging_graph(ocp, name))
 
