@@ -18,7 +18,7 @@ from .horizon.cost import General, LqrTerminal, Quadratic
 from .horizon.expansion import ExactHessian, GaussNewton
 from .horizon.problem import Horizon
 from .integrate import Cvodes, Euler, RungeKutta4
-from .limits import Limits
+from .limits import Limits, Path
 from .metrics import Metrics, measure
 from .optimisers.anderson import Anderson
 from .optimisers.fixed_point import FixedPoint
@@ -71,6 +71,7 @@ __all__ = [
     "OpenPlan",
     "Osqp",
     "Parameter",
+    "Path",
     "Plan",
     "Plant",
     "Problem",

@@ -41,12 +41,11 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
     assert problem.horizon is not None
     assert problem.cost is not None
     plant = problem.plant
-    one_cycle = replace(problem.horizon, stages=1, step=problem.period)
+    one_cycle = replace(problem.horizon, stages=1, step=problem.period, terminal=())
     ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits)
     data_of = stage_data(plant, problem.reference, one_cycle, problem.cost)
     states, commands = log[:, layout.slice("state")], log[:, layout.slice("command")]
-    if ocp.state.size > plant.state.size:
-        states = np.hstack([states, np.vstack([commands[:1], commands[:-1]])])
+    states = np.asarray(ocp.start(states.T, np.vstack([commands[:1], commands[:-1]]).T).full()).T
     times = log[:, layout.slice("time")]
     function = _cost_function(ocp, data_of, _CHUNK)
     evaluator = Evaluator(function)

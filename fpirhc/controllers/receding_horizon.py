@@ -130,9 +130,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
 
     def step(s: Any) -> dict[str, Expression]:
         data = data_of(s.time, s.parameters)
-        first = s._plan_state
-        if ocp.state.size > plant.state.size:
-            first = ca.vertcat(first, s._command_before)
+        first = ocp.start(s._plan_state, s._command_before)
         lower, upper = ocp.input_lower - s._correction_before, ocp.input_upper - s._correction_before
         remembered = optimiser.shifted(ocp, memory.join({m: getattr(s, m) for m in memory.names}))
         inputs, diagnostics, following = solve(first, data, lower, upper, remembered)

@@ -5,8 +5,8 @@ For a bounded state x with multiplier y and weight w, every stage (and the end) 
     w/2 dist^2(x + y/w, [lower, upper]),      and after a solve      y <- w (x + y/w - clip(x + y/w, lower, upper)).
 
 Its gradient is the multiplier that the update gives, so the stationarity of the augmented problem is that of the constrained one
-with the new multipliers. Weights come from how far the inputs can move a state: w_k = 100 / max_i sum_j (dx_ki/du_j)^2 D_j along the
-reference, which makes the violation shrink to about a hundredth per update.
+with the new multipliers. Weights come from how far the inputs can move a state: w_k = 100 / max_i sum_j (dx_ki/du_j)^2 D_j along
+the reference, which makes the violation shrink to about a hundredth per update.
 
 References: M. R. Hestenes, J. Optim. Theory Appl. 4(5), 1969; R. T. Rockafellar, SIAM J. Control 12(2), 1974.
 """

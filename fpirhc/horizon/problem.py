@@ -19,6 +19,7 @@ import numpy as np
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, Mistakes, NotSupported
 from fpirhc.horizon.cost import Cost, Linearisation, View
 from fpirhc.horizon.curvature import Along, expand_along, input_curvature
+from fpirhc.horizon.written import Written, ends, hard, hard_state_bounds, paths, rates, soft_names, softened
 from fpirhc.integrate import Integrator, RungeKutta4
 from fpirhc.limits import Limits
 from fpirhc.plant import Plant
@@ -33,6 +34,7 @@ class Horizon:
     Parameters:
         stages: number of stages N. step: length of one stage, s, with the input held.
         discretisation: how the model moves over one stage (RungeKutta4(), Euler()).
+        terminal: names of states that must meet the reference at the end of the horizon.
 
     Raises:
         InvalidValue: fewer than one stage, or a step that is not positive.
@@ -41,6 +43,7 @@ class Horizon:
     stages: int
     step: float
     discretisation: Integrator = field(default_factory=RungeKutta4)
+    terminal: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.stages, int) or self.stages < 1:
@@ -56,6 +59,7 @@ class OptimalControl:
     """The standard form; sizes: ns = state.size, nu = input.size, ntheta = data.size.
 
     dynamics: (s, u, theta) -> s_next. stage_cost: (s, u, theta) -> (l, terms). terminal_cost: (s, theta) -> T.
+    start: (x, u before) -> s_0, from the plant's state and the input of the stage before.
     Bounds are infinite where free; an optimiser may be given other input bounds from call to call. `curvature` (nu) is the second
     derivative of the cost rate along each input near the reference: it turns gradients into the units of the inputs. `nodes` are
     the states, inputs and data along the reference from t = 0, `along` the quadratic model of the cost there.
@@ -70,6 +74,7 @@ class OptimalControl:
     stage_cost: ca.Function
     terminal_cost: ca.Function
     terms: tuple[str, ...]
+    start: ca.Function
     state_lower: np.ndarray
     state_upper: np.ndarray
     input_lower: np.ndarray
@@ -84,48 +89,56 @@ class OptimalControl:
         return bool(np.isfinite(self.state_lower).any() or np.isfinite(self.state_upper).any())
 
 
-def data_layout(plant: Plant) -> Layout:
-    """What one stage is given."""
-    return Layout(
-        (
-            scalar("time", "s"),
-            Signal("reference", plant.state.elements, plant.state.units),
-            Signal("feedforward", plant.input.elements, plant.input.units),
-            plant.parameter,
-        )
+def data_layout(plant: Plant, horizon: Horizon) -> Layout:
+    """What one stage is given; with a terminal equality also whether it is the last, and the reference after it."""
+    signals = (
+        scalar("time", "s"),
+        Signal("reference", plant.state.elements, plant.state.units),
+        Signal("feedforward", plant.input.elements, plant.input.units),
+        plant.parameter,
     )
+    if not horizon.terminal:
+        return Layout(signals)
+    return Layout((*signals, scalar("last"), Signal("target", plant.state.elements, plant.state.units)))
 
 
 def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits) -> OptimalControl:
     """Return the standard form of one horizon.
 
     Raises:
-        InvalidProblem: mistakes in the cost, or a cost that is not finite at the reference (the term is named).
+        InvalidProblem: mistakes in the cost or the limits, or a cost that is not finite at the reference (the term is named).
     """
     cost.check(plant)
     limits.check(plant)
-    nx = plant.state.size
-    state = _stage_state(plant, cost)
-    s, u = ca.SX.sym("s", state.size), ca.SX.sym("u", plant.input.size)
-    theta = ca.SX.sym("theta", data_layout(plant).size)
-    view = _view(plant, s, u, theta, cost)
+    _check_terminal(plant, horizon)
+    nx, layout = plant.state.size, data_layout(plant, horizon)
+    keeps_input = cost.uses_rate or bool(limits.rates)
+    free = plant.input.size * keeps_input
+    x, before = ca.SX.sym("x", nx), ca.SX.sym("before", free)
+    u, theta = ca.SX.sym("u", plant.input.size), ca.SX.sym("theta", layout.size)
+    view = _view(plant, ca.vertcat(x, before), u, layout.split(theta), cost, keeps_input)
     try:
-        terms = _scalar_terms(cost.stage(view))
         advance = _advance(plant, horizon)
+        moved = advance(x, u, view.parameters.vector)
+        extra = _written(plant, horizon, limits, view, moved, layout.split(theta))
+        soft = softened(extra, limits, plant, x)
+        terms = {**_scalar_terms(cost.stage(view)), **soft}
         given = cost.terminal(view, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.step)
-        final = _scalar_terms({"terminal": given})["terminal"]
+        end = sum((soft[f"soft {e}"] for e in limits.soft if e in limits.states), start=ca.SX(0))
+        final = _scalar_terms({"terminal": given})["terminal"] + horizon.step * end
     except InvalidName as error:
         raise InvalidProblem(f"cost: {error}") from None
-    moved = advance(s[:nx], u, view.parameters.vector)
-    following = ca.vertcat(moved, u) if state.size > nx else moved
+    binding = hard(extra, soft_names(limits, plant))
+    state = _stage_state(plant, keeps_input, binding)
+    s = ca.vertcat(x, before, ca.SX.sym("z", len(binding)))
+    following = ca.vertcat(moved, *([u] if keeps_input else []), *(w.expression for w in binding))
     stacked: Any = ca.vertcat(*terms.values())
     column = horizon.step * stacked
-    lower, upper = limits.state_bounds(plant)
-    free = np.full(state.size - nx, np.inf)
+    lower, upper = hard_state_bounds(limits, plant)
     dynamics = ca.Function("fpirhc_dynamics", [s, u, theta], [ca.densify(following)])
     stage_cost = ca.Function("fpirhc_stage_cost", [s, u, theta], [ca.sum1(column), ca.densify(column)])
     terminal_cost = ca.Function("fpirhc_terminal_cost", [s, theta], [ca.densify(final)])
-    nodes = _nodes(plant, reference, horizon, cost, state.size)
+    nodes = _nodes(plant, reference, horizon, cost, (free, len(binding)))
     _check_finite(tuple(terms), stage_cost, terminal_cost, nodes, cost)
     along = expand_along(dynamics, stage_cost, terminal_cost, nodes)
     return OptimalControl(
@@ -133,13 +146,14 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
         step=horizon.step,
         state=state,
         input=plant.input,
-        data=data_layout(plant),
+        data=layout,
         dynamics=dynamics,
         stage_cost=stage_cost,
         terminal_cost=terminal_cost,
         terms=tuple(terms),
-        state_lower=np.append(lower, -free),
-        state_upper=np.append(upper, free),
+        start=_start(plant, free, len(binding)),
+        state_lower=np.concatenate([lower, np.full(free, -np.inf), [w.lower for w in binding]]),
+        state_upper=np.concatenate([upper, np.full(free, np.inf), [w.upper for w in binding]]),
         input_lower=limits.input_bounds(plant)[0],
         input_upper=limits.input_bounds(plant)[1],
         curvature=input_curvature(along, horizon.step),
@@ -162,21 +176,54 @@ def stage_data(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost)
     nodes = horizon.stages + 1
     times = start + ca.DM(np.arange(nodes) * horizon.step).T
     table = one.map(nodes)(times, ca.repmat(parameters, 1, nodes))
+    if horizon.terminal:
+        last, after = np.zeros((1, nodes)), [*range(1, nodes), nodes - 1]
+        last[0, nodes - 2] = 1.0
+        targets = table[data_layout(plant, horizon).slice("reference"), :][:, after]
+        table = ca.vertcat(table, last, targets)
     return ca.Function("fpirhc_horizon_data", [start, parameters], [table], ["t", "p"], ["data"])
 
 
-def _stage_state(plant: Plant, cost: Cost) -> Signal:
-    if not cost.uses_rate:
-        return plant.state
-    before = tuple(f"{i} before" for i in plant.input.elements)
-    return Signal("state", plant.state.elements + before, plant.state.units + plant.input.units)
+def _check_terminal(plant: Plant, horizon: Horizon) -> None:
+    mistakes = Mistakes("horizon")
+    mistakes.unknown("terminal: state", horizon.terminal, plant.state.elements)
+    mistakes.raise_if_any()
 
 
-def _view(plant: Plant, s: Expression, u: Expression, theta: Expression, cost: Cost) -> View:
-    given = data_layout(plant).split(theta)
+def _stage_state(plant: Plant, keeps_input: bool, binding: list[Written]) -> Signal:
+    before = tuple(f"{i} before" for i in plant.input.elements) if keeps_input else ()
+    units = plant.input.units if keeps_input else ()
+    return Signal(
+        "state",
+        plant.state.elements + before + tuple(w.name for w in binding),
+        plant.state.units + units + tuple(w.unit for w in binding),
+    )
+
+
+def _start(plant: Plant, free: int, written: int) -> ca.Function:
+    x, u = ca.SX.sym("x", plant.state.size), ca.SX.sym("u", plant.input.size)
+    first = ca.vertcat(x, *([u] if free else []), ca.SX.zeros(written))
+    return ca.Function("fpirhc_stage_start", [x, u], [ca.densify(first)], ["x", "u"], ["s0"])
+
+
+def _written(
+    plant: Plant, horizon: Horizon, limits: Limits, view: View, moved: Expression, given: Mapping[str, Expression]
+) -> list[Written]:
+    found = [*rates(limits, plant, view, horizon.step), *paths(limits, view)]
+    for entry in found:
+        if ca.SX(entry.expression).numel() != 1:
+            raise InvalidProblem(f"limits: path '{entry.name}' must be one scalar, got {entry.expression.shape}")
+    if horizon.terminal:
+        found += ends(horizon.terminal, plant, moved, given["target"], given["last"])
+    return found
+
+
+def _view(
+    plant: Plant, s: Expression, u: Expression, given: Mapping[str, Expression], cost: Cost, keeps_input: bool
+) -> View:
     nx, inputs = plant.state.size, plant.input.elements
     # What the cost does not ask for is NaN, so that using it anyway is found at once.
-    before = s[nx:] if cost.uses_rate else ca.SX.nan(len(inputs))
+    before = s[nx:] if keeps_input else ca.SX.nan(len(inputs))
     feedforward = given["feedforward"] if cost.uses_feedforward else ca.SX.nan(len(inputs))
     return View(
         state=Named(plant.state.elements, s[:nx], "state"),
@@ -221,15 +268,14 @@ def _scalar_terms(given: Any) -> dict[str, Expression]:
 
 
 def _nodes(
-    plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, size: int
+    plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, extra: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States (of this size), inputs and data along the reference from t = 0."""
+    """States (the plant's, `extra` input and written entries), inputs and data along the reference from t = 0."""
     table: Any = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
     data = np.asarray(table.full())
-    given = {
-        name: data[place] for name, place in ((n, data_layout(plant).slice(n)) for n in ("reference", "feedforward"))
-    }
-    states = np.vstack([given["reference"], given["feedforward"]])[:size]
+    layout = data_layout(plant, horizon)
+    given = {name: data[layout.slice(name)] for name in ("reference", "feedforward")}
+    states = np.vstack([given["reference"], given["feedforward"][: extra[0]], np.zeros((extra[1], data.shape[1]))])
     return states, given["feedforward"][:, : horizon.stages], data
 
 
