@@ -39,6 +39,22 @@ class Along:
             costate = self.q[i] @ states[i] + self.s[i].T @ moves[i] + self.a[i].T @ costate
         return result
 
+    def sensitivity(self) -> np.ndarray:
+        """Return dS/dU, shape (N, ns, N nu): how the states s_1 ... s_N follow the inputs."""
+        stages, ns, nu = self.b.shape
+        moved, found = np.zeros((ns, stages * nu)), np.empty((stages, ns, stages * nu))
+        for i in range(stages):
+            moved = self.a[i] @ moved
+            moved[:, i * nu : (i + 1) * nu] += self.b[i]
+            found[i] = moved
+        return found
+
+    def hessian(self) -> np.ndarray:
+        """Return M (N nu, N nu), the Hessian of V with the dynamics linearised."""
+        stages, _, nu = self.b.shape
+        columns = np.eye(stages * nu).reshape(-1, stages, nu)
+        return np.array([self.hessian_times(column).ravel() for column in columns])
+
     def least_bend(self) -> float:
         """Smallest eigenvalue of a stage's cost Hessian, relative to its largest."""
         blocks = np.block([[self.q, self.s.transpose(0, 2, 1)], [self.s, self.r]])

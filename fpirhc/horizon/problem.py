@@ -62,7 +62,8 @@ class OptimalControl:
     start: (x, u before) -> s_0, from the plant's state and the input of the stage before.
     Bounds are infinite where free; an optimiser may be given other input bounds from call to call. `curvature` (nu) is the second
     derivative of the cost rate along each input near the reference: it turns gradients into the units of the inputs. `nodes` are
-    the states, inputs and data along the reference from t = 0, `along` the quadratic model of the cost there.
+    the states, inputs and data along the reference from t = 0, `along` the quadratic model of the cost there. The last `written`
+    entries of the state are limits of rates, paths and the end: s_0 says nothing about them.
     """
 
     stages: int
@@ -82,6 +83,7 @@ class OptimalControl:
     curvature: np.ndarray
     nodes: tuple[np.ndarray, np.ndarray, np.ndarray]
     along: Along
+    written: int
 
     @property
     def bounds_states(self) -> bool:
@@ -159,6 +161,7 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
         curvature=input_curvature(along, horizon.step),
         nodes=nodes,
         along=along,
+        written=len(binding),
     )
 
 

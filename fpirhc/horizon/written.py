@@ -17,6 +17,8 @@ from fpirhc.limits import Limits
 from fpirhc.plant import Plant
 from fpirhc.symbolic.layout import Expression
 
+_HAIR = 1e-9
+
 
 @dataclass(frozen=True, eq=False)
 class Written:
@@ -47,11 +49,15 @@ def paths(limits: Limits, view: View) -> list[Written]:
 def ends(
     names: tuple[str, ...], plant: Plant, following: Expression, target: Expression, last: Expression
 ) -> list[Written]:
-    """State minus reference at the end of the horizon, zero there and free before."""
+    """State minus reference at the end of the horizon, zero before whatever the state is.
+
+    The bounds leave a hair's breadth: interior-point solvers count a fixed variable as an equation, and would find too many.
+    """
     places = {e: k for k, e in enumerate(plant.state.elements)}
     units = dict(zip(plant.state.elements, plant.state.units, strict=True))
     return [
-        Written(f"{e} at the end", units[e], last * (following[places[e]] - target[places[e]]), 0.0, 0.0) for e in names
+        Written(f"{e} at the end", units[e], last * (following[places[e]] - target[places[e]]), -_HAIR, _HAIR)
+        for e in names
     ]
 
 

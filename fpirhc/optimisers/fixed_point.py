@@ -31,6 +31,7 @@ J. K. Tar, Electronics 11, 1243, 2022, for the transition between gradient desce
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import resources
 
@@ -44,7 +45,7 @@ from fpirhc.horizon.expansion import Bend, GaussNewton, bent_end, bent_stage, li
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import PIVOT, rounds
 from fpirhc.optimisers.base import FINITE, Optimiser, clip, is_finite, sane, shift, stationarity, status_of
-from fpirhc.optimisers.constrained import MULTIPLIERS, constrained_step, shifted_multipliers, with_multipliers
+from fpirhc.optimisers.constrained import constrained_step, shifted_multipliers, with_multipliers
 from fpirhc.optimisers.search import (
     ARMIJO,
     ROUNDING,
@@ -72,6 +73,7 @@ class FixedPoint(Optimiser):
     Parameters:
         iterations: per call; 1 is the spirit of the method, one step per control cycle.
         tolerance: of the stationarity (in the unit of the inputs), below which a plan is converged.
+        updates: of the multipliers of state bounds per call, each after `iterations`; without state bounds there are none.
         feasible: violation of a state bound (in its unit) below which a plan counts as converged.
         map: the deformation that makes the next plan; Affine(gain=-2.0) is the full step, a Sigmoid's scale limits it.
         bend: GaussNewton() or ExactHessian().
@@ -86,11 +88,14 @@ class FixedPoint(Optimiser):
     map: Deformation = field(default_factory=lambda: Affine(gain=-2.0))
     bend: Bend = field(default_factory=GaussNewton)
     damping: float = 0.0
+    updates: int = 5
     feasible: float = 1e-8
 
     def __post_init__(self) -> None:
         if self.iterations < 1:
             raise InvalidValue(f"FixedPoint needs at least 1 iteration, got {self.iterations}")
+        if self.updates < 1:
+            raise InvalidValue(f"FixedPoint needs at least 1 update, got {self.updates}")
         if not self.tolerance > 0:
             raise InvalidValue(f"FixedPoint needs a positive tolerance, got {self.tolerance}")
         if not 0 <= self.damping < float("inf"):
@@ -121,7 +126,7 @@ class FixedPoint(Optimiser):
             "plan_gains": gains,
         }
         if ocp.bounds_states:
-            moved[MULTIPLIERS] = shifted_multipliers(ocp, kept[MULTIPLIERS])
+            moved |= shifted_multipliers(ocp, kept)
         return self.memory(ocp).join({**kept, **moved})
 
     def step(self, ocp: OptimalControl) -> ca.Function:
@@ -130,16 +135,28 @@ class FixedPoint(Optimiser):
         Every call does the same `iterations`; as C it runs as the loops of fixed_point.c.
         """
         if ocp.bounds_states:
-            return constrained_step(ocp, self.step, self.memory(augmented(ocp)), self.tolerance, self.feasible)
+            return self._constrained(ocp, self.step, self.updates)
         driver = self._driver(ocp, iterations=self.iterations, stop_early=0)
         return with_driver("fpirhc_fixed_point", driver, lambda name: self._graph(ocp, name))
 
     def converging(self, ocp: OptimalControl) -> ca.Function:
         """The same, but stops where the tolerance is met, after at most 100 iterations."""
         if ocp.bounds_states:
-            return constrained_step(ocp, self.converging, self.memory(augmented(ocp)), self.tolerance, self.feasible)
+            return self._constrained(ocp, self.converging, 1)
         driver = self._driver(ocp, iterations=MOST, stop_early=1)
         return with_driver("fpirhc_fixed_point_converging", driver, lambda name: self._converging_graph(ocp, name))
+
+    def _constrained(
+        self, ocp: OptimalControl, build: Callable[[OptimalControl], ca.Function], updates: int
+    ) -> ca.Function:
+        moved = augmented(ocp)
+
+        def prepare(memory: dict[str, Expression], steeper: Expression) -> dict[str, Expression]:
+            # A call starts with twice the remembered gamma.
+            return {**memory, "plan_gamma": 0.5 * first_gamma(moved) / steeper}
+
+        inner = self.memory(moved)
+        return constrained_step(ocp, build, inner, prepare, updates, self.tolerance, self.feasible)
 
     def _driver(self, ocp: OptimalControl, *, iterations: int, stop_early: int) -> Driver:
         nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages

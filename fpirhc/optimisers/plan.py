@@ -10,10 +10,12 @@ import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
-from fpirhc.optimisers.base import Optimiser, judge
+from fpirhc.optimisers.base import FEASIBLE, Optimiser, judge
 from fpirhc.optimisers.multipliers import fit_multipliers
 from fpirhc.status import Status
 
+_WORST = 5  # violations told
+_PATIENCE = 4  # calls in a row that may leave the violation as it is
 _SHRINKING = 0.9  # a violation counts as shrinking below this share of the last one
 
 
@@ -41,6 +43,25 @@ class Plan:
     def state_multipliers(self) -> np.ndarray:
         """Multipliers of the state bounds, shape (ns, N), fitted to the plan itself: the optimiser is not asked."""
         return fit_multipliers(self._ocp, self.inputs, self.states[:, 0], self._data, self._bounds)
+
+    def violations(self) -> tuple[str, ...]:
+        """The five worst violations of state bounds in words, the first state before all others; empty when there are none."""
+        ocp, found = self._ocp, []
+        for k, (name, unit) in enumerate(zip(ocp.state.elements, ocp.state.units, strict=True)):
+            low, high = ocp.state_lower[k], ocp.state_upper[k]
+            for stage, value in enumerate(self.states[k]):
+                by = max(low - value, value - high)
+                means_something = stage > 0 or k < ocp.state.size - ocp.written
+                if by > FEASIBLE and means_something:
+                    side = f"below {low:g}" if value < low else f"above {high:g}"
+                    found.append((stage > 0, -by, f"'{name}' is {value:.6g} {unit}, {side}, at stage {stage}"))
+        return tuple(text for _, _, text in sorted(found)[:_WORST])
+
+    def slacks(self) -> dict[str, float]:
+        """Cost of every soft limit over the horizon by name, zero where it is kept."""
+        _, _, terms = rollout(self._ocp)(self.states[:, 0], self.inputs, self._data)
+        values = zip(self._ocp.terms, np.asarray(terms.full()).ravel(), strict=True)
+        return {name.removeprefix("soft "): float(v) for name, v in values if name.startswith("soft ")}
 
     def verify(self) -> tuple[float, float, float]:
         """Recompute (cost, stationarity, feasibility) from the problem's own functions."""
@@ -77,15 +98,15 @@ def solve(
     status, count = Status.NOT_CONVERGED, 0
     diagnostics = np.zeros(5)
     iterations = 0.0
-    violation, better = np.inf, True
-    while status in (Status.NOT_CONVERGED, Status.INFEASIBLE) and better and count < calls:
+    violation, stuck = np.inf, 0
+    while status in (Status.NOT_CONVERGED, Status.INFEASIBLE) and stuck < _PATIENCE and count < calls:
         given = step(state, data, *bounds, memory)
         inputs, diagnostics, memory = (np.asarray(v.full()) for v in given)
         diagnostics, memory = diagnostics.ravel(), memory.ravel()
         iterations += diagnostics[3]
         status, count = Status(int(diagnostics[4])), count + 1
         better = status == Status.NOT_CONVERGED or diagnostics[2] < _SHRINKING * violation
-        violation = diagnostics[2]
+        stuck, violation = (0 if better else stuck + 1), min(violation, diagnostics[2])
     states = np.asarray(rollout(ocp)(state, inputs, data)[0].full())
     return Plan(
         inputs,

@@ -1,0 +1,187 @@
+"""Limits of states, rates, paths and the horizon's end: the same plans as an independent solver, and names in every complaint."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from plants import pendulum
+
+import fpirhc as fp
+from fpirhc.errors import FpirhcError, NotSupported
+from fpirhc.horizon.augmented import augmented, bounded_states, penalty_weights
+from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.horizon.rollout import rollout
+
+PLANT, REFERENCE = pendulum(), fp.Trajectory(lambda t: {"angle": ca.sin(2 * t)})
+COST = fp.Quadratic(states={"angle": 10.0, "angle'": 0.1}, effort={"torque": 0.05})
+FIRST = np.array([0.6, 0.0])
+FIXED = fp.FixedPoint(iterations=1, tolerance=1e-7)
+IPOPT = fp.InteriorPoint(tolerance=1e-4, accuracy=1e-11)
+
+
+def horizon_of(limits, terminal=(), cost=COST, stages=12):
+    horizon = fp.Horizon(stages=stages, step=0.05, terminal=terminal)
+    ocp = transcribe(PLANT, REFERENCE, horizon, cost, limits)
+    data = stage_data(PLANT, REFERENCE, horizon, cost)(0.0, PLANT.approximate).full()
+    return ocp, data, ocp.start(FIRST, [0.0]).full().ravel()
+
+
+def speed_and_angle(view):
+    return view.state["angle'"] + 2 * view.state.angle
+
+
+CASES = {
+    "state": (fp.Limits(states={"angle'": (-0.2, 0.3)}), ()),
+    "state and input": (fp.Limits(inputs={"torque": (-4.0, 4.0)}, states={"angle'": (-0.2, 0.5)}), ()),
+    "rate": (fp.Limits(rates={"torque": (-10.0, 10.0)}), ()),
+    "path": (fp.Limits(paths={"mix": fp.Path(speed_and_angle, lower=1.0)}), ()),
+    "input path": (fp.Limits(paths={"power": fp.Path(lambda v: v.input.torque * v.state["angle'"], upper=0.5)}), ()),
+    "terminal": (fp.Limits(), ("angle",)),
+    "terminal and rate": (fp.Limits(rates={"torque": (-40.0, 40.0)}), ("angle", "angle'")),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_limits_are_kept_at_the_same_optimum_as_ipopt(case):
+    """The limit is active, the plan is inside, and cost and inputs are those of an interior-point method."""
+    limits, terminal = CASES[case]
+    ocp, data, first = horizon_of(limits, terminal)
+    free, free_data, free_first = horizon_of(fp.Limits(inputs=limits.inputs))
+    plan, other = fp.solve(ocp, FIXED, first, data), fp.solve(ocp, IPOPT, first, data)
+    unlimited = fp.solve(free, FIXED, free_first, free_data)
+    assert plan.status == fp.Status.OK
+    assert other.status == fp.Status.OK
+    assert plan.feasibility <= 1e-8
+    assert plan.cost == pytest.approx(other.cost, rel=1e-6)
+    assert plan.cost > unlimited.cost * (1 + 1e-6), "the limit must cost something, or it is not active"
+    np.testing.assert_allclose(plan.inputs, other.inputs, atol=2e-5)
+    assert plan.verify()[1] <= 1e-6
+    assert plan.violations() == ()
+
+
+def test_multipliers_are_those_of_ipopt():
+    """The augmented Lagrangian's multipliers, fitted and found, agree with an independent fit at IPOPT's plan."""
+    ocp, data, first = horizon_of(CASES["state"][0])
+    plan, other = fp.solve(ocp, FIXED, first, data), fp.solve(ocp, IPOPT, first, data)
+    np.testing.assert_allclose(
+        plan.state_multipliers, other.state_multipliers, atol=1e-3 * plan.state_multipliers.max()
+    )
+
+
+def test_soft_limits_are_violated_at_their_price():
+    """More weight, less violation; the price stands in the cost by name; hard where heavy."""
+    lowest, prices = [], []
+    for weight in (1e0, 1e2, 1e4):
+        ocp, data, first = horizon_of(fp.Limits(states={"angle'": (-0.5, 0.5)}, soft={"angle'": weight}))
+        plan = fp.solve(ocp, FIXED, first, data)
+        assert plan.status == fp.Status.OK
+        lowest.append(plan.states[1].min())
+        prices.append(plan.slacks()["angle'"])
+    assert lowest[0] < lowest[1] < lowest[2] < -0.5 + 1e-12
+    assert lowest[2] > -0.51
+    assert all(p > 0 for p in prices)
+    kept, data, first = horizon_of(fp.Limits(states={"angle'": (-50.0, 50.0)}, soft={"angle'": 10.0}))
+    assert fp.solve(kept, FIXED, first, data).slacks() == {"angle'": 0.0}
+
+
+def test_soft_rates_and_paths():
+    """They are no bounds any more, and they pull."""
+    hard, soft = CASES["rate"][0], fp.Limits(rates={"torque": (-10.0, 10.0)}, soft={"torque": 1e-3})
+    ocp, data, first = horizon_of(soft)
+    assert not ocp.bounds_states
+    plan = fp.solve(ocp, FIXED, first, data)
+    strict = fp.solve(*swapped(horizon_of(hard)))
+    steps = [np.abs(np.diff(p.inputs)).max() for p in (plan, strict)]
+    assert steps[0] > steps[1] * 1.01
+
+
+def swapped(given):
+    ocp, data, first = given
+    return ocp, FIXED, first, data
+
+
+def test_violations_are_named_with_values_the_first_state_first():
+    """A first state outside its limit, and stages that cannot be inside."""
+    ocp, data, _ = horizon_of(fp.Limits(inputs={"torque": (-0.1, 0.1)}, states={"angle": (0.9, 1.0)}))
+    plan = fp.solve(ocp, FIXED, FIRST, data, calls=4)
+    assert plan.status == fp.Status.INFEASIBLE
+    told = plan.violations()
+    assert len(told) == 5
+    assert told[0] == "'angle' is 0.6 rad, below 0.9, at stage 0"
+    assert "below 0.9, at stage" in told[1]
+
+
+def test_augmented_problem_has_no_state_bounds_and_the_same_optimum_cost_inside():
+    """Inside the bounds and without multipliers the penalty is zero."""
+    ocp, data, _ = horizon_of(fp.Limits(states={"angle'": (-5.0, 5.0)}))
+    moved = augmented(ocp)
+    assert not moved.bounds_states
+    assert bounded_states(ocp) == [1]
+    assert penalty_weights(ocp)[0] > 0
+    inputs, none = np.zeros((1, ocp.stages)), np.vstack([np.ones(ocp.stages + 1), np.zeros(ocp.stages + 1)])
+    still = np.array([0.05, 0.0])
+    values = rollout(ocp)(still, inputs, data)[1], rollout(moved)(still, inputs, np.vstack([data, none]))[1]
+    assert float(values[0]) == pytest.approx(float(values[1]), rel=1e-12)
+
+
+LOOPS = {
+    "state": (fp.Limits(states={"angle'": (-1.0, 1.0)}), ()),
+    "rate": (fp.Limits(rates={"torque": (-30.0, 30.0)}), ()),
+    "terminal": (fp.Limits(), ("angle",)),
+}
+
+
+@pytest.mark.parametrize("case", LOOPS)
+def test_limits_in_a_closed_loop(case):
+    """A few updates of the multipliers per cycle keep the limit closely, although it moves along the plan."""
+    limits, terminal = LOOPS[case]
+    problem = fp.Problem(
+        plant=pendulum(),
+        reference=REFERENCE,
+        start={"angle": 0.3},
+        period=0.05,
+        duration=6.0,
+        limits=limits,
+        horizon=fp.Horizon(stages=20, step=0.05, terminal=terminal),
+        cost=COST,
+        measure_from=1.0,
+    )
+    controller = fp.Informed(fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=1e-3, feasible=1e-3)))
+    run = fp.simulate(problem, controller, seed=0)
+    assert run.stop is None
+    assert fp.measure(problem, run).statuses["OK"] >= 110
+    if case == "state":
+        assert np.abs(run["state.angle'"][20:]).max() < 1.001
+    if case == "rate":
+        assert np.abs(np.diff(run["command.torque"])[5:]).max() <= 30 * 0.05 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("limits", "terminal", "message"),
+    [
+        (fp.Limits(rates={"torqe": (-1.0, 1.0)}), (), "torque"),
+        (fp.Limits(rates={"torque": (1.0, -1.0)}), (), "swap them"),
+        (fp.Limits(paths={"angle": fp.Path(lambda v: v.state.angle)}), (), "already the name"),
+        (fp.Limits(paths={"mix": 3.0}), (), "must be a Path"),
+        (fp.Limits(paths={"mix": fp.Path(lambda v: v.state.angel, upper=1.0)}), (), "angle"),
+        (fp.Limits(paths={"mix": fp.Path(lambda v: v.state.vector, upper=1.0)}), (), "one scalar"),
+        (fp.Limits(soft={"angle": 1.0}), (), "soft: limit of"),
+        (fp.Limits(states={"angle": (0, 1)}, soft={"angle": -1.0}), (), "positive"),
+        (fp.Limits(), ("angel",), "angle"),
+    ],
+)
+def test_mistakes_are_named(limits, terminal, message):
+    with pytest.raises(FpirhcError, match=message):
+        horizon_of(limits, terminal)
+
+
+def test_who_does_not_serve_limits_says_who_does():
+    """The gradient methods name the optimisers that can."""
+    ocp, data, first = horizon_of(CASES["rate"][0])
+    for optimiser in (
+        fp.ReducedGradient(iterations=1, tolerance=1.0),
+        fp.GradientFixedPoint(iterations=1, tolerance=1.0),
+    ):
+        with pytest.raises(NotSupported, match="FixedPoint"):
+            fp.solve(ocp, optimiser, first, data)
