@@ -21,6 +21,7 @@ from .integrate import Cvodes, Euler, RungeKutta4
 from .limits import Limits, Path
 from .metrics import Metrics, measure
 from .optimisers.anderson import Anderson
+from .optimisers.certificate import Certificate, certify
 from .optimisers.fixed_point import FixedPoint
 from .optimisers.full_space import FullSpaceFixedPoint
 from .optimisers.gradient_fixed_point import GradientFixedPoint
@@ -44,6 +45,7 @@ from .tracking.exponential import Exponential
 __all__ = [
     "Affine",
     "Anderson",
+    "Certificate",
     "Comparison",
     "ComputedTorque",
     "Cvodes",
@@ -97,6 +99,7 @@ __all__ = [
     "Table",
     "Trajectory",
     "assess_gain",
+    "certify",
     "check_deformation",
     "check_gain",
     "compare",

@@ -39,7 +39,7 @@ import casadi as ca
 
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
-from fpirhc.errors import InvalidValue
+from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.horizon.augmented import augmented
 from fpirhc.horizon.expansion import Bend, GaussNewton, bent_end, bent_stage, linear_stage
 from fpirhc.horizon.problem import OptimalControl
@@ -64,6 +64,7 @@ from fpirhc.symbolic.driver import Driver, with_driver
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 MOST = 100  # iterations of one converging call
+_CONVEX = 1e-6  # relative eigenvalue below zero that is taken for rounding
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,19 @@ class FixedPoint(Optimiser):
             raise InvalidValue(f"FixedPoint needs a positive tolerance, got {self.tolerance}")
         if not 0 <= self.damping < float("inf"):
             raise InvalidValue(f"FixedPoint(damping={self.damping!r}): expected a finite number of at least 0")
+
+    def check(self, ocp: OptimalControl) -> None:
+        """Raise if the cost is not convex along the reference.
+
+        Raises:
+            NotSupported: a quadratic model of such a cost has no minimum.
+        """
+        least = ocp.along.least_bend()
+        if least < -_CONVEX:
+            raise NotSupported(
+                f"FixedPoint needs a cost that bends upwards; along the reference the stage or terminal cost has an eigenvalue of "
+                f"{least:.2g} times its largest. Use ReducedGradient() or InteriorPoint(), or add a convex term to the cost"
+            )
 
     def memory(self, ocp: OptimalControl) -> Layout:
         """The plan, its states and feedback, the line search's step lengths, and the multipliers of state bounds."""

@@ -24,7 +24,8 @@ class Plan:
     """A solved horizon.
 
     inputs (nu, N), states (ns, N + 1). cost, stationarity, feasibility as defined in `fpirhc.optimisers.base`; iterations as far as
-    the optimiser tells (-1: it does not); calls of its step; status.
+    the optimiser tells (-1: it does not); calls of its step; status. problem, data (ntheta, N + 1), bounds of the inputs:
+    what was solved.
     """
 
     inputs: np.ndarray
@@ -35,18 +36,18 @@ class Plan:
     iterations: float
     calls: int
     status: Status
-    _ocp: OptimalControl
-    _data: np.ndarray
-    _bounds: tuple[np.ndarray, np.ndarray]
+    problem: OptimalControl
+    data: np.ndarray
+    bounds: tuple[np.ndarray, np.ndarray]
 
     @cached_property
     def state_multipliers(self) -> np.ndarray:
         """Multipliers of the state bounds, shape (ns, N), fitted to the plan itself: the optimiser is not asked."""
-        return fit_multipliers(self._ocp, self.inputs, self.states[:, 0], self._data, self._bounds)
+        return fit_multipliers(self.problem, self.inputs, self.states[:, 0], self.data, self.bounds)
 
     def violations(self) -> tuple[str, ...]:
         """The five worst violations of state bounds in words, the first state before all others; empty when there are none."""
-        ocp, found = self._ocp, []
+        ocp, found = self.problem, []
         for k, (name, unit) in enumerate(zip(ocp.state.elements, ocp.state.units, strict=True)):
             low, high = ocp.state_lower[k], ocp.state_upper[k]
             for stage, value in enumerate(self.states[k]):
@@ -59,14 +60,14 @@ class Plan:
 
     def slacks(self) -> dict[str, float]:
         """Cost of every soft limit over the horizon by name, zero where it is kept."""
-        _, _, terms = rollout(self._ocp)(self.states[:, 0], self.inputs, self._data)
-        values = zip(self._ocp.terms, np.asarray(terms.full()).ravel(), strict=True)
+        _, _, terms = rollout(self.problem)(self.states[:, 0], self.inputs, self.data)
+        values = zip(self.problem.terms, np.asarray(terms.full()).ravel(), strict=True)
         return {name.removeprefix("soft "): float(v) for name, v in values if name.startswith("soft ")}
 
     def verify(self) -> tuple[float, float, float]:
         """Recompute (cost, stationarity, feasibility) from the problem's own functions."""
-        ocp = self._ocp
-        found = judge(ocp)(self.inputs, self.states[:, 0], self._data, *self._bounds, self.state_multipliers)
+        ocp = self.problem
+        found = judge(ocp)(self.inputs, self.states[:, 0], self.data, *self.bounds, self.state_multipliers)
         cost, stationarity, feasibility = (float(v) for v in found)
         return cost, stationarity, feasibility
 

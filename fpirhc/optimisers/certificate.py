@@ -1,0 +1,134 @@
+"""What can be said about a plan beyond its residual: how fast the iteration contracts there, and how far the optimum is.
+
+At a plan U with free inputs (not held by an active bound) let H be the exact Hessian of V and M the Hessian of the quadratic
+model, both on the free inputs. One step of the preconditioned iteration multiplies a small error by I - a M^-1 H, which is
+self-adjoint in the inner product of M, so that its norm there is its spectral radius, the contraction factor
+
+    K = |I - a M^-1 H|_M = max |1 - a eig(M^-1 H)|.
+
+With K < 1, Banach's a-posteriori bound and strong convexity relative to M give, with the step h = M^-1 g,
+
+    |U - U*|_M <= a |h|_M / (1 - K),        V(U) - V(U*) <= g'h / (2 (1 - K_1)),   K_1 = |I - M^-1 H|_M.
+
+Both hold where H varies little between U and U* and the same bounds stay active. H is therefore computed at U and one step further:
+K is the larger of both plus their difference, and where the sets of free inputs differ nothing is said. The ratio of the last two
+steps is not such a bound and is not offered as one.
+
+References: S. Banach, Fund. Math. 3, 1922; J. M. Ortega, W. C. Rheinboldt, Iterative Solution of Nonlinear Equations, 1970, ch. 12.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.horizon.expansion import GaussNewton, bent_end, bent_stage, linear_stage
+from fpirhc.horizon.rollout import reduced_gradient
+from fpirhc.optimisers.plan import Plan
+
+_ROUNDING = 1e-14  # relative to the trace, added to the model before it is factorised
+_AT_BOUND = 1e-9  # relative distance within which an input counts as at its bound
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What is known about a plan.
+
+    stationarity, feasibility: as of the plan, recomputed. factor: K, infinite where nothing can be said.
+    error: bound of the distance to the optimum in the M-norm (square root of cost), NaN where K >= 1. input_error: bound of the
+    error of any input, in its unit. suboptimality: bound of V(U) - V(U*). free: number of free inputs. curvature: least
+    eigenvalue of M^-1 H; a plan where it is not positive is no strict minimum.
+    """
+
+    stationarity: float
+    feasibility: float
+    factor: float
+    error: float
+    input_error: float
+    suboptimality: float
+    free: int
+    curvature: float
+
+
+def certify(plan: Plan, *, gain: float = 1.0) -> Certificate:
+    """Return what is known about a plan for an iteration of effective gain `gain` (1: full Gauss-Newton steps)."""
+    _, stationarity, feasibility = plan.verify()
+    slope, hessian = _second_order(plan, plan.inputs)
+    free = _free(plan, plan.inputs, slope)
+    if not free.any():
+        return Certificate(stationarity, feasibility, 0.0, 0.0, 0.0, 0.0, 0, float("inf"))
+    model = _model(plan)[np.ix_(free, free)]
+    root = np.linalg.cholesky(model + _ROUNDING * np.trace(model) * np.eye(model.shape[0]))
+    move = np.linalg.solve(model, slope[free])
+    values = _relative_eigenvalues(root, hessian[np.ix_(free, free)])
+    further = plan.inputs.ravel(order="F").copy()
+    further[free] -= gain * move
+    inputs = np.clip(further.reshape(plan.inputs.shape, order="F"), *(b[:, None] for b in plan.bounds))
+    slope_there, hessian_there = _second_order(plan, inputs)
+    same = bool(np.all(_free(plan, inputs, slope_there) == free))
+    beyond = _relative_eigenvalues(root, hessian_there[np.ix_(free, free)])
+    factor, unit = (_over_both(a, values, beyond) if same else float("inf") for a in (gain, 1.0))
+    length = float(np.sqrt(max(slope[free] @ move, 0.0)))
+    error = gain * length / (1 - factor) if factor < 1 else float("nan")
+    spread = float(np.sqrt(np.linalg.inv(model).diagonal().max()))
+    suboptimality = length**2 / (2 * (1 - unit)) if unit < 1 else float("nan")
+    least = float(values.min())
+    return Certificate(stationarity, feasibility, factor, error, spread * error, suboptimality, int(free.sum()), least)
+
+
+def _over_both(gain: float, here: np.ndarray, there: np.ndarray) -> float:
+    one, other = (float(np.abs(1 - gain * v).max()) for v in (here, there))
+    return max(one, other) + abs(one - other)
+
+
+def _relative_eigenvalues(root: np.ndarray, hessian: np.ndarray) -> np.ndarray:
+    """Eigenvalues of M^-1 H with M = root root'."""
+    half = np.linalg.solve(root, hessian)
+    whole = np.linalg.solve(root, half.T)
+    return np.asarray(np.linalg.eigvalsh(0.5 * (whole + whole.T)))
+
+
+def _second_order(plan: Plan, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient (N nu) and exact Hessian (N nu, N nu) of the Lagrangian at these inputs, by Hessian-vector products."""
+    ocp = plan.problem
+    nu, n = ocp.input.size, ocp.stages
+    inputs, direction = ca.MX.sym("U", nu, n), ca.MX.sym("d", nu, n)
+    slope = reduced_gradient(ocp)(plan.states[:, 0], inputs, plan.data, plan.state_multipliers)[1]
+    product = ca.Function("fpirhc_hessian_times", [inputs, direction], [ca.vec(ca.jtimes(slope, inputs, direction))])
+    first = np.asarray(ca.Function("fpirhc_slope", [inputs], [ca.vec(slope)])(at).full()).ravel()
+    columns = product.map(nu * n)(
+        np.tile(at, nu * n), np.eye(nu * n).reshape(-1, n, nu).transpose(2, 0, 1).reshape(nu, -1)
+    )
+    return first, np.asarray(columns.full())
+
+
+def _free(plan: Plan, inputs: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Inputs that no active bound holds: not at a bound, or pushed away from it."""
+    lower, upper = (np.tile(b, plan.problem.stages) for b in plan.bounds)
+    values = inputs.ravel(order="F")
+    near = _AT_BOUND * (1 + np.abs(values))
+    held = ((values <= lower + near) & (slope > 0)) | ((values >= upper - near) & (slope < 0))
+    return ~held
+
+
+def _model(plan: Plan) -> np.ndarray:
+    """M (N nu, N nu) at the plan, by propagating the linearised model."""
+    ocp, data = plan.problem, plan.data
+    n, nu = ocp.stages, ocp.input.size
+    linear, bent = linear_stage(ocp), bent_stage(ocp, GaussNewton())
+    moved, total = np.zeros((ocp.state.size, n * nu)), np.zeros((n * nu, n * nu))
+    for i in range(n):
+        s, u, theta = plan.states[:, i], plan.inputs[:, i], data[:, i]
+        _, _, a, b, _, _ = (np.asarray(v.full()) for v in linear(s, u, theta))
+        q, cross, r = (np.asarray(v.full()) for v in bent(s, u, theta, np.zeros(ocp.state.size)))
+        own = slice(i * nu, (i + 1) * nu)
+        total += moved.T @ q @ moved
+        total[own] += cross @ moved
+        total[:, own] += (cross @ moved).T
+        total[own, own] += r
+        moved = a @ moved
+        moved[:, own] += b
+    final = np.asarray(bent_end(ocp)(plan.states[:, n], data[:, n])[2].full())
+    return np.asarray(total + moved.T @ final @ moved)

@@ -1,0 +1,96 @@
+"""Certificates: the predicted contraction is the measured one, and no bound is ever below the true error."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_fixed_point import SWING, linear_problem, pendulum_problem
+
+import fpirhc as fp
+from fpirhc.horizon.problem import stage_data, transcribe
+
+PROBLEMS = ("two_mass", "van_der_pol", "cart_pole", "two_link_arm", "chain_of_masses")
+
+
+def first_horizon(name):
+    p = fp.load_problem(name).problem
+    ocp = transcribe(p.plant, p.reference, p.horizon, p.cost, p.limits)
+    data = stage_data(p.plant, p.reference, p.horizon, p.cost)(0.0, p.plant.approximate).full()
+    return ocp, data, ocp.start(p.start_state, np.zeros(ocp.input.size)).full().ravel()
+
+
+def iterates(ocp, data, first, count):
+    """Plans after 1, 2, ... iterations from rest."""
+    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-13)
+    bounds, memory, step = (ocp.input_lower, ocp.input_upper), optimiser.memory(ocp).start(), optimiser.step(ocp)
+    best = fp.solve(ocp, replace(optimiser, tolerance=1e-9), first, data)
+    for _ in range(count):
+        inputs, told, memory = (v.full() for v in step(first, data, *bounds, memory))
+        yield replace(best, inputs=inputs, states=best.states, cost=float(told.ravel()[0])), best
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_no_bound_is_below_the_true_error(name):
+    """On every iterate of every shipped problem: distance to the optimum, error of any input, and suboptimality."""
+    from fpirhc.horizon.rollout import rollout
+
+    ocp, data, first = first_horizon(name)
+    said = 0
+    for plan, best in iterates(ocp, data, first, 14):
+        plan = replace(plan, states=rollout(ocp)(first, plan.inputs, data)[0].full())
+        certificate = fp.certify(plan)
+        if not np.isfinite(certificate.input_error):
+            continue
+        said += 1
+        slack = 1e-7 * (1 + np.abs(best.inputs).max())
+        assert np.abs(plan.inputs - best.inputs).max() <= certificate.input_error + slack
+        assert plan.cost - best.cost <= certificate.suboptimality + 1e-11 * (1 + abs(best.cost))
+    assert said >= 2
+
+
+def test_factor_on_a_linear_quadratic_problem_is_zero():
+    """The model is exact there, so one step is the optimum and the bound says so."""
+    ocp, data, first = linear_problem()
+    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6), first, data)
+    certificate = fp.certify(plan)
+    assert certificate.factor < 1e-8
+    assert certificate.curvature == pytest.approx(1.0)
+    half = fp.certify(plan, gain=0.5)
+    assert half.factor == pytest.approx(0.5, abs=1e-8)
+
+
+def test_factor_is_the_rate_of_the_iteration():
+    """Errors in the M-norm shrink by K near the optimum."""
+    ocp, data = pendulum_problem(SWING, horizon=fp.Horizon(stages=15, step=0.1))
+    first = np.array([2.5, 0.0])
+    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-12)
+    best = fp.solve(ocp, optimiser, first, data)
+    step, memory = optimiser.step(ocp), optimiser.memory(ocp).start()
+    memory[optimiser.memory(ocp).slice("plan_inputs")] = best.inputs.ravel(order="F") + 1e-3
+    distances = []
+    for _ in range(7):
+        inputs, _, memory = step(first, data, ocp.input_lower, ocp.input_upper, memory)
+        distances.append(np.linalg.norm(inputs.full() - best.inputs))
+    assert distances[-1] / distances[-2] == pytest.approx(fp.certify(best).factor, abs=0.01)
+
+
+def test_nothing_is_free_when_every_bound_holds():
+    """A plan in a corner of its box cannot move: nothing is left to bound."""
+    ocp, data = pendulum_problem(limits=fp.Limits(inputs={"torque": (3.0, 3.0)}))
+    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6), np.array([0.5, 0.0]), data)
+    certificate = fp.certify(plan)
+    assert certificate.input_error == 0.0 or certificate.free > 0
+
+
+def test_a_saddle_is_not_certified():
+    """Standing upright with a cost that wants to fall: curvature below zero, no bound."""
+    ocp, data = pendulum_problem(
+        fp.Quadratic(states={"angle": 1e-3}, effort={"torque": 1e-4}, terminal_cost={"angle": 50.0}),
+        horizon=fp.Horizon(stages=30, step=0.1),
+    )
+    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6), np.array([np.pi * 3, 0.0]), data, calls=1)
+    certificate = fp.certify(replace(plan, inputs=0 * plan.inputs))
+    assert certificate.factor > 0
+    assert np.isfinite(certificate.curvature)
