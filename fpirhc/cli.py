@@ -1,7 +1,8 @@
-"""The command line: list, run and compare problems.
+"""The command line: list, solve, run and compare problems.
 
 Exit codes: 0 finished; 2 bad input (names, values, a problem file, an option); 3 a folder or file cannot be written;
-4 the run ended early because a signal was not finite (`run` only; `compare` reports it); 130 interrupted.
+4 the run ended early because a signal was not finite (`run`; `compare` reports it) or a plan did not converge (`solve`);
+130 interrupted.
 """
 
 from __future__ import annotations
@@ -22,9 +23,12 @@ _EXAMPLES = """examples:
   fpirhc compare two_mass                       every controller of a problem, with a report
   fpirhc compare my_arm.py --controllers RHC RHC+FPI --out results/arm
   fpirhc compare two_mass --json                one JSON object on standard output
+  fpirhc compare two_mass --optimisers all      the headline pair with every optimiser
   fpirhc run two_mass "RHC+FPI" --out results   one run, saved as .npz and .png
+  fpirhc solve cart_pole --optimisers fixed-point ipopt      the first horizon, open loop, with certificates
 
-exit codes: 0 finished, 2 bad input, 3 cannot write, 4 the run ended early (run only), 130 interrupted
+exit codes: 0 finished, 2 bad input, 3 cannot write, 4 the run ended early (run)
+or a plan did not converge (solve), 130 interrupted
 """
 
 
@@ -60,6 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     _add_compare(commands)
     _add_run(commands)
+    _add_solve(commands)
     listing = commands.add_parser("list", help="list the shipped problems")
     listing.set_defaults(command=_list)
     return parser
@@ -74,6 +79,7 @@ def _add_compare(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     _add_common(command)
     command.add_argument("--controllers", nargs="+", metavar="NAME", help="only these controllers (default: all)")
+    _add_optimisers(command)
     command.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
     command.set_defaults(command=_compare)
 
@@ -90,9 +96,37 @@ def _add_run(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     command.set_defaults(command=_run)
 
 
-def _add_common(command: argparse.ArgumentParser) -> None:
+def _add_solve(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    command = commands.add_parser(
+        "solve",
+        help="solve a problem's first horizon open loop, to a tolerance",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _add_problem(command)
+    _add_optimisers(command)
+    command.add_argument(
+        "--tolerance", type=float, default=1e-6, help="of the stationarity, in the unit of the inputs (1e-6)"
+    )
+    command.set_defaults(command=_solve)
+
+
+def _add_problem(command: argparse.ArgumentParser) -> None:
     command.add_argument("problem", metavar="PROBLEM", help="name of a shipped problem, or path of a problem file")
     command.add_argument("--out", metavar="FOLDER", help="where results are written (default: results/PROBLEM)")
+
+
+def _add_optimisers(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--optimisers",
+        nargs="+",
+        metavar="NAME",
+        help="fixed-point, reduced-gradient, ipopt, fatrop, qrqp, osqp, osqp-rti, or all",
+    )
+
+
+def _add_common(command: argparse.ArgumentParser) -> None:
+    _add_problem(command)
     command.add_argument("--seed", type=int, default=0, help="seed of the disturbances' noise (default: 0)")
     command.add_argument(
         "--no-compile", action="store_true", help="use CasADi's virtual machine even with a C compiler"
@@ -124,12 +158,18 @@ def _compare(options: argparse.Namespace) -> int:
     from fpirhc.studies.problem_file import load_problem
 
     task = load_problem(options.problem)
+    chosen = options.controllers
+    if options.optimisers:
+        from fpirhc.studies.compare import select
+        from fpirhc.studies.rivals import with_optimisers
+
+        task, chosen = with_optimisers(task, options.optimisers, chosen and list(select(task, chosen))), None
     folder = _folder(options, task.name)
     with progress_bars() as progress:
         comparison = compare(
             task,
             seed=options.seed,
-            controllers=options.controllers,
+            controllers=chosen,
             compiled=not options.no_compile,
             command=_command(options),
             progress=progress,
@@ -144,6 +184,22 @@ def _compare(options: argparse.Namespace) -> int:
     else:
         show(comparison, report)
     return _comparison_code(comparison)
+
+
+def _solve(options: argparse.Namespace) -> int:
+    from fpirhc.report.figures import plan_figure, save_figure
+    from fpirhc.report.terminal import show_plans
+    from fpirhc.status import Status
+    from fpirhc.studies.open_loop import solve_first
+    from fpirhc.studies.problem_file import load_problem
+
+    task = load_problem(options.problem)
+    folder = _folder(options, task.name)
+    solved = solve_first(task, options.optimisers or ["fixed-point"], options.tolerance)
+    picture = folder / "plan.png"
+    save_figure(plan_figure(task.problem, solved), picture)
+    show_plans(task.name, solved, picture)
+    return OK if all(one.plan.status == Status.OK for one in solved) else ENDED_EARLY
 
 
 def _comparison_code(comparison: Comparison) -> int:
@@ -211,6 +267,8 @@ def _command(options: argparse.Namespace) -> str:
     words = ["fpirhc", "compare", options.problem, "--seed", str(options.seed)]
     if options.controllers:
         words += ["--controllers", *options.controllers]
+    if options.optimisers:
+        words += ["--optimisers", *options.optimisers]
     if options.no_compile:
         words.append("--no-compile")
     return shlex.join(words)

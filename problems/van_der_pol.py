@@ -47,7 +47,7 @@ problem = fp.Problem(
     measure_from=3.0,  # s
 )
 
-optimiser = fp.ReducedGradient(iterations=50, tolerance=1e-2)  # N
+optimiser = fp.FixedPoint(iterations=1, tolerance=1e-2)  # N
 sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=50.0)  # scale in m/s^2: the plan may jump from limit to limit
 
 controllers = {

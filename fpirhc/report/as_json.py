@@ -36,9 +36,18 @@ def _entry(entry: Entry) -> dict[str, Any]:
         "cost": dict(metrics.cost),
         "cycle_us": None
         if cycle is None
-        else {"median": cycle.median, "p99": cycle.p99, "max": cycle.maximum, "first": cycle.first},
+        else {
+            "median": cycle.median,
+            "p99": cycle.p99,
+            "max": cycle.maximum,
+            "first": cycle.first,
+            "planning": cycle.planning,
+        },
         "statuses": dict(metrics.statuses),
         "solve": dict(metrics.solve),
+        "optimality": None
+        if entry.optimality is None
+        else {"median": entry.optimality.median, "worst": entry.optimality.worst, "plans": entry.optimality.plans},
         "contraction": None
         if contraction is None
         else {"predicted": contraction.predicted, "measured": contraction.measured},

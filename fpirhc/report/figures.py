@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,8 +14,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from fpirhc.problem import Problem
     from fpirhc.run import Run
     from fpirhc.studies.compare import Comparison, Entry
+    from fpirhc.studies.open_loop import Solved
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5b4a9c", "#8c6d1f", "#7f7f7f", "#111111")
 _RESPONSES = {"nominal": "#009e73", "desired": "#0072b2", "deformed": "#e69f00", "realised": "#d55e00"}
@@ -50,6 +53,31 @@ def run_figure(run: Run) -> Figure:
         axis.set_ylabel(what)
         _legend(axis)
     axes[3].set_xlabel("time [s]")
+    return figure
+
+
+def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
+    """States with their reference and inputs of open-loop plans over the horizon, one line per optimiser."""
+    assert problem.horizon is not None
+    plant, plan = problem.plant, solved[0].plan
+    names = [*plant.state.elements, *plant.input.elements]
+    figure = _figure(9, 2.0 * len(names) + 1, f"plans of {plan.problem.stages} stages")
+    axes = np.atleast_1d(figure.subplots(len(names), 1, sharex=True))
+    times = np.arange(plan.problem.stages + 1) * plan.problem.step
+    reference = plan.data[plan.problem.data.slice("reference")]
+    for k, (axis, name) in enumerate(zip(axes, names, strict=True)):
+        is_state = k < plant.state.size
+        if is_state:
+            axis.plot(times, reference[k], "--", color="#777777", label="reference")
+        for one, colour in zip(solved, PALETTE, strict=False):
+            if is_state:
+                axis.plot(times, one.plan.states[k], color=colour, label=one.name)
+            else:
+                axis.stairs(one.plan.inputs[k - plant.state.size], times, baseline=None, color=colour, label=one.name)
+        unit = plant.state.units[k] if is_state else plant.input.units[k - plant.state.size]
+        axis.set_ylabel(f"{name} [{unit}]")
+    _legend(axes[0])
+    axes[-1].set_xlabel("time [s]")
     return figure
 
 

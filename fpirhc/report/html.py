@@ -8,7 +8,7 @@ import io
 import json
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -110,7 +110,8 @@ def _table(comparison: Comparison) -> str:
     heads += [f"settled {c} [s]" for c in names]
     heads += [f"rms {i} [{run.unit(f'command.{i}')}]" for i in inputs]
     heads += ["clipped", "cost", "cycle median [us]", "p99", "max", "first", "contraction predicted", "measured"]
-    heads += ["solve: iterations", "worst residual", "statuses (cycles)"]
+    heads += ["plan median [us]", "iterations", "worst residual", "cost above optimum: median", "worst"]
+    heads += ["statuses (cycles)"]
     best = {c: min((e.metrics.rms_error[c] for e in entries if e.run.stop is None), default=math.nan) for c in names}
     rows = "".join(_row(e, names, inputs, best) for e in entries)
     skipped = "".join(
@@ -138,7 +139,10 @@ def _row(entry: Entry, names: Sequence[str], inputs: Sequence[str], best: dict[s
     values.append(_number(metrics.cost.get("total")))
     values += [_number(v) for v in ((cycle.median, cycle.p99, cycle.maximum, cycle.first) if cycle else (None,) * 4)]
     values += [_number(v) for v in ((contraction.predicted, contraction.measured) if contraction else (None, None))]
-    values += [_number(metrics.solve.get("median_iterations")), _number(metrics.solve.get("worst_stationarity"))]
+    values += [_number(cycle.planning if cycle and metrics.solve else None), _iterations(metrics.solve)]
+    values += [_number(metrics.solve.get("worst_stationarity"))]
+    excess = entry.optimality
+    values += [_number(v, 2) for v in ((excess.median, excess.worst) if excess else (None, None))]
     cells += [f"<td>{v}</td>" for v in values]
     words = ", ".join(f"{k.lower().replace('_', ' ')} {v}" for k, v in metrics.statuses.items())
     if entry.run.stop:
@@ -147,6 +151,11 @@ def _row(entry: Entry, names: Sequence[str], inputs: Sequence[str], best: dict[s
     return (
         f"<tr><th scope='row'>{_text(entry.name)}{notes}</th>{''.join(cells)}<td class='words'>{_text(words)}</td></tr>"
     )
+
+
+def _iterations(solve: Mapping[str, float]) -> str:
+    known = solve.get("median_iterations", -1.0)
+    return _number(known if known >= 0 else None)
 
 
 def _charts() -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,12 +15,14 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 
 from fpirhc.metrics import measure
+from fpirhc.status import Status
 
 if TYPE_CHECKING:
     from fpirhc.problem import Problem
     from fpirhc.run import Run
     from fpirhc.studies.compare import Comparison, Entry
     from fpirhc.studies.compare import Progress as Report
+    from fpirhc.studies.open_loop import Solved
 
 
 @contextmanager
@@ -52,6 +54,8 @@ def show(comparison: Comparison, report: Path) -> None:
     for sentence in comparison.verdict:
         console.print(f"- {sentence}", markup=False, highlight=False)
     console.print(_table(comparison))
+    if sum(e.optimality is not None for e in comparison.entries) > 1:
+        console.print(_plans(comparison))
     for name, why in comparison.skipped.items():
         console.print(f"skipped {name}: {why}", markup=False, highlight=False)
     console.print(f"report: {report}", markup=False, highlight=False, soft_wrap=True)
@@ -67,6 +71,38 @@ def show_run(problem: Problem, run: Run, saved: Path) -> None:
     if run.stop:
         console.print(f"ended early: {run.stop}", markup=False, highlight=False)
     console.print(f"saved: {saved}", markup=False, highlight=False, soft_wrap=True)
+
+
+def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
+    """Print what open-loop solves found."""
+    console = Console()
+    caption = "K: contraction factor; du <: error of any input at most; dV <: cost above the optimum at most"
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=f"{task}, first horizon", caption=caption)
+    table.add_column("optimiser", no_wrap=True)
+    for head in ("cost", "residual", "iter", "K", "du <", "dV <", "status"):
+        table.add_column(head, justify="right", no_wrap=True)
+    for one in solved:
+        plan, known = one.plan, one.certificate
+        bounds = (
+            [f"{known.factor:.3f}", f"{known.input_error:.1e}", f"{known.suboptimality:.1e}"] if known else ["-"] * 3
+        )
+        table.add_row(
+            one.name,
+            f"{plan.cost:.7g}",
+            f"{plan.stationarity:.0e}",
+            f"{plan.iterations:.0f}" if plan.iterations >= 0 else "-",
+            *bounds,
+            plan.status.name.lower().replace("_", " "),
+        )
+    console.print(table)
+    for one in solved:
+        for text in one.plan.violations():
+            console.print(f"{one.name}: {text}", markup=False, highlight=False)
+        for name, price in one.plan.slacks().items():
+            console.print(f"{one.name}: soft limit '{name}' costs {price:.4g}", markup=False, highlight=False)
+        if one.plan.status != Status.OK:
+            console.print(f"{one.name}: {one.plan.status.remedy}", markup=False, highlight=False)
+    console.print(f"picture: {picture}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _table(comparison: Comparison) -> Table:
@@ -96,6 +132,28 @@ def _row(entry: Entry, names: list[str]) -> list[str]:
     factor = f"{contraction.predicted:.3f}" if contraction else ""
     status = "ended early" if entry.run.stop else metrics.worst_status.lower().replace("_", " ")
     return [entry.name.replace("[", "\\["), *errors, *times, f"{100 * metrics.clipped_share:.2g} %", factor, status]
+
+
+def _plans(comparison: Comparison) -> Table:
+    """How the optimisers did: cost above the converged optimum, iterations, time of the cycles that plan."""
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title="plans")
+    table.add_column("controller", no_wrap=True)
+    for head in ("iter", "residual", "above opt.", "plan us", "max us", "first us"):
+        table.add_column(head, justify="right")
+    for entry in comparison.entries:
+        solve, cycle, excess = entry.metrics.solve, entry.cycle, entry.optimality
+        if not solve:
+            continue
+        known = solve["median_iterations"]
+        times = [f"{v:.3g}" for v in (cycle.planning, cycle.maximum, cycle.first)] if cycle else ["", "", ""]
+        table.add_row(
+            entry.name.replace("[", "\\["),
+            f"{known:.0f}" if known >= 0 else "-",
+            f"{solve['median_stationarity']:.1e}",
+            f"{excess.median:.1e}" if excess else "-",
+            *times,
+        )
+    return table
 
 
 def _number(value: float) -> str:

@@ -19,6 +19,7 @@ from fpirhc.metrics import Metrics, measure
 from fpirhc.problem import Problem
 from fpirhc.run import Run
 from fpirhc.simulation import simulate
+from fpirhc.studies.optimality import Optimality, measure_optimality
 from fpirhc.studies.problem_file import Task
 from fpirhc.studies.timing import CycleTime, measure_cycle
 from fpirhc.studies.verdict import verdict
@@ -47,6 +48,7 @@ class Entry:
     adaptive: bool
     pair: str | None
     contraction: Contraction | None
+    optimality: Optimality | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -184,6 +186,7 @@ def _entry(
         adaptive=adaptive,
         pair=_pair(chosen, name) if adaptive else None,
         contraction=_contraction(problem, resolved, run) if adaptive else None,
+        optimality=measure_optimality(problem, resolved, run, compiled=compiled),
         notes=_notes(controller, resolved),
     )
 

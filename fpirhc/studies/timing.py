@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.problem import Problem
+from fpirhc.problem import Problem, cycles_per_stage
 from fpirhc.run import Run
 from fpirhc.stepper import Stepper
 
@@ -17,12 +17,16 @@ REPLAYED = 2000  # cycles of the run that are stepped again, one by one
 
 @dataclass(frozen=True)
 class CycleTime:
-    """Wall time of one call of `Stepper.step`, microseconds; `first` is kept apart from the rest."""
+    """Wall time of one call of `Stepper.step`, microseconds; `first` is kept apart from the rest.
+
+    planning: median of the cycles in which a new plan is made; the median of all where none is.
+    """
 
     median: float
     p99: float
     maximum: float
     first: float
+    planning: float
 
 
 def measure_cycle(problem: Problem, controller: Controller, run: Run, *, compiled: bool = True) -> CycleTime | None:
@@ -44,4 +48,12 @@ def measure_cycle(problem: Problem, controller: Controller, run: Run, *, compile
         taken[k] = time.perf_counter_ns() - begin
     micro = taken / 1e3
     later = micro[1:]
-    return CycleTime(float(np.median(later)), float(np.quantile(later, 0.99)), float(later.max()), float(micro[0]))
+    stride = cycles_per_stage(problem.horizon, problem.period) if problem.horizon and "solve" in run.layout else 1
+    plans = micro[stride::stride] if cycles > stride else micro
+    return CycleTime(
+        median=float(np.median(later)),
+        p99=float(np.quantile(later, 0.99)),
+        maximum=float(later.max()),
+        first=float(micro[0]),
+        planning=float(np.median(plans)),
+    )

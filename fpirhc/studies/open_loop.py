@@ -1,0 +1,52 @@
+"""Open-loop solves of a problem's first horizon, with what is known about each plan."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fpirhc.errors import InvalidName, InvalidProblem, nearest
+from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.optimisers.certificate import Certificate, certify
+from fpirhc.optimisers.plan import Plan, solve
+from fpirhc.studies.problem_file import Task
+from fpirhc.studies.rivals import OPTIMISERS
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """One optimiser's plan; no certificate where the plan is not inside its bounds."""
+
+    name: str
+    plan: Plan
+    certificate: Certificate | None
+
+
+def solve_first(task: Task, names: Sequence[str], tolerance: float) -> list[Solved]:
+    """Solve the horizon that begins at the start of the problem, with the approximate model.
+
+    Raises:
+        InvalidProblem: the problem has no horizon or cost. InvalidName: an unknown optimiser. NotSupported: one that cannot
+            serve the problem.
+    """
+    problem = task.problem
+    if problem.horizon is None or problem.cost is None:
+        raise InvalidProblem(f"problem '{task.name}' has no horizon or no cost; give Problem(horizon=..., cost=...)")
+    unknown = [n for n in names if n != "all" and n not in OPTIMISERS]
+    if unknown:
+        raise InvalidName(f"optimiser '{unknown[0]}' is unknown.{nearest(unknown[0], [*OPTIMISERS, 'all'])}")
+    plant = problem.plant
+    ocp = transcribe(plant, problem.reference, problem.horizon, problem.cost, problem.limits)
+    data = np.asarray(
+        stage_data(plant, problem.reference, problem.horizon, problem.cost)(0.0, plant.approximate).full()
+    )
+    first = np.asarray(ocp.start(problem.start_state, np.zeros(plant.input.size)).full()).ravel()
+    solved = []
+    for name in OPTIMISERS if "all" in names else dict.fromkeys(names):
+        label, build = OPTIMISERS[name]
+        plan = solve(ocp, build(tolerance), first, data)
+        certified = plan.feasibility < np.inf and np.isfinite(plan.states).all()
+        solved.append(Solved(label, plan, certify(plan) if certified else None))
+    return solved
