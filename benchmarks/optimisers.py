@@ -11,6 +11,7 @@ as CasADi ships them, in the virtual machine, unless 'compiled' is said.
 
 from __future__ import annotations
 
+import runpy
 import sys
 import time
 from collections.abc import Callable
@@ -26,7 +27,6 @@ from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.base import Optimiser, judge
 from fpirhc.optimisers.nlp import _MultipleShooting
 from fpirhc.optimisers.shooting import interleave, program, separate, shift_dynamics, shift_variables, sizes
-from fpirhc.studies.problem_file import Task
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import native
 
@@ -34,7 +34,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from table import write_table
 
 PLANS = 200
-PROBLEMS = ["two_mass"]
+PROBLEMS = [
+    "two_mass",
+    "cart_pole",
+    "van_der_pol",
+    "two_link_arm",
+    "chain_of_masses:3",
+    "chain_of_masses:5",
+    "chain_of_masses:7",
+]
 JIT = {"jit": True, "compiler": "shell", "jit_options": {"flags": ["-O2"], "verbose": False}, "jit_temp_suffix": True}
 
 
@@ -48,11 +56,16 @@ class Horizons:
     tolerance: float
 
 
-def recorded(task: Task) -> Horizons:
+def problem_of(name: str) -> fp.Problem:
+    """A shipped problem; 'chain_of_masses:5' is the chain of five."""
+    base, _, size = name.partition(":")
+    task = fp.load_problem(base)
+    return runpy.run_path(str(task.path))["chain"](int(size)) if size else task.problem
+
+
+def recorded(p: fp.Problem) -> Horizons:
     """Plan, apply, and let the exact plant move, 200 times."""
-    p = task.problem
-    controller = next(c for c in task.controllers.values() if isinstance(c, fp.RecedingHorizon))
-    cost = controller.cost or p.cost
+    cost = p.cost
     ocp = transcribe(p.plant, p.reference, p.horizon, cost, p.limits)
     data_of = stage_data(p.plant, p.reference, p.horizon, cost)
     advance = fp.RungeKutta4(4).step(p.plant, p.horizon.step)
@@ -64,7 +77,7 @@ def recorded(task: Task) -> Horizons:
     before = np.zeros(ocp.input.size)
     for k in range(PLANS):
         given = np.asarray(data_of(k * p.horizon.step, p.plant.approximate).full())
-        s0 = state if ocp.state.size == state.size else np.append(state, before)
+        s0 = ocp.start(state, before).full().ravel()
         first.append(s0)
         data.append(given)
         before = solve(s0, given)[0][:, 0]
@@ -167,9 +180,9 @@ def ways(horizons: Horizons) -> dict[str, Callable[[], Callable]]:
 
 def rows_of(name: str) -> list[tuple[str, ...]]:
     """One row per optimiser for this problem."""
-    horizons = recorded(fp.load_problem(name))
+    horizons = recorded(problem_of(name))
     ocp, rows, base = horizons.ocp, [], None
-    title = f"{Path(name).stem} (N = {ocp.stages}, {ocp.state.size} states)"
+    title = f"{name} (N = {ocp.stages}, {ocp.state.size} states)"
     for way, build in ways(horizons).items():
         seconds, residuals, iterations = measured(horizons, build())
         middle = float(np.median(seconds[1:]))

@@ -71,7 +71,7 @@ def test_json_is_one_object_on_standard_output(folder, capsys):
     assert plain["contraction"] is None
     assert adaptive["contraction"]["predicted"] == pytest.approx(1 - 0.5 * 0.396737 * 1.6, abs=1e-3)
     assert adaptive["contraction"]["measured"] == pytest.approx(adaptive["contraction"]["predicted"], abs=0.02)
-    assert set(adaptive["cycle_us"]) == {"median", "p99", "max", "first"}
+    assert set(adaptive["cycle_us"]) == {"median", "p99", "max", "first", "planning"}
     assert adaptive["statuses"] == {"OK": 2000}
 
 

@@ -119,7 +119,7 @@ def _table(comparison: Comparison) -> Table:
         table.add_column(f"rms {name} \\[{unit}]", justify="right")
     for head in ("cycle us", "p99 us", "clipped", "factor"):
         table.add_column(head, justify="right")
-    table.add_column("status")
+    table.add_column("status", no_wrap=True)
     for entry in comparison.entries:
         table.add_row(*_row(entry, names))
     return table
@@ -130,7 +130,8 @@ def _row(entry: Entry, names: list[str]) -> list[str]:
     errors = [_number(metrics.rms_error[n]) for n in names]
     times = [f"{cycle.median:.2g}", f"{cycle.p99:.3g}"] if cycle else ["", ""]
     factor = f"{contraction.predicted:.3f}" if contraction else ""
-    status = "ended early" if entry.run.stop else metrics.worst_status.lower().replace("_", " ")
+    fine = metrics.statuses.get("OK", 0) / max(sum(metrics.statuses.values()), 1)
+    status = "ended early" if entry.run.stop else "ok" if fine == 1 else f"ok {100 * fine:.3g} %"
     return [entry.name.replace("[", "\\["), *errors, *times, f"{100 * metrics.clipped_share:.2g} %", factor, status]
 
 
