@@ -9,11 +9,18 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import casadi as ca
 
+_SIGNATURE = "(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem)"
+_FUNCTION = re.compile(r"^/\*[^\n]*\*/\nstatic int (casadi_f\d+)\([^\n]*\{\n.*?^\}\n", re.MULTILINE | re.DOTALL)
+_CALL = re.compile(r"\bcasadi_f\d+\b")
+# Large leaves are compiled without much optimising; the loops around them never are.
+_FAST = """#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC optimize ("O3")
+#endif"""
 _drivers: dict[str, str] = {}
 
 
@@ -43,7 +50,7 @@ class Driver:
         ]
         # The leaves belong to this file alone: the same names in other drivers must not meet in one library.
         generated = re.sub(r"^CASADI_SYMBOL_EXPORT ", "static ", generator.dump(), flags=re.MULTILINE)
-        return "\n".join([generated, *lines, self.text])
+        return "\n".join([generated, *lines, _FAST, self.text])
 
 
 def with_driver(name: str, driver: Driver, build: Callable[[str], ca.Function]) -> ca.Function:
@@ -54,26 +61,36 @@ def with_driver(name: str, driver: Driver, build: Callable[[str], ca.Function]) 
     return build(unique)
 
 
-def substitute(source: str) -> tuple[str, Sequence[str]]:
+def substitute(source: str) -> tuple[str, list[str]]:
     """Return generated C with the bodies of Functions that have a driver replaced, and the drivers' own C files."""
     files = []
     for name in dict.fromkeys(re.findall(r"^/\* (fpirhc_\w+):\(", source, re.MULTILINE)):
         if name not in _drivers:
             continue
         body = re.compile(
-            rf"(^/\* {name}:\(.*?\*/\nstatic int \w+\(const casadi_real\*\* arg, casadi_real\*\* res, casadi_int\* iw, "
-            r"casadi_real\* w, int mem\) \{\n).*?^\}$",
-            re.MULTILINE | re.DOTALL,
+            rf"(^/\* {name}:\([^\n]*\*/\nstatic int \w+\([^\n]*\) \{{\n).*?^\}}$", re.MULTILINE | re.DOTALL
         )
         entry = f"{name}_driver"
         source, count = body.subn(rf"\1  return {entry}(arg, res, iw, w, mem);\n}}", source)
         if count:
-            declared = (
-                f"int {entry}(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem);\n"
-            )
+            declared = f"int {entry}{_SIGNATURE};\n"
             source = source.replace(f"/* {name}:(", f"{declared}/* {name}:(", 1)
             files.append(f"#define ENTRY {entry}\n{_drivers[name]}")
-    return source, files
+    return (_without_unused(source) if files else source), files
+
+
+def _without_unused(source: str) -> str:
+    """Drop the static functions that nothing calls any more: compilers would read and then forget them."""
+    found = {m[1]: m[0] for m in _FUNCTION.finditer(source)}
+    rest = re.sub(r"^#define .*$", "", _FUNCTION.sub("", source), flags=re.MULTILINE)
+    called, waiting = set[str](), [rest]
+    while waiting:
+        for name in set(_CALL.findall(waiting.pop())) & found.keys() - called:
+            called.add(name)
+            waiting.append(found[name].partition("{")[2])
+    for name in found.keys() - called:
+        source = source.replace(found[name], "")
+    return source
 
 
 def _renamed(leaf: ca.Function, name: str) -> ca.Function:
