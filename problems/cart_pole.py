@@ -65,7 +65,9 @@ problem = fp.Problem(
     measure_from=5.0,  # s
 )
 
-optimiser = fp.FixedPoint(iterations=1, tolerance=5e-2)  # N
+optimiser = fp.FixedPoint(
+    iterations=5, tolerance=5e-2
+)  # N; one is enough with the pole up, not for a swing-up by a wrong model
 sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=100.0)  # scale in m/s^2: the plan may jump from limit to limit
 
 controllers = {

@@ -190,3 +190,75 @@ def test_without_a_compiler_it_says_so(folder, capsys, monkeypatch):
     monkeypatch.setitem(os.environ, "FPIRHC_CC", "none")
     assert main(["compare", "line.py"]) == 0
     assert "virtual machine, more slowly" in capsys.readouterr().err
+
+
+HORIZON = """    measure_from=1.0,
+    horizon=fp.Horizon(stages=10, step=1e-2),
+    cost=fp.Quadratic(states={"y": 100.0, "y'": 1.0}, correction={"u": 1e-2}),
+    limits=fp.Limits(inputs={"u": (-30.0, 30.0)}),
+"""
+PLANNERS = """controllers = {
+    "RHC": fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3)),
+    "RHC+FPI": fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), fp.Sigmoid(gain=-0.5, scale=50.0)),
+"""
+
+
+def _receding(folder: Path) -> None:
+    text = GOOD.replace("    measure_from=1.0,\n", HORIZON).replace("controllers = {\n", PLANNERS)
+    (folder / "line.py").write_text(text + 'headline = ("RHC", "RHC+FPI")\n')
+
+
+def test_solve_prints_certificates_and_draws_the_plan(folder, capsys):
+    """Every optimiser finds the same cost; the picture is there; the exit code says that all converged."""
+    _receding(folder)
+    assert main(["solve", "line.py", "--optimisers", "fixed-point", "qrqp", "--tolerance", "1e-5"]) == 0
+    printed = capsys.readouterr().out
+    assert "FPI" in printed
+    assert "SQP qrqp" in printed
+    assert "contraction factor" in printed
+    assert (folder / "results" / "line" / "plan.png").stat().st_size > 10_000
+
+
+def test_solve_tells_what_is_violated_by_name(folder, capsys):
+    """Limits that the first state breaks: named with values, an exit code of their own, and the remedy."""
+    _receding(folder)
+    text = (folder / "line.py").read_text()
+    (folder / "line.py").write_text(text.replace('limits=fp.Limits(inputs={"u": (-30.0, 30.0)})', TIGHT))
+    assert main(["solve", "line.py"]) == 4
+    printed = capsys.readouterr().out
+    assert "'y' is 0.5 m, below 0.8, at stage 0" in printed
+    assert "check the initial state" in printed.replace("\n", " ")
+
+
+TIGHT = 'limits=fp.Limits(inputs={"u": (-1.0, 1.0)}, states={"y": (0.8, 1.0)})'
+
+
+def test_optimisers_are_compared_by_name(folder, capsys):
+    """The headline pair once per optimiser, with their distance from the optimum."""
+    _receding(folder)
+    assert main(["compare", "line.py", "--optimisers", "fixed-point", "qrqp", "--no-compile"]) == 0
+    printed = capsys.readouterr().out
+    for name in ("RHC (FPI)", "RHC+FPI (FPI)", "RHC (SQP qrqp)", "RHC+FPI (SQP qrqp)", "above opt."):
+        assert name in printed
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (["solve", "line.py", "--optimisers", "ipop"], "Did you mean 'ipopt'"),
+        (["compare", "line.py", "--optimisers", "fixd-point"], "Did you mean 'fixed-point'"),
+        (["compare", "line.py", "--optimisers", "all", "--controllers", "CTC"], "plans with an optimiser"),
+        (["solve", "line.py", "--tolerance", "-1"], "positive tolerance"),
+    ],
+)
+def test_wrong_optimisers_are_named(folder, capsys, command, message):
+    """One clear line and exit code 2."""
+    _receding(folder)
+    assert main(command) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_solve_without_a_horizon_says_what_is_missing(folder, capsys):
+    """A problem for tracking laws has nothing to solve."""
+    assert main(["solve", "line.py"]) == 2
+    assert "no horizon or no cost" in capsys.readouterr().err

@@ -7,6 +7,8 @@ response that the model gives to the plan's first input is the nominal one; it i
     delta = command - inverse model(q^Des),
 
 so the optimiser is given input bounds shifted by -delta of the last cycle: what it plans stays feasible for the actuator.
+
+The first plan is prepared before the run, for the problem's start, so that one iteration per cycle only has to follow.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
 from fpirhc.controllers.nominal import Nominal, Restart
@@ -115,9 +118,9 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     assert problem.horizon is not None
     assert problem.cost is not None
     plant, ocp = problem.plant, _optimal_control(problem)
-    memory = optimiser.memory(ocp)
-    solve = optimiser.step(ocp)
     data_of = stage_data(plant, problem.reference, problem.horizon, problem.cost)
+    memory = _first_memory(problem, optimiser, ocp, data_of)
+    solve = optimiser.step(ocp)
     feedforward_of = _feedforward(problem)
     reads = (
         scalar("time", "s"),
@@ -132,15 +135,24 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         data = data_of(s.time, s.parameters)
         first = ocp.start(s._plan_state, s._command_before)
         lower, upper = ocp.input_lower - s._correction_before, ocp.input_upper - s._correction_before
-        remembered = optimiser.shifted(ocp, memory.join({m: getattr(s, m) for m in memory.names}))
+        before = memory.join({m: getattr(s, m) for m in memory.names})
+        remembered = ca.if_else(s.plan_begun > 0.5, optimiser.shifted(ocp, before), before)
         inputs, diagnostics, following = solve(first, data, lower, upper, remembered)
         status = diagnostics[_SOLVE.index("status")]
         failed = status > int(Status.NOT_CONVERGED) + 0.5
         planned, judged = on_failure.choose(failed, inputs[:, 0], feedforward_of(s.time, s.parameters), status)
         kept = {f"{m}_next": v for m, v in memory.split(following).items()}
-        return {"planned": planned, "solve": diagnostics, "_solve_status": judged, **kept}
+        return {"planned": planned, "solve": diagnostics, "_solve_status": judged, "plan_begun_next": 1, **kept}
 
-    return Block("plan", Layout(reads), Layout(writes), step, memory, opaque=True)
+    own = memory + Layout((scalar("plan_begun"),))
+    return Block("plan", Layout(reads), Layout(writes), step, own, opaque=True)
+
+
+def _first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> Layout:
+    """The optimiser's memory, starting with what it finds for the first horizon at the problem's start."""
+    first = np.asarray(ocp.start(problem.start_state, np.zeros(ocp.input.size)).full()).ravel()
+    data = np.asarray(data_of(0.0, problem.plant.approximate).full())
+    return optimiser.memory(ocp).starting_at(optimiser.first_memory(ocp, first, data))
 
 
 def _feedforward(problem: Problem) -> ca.Function:

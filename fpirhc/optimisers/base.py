@@ -16,6 +16,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 import casadi as ca
+import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient, rollout
@@ -57,6 +58,10 @@ class Optimiser(ABC):
     def converging(self, ocp: OptimalControl) -> ca.Function:
         """Like `step`, but may stop as soon as the plan is converged, and may work longer: for open-loop solves."""
         return self.step(ocp)
+
+    def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:  # noqa: ARG002
+        """Memory to begin a run with, for a first horizon that is known beforehand; nothing unless an optimiser says otherwise."""
+        return self.memory(ocp).start()
 
 
 def shift(columns: Expression) -> Expression:

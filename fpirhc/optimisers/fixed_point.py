@@ -36,6 +36,7 @@ from dataclasses import dataclass, field
 from importlib import resources
 
 import casadi as ca
+import numpy as np
 
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
@@ -64,6 +65,7 @@ from fpirhc.symbolic.driver import Driver, with_driver
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 MOST = 100  # iterations of one converging call
+_FIRST_CALLS = 5  # of `converging`, before a run
 _CONVEX = 1e-6  # relative eigenvalue below zero that is taken for rounding
 
 
@@ -159,6 +161,16 @@ class FixedPoint(Optimiser):
             return self._constrained(ocp, self.converging, 1)
         driver = self._driver(ocp, iterations=MOST, stop_early=1)
         return with_driver("fpirhc_fixed_point_converging", driver, lambda name: self._converging_graph(ocp, name))
+
+    def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:
+        """The memory after solving the first horizon to the tolerance, as far as that succeeds."""
+        step, memory = self.converging(ocp), self.memory(ocp).start()
+        for _ in range(_FIRST_CALLS):
+            _, told, following = step(state, data, ocp.input_lower, ocp.input_upper, memory)
+            memory = np.asarray(following.full()).ravel()
+            if int(told[4]) == Status.OK:
+                break
+        return memory if np.isfinite(memory).all() else self.memory(ocp).start()
 
     def _constrained(
         self, ocp: OptimalControl, build: Callable[[OptimalControl], ca.Function], updates: int

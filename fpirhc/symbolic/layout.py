@@ -8,7 +8,7 @@ CasADi expressions alike. `Named` gives a vector's elements by attribute: `q.q1`
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -154,6 +154,11 @@ class Layout:
     def start(self) -> np.ndarray:
         """Start values, shape (size,)."""
         return np.concatenate([s.start_vector() for s in self.signals]) if self.signals else np.zeros(0)
+
+    def starting_at(self, values: np.ndarray) -> Layout:
+        """The same signals with these start values, shape (size,)."""
+        parts = {s.name: tuple(map(float, values[self.slice(s.name)])) for s in self.signals}
+        return Layout(tuple(replace(s, start=parts[s.name]) for s in self.signals))
 
     def pack(self, values: Mapping[str, Any]) -> np.ndarray:
         """Numbers by name -> flat vector; signals not named take their start value.
