@@ -14,11 +14,11 @@ and the small joint friction stay uncorrected.
 The reference is a slow sway of the cart with the tilt that it needs (of the linearised pole), from 0 s on; the pole starts
 hanging. Effort is counted relative to the feedforward along that sway.
 
-Measured (rms error of the cart from 5 s on; time until the pole stays within 0.2 rad of its reference): RHC 8.8e-3 m,
-1.65 s; RHC+FPI 1.9e-4 m, 1.29 s; exact model 2.0e-5 m, 1.18 s. The force is at a limit in 2 to 4 % of the cycles, all before
-1.6 s. Near the limit, whether a swing-up succeeds depends on details: with 20 N, RHC never gets the pole up and
-RHC+FPI does in 3.1 s, before the exact model (5.2 s). With a model that is too light (M = 0.7 kg, m = 0.07 kg) and 30 N it is
-the other way round: RHC is up after 0.8 s and RHC+FPI fails, though 80 N are enough for it.
+Measured (rms error of the cart from 5 s on; time until the pole stays within 0.2 rad of its reference): RHC 8.5e-3 m,
+2.6 s; RHC+FPI 1.8e-4 m, 1.2 s; exact model 2.0e-5 m, 1.1 s. The force is at a limit in 3 to 5 % of the cycles, all before
+1.7 s. Near the limit, whether and when a swing-up succeeds depends on details: with 20 N, RHC never gets the pole up and
+RHC+FPI does in 3.0 s, before the exact model (5.0 s). With a model that is too light (M = 0.7 kg, m = 0.07 kg) and 30 N it is
+the other way round: RHC is up after 1.1 s and RHC+FPI only after 12.7 s.
 """
 
 import casadi as ca

@@ -18,6 +18,7 @@ from abc import ABC, abstractmethod
 import casadi as ca
 import numpy as np
 
+from fpirhc.errors import InvalidValue
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient, rollout
 from fpirhc.status import Status
@@ -62,6 +63,18 @@ class Optimiser(ABC):
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:  # noqa: ARG002
         """Memory to begin a run with, for a first horizon that is known beforehand; nothing unless an optimiser says otherwise."""
         return self.memory(ocp).start()
+
+
+def require_settings(owner: str, iterations: int, tolerance: float) -> None:
+    """Check what every iterative optimiser is given.
+
+    Raises:
+        InvalidValue: fewer than one iteration, or a tolerance that is not positive.
+    """
+    if iterations < 1:
+        raise InvalidValue(f"{owner} needs at least 1 iteration, got {iterations}")
+    if not tolerance > 0:
+        raise InvalidValue(f"{owner} needs a positive tolerance, got {tolerance}")
 
 
 def shift(columns: Expression) -> Expression:

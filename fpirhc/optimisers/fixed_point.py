@@ -45,7 +45,17 @@ from fpirhc.horizon.augmented import augmented
 from fpirhc.horizon.expansion import Bend, GaussNewton, bent_end, bent_stage, linear_stage
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import PIVOT, rounds
-from fpirhc.optimisers.base import FINITE, Optimiser, clip, is_finite, sane, shift, stationarity, status_of
+from fpirhc.optimisers.base import (
+    FINITE,
+    Optimiser,
+    clip,
+    is_finite,
+    require_settings,
+    sane,
+    shift,
+    stationarity,
+    status_of,
+)
 from fpirhc.optimisers.constrained import constrained_step, shifted_multipliers, with_multipliers
 from fpirhc.optimisers.search import (
     ARMIJO,
@@ -95,12 +105,9 @@ class FixedPoint(Optimiser):
     feasible: float = 1e-8
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise InvalidValue(f"FixedPoint needs at least 1 iteration, got {self.iterations}")
+        require_settings("FixedPoint", self.iterations, self.tolerance)
         if self.updates < 1:
             raise InvalidValue(f"FixedPoint needs at least 1 update, got {self.updates}")
-        if not self.tolerance > 0:
-            raise InvalidValue(f"FixedPoint needs a positive tolerance, got {self.tolerance}")
         if not 0 <= self.damping < float("inf"):
             raise InvalidValue(f"FixedPoint(damping={self.damping!r}): expected a finite number of at least 0")
 

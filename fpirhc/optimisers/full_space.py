@@ -21,12 +21,12 @@ import numpy as np
 
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
-from fpirhc.errors import InvalidValue, NotContractive, NotSupported
+from fpirhc.errors import NotContractive, NotSupported
 from fpirhc.horizon.auxiliary import auxiliary_gradient, auxiliary_hessian
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.anderson import Anderson, iterated
-from fpirhc.optimisers.base import Optimiser, is_finite, judge, sane, shift, status_of
+from fpirhc.optimisers.base import Optimiser, is_finite, judge, require_settings, sane, shift, status_of
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
@@ -55,10 +55,7 @@ class FullSpaceFixedPoint(Optimiser):
     acceleration: Anderson | None = None
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise InvalidValue(f"FullSpaceFixedPoint needs at least 1 iteration, got {self.iterations}")
-        if not self.tolerance > 0:
-            raise InvalidValue(f"FullSpaceFixedPoint needs a positive tolerance, got {self.tolerance}")
+        require_settings("FullSpaceFixedPoint", self.iterations, self.tolerance)
 
     def check(self, ocp: OptimalControl) -> None:
         """Raise if anything is bounded, or the map's gain cannot contract.

@@ -19,12 +19,22 @@ import casadi as ca
 
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
-from fpirhc.errors import InvalidValue, NotContractive, NotSupported
+from fpirhc.errors import NotContractive, NotSupported
 from fpirhc.horizon.curvature import steepest_curvature
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.anderson import Anderson, iterated
-from fpirhc.optimisers.base import Optimiser, clip, is_finite, judge, remembered_plan, sane, shift, status_of
+from fpirhc.optimisers.base import (
+    Optimiser,
+    clip,
+    is_finite,
+    judge,
+    remembered_plan,
+    require_settings,
+    sane,
+    shift,
+    status_of,
+)
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
@@ -50,10 +60,7 @@ class GradientFixedPoint(Optimiser):
     acceleration: Anderson | None = None
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise InvalidValue(f"GradientFixedPoint needs at least 1 iteration, got {self.iterations}")
-        if not self.tolerance > 0:
-            raise InvalidValue(f"GradientFixedPoint needs a positive tolerance, got {self.tolerance}")
+        require_settings("GradientFixedPoint", self.iterations, self.tolerance)
 
     def check(self, ocp: OptimalControl) -> None:
         """Raise if states are bounded, or the map's gain cannot contract.

@@ -18,10 +18,20 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.errors import NotSupported
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient
-from fpirhc.optimisers.base import Optimiser, clip, is_finite, judge, remembered_plan, sane, shift, status_of
+from fpirhc.optimisers.base import (
+    Optimiser,
+    clip,
+    is_finite,
+    judge,
+    remembered_plan,
+    require_settings,
+    sane,
+    shift,
+    status_of,
+)
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
@@ -48,10 +58,7 @@ class ReducedGradient(Optimiser):
     tolerance: float
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise InvalidValue(f"ReducedGradient needs at least 1 iteration, got {self.iterations}")
-        if not self.tolerance > 0:
-            raise InvalidValue(f"ReducedGradient needs a positive tolerance, got {self.tolerance}")
+        require_settings("ReducedGradient", self.iterations, self.tolerance)
 
     def check(self, ocp: OptimalControl) -> None:
         """Raise if states are bounded.

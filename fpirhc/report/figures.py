@@ -69,11 +69,12 @@ def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
         is_state = k < plant.state.size
         if is_state:
             axis.plot(times, reference[k], "--", color="#777777", label="reference")
-        for one, colour in zip(solved, PALETTE, strict=False):
+        for row, (one, colour) in enumerate(zip(solved, PALETTE, strict=False)):
+            width = max(1.0, 3.0 - 0.7 * row)  # plans that agree lie on each other
             if is_state:
-                axis.plot(times, one.plan.states[k], color=colour, label=one.name)
+                axis.plot(times, one.plan.states[k], color=colour, label=one.name, linewidth=width)
             else:
-                axis.stairs(one.plan.inputs[k - plant.state.size], times, baseline=None, color=colour, label=one.name)
+                axis.stairs(one.plan.inputs[k - plant.state.size], times, baseline=None, color=colour, linewidth=width)
         unit = plant.state.units[k] if is_state else plant.input.units[k - plant.state.size]
         axis.set_ylabel(f"{name} [{unit}]")
     _legend(axes[0])
