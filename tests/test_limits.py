@@ -185,3 +185,34 @@ def test_who_does_not_serve_limits_says_who_does():
     ):
         with pytest.raises(NotSupported, match="FixedPoint"):
             fp.solve(ocp, optimiser, first, data)
+
+
+def test_overflow_is_placed():
+    """The state and the stage from which on a plan is not finite, or the cost term that is not."""
+    plant = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "N"},
+        order=1,
+        response=lambda q, u, p: {"y": p.gain * q.y**3 + u.u},
+        parameters={"gain": fp.Parameter(1.0, 1.0, "1")},
+    )
+    reference, horizon = fp.Trajectory(lambda t: {"y": 0 * t}), fp.Horizon(stages=10, step=0.1)
+    ocp = transcribe(plant, reference, horizon, fp.Quadratic(states={"y": 1.0}, effort={"u": 1.0}), fp.Limits())
+    data = np.zeros((ocp.data.size, 11)) + np.array([[1.0 if e == "parameters.gain" else 0.0] for e in columns(ocp)])
+    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6), np.array([30.0]), data, calls=1)
+    assert plan.status == fp.Status.NON_FINITE
+    assert "'y' is" in plan.overflow()
+    assert "at stage" in plan.overflow()
+    good = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6), np.array([0.3]), data)
+    assert good.overflow() == ""
+
+
+def columns(ocp):
+    return [c for signal in ocp.data.signals for c in signal.columns]
+
+
+def test_tolerances_below_rounding_are_refused():
+    """With the number that would do."""
+    ocp, data, first = horizon_of(fp.Limits(inputs={"torque": (-1e6, 1e6)}))
+    with pytest.raises(FpirhcError, match="rounded to 1e-09; use 1e-06"):
+        fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-12), first, data)

@@ -74,6 +74,7 @@ from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, with_driver
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
+_DIGITS = 1e-15  # relative rounding of a number
 MOST = 100  # iterations of one converging call
 _FIRST_CALLS = 5  # of `converging`, before a run
 _CONVEX = 1e-6  # relative eigenvalue below zero that is taken for rounding
@@ -112,11 +113,18 @@ class FixedPoint(Optimiser):
             raise InvalidValue(f"FixedPoint(damping={self.damping!r}): expected a finite number of at least 0")
 
     def check(self, ocp: OptimalControl) -> None:
-        """Raise if the cost is not convex along the reference.
+        """Raise if the cost is not convex along the reference, or the tolerance cannot be met.
 
         Raises:
-            NotSupported: a quadratic model of such a cost has no minimum.
+            NotSupported: a quadratic model of such a cost has no minimum. InvalidValue: a tolerance below the rounding of inputs.
         """
+        reach = np.abs(np.concatenate([ocp.input_lower, ocp.input_upper, ocp.nodes[1].ravel()]))
+        rounding = _DIGITS * float(reach[np.isfinite(reach)].max(initial=0.0))
+        if self.tolerance < rounding:
+            raise InvalidValue(
+                f"FixedPoint(tolerance={self.tolerance:g}): inputs of this size are rounded to {rounding:.1g}; "
+                f"use {1e3 * rounding:.0g}"
+            )
         least = ocp.along.least_bend()
         if least < -_CONVEX:
             raise NotSupported(

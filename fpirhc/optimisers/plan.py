@@ -58,6 +58,24 @@ class Plan:
                     found.append((stage > 0, -by, f"'{name}' is {value:.6g} {unit}, {side}, at stage {stage}"))
         return tuple(text for _, _, text in sorted(found)[:_WORST])
 
+    def overflow(self) -> str:
+        """Where the plan stops being finite: the state, input or cost term and its stage, in words; empty when nowhere."""
+        ocp = self.problem
+        for stage in range(ocp.stages + 1):
+            for names, values in ((ocp.state.elements, self.states), (ocp.input.elements, self.inputs)):
+                column = values[:, min(stage, values.shape[1] - 1)]
+                bad = np.flatnonzero(~np.isfinite(column))
+                if bad.size:
+                    return f"'{names[bad[0]]}' is {column[bad[0]]} at stage {stage}"
+            if stage < ocp.stages:
+                given = self.states[:, stage], self.inputs[:, stage], self.data[:, stage]
+                terms = np.asarray(ocp.stage_cost(*given)[1].full()).ravel()
+                bad = np.flatnonzero(~np.isfinite(terms))
+                if bad.size:
+                    return f"cost term '{ocp.terms[bad[0]]}' is {terms[bad[0]]} at stage {stage}"
+        final = float(ocp.terminal_cost(self.states[:, ocp.stages], self.data[:, ocp.stages]))
+        return "" if np.isfinite(final) else f"the terminal cost is {final} at stage {ocp.stages}"
+
     def slacks(self) -> dict[str, float]:
         """Cost of every soft limit over the horizon by name, zero where it is kept."""
         _, _, terms = rollout(self.problem)(self.states[:, 0], self.inputs, self.data)

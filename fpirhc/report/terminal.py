@@ -100,6 +100,8 @@ def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
             console.print(f"{one.name}: {text}", markup=False, highlight=False)
         for name, price in one.plan.slacks().items():
             console.print(f"{one.name}: soft limit '{name}' costs {price:.4g}", markup=False, highlight=False)
+        if one.plan.overflow():
+            console.print(f"{one.name}: {one.plan.overflow()}", markup=False, highlight=False)
         if one.plan.status != Status.OK:
             console.print(f"{one.name}: {one.plan.status.remedy}", markup=False, highlight=False)
     console.print(f"picture: {picture}", markup=False, highlight=False, soft_wrap=True)

@@ -47,6 +47,5 @@ def solve_first(task: Task, names: Sequence[str], tolerance: float) -> list[Solv
     for name in OPTIMISERS if "all" in names else dict.fromkeys(names):
         label, build = OPTIMISERS[name]
         plan = solve(ocp, build(tolerance), first, data)
-        certified = plan.feasibility < np.inf and np.isfinite(plan.states).all()
-        solved.append(Solved(label, plan, certify(plan) if certified else None))
+        solved.append(Solved(label, plan, None if plan.overflow() else certify(plan)))
     return solved
