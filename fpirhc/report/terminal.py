@@ -119,7 +119,7 @@ def _table(comparison: Comparison) -> Table:
     for name in names:
         unit = first.run.unit(f"error.{name}") if first else ""
         table.add_column(f"rms {name} \\[{unit}]", justify="right")
-    for head in ("cycle us", "p99 us", "clipped", "factor"):
+    for head in ("cycle us", "clipped", "factor"):
         table.add_column(head, justify="right")
     table.add_column("status", no_wrap=True)
     for entry in comparison.entries:
@@ -130,7 +130,7 @@ def _table(comparison: Comparison) -> Table:
 def _row(entry: Entry, names: list[str]) -> list[str]:
     metrics, cycle, contraction = entry.metrics, entry.cycle, entry.contraction
     errors = [_number(metrics.rms_error[n]) for n in names]
-    times = [f"{cycle.median:.2g}", f"{cycle.p99:.3g}"] if cycle else ["", ""]
+    times = [f"{cycle.median:.2g}"] if cycle else [""]
     factor = f"{contraction.predicted:.3f}" if contraction else ""
     fine = metrics.statuses.get("OK", 0) / max(sum(metrics.statuses.values()), 1)
     status = "ended early" if entry.run.stop else "ok" if fine == 1 else f"ok {100 * fine:.3g} %"
@@ -141,22 +141,26 @@ def _plans(comparison: Comparison) -> Table:
     """How the optimisers did: cost above the converged optimum, iterations, time of the cycles that plan."""
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title="plans")
     table.add_column("controller", no_wrap=True)
-    for head in ("iter", "residual", "above opt.", "plan us", "max us", "first us"):
+    for head in ("iter", "residual", "above opt.", "plan us", "p99 us", "max us", "first us"):
         table.add_column(head, justify="right")
     for entry in comparison.entries:
         solve, cycle, excess = entry.metrics.solve, entry.cycle, entry.optimality
         if not solve:
             continue
         known = solve["median_iterations"]
-        times = [f"{v:.3g}" for v in (cycle.planning, cycle.maximum, cycle.first)] if cycle else ["", "", ""]
+        times = [_micro(v) for v in (cycle.planning, cycle.p99, cycle.maximum, cycle.first)] if cycle else [""] * 4
         table.add_row(
             entry.name.replace("[", "\\["),
             f"{known:.0f}" if known >= 0 else "-",
-            f"{solve['median_stationarity']:.1e}",
-            f"{excess.median:.1e}" if excess else "-",
+            f"{solve['median_stationarity']:.0e}",
+            f"{excess.median:.0e}" if excess else "-",
             *times,
         )
     return table
+
+
+def _micro(value: float) -> str:
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def _number(value: float) -> str:
