@@ -7,11 +7,13 @@ from .controllers.nominal import OpenPlan, Restart, RestartAndTrack
 from .controllers.on_failure import Feedforward, HoldPlan, StopRun
 from .controllers.receding_horizon import RecedingHorizon
 from .deformation.affine import Affine
+from .deformation.guarded import Guarded
 from .deformation.identity import Identity
 from .deformation.rfpt import Rfpt
 from .deformation.rfpt_vector import RfptVector
 from .deformation.rotation import Rotation
 from .deformation.sigmoid import Sigmoid
+from .deformation.tuned import Tuned
 from .disturbance import Formula, Noise, Pulse, Sine, Step
 from .errors import FpirhcError
 from .horizon.cost import General, LqrTerminal, Quadratic
@@ -61,6 +63,7 @@ __all__ = [
     "GaussNewton",
     "General",
     "GradientFixedPoint",
+    "Guarded",
     "HoldPlan",
     "Horizon",
     "Identity",
@@ -98,6 +101,7 @@ __all__ = [
     "StopRun",
     "Table",
     "Trajectory",
+    "Tuned",
     "assess_gain",
     "certify",
     "check_deformation",

@@ -132,9 +132,11 @@ def deform_block(plant: Plant, deformation: Deformation) -> Block:
         deformed, following = deformation.step(s._request_before, s.realised, s.desired, remembered)
         valid = s.started > 0.5
         kept = {f"{m}_next": ca.if_else(valid, following[m], remembered[m]) for m in memory.names}
-        return {"_deformed_wanted": ca.if_else(valid, deformed, s.desired), **kept}
+        shown = {name: kept[f"{source}_next"] for name, source in deformation.shown().items()}
+        return {"_deformed_wanted": ca.if_else(valid, deformed, s.desired), **shown, **kept}
 
-    return Block("deform", Layout(reads), Layout((plant.response_signal("_deformed_wanted"),)), step, memory)
+    logged = tuple(scalar(name) for name in deformation.shown())
+    return Block("deform", Layout(reads), Layout((plant.response_signal("_deformed_wanted"), *logged)), step, memory)
 
 
 def _invert_block(plant: Plant) -> Block:

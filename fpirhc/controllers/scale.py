@@ -13,7 +13,9 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.guarded import Guarded
 from fpirhc.deformation.sigmoid import Sigmoid
+from fpirhc.deformation.tuned import Tuned
 from fpirhc.errors import InvalidValue
 from fpirhc.problem import Problem
 
@@ -22,6 +24,8 @@ _SAMPLES = 2000
 
 def scaled_for_reference(deformation: Deformation, problem: Problem) -> Deformation:
     """Return the deformation with S = max(1, 2 period max|d/dt r^N|), r^N the nominal response, unless S is given."""
+    if isinstance(deformation, Tuned | Guarded):
+        return replace(deformation, map=scaled_for_reference(deformation.map, problem))
     if not _is_open(deformation):
         return deformation
     return _with_scale(deformation, max(1.0, 2 * problem.period * _reference_slew(problem)))
@@ -33,6 +37,8 @@ def scaled_for_plan(deformation: Deformation, problem: Problem) -> Deformation:
     Raises:
         InvalidValue: some input has no finite limits, so nothing bounds the jump.
     """
+    if isinstance(deformation, Tuned | Guarded):
+        return replace(deformation, map=scaled_for_plan(deformation.map, problem))
     if not _is_open(deformation):
         return deformation
     plant = problem.plant

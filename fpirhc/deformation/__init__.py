@@ -2,10 +2,12 @@
 
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.guarded import Guarded
 from fpirhc.deformation.identity import Identity
 from fpirhc.deformation.rfpt import Rfpt
 from fpirhc.deformation.rfpt_vector import RfptVector
 from fpirhc.deformation.rotation import Rotation
 from fpirhc.deformation.sigmoid import Sigmoid
+from fpirhc.deformation.tuned import Tuned
 
-__all__ = ["Affine", "Deformation", "Identity", "Rfpt", "RfptVector", "Rotation", "Sigmoid"]
+__all__ = ["Affine", "Deformation", "Guarded", "Identity", "Rfpt", "RfptVector", "Rotation", "Sigmoid", "Tuned"]

@@ -32,6 +32,10 @@ class Deformation(ABC):
         del elements
         return Layout()
 
+    def shown(self) -> Mapping[str, str]:
+        """Signals to log: name -> the scalar of the memory that it shows."""
+        return {}
+
     @abstractmethod
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]

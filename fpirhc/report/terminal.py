@@ -139,9 +139,10 @@ def _row(entry: Entry, names: list[str]) -> list[str]:
 
 def _plans(comparison: Comparison) -> Table:
     """How the optimisers did: cost above the converged optimum, iterations, time of the cycles that plan."""
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title="plans")
+    caption = "gap: cost above the converged optimum, relative; plan us: the cycles that plan"
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title="plans", caption=caption)
     table.add_column("controller", no_wrap=True)
-    for head in ("iter", "residual", "above opt.", "plan us", "p99 us", "max us", "first us"):
+    for head in ("iter", "residual", "gap", "plan us", "p99 us", "max us", "first us"):
         table.add_column(head, justify="right")
     for entry in comparison.entries:
         solve, cycle, excess = entry.metrics.solve, entry.cycle, entry.optimality
