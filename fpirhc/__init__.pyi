@@ -5,8 +5,11 @@ from .controllers.computed_torque import ComputedTorque
 from .controllers.informed import Informed
 from .controllers.nominal import OpenPlan, Restart, RestartAndTrack
 from .controllers.on_failure import Feedforward, HoldPlan, StopRun
+from .controllers.predicted import ByDesired, ByModel, Predicted
 from .controllers.receding_horizon import RecedingHorizon
+from .dead_time import DeadTime
 from .deformation.affine import Affine
+from .deformation.delayed import Increment, Paired
 from .deformation.guarded import Guarded
 from .deformation.identity import Identity
 from .deformation.rfpt import Rfpt
@@ -47,10 +50,13 @@ from .tracking.exponential import Exponential
 __all__ = [
     "Affine",
     "Anderson",
+    "ByDesired",
+    "ByModel",
     "Certificate",
     "Comparison",
     "ComputedTorque",
     "Cvodes",
+    "DeadTime",
     "Euler",
     "ExactHessian",
     "Exponential",
@@ -67,6 +73,7 @@ __all__ = [
     "HoldPlan",
     "Horizon",
     "Identity",
+    "Increment",
     "Informed",
     "InteriorPoint",
     "Limits",
@@ -75,10 +82,12 @@ __all__ = [
     "Noise",
     "OpenPlan",
     "Osqp",
+    "Paired",
     "Parameter",
     "Path",
     "Plan",
     "Plant",
+    "Predicted",
     "Problem",
     "Pulse",
     "Qrqp",

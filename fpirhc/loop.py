@@ -6,15 +6,18 @@ held since t_{k-1}; the controller turns them into a command; the plant moves on
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from fpirhc.controllers.base import Controller, like, prepared
+from fpirhc.dead_time import delay_block
 from fpirhc.plant import Plant
 from fpirhc.problem import Problem
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 
 
 def close_loop(problem: Problem, controller: Controller) -> Composite:
@@ -23,11 +26,11 @@ def close_loop(problem: Problem, controller: Controller) -> Composite:
     Both parameter sets are part of the memory (constant), so that other values need no new Function. The disturbance
     input exists only when the problem has disturbances.
     """
-    plant = problem.plant
     chosen = prepared(problem, controller)
     blocks, delays = chosen.blocks(problem)
     disturbed = disturbance_signals(problem)
-    around = [_clock_block(problem.period), _sense_block(plant), *blocks, _advance_block(problem, disturbed)]
+    seeing = _sense_blocks(problem, predicts="state_ahead" in [n for b in blocks for n in b.writes.names])
+    around = [_clock_block(problem.period), *seeing, *blocks, *_actuate(problem, disturbed)]
     return compose("loop", Layout(disturbed), around, [*_plant_delays(problem, chosen), *delays])
 
 
@@ -66,7 +69,38 @@ def _clock_block(period: float) -> Block:
     return Block("clock", Layout(), Layout((scalar("time", "s"),)), step, Layout((scalar("cycle"),)))
 
 
-def _sense_block(plant: Plant) -> Block:
+def _sense_blocks(problem: Problem, *, predicts: bool) -> list[Block]:
+    """The plant's state and response as the controller gets them; with dead time also the true ones and the true error."""
+    plant, behind = problem.plant, problem.dead_time.measurement / problem.period
+    if not behind:
+        sense = [_sense_block(plant, plant.state, plant.response_signal("realised"))]
+        return [*sense, _truth_block(problem, plant.state)] if predicts or problem.dead_time.inputs else sense
+    start = tuple(float(v) for v in problem.start_state)
+    resting = plant.controlled_response_function(start, np.zeros(plant.input.size), plant.exact).full().ravel()
+    true_state, true_response = like(plant.state, "plant_state"), plant.response_signal("plant_realised")
+    seen = Signal("realised", true_response.elements, true_response.units, tuple(map(float, resting)))
+    return [
+        _sense_block(plant, true_state, true_response),
+        _truth_block(problem, true_state),
+        delay_block("see_state", true_state, replace(plant.state, start=start), [behind] * plant.state.size),
+        delay_block("see_response", true_response, seen, [behind] * seen.size),
+    ]
+
+
+def _truth_block(problem: Problem, state: Signal) -> Block:
+    """Block (time, true state) -> true error of the controlled coordinates, by which a run is judged."""
+    plant, function = problem.plant, problem.reference.function(problem.plant)
+    places = [plant.state.elements.index(c) for c in plant.controlled_names]
+    units = [plant.coordinates[c] for c in plant.controlled_names]
+    writes = Layout((vector("true_error", plant.controlled_names, units),))
+
+    def step(s: Any) -> dict[str, Expression]:
+        return {"true_error": (function(s.time)[0] - getattr(s, state.name))[places]}
+
+    return Block("truth", Layout((scalar("time", "s"), state)), writes, step, opaque=problem.reference.opaque)
+
+
+def _sense_block(plant: Plant, state: Signal, realised: Signal) -> Block:
     """What the controller measures: the true state, and the true response just before this cycle's command.
 
     The response is computed here and not at the end of the last cycle, because it shares its costly terms with the first
@@ -82,24 +116,38 @@ def _sense_block(plant: Plant) -> Block:
 
     def step(s: Any) -> dict[str, Expression]:
         forcing = s._forcing_before[list(plant.controlled_indices)]
-        return {"state": s._state_before, "realised": response(s._state_before, s._acting_before, s._exact) + forcing}
+        found = response(s._state_before, s._acting_before, s._exact) + forcing
+        return {state.name: s._state_before, realised.name: found}
 
-    return Block("sense", Layout(reads), Layout((plant.state, plant.response_signal("realised"))), step)
+    return Block("sense", Layout(reads), Layout((state, realised)), step)
 
 
-def _advance_block(problem: Problem, disturbed: tuple[Signal, ...]) -> Block:
-    """The exact plant over one period with the command held."""
+def _actuate(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:
+    """The command's way to the plant, and the plant over one period."""
+    cycles = [problem.dead_time.inputs.get(name, 0.0) / problem.period for name in problem.plant.inputs]
+    if not any(cycles):
+        return [_advance_block(problem, disturbed, problem.plant.input)]
+    arriving = like(problem.plant.input, "arriving")
+    return [
+        delay_block("send_command", problem.plant.input, arriving, cycles),
+        _advance_block(problem, disturbed, arriving),
+    ]
+
+
+def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Signal) -> Block:
+    """The exact plant over one period with the arriving command held."""
     plant = problem.plant
     advance = problem.integrator.step(plant, problem.period)
-    reads = (plant.state, plant.input, like(plant.parameter, "_exact"), *disturbed)
+    state = like(plant.state, "plant_state") if problem.dead_time.measurement else plant.state
+    reads = (state, arriving, like(plant.parameter, "_exact"), *disturbed)
     writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
 
     def step(s: Any) -> dict[str, Expression]:
-        u, w = s.command, ca.DM.zeros(len(plant.names))
+        u, w = getattr(s, arriving.name), ca.DM.zeros(len(plant.names))
         if disturbed:
             added = dict(zip(problem.disturbances, ca.vertsplit(s.disturbance), strict=True))
             u = u + ca.vertcat(*(added.get(name, 0) for name in plant.inputs))
             w = ca.vertcat(*(added.get(name, 0) for name in plant.names))
-        return {"_state_after": advance(s.state, u, s._exact, w), "_acting": u, "_forcing": w}
+        return {"_state_after": advance(getattr(s, state.name), u, s._exact, w), "_acting": u, "_forcing": w}
 
     return Block("advance", Layout(reads), Layout(writes), step, opaque=problem.integrator.opaque)

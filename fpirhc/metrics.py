@@ -45,7 +45,7 @@ def measure(problem: Problem, run: Run) -> Metrics:
     """Return the metrics of a run; a run that ended before `measure_from` has NaN errors."""
     names = run.layout["error"].elements
     late = run.time >= problem.measure_from - 0.5 * problem.period
-    errors, commands = run["error"][late], run["command"][late]
+    errors, commands = true_errors(run)[late], run["command"][late]
     complete = run.stop is None and errors.shape[0] > 0
     if not complete:
         errors = np.full((1, len(names)), np.nan)
@@ -61,6 +61,11 @@ def measure(problem: Problem, run: Run) -> Metrics:
         statuses=_statuses(run),
         worst_status=_worst(run),
     )
+
+
+def true_errors(run: Run) -> np.ndarray:
+    """Reference minus the plant's state at the same time; what a controller sees may be delayed or predicted."""
+    return run["true_error"] if "true_error" in run.layout else run["error"]
 
 
 def _by_name(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:

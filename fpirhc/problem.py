@@ -10,6 +10,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from fpirhc.dead_time import DeadTime
 from fpirhc.disturbance import Disturbance
 from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
 from fpirhc.horizon.cost import Cost
@@ -31,6 +32,7 @@ class Problem:
         period: control cycle, s. duration: length of a run, s.
         limits: of inputs and states. disturbances: by name of the input or coordinate they add to.
         horizon, cost: what a receding-horizon controller looks ahead with.
+        dead_time: of inputs and measurement; what a controller believes of it is the controller's.
         integrator: how the simulated plant moves within a cycle.
         measure_from: metrics are taken from this time on, s (the transient before it is left out).
 
@@ -45,6 +47,7 @@ class Problem:
     duration: float
     limits: Limits = field(default_factory=Limits)
     disturbances: Mapping[str, Disturbance] = field(default_factory=dict)
+    dead_time: DeadTime = field(default_factory=DeadTime)
     horizon: Horizon | None = None
     cost: Cost | None = None
     integrator: Integrator = field(default_factory=RungeKutta4)
@@ -56,7 +59,12 @@ class Problem:
         _check_start(self, mistakes)
         plant = self.plant
         mistakes.unknown("disturbances: input or coordinate", self.disturbances, [*plant.inputs, *plant.coordinates])
-        for check in (lambda: self.limits.check(plant), lambda: self.reference.function(plant)):
+        checks = (
+            lambda: self.limits.check(plant),
+            lambda: self.reference.function(plant),
+            lambda: self.dead_time.check(plant, self.period),
+        )
+        for check in checks:
             try:
                 check()
             except FpirhcError as error:

@@ -17,7 +17,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fpirhc.deformation
-from fpirhc.deformation import Affine, Deformation, Guarded, Identity, Rfpt, RfptVector, Rotation, Sigmoid, Tuned
+from fpirhc.deformation import (
+    Affine,
+    Deformation,
+    Guarded,
+    Identity,
+    Increment,
+    Paired,
+    Rfpt,
+    RfptVector,
+    Rotation,
+    Sigmoid,
+    Tuned,
+)
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.testing import check_deformation
 
@@ -39,6 +51,7 @@ WRAPPERS = (
     Guarded(Sigmoid(gain=-0.5, scale=1.0), largest_deformation=1e12),
     Guarded(Tuned(Rfpt(offset=1e5, sign=-1, gain=5e-6), largest_gain=0.9), largest_deformation=1e12),
 )
+DELAYED = (Paired(Sigmoid(gain=-0.5, scale=1.0), cycles=3), Increment(Affine(gain=-0.5), cycles=2.5))
 MAPS = (Identity(), *ITERATING)
 NEARLY_LINEAR = (
     Affine(gain=-0.5),
@@ -88,7 +101,7 @@ def concrete_maps() -> set[type[Deformation]]:
 
 def test_every_map_is_tested() -> None:
     """A new file in the package must join the tuples above, or its laws would go unchecked."""
-    assert concrete_maps() == {type(m) for m in (*MAPS, *WRAPPERS)}
+    assert concrete_maps() == {type(m) for m in (*MAPS, *WRAPPERS, *DELAYED)}
 
 
 @pytest.mark.parametrize("elements", [("q1",), ("q1", "q2", "q3")], ids=len)

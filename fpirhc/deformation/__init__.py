@@ -2,6 +2,7 @@
 
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.delayed import Increment, Paired
 from fpirhc.deformation.guarded import Guarded
 from fpirhc.deformation.identity import Identity
 from fpirhc.deformation.rfpt import Rfpt
@@ -10,4 +11,16 @@ from fpirhc.deformation.rotation import Rotation
 from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.deformation.tuned import Tuned
 
-__all__ = ["Affine", "Deformation", "Guarded", "Identity", "Rfpt", "RfptVector", "Rotation", "Sigmoid", "Tuned"]
+__all__ = [
+    "Affine",
+    "Deformation",
+    "Guarded",
+    "Identity",
+    "Increment",
+    "Paired",
+    "Rfpt",
+    "RfptVector",
+    "Rotation",
+    "Sigmoid",
+    "Tuned",
+]

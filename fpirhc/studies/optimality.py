@@ -9,6 +9,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller, prepared
 from fpirhc.controllers.informed import Informed
 from fpirhc.controllers.nominal import OpenPlan
+from fpirhc.controllers.predicted import Predicted
 from fpirhc.controllers.receding_horizon import RecedingHorizon
 from fpirhc.errors import FpirhcError
 from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
@@ -94,7 +95,7 @@ class _Solver:
 
 def with_optimiser(controller: Controller, optimiser: object) -> Controller | None:
     """The same controller with another optimiser; None when it has none."""
-    if isinstance(controller, Informed):
+    if isinstance(controller, Informed | Predicted):
         inner = with_optimiser(controller.controller, optimiser)
         return None if inner is None else replace(controller, controller=inner)
     if isinstance(controller, RecedingHorizon):

@@ -1,0 +1,198 @@
+"""A controller that acts on the state in which its command will act.
+
+With a dead time of the inputs the command of this cycle acts later, and with one of the measurement the measured state is old. The
+wrapper integrates the measured state over both with what it has sent meanwhile, and hands the wrapped controller that state and the
+time at which the command acts (O. J. M. Smith 1957; Z. Artstein 1982). A receding horizon then starts where its first input acts.
+
+Two ways to predict, as values:
+
+    ByModel    the approximate model integrated over the commands on their way.
+    ByDesired  the desired responses on their way, integrated: no model is needed, because a deformation makes the realised
+               response the desired one. For plants whose every coordinate is controlled.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.controllers.base import Controller, compose_controller, like
+from fpirhc.dead_time import MOST
+from fpirhc.deformation.base import Deformation
+from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.integrate import RungeKutta4
+from fpirhc.plant import Plant
+from fpirhc.problem import Problem
+from fpirhc.symbolic.block import Block, Composite, Delay
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+
+
+class Predictor(ABC):
+    """Contract: how the state moves over one cycle under what was sent, and what was sent."""
+
+    @abstractmethod
+    def check(self, plant: Plant) -> None:
+        """Raise NotSupported where the plant does not fit."""
+
+    @abstractmethod
+    def sent(self, plant: Plant) -> Signal:
+        """The signal that is queued: written by the controller."""
+
+    @abstractmethod
+    def advance(self, plant: Plant, period: float) -> ca.Function:
+        """Function (state, sent, parameters) -> state one cycle later."""
+
+
+@dataclass(frozen=True)
+class ByModel(Predictor):
+    """Integrate the approximate model over the queued commands."""
+
+    def check(self, plant: Plant) -> None:
+        """Every plant fits."""
+
+    def sent(self, plant: Plant) -> Signal:
+        """The commands."""
+        return plant.input
+
+    def advance(self, plant: Plant, period: float) -> ca.Function:
+        """One Runge-Kutta step of the model."""
+        step = RungeKutta4().step(plant, period)
+        x, u, p = plant._symbols()
+        return ca.Function("fpirhc_predict", [x, u, p], [step(x, u, p, ca.SX.zeros(len(plant.names)))])
+
+
+@dataclass(frozen=True)
+class ByDesired(Predictor):
+    """Integrate the queued desired responses."""
+
+    def check(self, plant: Plant) -> None:
+        """Raise if some coordinate is not controlled.
+
+        Raises:
+            NotSupported: its motion needs a model.
+        """
+        if len(plant.controlled_names) != len(plant.names):
+            raise NotSupported("ByDesired() needs every coordinate to be controlled; use ByModel()")
+
+    def sent(self, plant: Plant) -> Signal:
+        """The desired responses."""
+        return plant.response_signal("desired")
+
+    def advance(self, plant: Plant, period: float) -> ca.Function:
+        """Taylor's formula with the highest derivative held."""
+        x, d, p = (
+            ca.SX.sym("x", plant.state.size),
+            ca.SX.sym("d", len(plant.names)),
+            ca.SX.sym("p", plant.parameter.size),
+        )
+        elements, following = plant.state.elements, {}
+        for k, name in enumerate(plant.names):
+            chain = [e for e in elements if e.rstrip("'") == name]
+            values = [x[elements.index(e)] for e in sorted(chain, key=len)] + [d[k]]
+            for order, element in enumerate(sorted(chain, key=len)):
+                series, factor = ca.SX(0), 1.0
+                for j, value in enumerate(values[order:]):
+                    series += factor * value
+                    factor *= period / (j + 1)
+                following[element] = series
+        return ca.Function("fpirhc_predict", [x, d, p], [ca.vertcat(*(following[e] for e in elements))])
+
+
+@dataclass(frozen=True)
+class Predicted(Controller):
+    """The wrapped controller on the predicted state.
+
+    Parameters:
+        controller: any controller.
+        inputs: dead time of the inputs that it is to bridge, s, rounded to control cycles. measurement: of the measurement, s.
+        by: how to predict.
+
+    Raises:
+        InvalidValue: a dead time that is negative or not finite.
+    """
+
+    controller: Controller
+    inputs: float
+    measurement: float = 0.0
+    by: Predictor = field(default_factory=ByModel)
+
+    def __post_init__(self) -> None:
+        for name, value in (("inputs", self.inputs), ("measurement", self.measurement)):
+            if not (np.isfinite(value) and value >= 0):
+                raise InvalidValue(f"Predicted({name}={value!r}): expected a number of seconds of at least 0")
+
+    @property
+    def adaptive(self) -> Deformation:
+        """The wrapped controller's deformation."""
+        return self.controller.adaptive
+
+    def parameters(self, plant: Plant) -> np.ndarray:
+        """The wrapped controller's parameters."""
+        return self.controller.parameters(plant)
+
+    def resolved(self, problem: Problem) -> Predicted:
+        """Return the wrapped controller resolved."""
+        return replace(self, controller=self.controller.resolved(problem))
+
+    def check(self, problem: Problem) -> None:
+        """Raise what the wrapped controller raises, and if the plant or the dead time does not fit.
+
+        Raises:
+            NotSupported: the predictor cannot serve the plant. InvalidValue: a dead time of more than 1000 cycles.
+        """
+        self.controller.check(problem)
+        self.by.check(problem.plant)
+        if self._cycles(problem) > MOST:
+            raise InvalidValue(f"Predicted: {self._cycles(problem)} cycles of dead time, more than {MOST}")
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Blocks predict, and the wrapped controller as one."""
+        plant, cycles = problem.plant, self._cycles(problem)
+        inner = compose_controller(problem, self.controller)
+        ahead = {"time": scalar("time_ahead", "s"), "state": like(plant.state, "state_ahead")}
+        sent = self.by.sent(plant)
+        before = Signal("_sent_before", sent.elements, sent.units)
+        predict = _predict_block(problem, self.by, cycles, self.inputs, before, tuple(ahead.values()))
+        return [predict, embedded("controller", inner, ahead)], [Delay(before, sent.name)]
+
+    def _cycles(self, problem: Problem) -> int:
+        return round((self.inputs + self.measurement) / problem.period)
+
+
+def _predict_block(
+    problem: Problem, by: Predictor, cycles: int, lead: float, before: Signal, writes: tuple[Signal, ...]
+) -> Block:
+    plant = problem.plant
+    queue = Signal("sent", tuple(f"{e}@{k}" for k in range(1, max(cycles, 1) + 1) for e in before.elements))
+    reads = (scalar("time", "s"), plant.state, plant.parameter, before)
+    advance = by.advance(plant, problem.period)
+
+    def step(s: Any) -> dict[str, Expression]:
+        # Newest first; the oldest acts first.
+        kept = ca.vertcat(s._sent_before, s.sent)[: queue.size]
+        state = s.state
+        if cycles:
+            size = before.size
+            columns = ca.horzcat(*(kept[size * k : size * (k + 1)] for k in reversed(range(cycles))))
+            moved = advance.mapaccum("fpirhc_predicted", cycles)(state, columns, ca.repmat(s.parameters, 1, cycles))
+            state = moved[:, -1]
+        return {"time_ahead": s.time + lead, "state_ahead": state, "sent_next": kept}
+
+    return Block("predict", Layout(reads), Layout(writes), step, Layout((queue,)), opaque=True)
+
+
+def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block:
+    """A composed step as one block; `feeds` renames what it reads."""
+    reads = tuple(feeds.get(s.name, s) for s in composite.reads.signals)
+
+    def step(s: Any) -> dict[str, Expression]:
+        memory = composite.memory.join({m: getattr(s, m) for m in composite.memory.names})
+        following, trace, *_ = composite.function(memory, *(getattr(s, r.name) for r in reads))
+        kept = {f"{m}_next": v for m, v in composite.memory.split(following).items()}
+        return {**composite.trace.split(trace), **kept}
+
+    return Block(name, Layout(reads), composite.trace, step, composite.memory, opaque=True)
