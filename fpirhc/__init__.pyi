@@ -15,6 +15,7 @@ from .deformation.identity import Identity
 from .deformation.rfpt import Rfpt
 from .deformation.rfpt_vector import RfptVector
 from .deformation.rotation import Rotation
+from .deformation.self_paired import DelayWatched, SelfPaired
 from .deformation.sigmoid import Sigmoid
 from .deformation.tuned import Tuned
 from .disturbance import Formula, Noise, Pulse, Sine, Step
@@ -57,6 +58,7 @@ __all__ = [
     "ComputedTorque",
     "Cvodes",
     "DeadTime",
+    "DelayWatched",
     "Euler",
     "ExactHessian",
     "Exponential",
@@ -101,6 +103,7 @@ __all__ = [
     "Rotation",
     "Run",
     "RungeKutta4",
+    "SelfPaired",
     "SequentialQuadratic",
     "Sigmoid",
     "Sine",

@@ -20,6 +20,7 @@ import fpirhc.deformation
 from fpirhc.deformation import (
     Affine,
     Deformation,
+    DelayWatched,
     Guarded,
     Identity,
     Increment,
@@ -27,6 +28,7 @@ from fpirhc.deformation import (
     Rfpt,
     RfptVector,
     Rotation,
+    SelfPaired,
     Sigmoid,
     Tuned,
 )
@@ -50,8 +52,13 @@ WRAPPERS = (
     Tuned(Affine(gain=-0.5), largest_gain=0.25),
     Guarded(Sigmoid(gain=-0.5, scale=1.0), largest_deformation=1e12),
     Guarded(Tuned(Rfpt(offset=1e5, sign=-1, gain=5e-6), largest_gain=0.9), largest_deformation=1e12),
+    DelayWatched(Sigmoid(gain=-0.5, scale=1.0), most=5),
 )
-DELAYED = (Paired(Sigmoid(gain=-0.5, scale=1.0), cycles=3), Increment(Affine(gain=-0.5), cycles=2.5))
+DELAYED = (
+    Paired(Sigmoid(gain=-0.5, scale=1.0), cycles=3),
+    Increment(Affine(gain=-0.5), cycles=2.5),
+    SelfPaired(Affine(gain=-0.5), most=5),
+)
 MAPS = (Identity(), *ITERATING)
 NEARLY_LINEAR = (
     Affine(gain=-0.5),

@@ -13,10 +13,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.delayed import Increment, Paired
-from fpirhc.deformation.guarded import Guarded
 from fpirhc.deformation.sigmoid import Sigmoid
-from fpirhc.deformation.tuned import Tuned
+from fpirhc.deformation.wrapper import Wrapper
 from fpirhc.errors import InvalidValue
 from fpirhc.problem import Problem
 
@@ -25,7 +23,7 @@ _SAMPLES = 2000
 
 def scaled_for_reference(deformation: Deformation, problem: Problem) -> Deformation:
     """Return the deformation with S = max(1, 2 period max|d/dt r^N|), r^N the nominal response, unless S is given."""
-    if isinstance(deformation, Tuned | Guarded | Paired | Increment):
+    if isinstance(deformation, Wrapper):
         return replace(deformation, map=scaled_for_reference(deformation.map, problem))
     if not _is_open(deformation):
         return deformation
@@ -38,7 +36,7 @@ def scaled_for_plan(deformation: Deformation, problem: Problem) -> Deformation:
     Raises:
         InvalidValue: some input has no finite limits, so nothing bounds the jump.
     """
-    if isinstance(deformation, Tuned | Guarded | Paired | Increment):
+    if isinstance(deformation, Wrapper):
         return replace(deformation, map=scaled_for_plan(deformation.map, problem))
     if not _is_open(deformation):
         return deformation

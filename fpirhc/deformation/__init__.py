@@ -8,12 +8,15 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.deformation.rfpt import Rfpt
 from fpirhc.deformation.rfpt_vector import RfptVector
 from fpirhc.deformation.rotation import Rotation
+from fpirhc.deformation.self_paired import DelayWatched, SelfPaired
 from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.deformation.tuned import Tuned
+from fpirhc.deformation.wrapper import Wrapper
 
 __all__ = [
     "Affine",
     "Deformation",
+    "DelayWatched",
     "Guarded",
     "Identity",
     "Increment",
@@ -21,6 +24,8 @@ __all__ = [
     "Rfpt",
     "RfptVector",
     "Rotation",
+    "SelfPaired",
     "Sigmoid",
     "Tuned",
+    "Wrapper",
 ]

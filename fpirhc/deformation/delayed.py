@@ -8,6 +8,11 @@
 
 d is in cycles and may be a fraction: then the pair is interpolated between two cycles. Until the first response to a request of
 this controller arrives, the request is the desired response.
+
+A dead time that is wrong by even one cycle makes the interleaved iterations answer each other: high modes grow at any gain, and
+the command chatters. With an `uncertainty` of m cycles the remembered request (its deformation, in the increment form) is a mean
+over the 2 m + 1 requests around the pair with triangular weights W. The modes then obey 1 = W(z) z^-(d+1) - a lambda z^-(d'+1) and
+decay at a lambda <= 0.5 while the true dead time d' is within m cycles of d; a constant deformation is still found exactly.
 """
 
 from __future__ import annotations
@@ -15,12 +20,11 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.wrapper import Wrapper, of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
@@ -28,34 +32,47 @@ MOST = 1000  # cycles of dead time: what is remembered is static
 
 
 @dataclass(frozen=True)
-class _Queued(Deformation):
+class _Queued(Wrapper):
     """The wrapped map with its own past requests and desired responses.
 
     Parameters:
         map: any deformation that iterates.
         cycles: dead time d between a request and its response, beyond the one cycle that every loop has.
+        uncertainty: by how many cycles the dead time may be wrong; at most d.
 
     Raises:
-        InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles.
+        InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time.
     """
 
-    map: Deformation
     cycles: float
+    uncertainty: int = 0
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.cycles) and 0 <= self.cycles <= MOST):
             raise InvalidValue(
                 f"{type(self).__name__}(cycles={self.cycles!r}): expected a dead time between 0 and {MOST} control cycles"
             )
-
-    @property
-    def gain(self) -> float:
-        """The map's own gain."""
-        return float(getattr(self.map, self.map.gain_name))
+        if not 0 <= self.uncertainty <= self.cycles:
+            raise InvalidValue(
+                f"{type(self).__name__}(uncertainty={self.uncertainty!r}): expected whole cycles from 0 to the dead time of "
+                f"{self.cycles:g}"
+            )
 
     @property
     def _length(self) -> int:
-        return math.ceil(self.cycles) + 1
+        return max(self._shares(self.uncertainty)) + 1
+
+    def _shares(self, width: int) -> dict[int, float]:
+        """Weights of what was pushed k cycles ago: a triangle over `width` cycles on both sides of `cycles`, interpolated."""
+        shares: dict[int, float] = {}
+        for j in range(-width, width + 1):
+            height = (1 - abs(j) / (width + 1)) / (width + 1)
+            whole = math.floor(self.cycles) + j
+            part = self.cycles - math.floor(self.cycles)
+            for place, share in ((whole, height * (1 - part)), (whole + 1, height * part)):
+                if share > 0:
+                    shares[place] = shares.get(place, 0.0) + share
+        return shares
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """The queues, how many pairs they hold, and the map's own memory."""
@@ -63,23 +80,18 @@ class _Queued(Deformation):
         queues = Signal("queue_requests", past), Signal("queue_desired", past), Signal("queue_now", elements)
         return Layout((*queues, scalar("queue_filled"))) + self.map.memory(elements)
 
-    def shown(self) -> Mapping[str, str]:
-        """What the map shows."""
-        return self.map.shown()
-
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return the next request from the pair that caused the response."""
-        inner = {name: value for name, value in memory.items() if not name.startswith("queue_")}
+        inner = of_map(self, memory, request.numel())
         first = memory["queue_filled"] < 0.5
         # The first request of a run is the desired response itself.
         asked = ca.if_else(first, request, memory["queue_now"])
         requests = self._pushed(memory["queue_requests"], request)
         wishes = self._pushed(memory["queue_desired"], asked)
         valid = memory["queue_filled"] >= self._length - 1
-        own = self._at(requests, request.numel()), self._at(wishes, request.numel())
-        wanted, following = self._request(*own, response, desired, inner)
+        wanted, following = self._request(requests, wishes, response, desired, inner)
         kept = {name: ca.if_else(valid, value, inner[name]) for name, value in following.items()}
         filled = ca.fmin(memory["queue_filled"] + 1, self._length)
         queues = {"queue_requests": requests, "queue_desired": wishes, "queue_now": desired, "queue_filled": filled}
@@ -88,43 +100,22 @@ class _Queued(Deformation):
     @abstractmethod
     def _request(
         self,
-        request: Expression,
-        asked: Expression,
+        requests: Expression,
+        wishes: Expression,
         response: Expression,
         desired: Expression,
         memory: Mapping[str, Expression],
     ) -> tuple[Expression, dict[str, Expression]]:
-        """The next request from the own pair (request, asked), the response and the desired response now."""
+        """The next request from the queues of requests and desired responses, the response and the desired response now."""
 
     def _pushed(self, queue: Expression, newest: Expression) -> Expression:
         # Not an empty slice: CasADi's [:0] of one entry is that entry.
         kept = newest.numel() * (self._length - 1)
         return ca.vertcat(newest, queue[:kept]) if kept else newest
 
-    def _at(self, queue: Expression, size: int) -> Expression:
-        """What was pushed `cycles` ago, interpolated."""
-        whole = math.floor(self.cycles)
-        share = self.cycles - whole
-        newer = queue[size * whole : size * (whole + 1)]
-        if share == 0:
-            return newer
-        return (1 - share) * newer + share * queue[size * (whole + 1) : size * (whole + 2)]
-
-    def effective_gain(self) -> float:
-        """The map's own."""
-        return self.map.effective_gain()
-
-    def secant_gain(self) -> float:
-        """The map's own."""
-        return self.map.secant_gain()
-
-    def largest_step(self) -> float:
-        """The map's own, from one pair to the next."""
-        return self.map.largest_step()
-
-    def with_effective_gain(self, gain: float) -> Self:
-        """Return the same form around the map with that gain."""
-        return replace(self, map=self.map.with_effective_gain(gain))
+    def _mean(self, queue: Expression, size: int, width: int) -> Expression:
+        """What was pushed `cycles` ago, a weighted mean over its neighbours within `width`."""
+        return sum(share * queue[size * k : size * (k + 1)] for k, share in self._shares(width).items())
 
 
 @dataclass(frozen=True)
@@ -133,14 +124,14 @@ class Paired(_Queued):
 
     def _request(
         self,
-        request: Expression,
-        asked: Expression,
+        requests: Expression,
+        wishes: Expression,
         response: Expression,
         desired: Expression,
         memory: Mapping[str, Expression],
     ) -> tuple[Expression, dict[str, Expression]]:
-        del asked
-        return self.map.step(request, response, desired, memory)
+        del wishes
+        return self.map.step(self._mean(requests, desired.numel(), self.uncertainty), response, desired, memory)
 
 
 @dataclass(frozen=True)
@@ -149,11 +140,13 @@ class Increment(_Queued):
 
     def _request(
         self,
-        request: Expression,
-        asked: Expression,
+        requests: Expression,
+        wishes: Expression,
         response: Expression,
         desired: Expression,
         memory: Mapping[str, Expression],
     ) -> tuple[Expression, dict[str, Expression]]:
-        wanted, following = self.map.step(request, response, asked, memory)
+        asked = self._mean(wishes, desired.numel(), 0)
+        deformed = self._mean(requests - wishes, desired.numel(), self.uncertainty)
+        wanted, following = self.map.step(asked + deformed, response, asked, memory)
         return desired + (wanted - asked), following

@@ -17,13 +17,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, smooth_norm
+from fpirhc.deformation.base import smooth_norm
 from fpirhc.deformation.forgetting import forget
+from fpirhc.deformation.wrapper import Wrapper, of_map, start_of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
@@ -38,7 +38,7 @@ _FINITE = 1e300
 
 
 @dataclass(frozen=True)
-class Guarded(Deformation):
+class Guarded(Wrapper):
     """The wrapped map, watched.
 
     Parameters:
@@ -49,17 +49,11 @@ class Guarded(Deformation):
         InvalidValue: a limit that is not positive.
     """
 
-    map: Deformation
     largest_deformation: float
 
     def __post_init__(self) -> None:
         if not 0 < self.largest_deformation < math.inf:
             raise InvalidValue(f"Guarded(largest_deformation={self.largest_deformation!r}): expected a positive number")
-
-    @property
-    def gain(self) -> float:
-        """The map's own gain."""
-        return float(getattr(self.map, self.map.gain_name))
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """What the guard has seen, and the map's own memory."""
@@ -76,7 +70,7 @@ class Guarded(Deformation):
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return the map's next request, or the desired response after a trip and in a pause."""
         own = {name.removeprefix("guard_"): v for name, v in memory.items() if name.startswith("guard_")}
-        inner = {name: v for name, v in memory.items() if not name.startswith("guard_")}
+        inner = of_map(self, memory, request.numel())
         wanted, following = self.map.step(request, response, desired, inner)
         candidate = request + own["factor"] * (wanted - request)
         active = ca.logic_not(ca.logic_or(own["pause"] > 0.5, own["fallback"] > 0.5))
@@ -86,12 +80,9 @@ class Guarded(Deformation):
         fallback = ca.logic_or(own["fallback"] > 0.5, trips > _TRIPS)
         kept = self._kept(own, seen, trip, active, trips, fallback)
         running = ca.logic_and(active, ca.logic_not(trip))
-        start = self.map.memory(tuple("x" * (k + 1) for k in range(request.numel()))).split(ca.DM(self._start(request)))
+        start = start_of_map(self, request.numel())
         forgotten = {name: ca.if_else(running, value, start[name]) for name, value in following.items()}
         return ca.if_else(running, candidate, desired), {**kept, **forgotten}
-
-    def _start(self, request: Expression) -> list[float]:
-        return [float(v) for v in self.map.memory(tuple("x" * (k + 1) for k in range(request.numel()))).start()]
 
     def _watched(
         self,
@@ -148,22 +139,6 @@ class Guarded(Deformation):
         pause = ca.if_else(trip, _PAUSE, ca.fmax(own["pause"] - 1, 0))
         whole = {"factor": factor, "pause": pause, "trips": trips, "clean": clean, "event": event, "fallback": fallback}
         return {f"guard_{name}": value for name, value in {**counted, **whole}.items()}
-
-    def effective_gain(self) -> float:
-        """The map's own."""
-        return self.map.effective_gain()
-
-    def secant_gain(self) -> float:
-        """The map's own."""
-        return self.map.secant_gain()
-
-    def largest_step(self) -> float:
-        """The map's own; a trip may go further, back to the desired response."""
-        return self.map.largest_step()
-
-    def with_effective_gain(self, gain: float) -> Self:
-        """Return the guard around the map with that gain."""
-        return replace(self, map=self.map.with_effective_gain(gain))
 
 
 def _finite(value: Expression) -> Expression:

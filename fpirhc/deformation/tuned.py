@@ -20,8 +20,8 @@ from typing import Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.forgetting import forget
+from fpirhc.deformation.wrapper import Wrapper, of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
@@ -32,7 +32,7 @@ _REST = 8  # cycles without a change after each change
 
 
 @dataclass(frozen=True)
-class Tuned(Deformation):
+class Tuned(Wrapper):
     """The wrapped map with its step scaled on line.
 
     Parameters:
@@ -43,7 +43,6 @@ class Tuned(Deformation):
         InvalidValue: a cap that is not positive in the direction of the map's own gain, or below it.
     """
 
-    map: Deformation
     largest_gain: float
 
     def __post_init__(self) -> None:
@@ -53,11 +52,6 @@ class Tuned(Deformation):
                 f"Tuned(largest_gain={self.largest_gain!r}): expected a bound beyond the map's own effective gain {gain:.4g}; "
                 "assess_gain(...).sector_limit gives one. A tuner without a bound probes until the loop oscillates"
             )
-
-    @property
-    def gain(self) -> float:
-        """The map's own gain, which the tuner starts from."""
-        return float(getattr(self.map, self.map.gain_name))
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """The factor, the sign correlation, the rest after a change, the last error; and the map's own."""
@@ -78,7 +72,7 @@ class Tuned(Deformation):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return r + factor (G(r, f, d) - r)."""
-        inner = {name: value for name, value in memory.items() if not name.startswith("tuner_")}
+        inner = of_map(self, memory, request.numel())
         wanted, following = self.map.step(request, response, desired, inner)
         factor, error = memory["tuner_factor"], response - desired
         product = ca.dot(error, memory["tuner_error"])
@@ -100,14 +94,6 @@ class Tuned(Deformation):
         own = {"tuner_factor": kept, "tuner_sign": seen, "tuner_rest": rest, "tuner_error": error}
         own["tuner_growing"] = ca.if_else(diverges, 0, growing)
         return request + factor * (wanted - request), {**own, **following}
-
-    def effective_gain(self) -> float:
-        """The map's own, which the factor starts from."""
-        return self.map.effective_gain()
-
-    def secant_gain(self) -> float:
-        """The map's own at the start."""
-        return self.map.secant_gain()
 
     def largest_step(self) -> float:
         """The map's, times the largest factor."""

@@ -1,0 +1,331 @@
+"""Dead time: where loops lose their stability, and what pairing, prediction and an estimate give back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from plants import linear, pendulum
+from test_adaptation import stepping
+
+import fpirhc as fp
+from fpirhc.errors import FpirhcError, InvalidValue, NotSupported
+
+DELAYS = (0, 1, 2, 3, 5, 10, 20)
+
+
+def affine(effective_gain: float) -> fp.Affine:
+    """r+ = r - a (f - d)."""
+    return fp.Affine(gain=-1.0).with_effective_gain(effective_gain)
+
+
+def iteration_radius(deformation: fp.Deformation, delay: int) -> float:
+    """Spectral radius of the scalar iteration whose response is the request of `delay` cycles earlier."""
+    layout = deformation.memory(("q",))
+    size = delay + 1  # requests on their way, newest first
+    z = ca.SX.sym("z", size + layout.size)
+    memory = layout.split(z[size:])
+    request, following = deformation.step(z[0], z[delay], ca.SX(0), memory)
+    on = ca.vertcat(request, z[: size - 1]) if delay else request
+    function = ca.Function("one", [z], [ca.jacobian(ca.vertcat(on, layout.join(following)), z)])
+    start = layout.start()
+    if "queue_filled" in layout.names:
+        start[layout.slice("queue_filled")] = 1e6
+    return float(np.abs(np.linalg.eigvals(function(np.r_[np.zeros(size), start]).full())).max())
+
+
+def limit(stable, low: float, high: float) -> float:
+    """Where `stable` ends, by bisection."""
+    while high - low > 1e-5:
+        middle = (low + high) / 2
+        low, high = (middle, high) if stable(middle) else (low, middle)
+    return low
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+def test_unpaired_limit(delay):
+    """z^(d+1) - z^d + a = 0 is stable up to a = 2 sin(pi / (2 (2 d + 1)))."""
+    found = limit(lambda a: iteration_radius(affine(a), delay) < 1, 0.01, 3.0)
+    assert found == pytest.approx(2 * np.sin(np.pi / (2 * (2 * delay + 1))), rel=1e-3)
+
+
+@pytest.mark.parametrize("form", [fp.Paired, fp.Increment])
+@pytest.mark.parametrize("delay", DELAYS)
+def test_paired_is_stable_at_any_delay(form, delay):
+    """D + 1 interleaved iterations: the rate is |1 - a|^(1/(d+1)), also at a = 1.9."""
+    for gain in (0.5, 1.9):
+        # The queue's own modes are zero; they form a Jordan block, whose computed eigenvalues are rounding^(1/size).
+        assert iteration_radius(form(affine(gain), cycles=delay), delay) == pytest.approx(
+            abs(1 - gain) ** (1 / (delay + 1)), abs=1e-6
+        )
+    assert iteration_radius(form(affine(2.05), cycles=delay), delay) > 1
+
+
+@pytest.mark.parametrize("form", [fp.Paired, fp.Increment])
+@pytest.mark.parametrize("delay", [6, 20])
+def test_uncertainty_tolerates_a_wrong_dead_time(form, delay):
+    """Off by one cycle the pairs answer each other and high modes grow; with the uncertainty stated they decay."""
+    assert iteration_radius(form(affine(0.5), cycles=delay), delay + 1) > 1
+    width = round(0.3 * delay)
+    for wrong in range(-width, width + 1):
+        assert iteration_radius(form(affine(0.5), cycles=delay, uncertainty=width), delay + wrong) < 1
+
+
+def test_uncertainty_still_finds_the_fixed_point():
+    """With a constant task the mean over the past is exact: the response becomes the desired one."""
+    step, layout = stepping(fp.Increment(affine(0.5), cycles=6, uncertainty=2))
+    memory, requests = layout.start(), [1.0] * 8
+    for _ in range(600):
+        request, memory = step(requests[-1], 3 + 0.7 * requests[-1 - 5], 1.0, memory)
+        requests.append(float(request))
+    assert 3 + 0.7 * requests[-1] == pytest.approx(1.0, abs=1e-9)
+
+
+def short(problem: fp.Problem, **changes) -> fp.Problem:
+    return replace(problem, duration=0.3, measure_from=0.0, **changes)
+
+
+TWO_MASS = short(fp.load_problem("two_mass").problem)
+SIGMOID = fp.Sigmoid(gain=-0.5, scale=2.0)
+LAW = fp.Exponential(rate=6.0)
+
+
+def test_no_dead_time_changes_no_bit():
+    """Zero delays, zero pairing, and prediction over nothing leave every signal as it is."""
+    plain = fp.simulate(TWO_MASS, fp.ComputedTorque(LAW, SIGMOID), seed=0, compiled=False)
+    zero = replace(TWO_MASS, dead_time=fp.DeadTime(inputs={"Q1": 0.0}, measurement=0.0))
+    others = {
+        "delay of zero": (zero, fp.ComputedTorque(LAW, SIGMOID)),
+        "paired": (TWO_MASS, fp.ComputedTorque(LAW, fp.Paired(SIGMOID, cycles=0))),
+        "predicted": (TWO_MASS, fp.Predicted(fp.ComputedTorque(LAW, SIGMOID), inputs=0.0)),
+    }
+    for name, (problem, controller) in others.items():
+        run = fp.simulate(problem, controller, seed=0, compiled=False)
+        for signal in ("state", "desired", "deformed", "command"):
+            np.testing.assert_array_equal(run[signal], plain[signal], err_msg=f"{name}: {signal}")
+
+
+def test_inputs_arrive_when_they_should():
+    """Each input has its own delay; a fraction of a cycle is interpolated; queues begin with zero commands."""
+    delayed = replace(TWO_MASS, dead_time=fp.DeadTime(inputs={"Q1": 3.25e-3, "Q2": 2e-3}))
+    run = fp.simulate(delayed, fp.ComputedTorque(LAW), seed=0, compiled=False)
+    sent, arrived = run["command"], run["arriving"]
+    padded = np.vstack([np.zeros((4, 2)), sent])
+    np.testing.assert_allclose(
+        arrived[:, 0], 0.75 * padded[1:-3, 0] + 0.25 * padded[:-4, 0], rtol=1e-12, equal_nan=False
+    )
+    np.testing.assert_array_equal(arrived[:, 1], padded[2:-2, 1])
+
+
+def test_measurements_are_old():
+    """The controller sees the state of 5 cycles ago (the start before that); the run is judged by the true one."""
+    delayed = replace(TWO_MASS, dead_time=fp.DeadTime(measurement=5e-3))
+    run = fp.simulate(delayed, fp.ComputedTorque(LAW, fp.Paired(SIGMOID, cycles=5)), seed=0, compiled=False)
+    np.testing.assert_array_equal(run["state"][5:], run["plant_state"][:-5])
+    np.testing.assert_array_equal(run["state"][:5], np.tile(delayed.start_state, (5, 1)))
+    np.testing.assert_array_equal(run["realised"][5:], run["plant_realised"][:-5])
+    np.testing.assert_allclose(run["true_error"], run["reference"][:, :2] - run["plant_state"][:, :2], atol=1e-14)
+    assert fp.measure(delayed, run).rms_error["q1"] == pytest.approx(np.sqrt(np.mean(run["true_error"][:, 0] ** 2)))
+
+
+def test_prediction_with_the_exact_model_undoes_the_dead_time():
+    """The plant moves as without dead time, that much later, when it rests in between."""
+    problem = fp.Problem(
+        plant=pendulum(mass=1.0, believed=1.4),
+        reference=fp.Trajectory(lambda t: {"angle": 0.4 + 0 * t}),
+        start={"angle": 0.0},
+        period=2e-3,
+        duration=1.5,
+    )
+    law = fp.ComputedTorque(fp.Exponential(rate=5.0, integral=False))
+    free = fp.simulate(problem, fp.Informed(law), seed=0)
+    for dead_time in (fp.DeadTime(inputs={"torque": 0.1}), fp.DeadTime(inputs={"torque": 0.06}, measurement=0.04)):
+        late = replace(problem, dead_time=dead_time)
+        predicted = fp.Predicted(law, inputs=dead_time.inputs["torque"], measurement=dead_time.measurement)
+        run = fp.simulate(late, fp.Informed(predicted), seed=0)
+        moved = run["plant_state" if dead_time.measurement else "state"]
+        shift = round(dead_time.inputs["torque"] / problem.period)
+        np.testing.assert_allclose(moved[shift:], free["state"][:-shift], atol=2e-8)
+
+
+def test_desired_responses_predict_an_ideal_plant():
+    """With an exact model the realised response is the desired one, and both predictors agree."""
+    problem = fp.Problem(
+        plant=linear(1.0, 1.0),
+        reference=fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}),
+        start={"y": 0.2},
+        period=1e-2,
+        duration=3.0,
+        dead_time=fp.DeadTime(inputs={"u": 0.05}),
+    )
+    law = fp.ComputedTorque(LAW)
+    states = [
+        fp.simulate(problem, fp.Predicted(law, inputs=0.05, by=by), seed=0, compiled=False)["state"]
+        for by in (fp.ByModel(), fp.ByDesired())
+    ]
+    np.testing.assert_allclose(states[0], states[1], atol=1e-9)
+
+
+DUFFING = fp.load_problem("delayed_mass")
+LATE = replace(DUFFING.problem, duration=9.0, measure_from=4.0)  # 60 ms, rate x dead time = 0.36
+
+
+def rms_error(dead_time: float, controller: fp.Controller) -> float:
+    problem = replace(LATE, dead_time=fp.DeadTime(inputs={"Q": dead_time}))
+    return fp.measure(problem, fp.simulate(problem, controller, seed=0)).rms_error["q"]
+
+
+def controllers(believed: float) -> dict[str, fp.Controller]:
+    """The forms of the deformation, for a believed dead time."""
+    cycles = believed / DUFFING.problem.period
+    sigmoid = fp.Sigmoid(gain=-0.5)
+    increment = fp.ComputedTorque(LAW, fp.Increment(sigmoid, cycles=cycles))
+    return {
+        "unpaired": fp.ComputedTorque(LAW, sigmoid),
+        "paired": fp.ComputedTorque(LAW, fp.Paired(sigmoid, cycles=cycles)),
+        "increment, by model": fp.Predicted(increment, inputs=believed),
+        "increment, by desired": fp.Predicted(increment, inputs=believed, by=fp.ByDesired()),
+        "increment, corrected": fp.Predicted(increment, inputs=believed, by=fp.ByModel(residual_time=0.2)),
+    }
+
+
+@pytest.mark.parametrize("product", [0.36, 0.6])
+def test_long_dead_time_needs_prediction(product):
+    """At rate x dead time of 0.36 and 0.6 the increment form with any prediction tracks; without prediction nothing does."""
+    dead_time = product / 6.0
+    errors = {name: rms_error(dead_time, c) for name, c in controllers(dead_time).items()}
+    assert max(e for name, e in errors.items() if "increment" in name) < 0.05
+    assert min(errors["unpaired"], errors["paired"]) > 0.2
+
+
+def test_residual_corrects_the_prediction():
+    """A model with its residual predicts better than the wrong model alone."""
+    errors = {name: rms_error(0.06, c) for name, c in controllers(0.06).items()}
+    assert errors["increment, corrected"] < 0.8 * errors["increment, by model"]
+
+
+@pytest.mark.parametrize("share", [0.7, 1.3])
+def test_misestimated_dead_time_degrades_gracefully(share):
+    """30 % too short or too long: a few times the error, and a command as smooth; without a stated uncertainty it chatters."""
+    errors, moves = [], []
+    for believed, uncertainty in ((0.06, 0), (share * 0.06, 18), (share * 0.06, 0)):
+        deformation = fp.Increment(fp.Sigmoid(gain=-0.5), cycles=1e3 * believed, uncertainty=uncertainty)
+        run = fp.simulate(LATE, fp.Predicted(fp.ComputedTorque(LAW, deformation), inputs=believed), seed=0)
+        late = run.time >= LATE.measure_from
+        errors.append(fp.measure(LATE, run).rms_error["q"])
+        moves.append(np.abs(np.diff(run["command"][late, 0])).mean())
+    assert errors[1] < 4 * errors[0]
+    assert moves[1] < 2 * moves[0]
+    assert moves[2] > 100 * moves[0]
+
+
+def test_receding_horizon_starts_where_its_command_acts():
+    """RHC with prediction over the dead time keeps the tracking of RHC without dead time; without prediction it loses it."""
+    task = fp.load_problem("van_der_pol")
+    problem = replace(task.problem, duration=6.0, measure_from=3.0)
+    late = replace(problem, dead_time=fp.DeadTime(inputs={"u": 0.1}))
+    rhc = task.controllers["RHC"]
+    runs = {
+        "free": (problem, fp.Informed(rhc)),
+        "late": (late, fp.Informed(rhc)),
+        "predicted": (late, fp.Informed(fp.Predicted(rhc, inputs=0.1))),
+    }
+    errors = {name: fp.measure(p, fp.simulate(p, c, seed=0)).rms_error["q"] for name, (p, c) in runs.items()}
+    assert errors["predicted"] < 2 * errors["free"] + 1e-3
+    assert errors["late"] > 5 * errors["predicted"]
+
+
+def test_compiled_equals_virtual_machine():
+    problem = replace(DUFFING.problem, duration=1.0, measure_from=0.0)
+    for controller in DUFFING.controllers.values():
+        runs = [fp.simulate(problem, controller, seed=0, compiled=c) for c in (True, False)]
+        np.testing.assert_allclose(runs[0]["state"], runs[1]["state"], rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("dead_time", "sentence"),
+    [
+        (fp.DeadTime(inputs={"Q3": 0.1}), "input 'Q3'.*Did you mean"),
+        (fp.DeadTime(inputs={"Q1": -0.1}), "'Q1' must be a number of seconds of at least 0"),
+        (fp.DeadTime(measurement=float("nan")), "'measurement' must be a number of seconds"),
+        (fp.DeadTime(inputs={"Q1": 2.0}), "'Q1' is 2 s, more than 1000 control cycles of 0.001 s"),
+    ],
+)
+def test_bad_dead_times(dead_time, sentence):
+    with pytest.raises(FpirhcError, match=sentence):
+        replace(TWO_MASS, dead_time=dead_time)
+
+
+def with_unknown_delay(deformation, desired, delay, noise, seed=0):
+    """Memories over the run of the scalar plant f = r + a slow disturbance, `delay` cycles late, with noise on the response."""
+    step, layout = stepping(deformation)
+    white = noise * np.random.default_rng(seed).standard_normal(len(desired))
+    memory, requests, errors, memories = layout.start(), [0.0] * (delay + 1), [], []
+    for k, wish in enumerate(desired):
+        response = requests[-1 - delay] + 0.3 * np.sin(0.01 * k)
+        request, memory = (v.full().ravel() for v in step(requests[-1], response + white[k], wish, memory))
+        requests.append(float(request[0]))
+        errors.append(response - wish)
+        memories.append(memory)
+    return np.array(errors), {n: np.array(memories)[:, layout.slice(n)] for n in layout.names}
+
+
+CYCLES = np.arange(4000)
+WHITE, SQUARE = np.random.default_rng(1).standard_normal(4000), np.sign(np.sin(0.02 * CYCLES))
+SELF_PAIRED = fp.SelfPaired(affine(0.3), most=50)
+
+
+@pytest.mark.parametrize("delay", [0, 3, 10, 30])
+@pytest.mark.parametrize("desired", [WHITE, SQUARE], ids=["white", "square"])
+def test_unknown_dead_time_is_found(desired, delay):
+    """At 20 dB of signal to noise, to one cycle, and the loop that uses it is stable."""
+    _, memory = with_unknown_delay(SELF_PAIRED, desired, delay, noise=0.1)
+    assert np.all(memory["pair_cycles"][:90] == -1)  # nothing is believed at first
+    used = memory["pair_cycles"][2000:]
+    assert np.all(np.abs(used - delay) <= 1)
+    assert np.abs(memory["pair_requests"]).max() < 10
+    assert memory["delay_confidence"].max() > 0.6
+
+
+def test_smooth_requests_tell_no_dead_time():
+    """A sine says nothing about a cycle more or less: no confidence, no adaptation, and nothing grows."""
+    _, memory = with_unknown_delay(SELF_PAIRED, np.sin(0.02 * CYCLES), 30, noise=0.0)
+    assert memory["delay_confidence"][100:].max() < 0.3
+    assert np.all(memory["pair_cycles"] == -1)
+
+
+def test_watching_changes_nothing():
+    """The estimate beside a map leaves the run as it is, and is in the run by name."""
+    square = replace(LATE, duration=2.0, measure_from=0.0)
+    plain, watched = (
+        fp.simulate(square, fp.ComputedTorque(LAW, d), seed=0, compiled=False)
+        for d in (SIGMOID, fp.DelayWatched(SIGMOID, most=80))
+    )
+    np.testing.assert_allclose(watched["command"], plain["command"], rtol=1e-9)
+    assert watched["dead_time_cycles"].shape == watched["dead_time_confidence"].shape == (square.cycles, 1)
+
+
+def test_bad_settings():
+    for most in (0, 201):
+        with pytest.raises(InvalidValue, match="between 1 and 200 cycles"):
+            fp.SelfPaired(SIGMOID, most=most)
+    with pytest.raises(InvalidValue, match="share between 0 and 1"):
+        fp.SelfPaired(SIGMOID, most=5, confidence=1.0)
+    with pytest.raises(InvalidValue, match="whole cycles from 0 to the dead time of 4"):
+        fp.Paired(SIGMOID, cycles=4, uncertainty=5)
+    with pytest.raises(InvalidValue, match="residual_time=0"):
+        fp.ByModel(residual_time=0.0)
+    for cycles in (-1, float("inf"), 1001):
+        with pytest.raises(InvalidValue, match="dead time between 0 and 1000"):
+            fp.Paired(SIGMOID, cycles=cycles)
+    with pytest.raises(InvalidValue, match=r"inputs=-0\.1"):
+        fp.Predicted(fp.ComputedTorque(LAW), inputs=-0.1)
+    with pytest.raises(InvalidValue, match="3000 cycles of dead time, more than 1000"):
+        fp.simulate(TWO_MASS, fp.Predicted(fp.ComputedTorque(LAW), inputs=3.0), seed=0)
+    cart_pole = fp.load_problem("cart_pole")
+    with pytest.raises(NotSupported, match=r"ByModel\(\)"):
+        fp.simulate(
+            cart_pole.problem, fp.Predicted(cart_pole.controllers["RHC"], inputs=0.1, by=fp.ByDesired()), seed=0
+        )
