@@ -30,12 +30,18 @@ class DeadTime:
     """Dead time in seconds.
 
     Parameters:
-        inputs: by input; zero where not named. The queue begins with zero commands.
+        inputs: by input; zero where not named.
         measurement: of the state and the response. The queue begins with the start.
+        before: commands that are on their way at the start, by input; zero where not named.
     """
 
     inputs: Mapping[str, float] = field(default_factory=dict)
     measurement: float = 0.0
+    before: Mapping[str, float] = field(default_factory=dict)
+
+    def commands_before(self, plant: Plant) -> tuple[float, ...]:
+        """The commands on their way at the start, one per input."""
+        return tuple(float(self.before.get(name, 0.0)) for name in plant.inputs)
 
     def check(self, plant: Plant, period: float) -> None:
         """Raise if a name is unknown, or a dead time is negative, not finite, or too long.
@@ -45,6 +51,10 @@ class DeadTime:
         """
         mistakes = Mistakes("dead_time")
         mistakes.unknown("input", self.inputs, plant.inputs)
+        mistakes.unknown("before: input", self.before, plant.inputs)
+        for name, value in self.before.items():
+            if not isinstance(value, int | float) or not math.isfinite(value):
+                mistakes.add(f"before: '{name}' must be a finite number, got {value!r}")
         for name, value in [*self.inputs.items(), ("measurement", self.measurement)]:
             if not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
                 mistakes.add(f"'{name}' must be a number of seconds of at least 0, got {value!r}")

@@ -46,9 +46,10 @@ def _plant_delays(problem: Problem, controller: Controller) -> list[Delay]:
     start = tuple(float(v) for v in problem.start_state)
     approximate = tuple(float(v) for v in controller.parameters(plant))
     exact = tuple(float(v) for v in plant.exact)
+    acting = problem.dead_time.commands_before(plant)
     return [
         Delay(Signal("_state_before", plant.state.elements, plant.state.units, start), "_state_after"),
-        Delay(like(plant.input, "_acting_before"), "_acting"),
+        Delay(Signal("_acting_before", plant.input.elements, plant.input.units, acting), "_acting"),
         Delay(_forcing(plant, "_forcing_before"), "_forcing"),
         Delay(Signal("parameters", plant.parameter.elements, plant.parameter.units, approximate), "parameters"),
         Delay(Signal("_exact", plant.parameter.elements, plant.parameter.units, exact), "_exact"),
@@ -127,7 +128,8 @@ def _actuate(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:
     cycles = [problem.dead_time.inputs.get(name, 0.0) / problem.period for name in problem.plant.inputs]
     if not any(cycles):
         return [_advance_block(problem, disturbed, problem.plant.input)]
-    arriving = like(problem.plant.input, "arriving")
+    plant = problem.plant
+    arriving = Signal("arriving", plant.input.elements, plant.input.units, problem.dead_time.commands_before(plant))
     return [
         delay_block("send_command", problem.plant.input, arriving, cycles),
         _advance_block(problem, disturbed, arriving),

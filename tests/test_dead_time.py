@@ -329,3 +329,26 @@ def test_bad_settings():
         fp.simulate(
             cart_pole.problem, fp.Predicted(cart_pole.controllers["RHC"], inputs=0.1, by=fp.ByDesired()), seed=0
         )
+
+
+def test_commands_on_their_way_at_the_start():
+    """In steady motion with the right commands on their way nothing moves; predicted from them, nothing is corrected."""
+    tanks = fp.load_problem("delayed_tanks")
+    resting = replace(
+        tanks.problem, reference=fp.Trajectory(lambda t: {"h2": 0.12 + 0 * t}), duration=20.0, measure_from=0.0
+    )
+    run = fp.simulate(resting, tanks.controllers["RHC exact model"], seed=0, compiled=False)
+    np.testing.assert_allclose(run["state.h2"], 0.12, atol=1e-4)
+    np.testing.assert_allclose(run["command"], 61.4, atol=0.2)
+
+
+@pytest.mark.parametrize("name", ["delayed_mass", "delayed_tanks"])
+def test_shipped_problems_tell_what_helps(name):
+    """With the same prediction FPI lowers the error; a controller that knows nothing of the dead time is the worst."""
+    task = fp.load_problem(name)
+    errors = {
+        c: fp.measure(task.problem, fp.simulate(task.problem, task.controllers[c], seed=0)).rms_error.popitem()[1]
+        for c in ("RHC", "RHC+FPI", "RHC not predicting")
+    }
+    assert errors["RHC+FPI"] < 0.8 * errors["RHC"]
+    assert errors["RHC not predicting"] > 10 * errors["RHC"]

@@ -49,6 +49,10 @@ class Predictor(ABC):
         """The signal that is queued: written by the controller."""
 
     @abstractmethod
+    def sent_at_start(self, problem: Problem) -> tuple[float, ...]:
+        """What is on its way when the run begins."""
+
+    @abstractmethod
     def advance(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, sent, parameters, residual of the responses) -> state one cycle later."""
 
@@ -80,6 +84,10 @@ class ByModel(Predictor):
         """The commands."""
         return plant.input
 
+    def sent_at_start(self, problem: Problem) -> tuple[float, ...]:
+        """The commands that the problem says."""
+        return problem.dead_time.commands_before(problem.plant)
+
     def advance(self, plant: Plant, period: float) -> ca.Function:
         """One Runge-Kutta step of the model."""
         step = RungeKutta4().step(plant, period)
@@ -104,6 +112,10 @@ class ByDesired(Predictor):
     def sent(self, plant: Plant) -> Signal:
         """The desired responses."""
         return plant.response_signal("desired")
+
+    def sent_at_start(self, problem: Problem) -> tuple[float, ...]:
+        """Zero: the plant was at rest or in steady motion."""
+        return (0.0,) * len(problem.plant.controlled_names)
 
     def advance(self, plant: Plant, period: float) -> ca.Function:
         """Taylor's formula with the highest derivative held."""
@@ -177,7 +189,7 @@ class Predicted(Controller):
         inner = compose_controller(problem, self.controller)
         ahead = {"time": scalar("time_ahead", "s"), "state": like(plant.state, "state_ahead")}
         sent = self.by.sent(plant)
-        before = Signal("_sent_before", sent.elements, sent.units)
+        before = Signal("_sent_before", sent.elements, sent.units, self.by.sent_at_start(problem))
         predict = _predict_block(problem, self.by, cycles, self.inputs, before, tuple(ahead.values()))
         return [predict, embedded("controller", inner, ahead)], [Delay(before, sent.name)]
 
@@ -190,7 +202,8 @@ def _predict_block(
 ) -> Block:
     plant, size = problem.plant, before.size
     # One more than is on its way: the oldest is what acted while the response was realised.
-    queue = Signal("sent", tuple(f"{e}@{k}" for k in range(1, cycles + 2) for e in before.elements))
+    past = tuple(f"{e}@{k}" for k in range(1, cycles + 2) for e in before.elements)
+    queue = Signal("sent", past, start=by.sent_at_start(problem) * (cycles + 1))
     residual = Signal("residual", plant.names, plant.response_units)
     reads = (scalar("time", "s"), plant.state, plant.response_signal("realised"), plant.parameter, before)
     advance = by.advance(plant, problem.period)

@@ -101,7 +101,8 @@ class SelfPaired(Wrapper):
         estimate = estimated(request, response, memory, self.most)
         stood, candidate, cycles = self._adopted(estimate, memory)
         size = request.numel()
-        requests: Expression = ca.vertcat(request, memory["pair_requests"])[: size * (self.most + 1)]
+        pushed: Expression = ca.vertcat(request, memory["pair_requests"])
+        requests = pushed[: size * (self.most + 1)]
         own = requests[:size]
         for k in range(1, self.most + 1):
             own = ca.if_else(cycles > k - 0.5, requests[size * k : size * (k + 1)], own)
