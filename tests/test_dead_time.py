@@ -339,7 +339,7 @@ def test_commands_on_their_way_at_the_start():
     )
     run = fp.simulate(resting, tanks.controllers["RHC exact model"], seed=0, compiled=False)
     np.testing.assert_allclose(run["state.h2"], 0.12, atol=1e-4)
-    np.testing.assert_allclose(run["command"], 61.4, atol=0.2)
+    np.testing.assert_allclose(run["command"], 61.4, atol=0.5)
 
 
 @pytest.mark.parametrize("name", ["delayed_mass", "delayed_tanks"])
