@@ -47,6 +47,7 @@ from .studies.problem_file import load_problem
 from .symbolic.functions import signed_power
 from .testing import check_deformation
 from .tracking.exponential import Exponential
+from .tracking.fractional import Fractional
 
 __all__ = [
     "Affine",
@@ -67,6 +68,7 @@ __all__ = [
     "FixedPoint",
     "Formula",
     "FpirhcError",
+    "Fractional",
     "FullSpaceFixedPoint",
     "GaussNewton",
     "General",

@@ -46,7 +46,7 @@ class ComputedTorque(Controller):
             reference_block(problem),
             rename("target", like(plant.state, "reference"), like(plant.state, "_target")),
             rename("nominal", response, plant.response_signal("nominal")),
-            self.tracking.law(plant),
+            self.tracking.law(plant, problem.period),
             *closing,
             self.tracking.update(plant, problem.period),
         ]

@@ -95,7 +95,7 @@ def _tracked(problem: Problem, tracking: Tracking, start: Callable[[Any], dict[s
     plant = problem.plant
     begin = _choose("plan_state", plant, start, ["_plan_state", "_target"])
     delay = Delay(like(plant.state, "_target_before"), "target")
-    after = [_propagate(plant, problem.period), tracking.law(plant)]
+    after = [_propagate(plant, problem.period), tracking.law(plant, problem.period)]
     return [begin], after, [tracking.update(plant, problem.period)], [delay, *tracking.delays(plant)]
 
 

@@ -16,8 +16,11 @@ class Tracking(ABC):
     """
 
     @abstractmethod
-    def law(self, plant: Plant) -> Block:
-        """Block (state, target, nominal, started, memory) -> (_target_error, desired, ...)."""
+    def law(self, plant: Plant, period: float) -> Block:
+        """Block (state, target, nominal, started, memory) -> (_target_error, desired, ...).
+
+        Where `started` is zero a run begins: what is remembered from before counts no more.
+        """
 
     @abstractmethod
     def update(self, plant: Plant, period: float) -> Block:

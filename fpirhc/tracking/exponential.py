@@ -20,8 +20,9 @@ import casadi as ca
 from fpirhc.errors import InvalidValue
 from fpirhc.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.tracking.base import Tracking
+from fpirhc.tracking.error import error_chains, error_signal, integral_delay, integral_signal, integral_update
 
 
 @dataclass(frozen=True)
@@ -50,19 +51,20 @@ class Exponential(Tracking):
         degree = order + 1 if self.integral else order
         return tuple(math.comb(degree, s) * self.rate ** (degree - s) for s in range(degree))
 
-    def law(self, plant: Plant) -> Block:
+    def law(self, plant: Plant, period: float) -> Block:
         """Block (state, target, nominal, started, integral) -> (error to the target, desired, integral in use)."""
+        del period
         reads = (
             plant.state,
             Signal("_target", plant.state.elements, plant.state.units),
             plant.response_signal("nominal"),
             scalar("started"),
-            _integral(plant, "_integral_before"),
+            integral_signal(plant, "_integral_before"),
         )
-        writes = (_error(plant), plant.response_signal("desired"), _integral(plant, "_integral_used"))
+        writes = (error_signal(plant), plant.response_signal("desired"), integral_signal(plant, "_integral_used"))
 
         def step(s: Any) -> dict[str, Expression]:
-            errors = _error_chains(plant, s._target - s.state)
+            errors = error_chains(plant, s._target - s.state)
             begin = ca.vertcat(*(self._first_integral(chain) for chain in errors))
             used = ca.if_else(s.started > 0.5, s._integral_before, begin)
             feedback = [self._feedback(used[k], chain) for k, chain in enumerate(errors)]
@@ -76,16 +78,11 @@ class Exponential(Tracking):
 
     def update(self, plant: Plant, period: float) -> Block:
         """Block that integrates the error, except while the command is clipped."""
-        reads = (_error(plant), scalar("clipped"), _integral(plant, "_integral_used"))
-
-        def step(s: Any) -> dict[str, Expression]:
-            return {"integral": s._integral_used + period * ca.if_else(s.clipped, 0, s._target_error)}
-
-        return Block("tracking_update", Layout(reads), Layout((_integral(plant, "integral"),)), step)
+        return integral_update(plant, period)
 
     def delays(self, plant: Plant) -> tuple[Delay, ...]:
         """The integral of the error is remembered."""
-        return (Delay(_integral(plant, "_integral_before"), "integral"),)
+        return integral_delay(plant)
 
     def _feedback(self, integral: Expression, chain: list[Expression]) -> Expression:
         terms = [integral, *chain] if self.integral else chain
@@ -96,22 +93,3 @@ class Exponential(Tracking):
             return chain[0] * 0
         first, *others = self.gains(len(chain))
         return -sum(g * e for g, e in zip(others, chain, strict=True)) / first
-
-
-def _error(plant: Plant) -> Signal:
-    units = [plant.coordinates[c] for c in plant.controlled_names]
-    return vector("_target_error", plant.controlled_names, units)
-
-
-def _integral(plant: Plant, name: str) -> Signal:
-    units = [f"{plant.coordinates[c]} s" for c in plant.controlled_names]
-    return vector(name, plant.controlled_names, units)
-
-
-def _error_chains(plant: Plant, error: Expression) -> list[list[Expression]]:
-    """Per controlled coordinate: [e, e', ...] below its order."""
-    chains = []
-    for k in plant.controlled_indices:
-        name, order = plant.names[k], plant.orders[k]
-        chains.append([error[plant.state.elements.index(name + "'" * s)] for s in range(order)])
-    return chains

@@ -1,0 +1,47 @@
+"""The tracking error of the controlled coordinates and its integral, as tracking laws pass them on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+
+from fpirhc.plant import Plant
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+
+
+def integral_update(plant: Plant, period: float) -> Block:
+    """Block that integrates the error, except while the command is clipped."""
+    reads = (error_signal(plant), scalar("clipped"), integral_signal(plant, "_integral_used"))
+
+    def step(s: Any) -> dict[str, Expression]:
+        return {"integral": s._integral_used + period * ca.if_else(s.clipped, 0, s._target_error)}
+
+    return Block("tracking_update", Layout(reads), Layout((integral_signal(plant, "integral"),)), step)
+
+
+def integral_delay(plant: Plant) -> tuple[Delay, ...]:
+    """The integral in the next cycle is what the update made of it."""
+    return (Delay(integral_signal(plant, "_integral_before"), "integral"),)
+
+
+def error_signal(plant: Plant) -> Signal:
+    """Error to the target of every controlled coordinate."""
+    units = [plant.coordinates[c] for c in plant.controlled_names]
+    return vector("_target_error", plant.controlled_names, units)
+
+
+def integral_signal(plant: Plant, name: str) -> Signal:
+    """Integral of the error of every controlled coordinate, under the given name."""
+    units = [f"{plant.coordinates[c]} s" for c in plant.controlled_names]
+    return vector(name, plant.controlled_names, units)
+
+
+def error_chains(plant: Plant, error: Expression) -> list[list[Expression]]:
+    """Per controlled coordinate: [e, e', ...] below its order."""
+    chains = []
+    for k in plant.controlled_indices:
+        name, order = plant.names[k], plant.orders[k]
+        chains.append([error[plant.state.elements.index(name + "'" * s)] for s in range(order)])
+    return chains

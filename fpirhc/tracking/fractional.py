@@ -1,0 +1,157 @@
+"""Power-law decay of the tracking error by a derivative of fractional order, for any relative order.
+
+With e = q^N - q, e_int its integral and S = (d/dt + rate)^n e_int the exponential law prescribes S' = -rate S. This one prescribes
+Caputo's derivative of order beta instead,
+
+    D^beta S = -rate^beta S,     so that     S(t) = S_0 E_beta(-(rate t)^beta)
+
+with the Mittag-Leffler function E_beta: faster than exponential at first and slower later (like t^-beta) for beta < 1, the
+exponential for beta = 1, a damped oscillation for beta > 1, where Caputo's derivative also needs S'(0), taken as zero. In control
+cycles it is the sum of Gruenwald and Letnikov over the last L cycles, solved for the S of the next cycle,
+
+    sum_{j=0}^{L} w_j (S - S_0)_{k+1-j} = -(rate period)^beta S_{k+1},     w_0 = 1,  w_j = w_{j-1} (1 - (beta + 1) / j),
+    q^(n),Des = q^(n),N + sum_{s<n} C(n, s) rate^(n-s) e^(s) - (S_{k+1} - S_k) / period.
+
+What it costs: L multiplications and L remembered numbers per coordinate in every cycle, L = memory / period. What it asks of the
+loop: for beta < 1 a change of the measured S is answered with the gain (1 - beta) / period in the very next cycle, many times
+`rate`, and the first desired response is large. So a constant response error h leaves S = period^(1-beta) h / rate^beta, less than
+the h / rate of the exponential law, while measurement noise and dead time weigh more; for beta > 1 it is the other way round.
+
+References: I. Podlubny, Fractional Differential Equations, Academic Press 1999, ch. 2 and 7 (sum, short memory).
+D. Matignon, Stability results for fractional differential equations, CESA 1996 (stable for beta < 2).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import InvalidValue
+from fpirhc.plant import Plant
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.tracking.base import Tracking
+from fpirhc.tracking.error import error_chains, error_signal, integral_delay, integral_signal, integral_update
+
+MOST = 20_000  # cycles of memory: what is remembered is static
+_REACH = 20.0  # memory x rate by default
+
+
+@dataclass(frozen=True)
+class Fractional(Tracking):
+    """S decays as the Mittag-Leffler function E_beta(-(rate t)^beta).
+
+    The integral of the error begins at zero with a run; S_0 is what S is then. Beyond the memory S stops decaying, at about
+    S_0 / (1 + gamma(1 - beta) (rate memory)^beta); that offset is one of e_int, and e itself goes on to zero.
+
+    Parameters:
+        rate: Lambda, 1/s.
+        order: beta, between 0 and 2, both excluded.
+        memory: how far back the sum reaches, s; at least 1 / rate. By default 20 / rate.
+
+    Raises:
+        InvalidValue: a rate, order or memory outside its range; when the loop is built, a memory of more than 20 000 cycles.
+    """
+
+    rate: float
+    order: float
+    memory: float | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.rate) and self.rate > 0):
+            raise InvalidValue(f"Fractional(rate={self.rate!r}): expected a positive number, 1/s")
+        if not 0 < self.order < 2:
+            raise InvalidValue(
+                f"Fractional(order={self.order!r}): expected a number between 0 and 2; below 1 decays without overshoot, "
+                "and from 2 on the error does not decay"
+            )
+        if self.memory is not None and not 1 <= self.rate * self.memory < math.inf:
+            raise InvalidValue(
+                f"Fractional(memory={self.memory!r}): expected at least 1 / rate = {1 / self.rate:.4g} s; 20 / rate is usual"
+            )
+
+    def cycles(self, period: float) -> int:
+        """Length L of the memory in control cycles.
+
+        Raises:
+            InvalidValue: more than 20 000.
+        """
+        memory = _REACH / self.rate if self.memory is None else self.memory
+        cycles = math.ceil(memory / period - 1e-9)
+        if cycles > MOST:
+            raise InvalidValue(
+                f"Fractional: a memory of {memory:g} s is {cycles} control cycles of {period:g} s, more than {MOST}; "
+                f"give memory={MOST * period:g} or less"
+            )
+        return max(cycles, 1)
+
+    def weights(self, cycles: int) -> np.ndarray:
+        """Weights w_1 ... w_L of the past, shape (cycles,)."""
+        return np.cumprod(1 - (self.order + 1) / np.arange(1, cycles + 1))
+
+    def gains(self, order: int) -> tuple[float, ...]:
+        """Gains of (e_int, e, e', ...) in S below its highest derivative, for relative order n."""
+        return tuple(math.comb(order, s) * self.rate ** (order - s) for s in range(order))
+
+    def law(self, plant: Plant, period: float) -> Block:
+        """Block (state, target, nominal, started, integral) -> (error to the target, desired, integral in use)."""
+        cycles, size = self.cycles(period), len(plant.controlled_names)
+        past = tuple(f"{c}@{j}" for c in plant.controlled_names for j in range(1, cycles + 1))
+        memory = Layout((Signal("decay_past", past), Signal("decay_first", plant.controlled_names)))
+        reads = (
+            plant.state,
+            Signal("_target", plant.state.elements, plant.state.units),
+            plant.response_signal("nominal"),
+            scalar("started"),
+            integral_signal(plant, "_integral_before"),
+        )
+        writes = (error_signal(plant), plant.response_signal("desired"), integral_signal(plant, "_integral_used"))
+        weights, stiffness = ca.DM(self.weights(cycles)), (self.rate * period) ** self.order
+
+        def step(s: Any) -> dict[str, Expression]:
+            errors = error_chains(plant, s._target - s.state)
+            running = s.started > 0.5
+            used = ca.if_else(running, s._integral_before, 0)
+            decaying, drift = self._decaying(used, errors)
+            first = ca.if_else(running, s.decay_first, decaying)
+            begun = ca.if_else(running, s.decay_past, 0)
+            kept = [_pushed(begun[cycles * k : cycles * (k + 1)], decaying[k] - first[k]) for k in range(size)]
+            # One product each, so that a long memory stays a short loop in generated code.
+            summed = ca.vertcat(*(ca.dot(weights, queue) for queue in kept))
+            following = -(summed + stiffness * first) / (1 + stiffness)
+            return {
+                "_target_error": ca.vertcat(*(chain[0] for chain in errors)),
+                "desired": s.nominal + drift - (following - (decaying - first)) / period,
+                "_integral_used": used,
+                "decay_past_next": ca.vertcat(*kept),
+                "decay_first_next": first,
+            }
+
+        return Block("tracking", Layout(reads), Layout(writes), step, memory, opaque=True)
+
+    def update(self, plant: Plant, period: float) -> Block:
+        """Block that integrates the error, except while the command is clipped."""
+        return integral_update(plant, period)
+
+    def delays(self, plant: Plant) -> tuple[Delay, ...]:
+        """The integral of the error is remembered; what else is, the law keeps itself."""
+        return integral_delay(plant)
+
+    def _decaying(self, integral: Expression, errors: list[list[Expression]]) -> tuple[Expression, Expression]:
+        """S, and its derivative without e^(n)."""
+        decaying, drift = [], []
+        for k, chain in enumerate(errors):
+            gains = self.gains(len(chain))
+            decaying.append(chain[-1] + sum(g * e for g, e in zip(gains, [integral[k], *chain], strict=False)))
+            drift.append(sum(g * e for g, e in zip(gains, chain, strict=True)))
+        return ca.vertcat(*decaying), ca.vertcat(*drift)
+
+
+def _pushed(queue: Expression, newest: Expression) -> Expression:
+    """The queue with a newest entry and without its oldest."""
+    # Not an empty slice: CasADi's [:0] of one entry is that entry.
+    return ca.vertcat(newest, queue[:-1]) if queue.numel() > 1 else newest

@@ -1,0 +1,171 @@
+"""The tracking law of fractional order: Mittag-Leffler decay, its weights and memory, what a response error leaves."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from plants import chain
+
+import fpirhc as fp
+from fpirhc.controllers.base import compose_controller
+from fpirhc.errors import InvalidValue
+
+
+def problem(order=1, *, period=1e-3, duration=2.002, **settings):
+    """A chain of integrators that is to stand still, from an error of 1 m."""
+    given = {"start": {"y": -1.0}, "reference": fp.Trajectory(lambda t: {"y": 0 * t}), **settings}
+    return fp.Problem(plant=chain(order), period=period, duration=duration, **given)
+
+
+def run(task, tracking, *, compiled=False):
+    return fp.simulate(task, fp.ComputedTorque(tracking), seed=0, compiled=compiled)
+
+
+def decaying(found, order, rate):
+    """S = (d/dt + rate)^n e_int of every cycle, from the logged state and integral."""
+    integral = np.concatenate([[0.0], found["integral.y"][:-1]])
+    chain_of_errors = [integral, *(-found["state"].T)]
+    return sum(math.comb(order, s) * rate ** (order - s) * chain_of_errors[s] for s in range(order + 1))
+
+
+def mittag_leffler(order, x):
+    """E_order(-x) by its power series, for x small enough that nothing cancels."""
+    return sum((-x) ** k / math.gamma(order * k + 1) for k in range(int(150 / order)))
+
+
+def test_series_is_the_exponential_and_the_cosine():
+    """E_1(-x) = exp(-x) and E_2(-x^2) = cos x: the yardstick of the tests below."""
+    assert mittag_leffler(1.0, 2.0) == pytest.approx(math.exp(-2), rel=1e-12)
+    assert mittag_leffler(2.0, 4.0) == pytest.approx(math.cos(2), rel=1e-12)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.parametrize(("beta", "after"), [(0.6, 0.300584), (0.8, 0.223547), (1.0, 0.135335)])
+def test_closed_loop_follows_mittag_leffler(order, beta, after):
+    """S(t) / S_0 = E_beta(-(rate t)^beta) on the ideal plant, whatever its relative order; `after` is E at rate t = 2."""
+    found = run(problem(order), fp.Fractional(rate=1.0, order=beta, memory=2.002))
+    surface = decaying(found, order, 1.0)
+    assert surface[2000] / surface[0] == pytest.approx(after, abs=1e-3)
+    late = np.arange(100, 2001, 100)
+    expected = [mittag_leffler(beta, (k * 1e-3) ** beta) for k in late]
+    np.testing.assert_allclose(surface[late] / surface[0], expected, atol=1e-3)
+
+
+def test_order_above_one_overshoots():
+    """For beta = 1.5 S swings through zero, as E_1.5 does; S'(0) is zero."""
+    found = run(problem(duration=4.0), fp.Fractional(rate=1.0, order=1.5, memory=4.0))
+    surface = decaying(found, 1, 1.0)
+    late = np.arange(100, 4000, 100)
+    expected = [mittag_leffler(1.5, (k * 1e-3) ** 1.5) for k in late]
+    np.testing.assert_allclose(surface[late] / surface[0], expected, atol=1e-3)
+    assert min(expected) < -0.1
+    assert surface[1] == pytest.approx(surface[0], rel=1e-4)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_order_one_is_the_exponential_law(order):
+    """With beta = 1 the errors differ from the exponential law's by the order of the period: half of it, half the difference."""
+
+    def difference(period):
+        task = problem(order, period=period, duration=1.5)
+        one = run(task, fp.Fractional(rate=4.0, order=1.0, memory=0.25))
+        other = run(task, fp.Exponential(rate=4.0, bumpless=False))
+        return np.abs(one["error.y"] - other["error.y"]).max()
+
+    assert difference(1e-3) < 4e-3
+    assert difference(5e-4) == pytest.approx(difference(1e-3) / 2, rel=0.05)
+
+
+@pytest.mark.parametrize("beta", [0.7, 1.0, 1.3])
+def test_what_a_response_error_leaves(beta):
+    """A constant response error h leaves S where the sum over the past equals its push: near period^(1-beta) h / rate^beta."""
+    rate, period, h = 6.0, 5e-3, 0.1
+    law = fp.Fractional(rate, beta)
+    task = problem(
+        period=period, duration=12.0, start={"y": 0.0}, disturbances={"u": fp.Step(at=0.0, size=h)}, measure_from=6.0
+    )
+    left = decaying(run(task, law), 1, rate)[-1]
+    stiffness = (rate * period) ** beta
+    rest = 1 + law.weights(law.cycles(period)).sum()
+    # In equilibrium every past S is the same, and each cycle adds (1 + stiffness) of the push, period h, to the implicit sum.
+    assert left == pytest.approx(-period * h * (1 + stiffness) / (stiffness + rest), rel=0.02)
+    assert left == pytest.approx(-(period ** (1 - beta)) * h / rate**beta, rel=0.15)
+
+
+def test_weights_are_binomials():
+    """w_j = (-1)^j C(beta, j), here for one half and for one."""
+    assert fp.Fractional(1.0, 0.5).weights(4) == pytest.approx([-1 / 2, -1 / 8, -1 / 16, -5 / 128])
+    assert fp.Fractional(1.0, 1.0).weights(4) == pytest.approx([-1, 0, 0, 0])
+
+
+def test_memory_is_static_and_bounded():
+    """20 / rate by default, one number per cycle and coordinate, and never more than 20 000 cycles."""
+    law = fp.Fractional(rate=4.0, order=0.8)
+    controller = compose_controller(problem(2), fp.ComputedTorque(law))
+    assert law.cycles(1e-3) == 5000
+    assert controller.memory["decay_past"].size == 5000
+    assert fp.Fractional(rate=1.0, order=0.8).cycles(1e-3) == 20_000
+    with pytest.raises(InvalidValue, match="give memory=10 or less"):
+        fp.Fractional(rate=1.0, order=0.8).cycles(5e-4)
+
+
+def test_shortest_memory_runs():
+    """A memory of one cycle is one number."""
+    found = run(problem(duration=0.2, period=0.01), fp.Fractional(rate=100.0, order=0.9, memory=0.01))
+    assert np.isfinite(found["desired"]).all()
+
+
+def test_a_fresh_start_forgets():
+    """Where `started` is zero the past does not count: the command is that of a first cycle."""
+    task = problem(2, duration=0.1)
+    stepper = fp.Stepper(task, fp.ComputedTorque(fp.Fractional(6.0, 0.7, memory=0.2)), compiled=False)
+    state = np.array([-1.0, 0.3])
+    first, memory = stepper.step(0.0, state, np.zeros(1), stepper.start())
+    for k in range(1, 5):
+        running, memory = stepper.step(k * 1e-3, state + 0.1 * k, np.zeros(1), memory)
+    memory[stepper.memory.slice("started")] = 0.0
+    again, after = stepper.step(5e-3, state, np.zeros(1), memory)
+    assert again == first
+    assert running != first
+    assert not after[stepper.memory.slice("decay_past")].any()
+
+
+def test_compiled_and_virtual_machine_agree():
+    """Two coordinates of the seed problem, with deformation: the same signals to rounding."""
+    task = replace(fp.load_problem("two_mass").problem, duration=0.3, measure_from=0.1)
+    controller = fp.ComputedTorque(fp.Fractional(6.0, 0.7, memory=0.2), fp.Sigmoid(gain=-0.5, scale=20.0))
+    in_vm, in_c = (fp.simulate(task, controller, seed=0, compiled=c) for c in (False, True))
+    assert in_c.compiled
+    np.testing.assert_allclose(in_c["error"], in_vm["error"], rtol=1e-9, atol=1e-12)
+
+
+def test_deformation_serves_the_law():
+    """On the seed problem with its wrong model beta = 0.7 leaves less error than the exponential law of the same rate."""
+    task = replace(fp.load_problem("two_mass").problem, duration=3.0, measure_from=2.0)
+    sigmoid = fp.Sigmoid(gain=-0.5, scale=20.0)
+    rms = [
+        np.sqrt(np.mean(fp.simulate(task, fp.ComputedTorque(law, sigmoid), seed=0)["error"][2000:] ** 2))
+        for law in (fp.Exponential(6.0), fp.Fractional(6.0, 0.7, memory=2.0))
+    ]
+    assert rms[1] < 0.4 * rms[0]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"rate": 0.0, "order": 0.5},
+        {"rate": math.inf, "order": 0.5},
+        {"rate": 1.0, "order": 0.0},
+        {"rate": 1.0, "order": 2.0},
+        {"rate": 1.0, "order": math.nan},
+        {"rate": 1.0, "order": 0.5, "memory": 0.5},
+        {"rate": 1.0, "order": 0.5, "memory": math.inf},
+    ],
+)
+def test_bad_settings_are_refused(settings):
+    """No decay from order 2 on, and no memory shorter than the decay it is to hold."""
+    with pytest.raises(InvalidValue, match="expected"):
+        fp.Fractional(**settings)
