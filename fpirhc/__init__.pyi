@@ -9,6 +9,8 @@ from .controllers.predicted import ByDesired, ByModel, Predicted
 from .controllers.receding_horizon import RecedingHorizon
 from .dead_time import DeadTime
 from .deformation.affine import Affine
+from .deformation.blended import Blended
+from .deformation.damped import Damped
 from .deformation.delayed import Increment, Paired
 from .deformation.guarded import Guarded
 from .deformation.identity import Identity
@@ -52,12 +54,14 @@ from .tracking.fractional import Fractional
 __all__ = [
     "Affine",
     "Anderson",
+    "Blended",
     "ByDesired",
     "ByModel",
     "Certificate",
     "Comparison",
     "ComputedTorque",
     "Cvodes",
+    "Damped",
     "DeadTime",
     "DelayWatched",
     "Euler",

@@ -2,6 +2,8 @@
 
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.blended import Blended
+from fpirhc.deformation.damped import Damped
 from fpirhc.deformation.delayed import Increment, Paired
 from fpirhc.deformation.guarded import Guarded
 from fpirhc.deformation.identity import Identity
@@ -15,6 +17,8 @@ from fpirhc.deformation.wrapper import Wrapper
 
 __all__ = [
     "Affine",
+    "Blended",
+    "Damped",
     "Deformation",
     "DelayWatched",
     "Guarded",

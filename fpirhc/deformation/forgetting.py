@@ -1,4 +1,4 @@
-"""The exponential mean of signs that the tuner and the guard listen to."""
+"""What the wrappers that adjust a gain listen to: the mean of signs, and errors that alternate and grow."""
 
 from __future__ import annotations
 
@@ -13,3 +13,9 @@ def forget(before: Expression, sign: Expression) -> Expression:
     """Return (1 - eta) before + eta sign; what is not a number is forgotten."""
     mean = (1 - FORGETTING) * before + FORGETTING * sign
     return ca.if_else(ca.fabs(mean) <= 1, mean, 0)
+
+
+def growing_in_a_row(count: Expression, error: Expression, before: Expression) -> Expression:
+    """Return how many errors in a row alternated in sign and grew; zero when the newest did not."""
+    grows = ca.logic_and(ca.dot(error, before) < 0, ca.sumsqr(error) > ca.sumsqr(before))
+    return ca.if_else(grows, count + 1, 0)

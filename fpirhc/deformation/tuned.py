@@ -20,7 +20,7 @@ from typing import Self
 
 import casadi as ca
 
-from fpirhc.deformation.forgetting import forget
+from fpirhc.deformation.forgetting import forget, growing_in_a_row
 from fpirhc.deformation.wrapper import Wrapper, of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -75,10 +75,8 @@ class Tuned(Wrapper):
         inner = of_map(self, memory, request.numel())
         wanted, following = self.map.step(request, response, desired, inner)
         factor, error = memory["tuner_factor"], response - desired
-        product = ca.dot(error, memory["tuner_error"])
-        seen = forget(memory["tuner_sign"], ca.sign(product))
-        grows = ca.logic_and(product < 0, ca.sumsqr(error) > ca.sumsqr(memory["tuner_error"]))
-        growing = ca.if_else(grows, memory["tuner_growing"] + 1, 0)
+        seen = forget(memory["tuner_sign"], ca.sign(ca.dot(error, memory["tuner_error"])))
+        growing = growing_in_a_row(memory["tuner_growing"], error, memory["tuner_error"])
         diverges = growing > _IN_A_ROW - 0.5
         resting = memory["tuner_rest"] > 0.5
         largest = self.largest_gain / self.map.effective_gain()
