@@ -2,11 +2,15 @@
 
 from .contraction import assess_gain, check_gain, response_jacobian, spectrum_over_box, spectrum_over_run
 from .controllers.computed_torque import ComputedTorque
+from .controllers.floquet import Floquet, floquet_radius
 from .controllers.informed import Informed
 from .controllers.nominal import OpenPlan, Restart, RestartAndTrack
 from .controllers.on_failure import Feedforward, HoldPlan, StopRun
 from .controllers.predicted import ByDesired, ByModel, Predicted
 from .controllers.receding_horizon import RecedingHorizon
+from .controllers.schedules import ByError, ByLookAhead, FixedSchedule, Periodic
+from .controllers.slot import Slot
+from .controllers.slotted import Slotted
 from .dead_time import DeadTime
 from .deformation.affine import Affine
 from .deformation.blended import Blended
@@ -39,6 +43,7 @@ from .optimisers.reduced_gradient import ReducedGradient
 from .plant import Parameter, Plant, structural_order
 from .problem import Problem
 from .reference import Table, Trajectory
+from .relative_order import OutputChain, output_chain
 from .report.html import write_report
 from .run import Run, load_run
 from .simulation import simulate
@@ -56,6 +61,8 @@ __all__ = [
     "Anderson",
     "Blended",
     "ByDesired",
+    "ByError",
+    "ByLookAhead",
     "ByModel",
     "Certificate",
     "Comparison",
@@ -70,6 +77,8 @@ __all__ = [
     "Fatrop",
     "Feedforward",
     "FixedPoint",
+    "FixedSchedule",
+    "Floquet",
     "Formula",
     "FpirhcError",
     "Fractional",
@@ -90,9 +99,11 @@ __all__ = [
     "Noise",
     "OpenPlan",
     "Osqp",
+    "OutputChain",
     "Paired",
     "Parameter",
     "Path",
+    "Periodic",
     "Plan",
     "Plant",
     "Predicted",
@@ -113,6 +124,8 @@ __all__ = [
     "SequentialQuadratic",
     "Sigmoid",
     "Sine",
+    "Slot",
+    "Slotted",
     "Status",
     "Step",
     "Stepper",
@@ -125,9 +138,11 @@ __all__ = [
     "check_deformation",
     "check_gain",
     "compare",
+    "floquet_radius",
     "load_problem",
     "load_run",
     "measure",
+    "output_chain",
     "response_jacobian",
     "signed_power",
     "simulate",

@@ -24,7 +24,7 @@ def judgements(problem: Problem, controller: Controller, layout: Layout, log: np
     if problem.cost is not None and problem.horizon is not None:
         found.append(_costs(problem, layout, log))
     gain = controller.adaptive.effective_gain()
-    if gain != 0 and log.shape[0]:
+    if gain != 0 and log.shape[0] and controller.response(problem) is None:
         plant = problem.plant
         states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]
         factors = contraction_along(plant, states, deformed, gain, approximate=controller.parameters(plant))

@@ -12,12 +12,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, like, prepared
+from fpirhc.controllers.base import Controller, Response, error_signal, like, prepared
 from fpirhc.dead_time import delay_block
 from fpirhc.plant import Plant
 from fpirhc.problem import Problem
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 
 def close_loop(problem: Problem, controller: Controller) -> Composite:
@@ -29,7 +29,9 @@ def close_loop(problem: Problem, controller: Controller) -> Composite:
     chosen = prepared(problem, controller)
     blocks, delays = chosen.blocks(problem)
     disturbed = disturbance_signals(problem)
-    seeing = _sense_blocks(problem, predicts="state_ahead" in [n for b in blocks for n in b.writes.names])
+    seeing = _sense_blocks(
+        problem, chosen.response(problem), predicts="state_ahead" in [n for b in blocks for n in b.writes.names]
+    )
     around = [_clock_block(problem.period), *seeing, *blocks, *_actuate(problem, disturbed)]
     return compose("loop", Layout(disturbed), around, [*_plant_delays(problem, chosen), *delays])
 
@@ -70,18 +72,19 @@ def _clock_block(period: float) -> Block:
     return Block("clock", Layout(), Layout((scalar("time", "s"),)), step, Layout((scalar("cycle"),)))
 
 
-def _sense_blocks(problem: Problem, *, predicts: bool) -> list[Block]:
+def _sense_blocks(problem: Problem, asked: Response | None, *, predicts: bool) -> list[Block]:
     """The plant's state and response as the controller gets them; with dead time also the true ones and the true error."""
     plant, behind = problem.plant, problem.dead_time.measurement / problem.period
+    response = asked or _own_response(plant)
     if not behind:
-        sense = [_sense_block(plant, plant.state, plant.response_signal("realised"))]
+        sense = [_sense_block(plant, plant.state, response)]
         return [*sense, _truth_block(problem, plant.state)] if predicts or problem.dead_time.inputs else sense
-    start = tuple(float(v) for v in problem.start_state)
-    resting = plant.controlled_response_function(start, np.zeros(plant.input.size), plant.exact).full().ravel()
-    true_state, true_response = like(plant.state, "plant_state"), plant.response_signal("plant_realised")
+    start, calm = tuple(float(v) for v in problem.start_state), np.zeros(len(plant.names))
+    resting = response.function(start, np.zeros(plant.input.size), plant.exact, calm).full().ravel()
+    true_state, true_response = like(plant.state, "plant_state"), like(response.signal, "plant_realised")
     seen = Signal("realised", true_response.elements, true_response.units, tuple(map(float, resting)))
     return [
-        _sense_block(plant, true_state, true_response),
+        _sense_block(plant, true_state, Response(true_response, response.function)),
         _truth_block(problem, true_state),
         delay_block("see_state", true_state, replace(plant.state, start=start), [behind] * plant.state.size),
         delay_block("see_response", true_response, seen, [behind] * seen.size),
@@ -89,11 +92,10 @@ def _sense_blocks(problem: Problem, *, predicts: bool) -> list[Block]:
 
 
 def _truth_block(problem: Problem, state: Signal) -> Block:
-    """Block (time, true state) -> true error of the controlled coordinates, by which a run is judged."""
+    """Block (time, true state) -> true error of the judged coordinates, by which a run is judged."""
     plant, function = problem.plant, problem.reference.function(problem.plant)
-    places = [plant.state.elements.index(c) for c in plant.controlled_names]
-    units = [plant.coordinates[c] for c in plant.controlled_names]
-    writes = Layout((vector("true_error", plant.controlled_names, units),))
+    places = [plant.state.elements.index(c) for c in problem.judged_names]
+    writes = Layout((error_signal(problem, "true_error"),))
 
     def step(s: Any) -> dict[str, Expression]:
         return {"true_error": (function(s.time)[0] - getattr(s, state.name))[places]}
@@ -101,13 +103,20 @@ def _truth_block(problem: Problem, state: Signal) -> Block:
     return Block("truth", Layout((scalar("time", "s"), state)), writes, step, opaque=problem.reference.opaque)
 
 
-def _sense_block(plant: Plant, state: Signal, realised: Signal) -> Block:
+def _own_response(plant: Plant) -> Response:
+    """The response of the controlled coordinates."""
+    x, u, p = plant._symbols()
+    w = ca.SX.sym("w", len(plant.names))
+    found = plant.controlled_response_function(x, u, p) + w[list(plant.controlled_indices)]
+    return Response(plant.response_signal("realised"), ca.Function("fpirhc_realised", [x, u, p, w], [found]))
+
+
+def _sense_block(plant: Plant, state: Signal, response: Response) -> Block:
     """What the controller measures: the true state, and the true response just before this cycle's command.
 
     The response is computed here and not at the end of the last cycle, because it shares its costly terms with the first
     Runge-Kutta evaluation of this cycle.
     """
-    response = plant.controlled_response_function
     reads = (
         like(plant.state, "_state_before"),
         like(plant.input, "_acting_before"),
@@ -116,11 +125,10 @@ def _sense_block(plant: Plant, state: Signal, realised: Signal) -> Block:
     )
 
     def step(s: Any) -> dict[str, Expression]:
-        forcing = s._forcing_before[list(plant.controlled_indices)]
-        found = response(s._state_before, s._acting_before, s._exact) + forcing
-        return {state.name: s._state_before, realised.name: found}
+        found = response.function(s._state_before, s._acting_before, s._exact, s._forcing_before)
+        return {state.name: s._state_before, response.signal.name: found}
 
-    return Block("sense", Layout(reads), Layout((state, realised)), step)
+    return Block("sense", Layout(reads), Layout((state, response.signal)), step)
 
 
 def _actuate(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:

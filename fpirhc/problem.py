@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -35,6 +35,7 @@ class Problem:
         dead_time: of inputs and measurement; what a controller believes of it is the controller's.
         integrator: how the simulated plant moves within a cycle.
         measure_from: metrics are taken from this time on, s (the transient before it is left out).
+        judged: coordinates whose errors are logged and measured; None: the plant's controlled ones.
 
     Raises:
         InvalidProblem: all mistakes together.
@@ -52,12 +53,14 @@ class Problem:
     cost: Cost | None = None
     integrator: Integrator = field(default_factory=RungeKutta4)
     measure_from: float = 0.0
+    judged: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("problem")
         _check_times(self, mistakes)
         _check_start(self, mistakes)
         plant = self.plant
+        mistakes.unknown("judged: coordinate", self.judged or (), plant.coordinates)
         mistakes.unknown("disturbances: input or coordinate", self.disturbances, [*plant.inputs, *plant.coordinates])
         checks = (
             lambda: self.limits.check(plant),
@@ -77,6 +80,11 @@ class Problem:
     def cycles(self) -> int:
         """Number of control cycles in a run."""
         return round(self.duration / self.period)
+
+    @cached_property
+    def judged_names(self) -> tuple[str, ...]:
+        """Coordinates whose errors are logged and measured."""
+        return self.plant.controlled_names if self.judged is None else tuple(self.judged)
 
     @cached_property
     def start_state(self) -> np.ndarray:

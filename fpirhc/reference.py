@@ -47,6 +47,13 @@ class Reference(ABC):
         results = [ca.densify(ca.vertcat(*state)), ca.densify(ca.vertcat(*response))]
         return ca.Function("fpirhc_reference", [t], results, ["t"], ["state", "response"])
 
+    def ladder(self, coordinate: str, order: int) -> ca.Function:
+        """Function t -> the coordinate's nominal value and its derivatives up to `order`, shape (order + 1,)."""
+        kind: Any = ca.MX if self.opaque else ca.SX
+        t = kind.sym("t")
+        values = _differentiate(kind(self.coordinates(t)[coordinate]), t, order)
+        return ca.Function("fpirhc_ladder", [t], [ca.densify(ca.vertcat(*values))])
+
 
 @dataclass(frozen=True, eq=False)
 class Trajectory(Reference):

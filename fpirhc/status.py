@@ -26,8 +26,8 @@ _REMEDIES = {
     "allow more iterations, loosen the tolerance, or scale the cost.",
     Status.INFEASIBLE: "the plan violates a bound or the dynamics: check the initial state against the "
     "limits, soften state limits, or lengthen the horizon.",
-    Status.HELD: "the optimiser failed and the stated policy replaced its plan: see the cycles counted "
-    "here and the solve residuals around them.",
+    Status.HELD: "the optimiser failed and the stated policy replaced its plan, or a slot's input had too little "
+    "effect and the command was held: see the cycles counted here and the signals around them.",
     Status.NON_FINITE: "a signal became NaN or infinite: look at the first such signal of the run; the "
     "model is outside its domain or the loop diverged.",
 }

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -28,6 +29,14 @@ from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 
 FINITE = 1e300  # |v| <= FINITE is false for NaN and infinity, and CasADi does not simplify it away
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """A response that the plant answers with: the signal 'realised' and its Function (state, input, parameters, forcing)."""
+
+    signal: Signal
+    function: ca.Function
 
 
 class Controller(ABC):
@@ -50,6 +59,14 @@ class Controller(ABC):
         """Return the controller with every automatic setting replaced by its value for this problem."""
         return self
 
+    def response(self, problem: Problem) -> Response | None:  # noqa: ARG002
+        """What the controller reads as 'realised', where that is not the response of the plant's controlled coordinates."""
+        return None
+
+    def notes(self, problem: Problem) -> tuple[str, ...]:  # noqa: ARG002
+        """Sentences about the controller on this problem for a reader of results."""
+        return ()
+
     def check(self, problem: Problem) -> None:  # noqa: B027 -- most controllers fit every problem
         """Raise if the controller cannot serve the problem."""
 
@@ -62,28 +79,31 @@ def prepared(problem: Problem, controller: Controller) -> Controller:
     """
     chosen = controller.resolved(problem)
     chosen.check(problem)
-    check_gain_sign(problem, chosen.adaptive)
+    if chosen.response(problem) is None:
+        check_gain_sign(problem, chosen.adaptive)
     return chosen
 
 
-def controller_reads(plant: Plant) -> Layout:
-    """What every controller is given each cycle."""
-    return Layout((scalar("time", "s"), plant.state, plant.response_signal("realised"), plant.parameter))
+def controller_reads(problem: Problem, controller: Controller) -> Layout:
+    """What a controller is given each cycle."""
+    plant, response = problem.plant, controller.response(problem)
+    realised = response.signal if response else plant.response_signal("realised")
+    return Layout((scalar("time", "s"), plant.state, realised, plant.parameter))
 
 
 def compose_controller(problem: Problem, controller: Controller) -> Composite:
     """Return the controller as one step: (memory, time, state, realised, parameters) -> (memory, trace, command)."""
-    blocks, delays = prepared(problem, controller).blocks(problem)
-    return compose("controller", controller_reads(problem.plant), blocks, delays, outputs=("command",))
+    chosen = prepared(problem, controller)
+    blocks, delays = chosen.blocks(problem)
+    return compose("controller", controller_reads(problem, chosen), blocks, delays, outputs=("command",))
 
 
 def reference_block(problem: Problem) -> Block:
-    """Block (time, state) -> (reference state, its response, error) of the controlled coordinates."""
+    """Block (time, state) -> (reference state, response of the controlled coordinates, error of the judged ones)."""
     plant = problem.plant
     function = problem.reference.function(plant)
     chosen = list(plant.controlled_indices)
-    places = [plant.state.elements.index(c) for c in plant.controlled_names]
-    units = [plant.coordinates[c] for c in plant.controlled_names]
+    places = [plant.state.elements.index(c) for c in problem.judged_names]
 
     def step(s: Any) -> dict[str, Expression]:
         state, response = function(s.time)
@@ -93,9 +113,15 @@ def reference_block(problem: Problem) -> Block:
     writes = (
         like(plant.state, "reference"),
         plant.response_signal("_reference_response"),
-        vector("error", plant.controlled_names, units),
+        error_signal(problem, "error"),
     )
     return Block("reference", reads, Layout(writes), step, opaque=problem.reference.opaque)
+
+
+def error_signal(problem: Problem, name: str) -> Signal:
+    """Return a signal that holds an error of every judged coordinate."""
+    units = [problem.plant.coordinates[c] for c in problem.judged_names]
+    return vector(name, problem.judged_names, units)
 
 
 def rename(name: str, source: Signal, target: Signal) -> Block:
@@ -167,7 +193,7 @@ def _limit_block(problem: Problem) -> Block:
         # Finiteness is asked before the clamp: fmin and fmax turn NaN into a full-scale command.
         finite = ca.mmin(ca.fabs(s.requested) <= FINITE)
         safe = ca.if_else(finite, s.requested, s._command_before)
-        command = _clip(safe, lower, upper)
+        command = clip(safe, lower, upper)
         clipped_request = meant(s.state, command, safe, s._deformed_wanted, s.parameters)
         return {
             "command": command,
@@ -194,7 +220,7 @@ def _meaning(plant: Plant) -> ca.Function:
     return ca.Function("fpirhc_meaning", [x, u, wanted, r, p], [ca.densify(means)])
 
 
-def _clip(u: Expression, lower: np.ndarray, upper: np.ndarray) -> Expression:
+def clip(u: Expression, lower: np.ndarray, upper: np.ndarray) -> Expression:
     """Clip entry by entry; a free side costs nothing."""
     entries = []
     for k, (low, high) in enumerate(zip(lower, upper, strict=True)):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fpirhc.controllers.base import Controller
+from fpirhc.controllers.base import Controller, Response
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant import Plant
 from fpirhc.problem import Problem
@@ -31,6 +31,14 @@ class Informed(Controller):
     def resolved(self, problem: Problem) -> Informed:
         """Return the wrapped controller resolved."""
         return replace(self, controller=self.controller.resolved(problem))
+
+    def response(self, problem: Problem) -> Response | None:
+        """The wrapped controller's."""
+        return self.controller.response(problem)
+
+    def notes(self, problem: Problem) -> tuple[str, ...]:
+        """The wrapped controller's."""
+        return self.controller.notes(problem)
 
     def check(self, problem: Problem) -> None:
         """Raise what the wrapped controller raises."""

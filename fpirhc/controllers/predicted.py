@@ -21,7 +21,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, compose_controller, like
+from fpirhc.controllers.base import Controller, Response, compose_controller, like
 from fpirhc.dead_time import MOST
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
@@ -169,6 +169,14 @@ class Predicted(Controller):
     def resolved(self, problem: Problem) -> Predicted:
         """Return the wrapped controller resolved."""
         return replace(self, controller=self.controller.resolved(problem))
+
+    def response(self, problem: Problem) -> Response | None:
+        """The wrapped controller's."""
+        return self.controller.response(problem)
+
+    def notes(self, problem: Problem) -> tuple[str, ...]:
+        """The wrapped controller's."""
+        return self.controller.notes(problem)
 
     def check(self, problem: Problem) -> None:
         """Raise what the wrapped controller raises, and if the plant or the dead time does not fit.

@@ -187,7 +187,7 @@ def _entry(
         pair=_pair(chosen, name) if adaptive else None,
         contraction=_contraction(problem, resolved, run) if adaptive else None,
         optimality=measure_optimality(problem, resolved, run, compiled=compiled),
-        notes=_notes(controller, resolved),
+        notes=(*_notes(controller, resolved), *resolved.notes(problem)),
     )
 
 
@@ -201,6 +201,8 @@ def _pair(chosen: Mapping[str, Controller], name: str) -> str | None:
 
 
 def _without_adaptation(settings: Any) -> Any:
+    if isinstance(settings, list):
+        return [_without_adaptation(v) for v in settings]
     if not isinstance(settings, dict):
         return settings
     identity = describe(Identity())
@@ -208,8 +210,8 @@ def _without_adaptation(settings: Any) -> Any:
 
 
 def _contraction(problem: Problem, controller: Controller, run: Run) -> Contraction | None:
-    """Predicted along the run and measured from it; None when the run is too short."""
-    if run.cycles < 10:
+    """Predicted along the run and measured from it; None when the run is too short, or the response not the plant's own."""
+    if run.cycles < 10 or controller.response(problem) is not None:
         return None
     deformation = controller.adaptive
     rows = np.unique(np.linspace(1, run.cycles - 1, 200).astype(int))
