@@ -62,6 +62,15 @@ class Run:
         """Number of cycles that were run."""
         return int(self.log.shape[0])
 
+    def spans(self) -> list[tuple[float, float, int]]:
+        """Time slots as (start in s, end in s, number of the slot); empty where the controller has none."""
+        if "slot" not in self.layout or not self.cycles:
+            return []
+        slots = self["slot"][:, 0].astype(int)
+        starts = [0, *(np.flatnonzero(np.diff(slots)) + 1).tolist()]
+        ends = [*starts[1:], self.cycles]
+        return [(a * self.period, b * self.period, int(slots[a])) for a, b in zip(starts, ends, strict=True)]
+
     def unit(self, column: str) -> str:
         """Unit of one column."""
         return self.layout.units[self.layout.columns.index(column)]

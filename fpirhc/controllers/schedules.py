@@ -84,6 +84,7 @@ class FixedSchedule(Schedule):
 
     def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
         """The longest span of each coordinate."""
+        del problem
         return {n: max((end - start for c, start, end in self.spans if c == n), default=0.0) for n in names}
 
     def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
@@ -158,6 +159,7 @@ class ByError(Schedule):
 
     def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
         """The shortest duration of a slot."""
+        del problem
         return dict.fromkeys(names, self.dwell)
 
     def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
@@ -199,6 +201,7 @@ class ByLookAhead(Schedule):
 
     def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
         """The shortest duration of a slot."""
+        del problem
         return dict.fromkeys(names, self.dwell)
 
     def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:

@@ -24,7 +24,7 @@ from fpirhc.plant import Plant
 from fpirhc.problem import Problem
 from fpirhc.relative_order import OutputChain, output_chain
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.tracking.base import Tracking
 
 
@@ -71,9 +71,9 @@ class Channel:
         """Name of this slot's own copy of a signal."""
         return f"_{name.lstrip('_')}_{self.number}"
 
-    def signal(self, name: str, elements: tuple[str, ...] = (), start: float = 0.0) -> Signal:
-        """This slot's own copy of a signal."""
-        return scalar(self.wire(name), start=start) if not elements else Signal(self.wire(name), elements)
+    def signal(self, name: str, elements: tuple[str, ...] = ()) -> Signal:
+        """A signal of this slot's own: a scalar, or with named elements."""
+        return Signal(self.wire(name), elements)
 
 
 def channel(problem: Problem, slot: Slot, number: int) -> Channel:
@@ -140,8 +140,7 @@ def for_channel(block: Block, one: Channel, shared: Set[str], names: Mapping[str
     reads_begun = [] if not own or begun.name in [s.name for s in reads] else [begun]
 
     def step(s: Any) -> dict[str, Expression]:
-        running = getattr(s, begun.name) > 0.5 if own else None
-        kept = [ca.if_else(running, getattr(s, m.name), ca.DM(m.start_vector())) for m in own]
+        kept = [ca.if_else(getattr(s, begun.name) > 0.5, getattr(s, m.name), ca.DM(m.start_vector())) for m in own]
         given = block.function(*(getattr(s, r.name) for r in reads), *kept)
         values = given if isinstance(given, tuple) else (given,)
         results = [renamed(w).name for w in block.writes.signals] + [f"{m.name}_next" for m in own]

@@ -155,7 +155,7 @@ class Slotted(Controller):
         mistakes.raise_if_any()
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks reference, slots' states, schedule, then per slot tracking, join, deform; invert, limit, judge, tracking update."""
+        """Blocks reference, schedule; per slot tracking, join, deform; then command, judge, tracking updates."""
         channels = self.channels(problem)
         blocks = [_reference_block(problem)]
         blocks += [_state_block(problem, one, self.smallest_gain) for one in channels]

@@ -51,6 +51,7 @@ def _entry(entry: Entry) -> dict[str, Any]:
         "contraction": None
         if contraction is None
         else {"predicted": contraction.predicted, "measured": contraction.measured},
+        "notes": list(entry.notes),
         "stop": entry.run.stop,
         "compiled": entry.run.compiled,
     }

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from fpirhc.studies.open_loop import Solved
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5b4a9c", "#8c6d1f", "#7f7f7f", "#111111")
+BANDS = ("#7f7f7f", "#e69f00", "#56b4e9", "#cc79a7")  # of time slots, drawn pale
 _RESPONSES = {"nominal": "#009e73", "desired": "#0072b2", "deformed": "#e69f00", "realised": "#d55e00"}
 _POINTS = 2000  # drawn per line
 _TALL = 20  # times the median range from which a panel's range is cut, so that one spike does not hide the rest
@@ -48,8 +49,10 @@ def run_figure(run: Run) -> Figure:
         _line(axes[1], run, f"reference.{name}", f"{name} reference", PALETTE[k], "--")
     for k, name in enumerate(run.layout["command"].elements):
         _line(axes[2], run, f"command.{name}", name, PALETTE[k])
-    _responses(axes[3], run, names[0])
-    for axis, what in zip(axes, ("error", "position", "command", f"responses of {names[0]}"), strict=True):
+    first = run.layout["desired"].elements[0]
+    _responses(axes[3], run, first)
+    for axis, what in zip(axes, ("error", "position", "command", f"responses of {first}"), strict=True):
+        _bands(axis, run)
         axis.set_ylabel(what)
         _legend(axis)
     axes[3].set_xlabel("time [s]")
@@ -97,6 +100,8 @@ def pair_figures(plain: Entry, adaptive: Entry) -> dict[str, Figure]:
         axes = figure.subplots(1, 2)
         for axis, entry in zip(axes, (plain, adaptive), strict=True):
             draw(axis, entry.run)
+            if draw is not _draw_phase:
+                _bands(axis, entry.run)
             axis.set_title(entry.name, fontsize=10)
             _legend(axis)
         found[title] = figure
@@ -129,6 +134,8 @@ def headline_figure(comparison: Comparison, plain: Entry, adaptive: Entry) -> Fi
     for column, entry in enumerate((plain, adaptive)):
         _draw_trajectory(axes[0, column], entry.run)
         _draw_error(axes[1, column], entry.run)
+        for row in (0, 1):
+            _bands(axes[row, column], entry.run)
         axes[0, column].set_title(entry.name, fontsize=10)
         axes[0, column].set_xlabel("")
         _legend(axes[0, column])
@@ -145,6 +152,22 @@ def _figure(width: float, height: float, title: str) -> Figure:
     if title:
         figure.suptitle(title, fontsize=11)
     return figure
+
+
+def _bands(axis: Axes, run: Run) -> None:
+    """Time slots as shaded bands, named in the legend."""
+    named: set[int] = set()
+    for start, end, slot in run.spans():
+        name = run.layout["desired"].elements[slot]
+        axis.axvspan(
+            start,
+            end,
+            color=BANDS[slot % len(BANDS)],
+            alpha=0.12,
+            lw=0,
+            label=None if slot in named else f"slot {name}",
+        )
+        named.add(slot)
 
 
 def _thin(values: np.ndarray) -> np.ndarray:
@@ -197,7 +220,7 @@ def _draw_command(axis: Axes, run: Run) -> None:
 
 
 def _draw_responses(axis: Axes, run: Run) -> None:
-    _responses(axis, run, run.layout["error"].elements[0])
+    _responses(axis, run, run.layout["desired"].elements[0])
     axis.set_xlabel("time [s]")
 
 

@@ -36,15 +36,23 @@ def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]
         lines = [(e.name, e.run, f"command.{i}") for e in entries]
         charts.append(_chart(f"command {i}", first.unit(f"command.{i}"), lines, edges))
     for e in entries:
-        for c in names:
+        for c in e.run.layout["desired"].elements:
             lines = [(signal, e.run, f"{signal}.{c}") for signal in _RESPONSES]
             chart = _chart(f"{e.name}: responses of {c}", e.run.unit(f"desired.{c}"), lines, edges)
             charts.append({**chart, "only": e.name})
     return {
-        "controllers": [{"name": e.name, "color": palette[k % len(palette)]} for k, e in enumerate(entries)],
+        "controllers": [
+            {"name": e.name, "color": palette[k % len(palette)], "slots": _slots(e.run)} for k, e in enumerate(entries)
+        ],
         "time": _round(np.repeat(longest.time[edges[:-1]], 2) + _halves(longest, edges)),
         "charts": charts,
     }
+
+
+def _slots(run: Run) -> list[list[float]]:
+    """Time slots as [start, end, number]; none where there are too many to be seen."""
+    spans = run.spans()
+    return [[float(f"{a:.6g}"), float(f"{b:.6g}"), slot] for a, b, slot in spans] if len(spans) <= INTERVALS else []
 
 
 def _edges(cycles: int) -> np.ndarray:

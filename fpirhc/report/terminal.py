@@ -56,6 +56,9 @@ def show(comparison: Comparison, report: Path) -> None:
     console.print(_table(comparison))
     if sum(e.optimality is not None for e in comparison.entries) > 1:
         console.print(_plans(comparison))
+    for entry in comparison.entries:
+        for note in entry.notes:
+            console.print(f"{entry.name}: {note}", markup=False, highlight=False)
     for name, why in comparison.skipped.items():
         console.print(f"skipped {name}: {why}", markup=False, highlight=False)
     console.print(f"report: {report}", markup=False, highlight=False, soft_wrap=True)

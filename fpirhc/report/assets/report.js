@@ -1,6 +1,7 @@
 "use strict";
 // Linked charts: one cursor, one zoom, one set of shown controllers. DATA is written by the page.
 const RESPONSES = { nominal: "#009e73", desired: "#0072b2", deformed: "#e69f00", realised: "#d55e00" };
+const BANDS = ["#7f7f7f", "#e69f00", "#56b4e9", "#cc79a7"];
 const colors = Object.fromEntries(DATA.controllers.map((c) => [c.name, c.color]));
 const ink = getComputedStyle(document.documentElement).getPropertyValue("--ink").trim();
 const faint = getComputedStyle(document.documentElement).getPropertyValue("--line").trim();
@@ -15,6 +16,23 @@ function zoomAll(source, key) {
   const { min, max } = source.scales.x;
   for (const plot of plots) if (plot.chart !== source) plot.chart.setScale("x", { min, max });
   zooming = false;
+}
+
+// Time slots as pale bands: those of the chart's own controller, else of the first one that is shown and has some.
+function bands(chart, spec) {
+  const owner = DATA.controllers.find((c) => c.slots.length && (spec.only ? c.name === spec.only : shown.has(c.name)));
+  if (!owner) return;
+  const { ctx, bbox } = chart;
+  ctx.save();
+  ctx.beginPath();
+  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
+  ctx.clip();
+  for (const [start, end, slot] of owner.slots) {
+    const left = chart.valToPos(start, "x", true);
+    ctx.fillStyle = BANDS[slot % BANDS.length] + "22";
+    ctx.fillRect(left, bbox.top, chart.valToPos(end, "x", true) - left, bbox.height);
+  }
+  ctx.restore();
 }
 
 function draw(spec) {
@@ -41,7 +59,7 @@ function draw(spec) {
     scales: { x: { time: false } },
     axes: [{ ...axis }, { ...axis, size: 62 }],
     cursor: { sync: { key: sync.key } },
-    hooks: { setScale: [zoomAll] },
+    hooks: { setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)] },
   };
   const chart = new uPlot(options, [DATA.time, ...spec.series.map((s) => s.values)], box);
   plots.push({ chart, box, spec });
