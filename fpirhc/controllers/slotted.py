@@ -105,9 +105,9 @@ class Slotted(Controller):
         if found.radius is None:
             return (f"no Floquet radius: {found.reason}",)
         alone = ", ".join(f"{name} {values.real.max():.3g}" for name, values in found.eigenvalues.items())
-        verb = "shrinks to" if found.radius < 1 else "grows to"
+        verb = "shrink" if found.radius < 1 else "grow"
         return (
-            f"Floquet radius {found.radius:.3g}: near the set-point an error {verb} that share per period of {found.period:g} s "
+            f"Floquet radius {found.radius:.3g} per period of {found.period:g} s: near the set-point errors {verb} "
             f"(largest real part in each slot alone, 1/s: {alone})",
         )
 

@@ -1,0 +1,61 @@
+"""Two masses on springs, force on the second only: slots of relative order 2 and 4."""
+
+import fpirhc as fp
+
+
+def response(q, v, u, p):
+    between = p.k2 * (q.q2 - q.q1)
+    return {
+        "q1": (between - p.k1 * q.q1 - p.b1 * v.q1) / p.m1,
+        "q2": (u.F - between - p.b2 * v.q2) / p.m2,
+    }
+
+
+plant = fp.Plant(
+    coordinates={"q1": "m", "q2": "m"},
+    inputs={"F": "N"},
+    order=2,
+    response=response,
+    controlled=("q2",),
+    parameters={
+        "m1": fp.Parameter(approximate=1.3, exact=1.0, unit="kg"),
+        "m2": fp.Parameter(approximate=1.5, exact=1.0, unit="kg"),
+        "k1": fp.Parameter(approximate=6.0, exact=5.0, unit="N/m"),
+        "k2": fp.Parameter(approximate=12.0, exact=10.0, unit="N/m"),
+        "b1": fp.Parameter(approximate=0.0, exact=0.2, unit="N s/m"),
+        "b2": fp.Parameter(approximate=0.0, exact=0.5, unit="N s/m"),
+    },
+)
+
+problem = fp.Problem(
+    plant=plant,
+    reference=fp.Trajectory(lambda t: {"q1": 0.2 + 0 * t, "q2": 0.3 + 0 * t}),  # at rest for k1 / k2 = 1 / 2
+    start={"q1": 0.0, "q2": 0.0},
+    period=2e-3,  # s
+    duration=20.0,  # s, five periods of the schedule
+    limits=fp.Limits(inputs={"F": (-20.0, 20.0)}),  # N
+    horizon=fp.Horizon(stages=30, step=5e-2),
+    cost=fp.Quadratic(states={"q1": 1e2, "q2": 1e2, "q1'": 1.0, "q2'": 1.0}, correction={"F": 1e-2}),
+    measure_from=8.0,  # s, after two periods
+    judged=("q1", "q2"),
+)
+
+schedule = fp.Periodic({"q2": 1.0, "q1": 3.0})  # s
+optimiser = fp.FixedPoint(iterations=1, tolerance=1e-2)  # N
+sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=100.0)  # scale in m/s^2 or m/s^4
+
+
+def slotted(deformation):
+    second = fp.Slot("q2", fp.Exponential(rate=4.0, integral=False), deformation, order=2)  # 1/s
+    first = fp.Slot("q1", fp.Exponential(rate=4.0, integral=False), deformation, order=4)
+    return fp.Slotted((second, first), schedule, blend=0.1)
+
+
+controllers = {
+    "slots": slotted(fp.Identity()),
+    "slots+FPI": slotted(sigmoid),
+    "slots exact model": fp.Informed(slotted(fp.Identity())),
+    "RHC": fp.RecedingHorizon(optimiser),
+    "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
+}
+headline = ("slots", "slots+FPI")

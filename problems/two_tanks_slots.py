@@ -1,0 +1,56 @@
+"""Two tanks in a row, one inflow: slots of relative order 1 and 2, and an input that cannot be negative."""
+
+import fpirhc as fp
+
+
+def response(q, u, p):
+    between = p.c1 * fp.signed_power(q.h1, 0.5)  # flow from the upper tank into the lower one, l/s
+    return {"h1": (u.inflow - between) / p.A1, "h2": (between - p.c2 * fp.signed_power(q.h2, 0.5)) / p.A2}
+
+
+plant = fp.Plant(
+    coordinates={"h1": "dm", "h2": "dm"},
+    inputs={"inflow": "l/s"},
+    order=1,
+    response=response,
+    controlled=("h1",),
+    parameters={
+        "A1": fp.Parameter(approximate=13.0, exact=10.0, unit="dm^2"),
+        "A2": fp.Parameter(approximate=13.0, exact=10.0, unit="dm^2"),
+        "c1": fp.Parameter(approximate=0.7, exact=0.6, unit="l/s/dm^0.5"),
+        "c2": fp.Parameter(approximate=0.6, exact=0.5, unit="l/s/dm^0.5"),
+    },
+)
+
+problem = fp.Problem(
+    plant=plant,
+    reference=fp.Trajectory(lambda t: {"h1": 2.5 + 0 * t, "h2": 3.6 + 0 * t}),  # at rest for c1 sqrt(h1) = c2 sqrt(h2)
+    start={"h1": 1.0, "h2": 5.0},
+    period=0.5,  # s
+    duration=600.0,  # s, five periods of the schedule
+    limits=fp.Limits(inputs={"inflow": (0.0, 2.5)}),  # l/s; at rest 0.95
+    horizon=fp.Horizon(stages=30, step=5.0),
+    cost=fp.Quadratic(states={"h1": 1.0, "h2": 1.0}, correction={"inflow": 1e-1}),
+    measure_from=240.0,  # s, after two periods
+    judged=("h1", "h2"),
+)
+
+schedule = fp.Periodic({"h2": 80.0, "h1": 40.0})  # s
+optimiser = fp.FixedPoint(iterations=2, tolerance=1e-3)  # l/s
+sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=1.0)  # scale in dm/s or dm/s^2
+
+
+def slotted(deformation):
+    lower = fp.Slot("h2", fp.Exponential(rate=0.06, integral=False), deformation, order=2)  # 1/s
+    upper = fp.Slot("h1", fp.Exponential(rate=0.1, integral=False), deformation, order=1)
+    return fp.Slotted((lower, upper), schedule, blend=2.0)
+
+
+controllers = {
+    "slots": slotted(fp.Identity()),
+    "slots+FPI": slotted(sigmoid),
+    "slots exact model": fp.Informed(slotted(fp.Identity())),
+    "RHC": fp.RecedingHorizon(optimiser),
+    "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
+}
+headline = ("slots", "slots+FPI")
