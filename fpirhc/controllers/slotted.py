@@ -104,7 +104,9 @@ class Slotted(Controller):
         found = radius_of(problem, self.channels(problem), self.schedule, self.blend)
         if found.radius is None:
             return (f"no Floquet radius: {found.reason}",)
-        alone = ", ".join(f"{name} {values.real.max():.3g}" for name, values in found.eigenvalues.items())
+        alone = ", ".join(
+            f"{name} {round(values.real.max(), 6) + 0.0:.3g}" for name, values in found.eigenvalues.items()
+        )
         verb = "shrink" if found.radius < 1 else "grow"
         return (
             f"Floquet radius {found.radius:.3g} per period of {found.period:g} s: near the set-point errors {verb} "

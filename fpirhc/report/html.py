@@ -58,7 +58,7 @@ def render(comparison: Comparison) -> str:
         f"<header><h1>{_text(comparison.title)}</h1></header>",
         _verdict(comparison),
         _table(comparison),
-        _charts(),
+        _charts(comparison),
         *_pictures(comparison),
         _contraction(comparison),
         _settings(comparison),
@@ -158,10 +158,13 @@ def _iterations(solve: Mapping[str, float]) -> str:
     return _number(known if known >= 0 else None)
 
 
-def _charts() -> str:
+def _charts(comparison: Comparison) -> str:
+    slots = any(e.run.spans() for e in comparison.entries)
+    bands = " Pale bands are the time slots of the first controller shown that has some." if slots else ""
     return (
         "<section><h2>Signals over time</h2><p>Drag across a chart to zoom all of them, double-click to return. Lines show "
-        "the extremes of each short interval, so no peak is lost.</p>"
+        "the extremes of each short interval, so no peak is lost."
+        f"{bands}</p>"
         "<div id='controllers' role='group' aria-label='controllers shown'></div><div id='charts'></div></section>"
     )
 
