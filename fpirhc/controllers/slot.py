@@ -16,9 +16,9 @@ import numpy as np
 
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.delayed import Increment, Paired
-from fpirhc.deformation.guarded import Guarded
 from fpirhc.deformation.identity import Identity
-from fpirhc.deformation.tuned import Tuned
+from fpirhc.deformation.self_paired import SelfPaired
+from fpirhc.deformation.wrapper import Wrapper
 from fpirhc.errors import InvalidProblem, NotInvertible, NotSupported
 from fpirhc.plant import Plant
 from fpirhc.problem import Problem
@@ -103,9 +103,9 @@ def channel(problem: Problem, slot: Slot, number: int) -> Channel:
 
 def _check_deformation(deformation: Deformation) -> None:
     inner = deformation
-    while isinstance(inner, Tuned | Guarded):
+    while isinstance(inner, Wrapper) and not isinstance(inner, Paired | Increment | SelfPaired):
         inner = inner.map
-    if isinstance(inner, Paired | Increment):
+    if isinstance(inner, Paired | Increment | SelfPaired):
         raise NotSupported(
             f"{type(inner).__name__} keeps pairs of earlier cycles, which belong to another slot after a switch; "
             "use the map itself"

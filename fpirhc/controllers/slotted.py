@@ -165,7 +165,7 @@ class Slotted(Controller):
         delays: list[Delay] = []
         for one in channels:
             light, law = one.plant, one.slot.tracking
-            blocks.append(for_channel(law.law(light), one, {"time"}, {"desired": one.wire("law")}))
+            blocks.append(for_channel(law.law(light, problem.period), one, {"time"}, {"desired": one.wire("law")}))
             blocks.append(_join_block(problem, channels, one, self.blend, self.blank))
             shown = {name: f"{name}_{one.slot.coordinate}" for name in one.slot.deformation.shown()}
             shown["started"] = one.wire("valid")
