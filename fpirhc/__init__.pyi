@@ -1,6 +1,6 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
-from .contraction import assess_gain, check_gain, response_jacobian, spectrum_over_box, spectrum_over_run
+from .contraction import assess_gain, check_gain, delayed_limit, response_jacobian, spectrum_over_box, spectrum_over_run
 from .controllers.computed_torque import ComputedTorque
 from .controllers.floquet import Floquet, floquet_radius
 from .controllers.informed import Informed
@@ -16,6 +16,7 @@ from .deformation.affine import Affine
 from .deformation.blended import Blended
 from .deformation.damped import Damped
 from .deformation.delayed import Increment, Paired
+from .deformation.filtered import Filtered
 from .deformation.guarded import Guarded
 from .deformation.identity import Identity
 from .deformation.rfpt import Rfpt
@@ -24,7 +25,7 @@ from .deformation.rotation import Rotation
 from .deformation.self_paired import DelayWatched, SelfPaired
 from .deformation.sigmoid import Sigmoid
 from .deformation.tuned import Tuned
-from .disturbance import Formula, Noise, Pulse, Sine, Step
+from .disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
 from .errors import FpirhcError
 from .horizon.cost import General, LqrTerminal, Quadratic
 from .horizon.expansion import ExactHessian, GaussNewton
@@ -46,6 +47,7 @@ from .reference import Table, Trajectory
 from .relative_order import OutputChain, output_chain
 from .report.html import write_report
 from .run import Run, load_run
+from .sensing import LowPassDifference, Measured, PositionDifference, SavitzkyGolay, Sensing, Sensor, VelocityDifference
 from .simulation import simulate
 from .status import Status
 from .stepper import Stepper
@@ -65,6 +67,7 @@ __all__ = [
     "ByLookAhead",
     "ByModel",
     "Certificate",
+    "ColouredNoise",
     "Comparison",
     "ComputedTorque",
     "Cvodes",
@@ -76,6 +79,7 @@ __all__ = [
     "Exponential",
     "Fatrop",
     "Feedforward",
+    "Filtered",
     "FixedPoint",
     "FixedSchedule",
     "Floquet",
@@ -94,7 +98,9 @@ __all__ = [
     "Informed",
     "InteriorPoint",
     "Limits",
+    "LowPassDifference",
     "LqrTerminal",
+    "Measured",
     "Metrics",
     "Noise",
     "OpenPlan",
@@ -106,6 +112,7 @@ __all__ = [
     "Periodic",
     "Plan",
     "Plant",
+    "PositionDifference",
     "Predicted",
     "Problem",
     "Pulse",
@@ -120,7 +127,10 @@ __all__ = [
     "Rotation",
     "Run",
     "RungeKutta4",
+    "SavitzkyGolay",
     "SelfPaired",
+    "Sensing",
+    "Sensor",
     "SequentialQuadratic",
     "Sigmoid",
     "Sine",
@@ -133,11 +143,13 @@ __all__ = [
     "Table",
     "Trajectory",
     "Tuned",
+    "VelocityDifference",
     "assess_gain",
     "certify",
     "check_deformation",
     "check_gain",
     "compare",
+    "delayed_limit",
     "floquet_radius",
     "load_problem",
     "load_run",

@@ -6,12 +6,14 @@ response). It is sampled once per control cycle and held over the cycle.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from scipy.signal import lfilter
 
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression
@@ -65,13 +67,53 @@ class Sine(Disturbance):
 
 @dataclass(frozen=True)
 class Noise(Disturbance):
-    """White Gaussian noise of the given standard deviation, drawn from the run's seed."""
+    """White Gaussian noise of the given standard deviation, drawn from the run's seed.
+
+    Raises:
+        InvalidValue: a deviation that is negative or not finite.
+    """
 
     deviation: float
+
+    def __post_init__(self) -> None:
+        _check_deviation(self)
 
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:
         """Return the noise's values."""
         return random.normal(0.0, self.deviation, times.shape)
+
+
+@dataclass(frozen=True)
+class ColouredNoise(Disturbance):
+    """Gaussian noise of the given standard deviation that forgets: correlation exp(-|t - t'| / correlation_time).
+
+        v_k = c v_{k-1} + sqrt(1 - c^2) deviation w_k,     c = exp(-T / correlation_time),
+
+    begun in its stationary distribution. It needs equally spaced times.
+
+    Raises:
+        InvalidValue: a deviation that is negative or not finite, a correlation time (s) that is not positive.
+    """
+
+    deviation: float
+    correlation_time: float
+
+    def __post_init__(self) -> None:
+        _check_deviation(self)
+        if not 0 < self.correlation_time < math.inf:
+            raise InvalidValue(
+                f"ColouredNoise(correlation_time={self.correlation_time!r}): expected a positive number of seconds; "
+                "noise that forgets at once is Noise(deviation=...)"
+            )
+
+    def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        """Return the noise's values."""
+        white = random.normal(0.0, self.deviation, times.shape)
+        if times.size < 2:
+            return white
+        kept = math.exp(-float(times[1] - times[0]) / self.correlation_time)
+        white[1:] *= math.sqrt(1 - kept**2)
+        return np.asarray(lfilter([1.0], [1.0, -kept], white))
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,3 +135,10 @@ class Formula(Disturbance):
             where = times[np.argmin(np.isfinite(found))]
             raise InvalidValue(f"a disturbance expression is not finite at t = {where:g} s")
         return found
+
+
+def _check_deviation(noise: Noise | ColouredNoise) -> None:
+    if not 0 <= noise.deviation < math.inf:
+        raise InvalidValue(
+            f"{type(noise).__name__}(deviation={noise.deviation!r}): expected a finite number of at least 0"
+        )

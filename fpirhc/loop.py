@@ -21,10 +21,10 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 
 def close_loop(problem: Problem, controller: Controller) -> Composite:
-    """Return the closed loop as one step: (memory, [disturbance]) -> (memory, trace).
+    """Return the closed loop as one step: (memory, [disturbance], [sensing]) -> (memory, trace).
 
     Both parameter sets are part of the memory (constant), so that other values need no new Function. The disturbance
-    input exists only when the problem has disturbances.
+    input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples.
     """
     chosen = prepared(problem, controller)
     blocks, delays = chosen.blocks(problem)
@@ -33,7 +33,9 @@ def close_loop(problem: Problem, controller: Controller) -> Composite:
         problem, chosen.response(problem), predicts="state_ahead" in [n for b in blocks for n in b.writes.names]
     )
     around = [_clock_block(problem.period), *seeing, *blocks, *_actuate(problem, disturbed)]
-    return compose("loop", Layout(disturbed), around, [*_plant_delays(problem, chosen), *delays])
+    return compose(
+        "loop", Layout((*disturbed, *problem.sensing.drawn)), around, [*_plant_delays(problem, chosen), *delays]
+    )
 
 
 def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:
@@ -73,22 +75,33 @@ def _clock_block(period: float) -> Block:
 
 
 def _sense_blocks(problem: Problem, asked: Response | None, *, predicts: bool) -> list[Block]:
-    """The plant's state and response as the controller gets them; with dead time also the true ones and the true error."""
+    """State and response as the controller gets them; where these are not the plant's own, also the true ones and error."""
     plant, behind = problem.plant, problem.dead_time.measurement / problem.period
     response = asked or _own_response(plant)
-    if not behind:
+    if not _hidden(problem):
         sense = [_sense_block(plant, plant.state, response)]
         return [*sense, _truth_block(problem, plant.state)] if predicts or problem.dead_time.inputs else sense
-    start, calm = tuple(float(v) for v in problem.start_state), np.zeros(len(plant.names))
-    resting = response.function(start, np.zeros(plant.input.size), plant.exact, calm).full().ravel()
     true_state, true_response = like(plant.state, "plant_state"), like(response.signal, "plant_realised")
-    seen = Signal("realised", true_response.elements, true_response.units, tuple(map(float, resting)))
-    return [
+    true = [
         _sense_block(plant, true_state, Response(true_response, response.function)),
         _truth_block(problem, true_state),
+    ]
+    if not problem.sensing.ideal:
+        signals = true_state, true_response
+        return [*true, *problem.sensing.blocks(plant, problem.period, problem.start_state, behind, signals)]
+    start, calm = tuple(float(v) for v in problem.start_state), np.zeros(len(plant.names))
+    resting = response.function(start, np.zeros(plant.input.size), plant.exact, calm).full().ravel()
+    seen = Signal("realised", true_response.elements, true_response.units, tuple(map(float, resting)))
+    return [
+        *true,
         delay_block("see_state", true_state, replace(plant.state, start=start), [behind] * plant.state.size),
         delay_block("see_response", true_response, seen, [behind] * seen.size),
     ]
+
+
+def _hidden(problem: Problem) -> bool:
+    """Whether the controller is given something else than the plant's own state and response."""
+    return bool(problem.dead_time.measurement) or not problem.sensing.ideal
 
 
 def _truth_block(problem: Problem, state: Signal) -> Block:
@@ -148,7 +161,7 @@ def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Si
     """The exact plant over one period with the arriving command held."""
     plant = problem.plant
     advance = problem.integrator.step(plant, problem.period)
-    state = like(plant.state, "plant_state") if problem.dead_time.measurement else plant.state
+    state = like(plant.state, "plant_state") if _hidden(problem) else plant.state
     reads = (state, arriving, like(plant.parameter, "_exact"), *disturbed)
     writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
 

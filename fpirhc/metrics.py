@@ -64,7 +64,7 @@ def measure(problem: Problem, run: Run) -> Metrics:
 
 
 def true_errors(run: Run) -> np.ndarray:
-    """Reference minus the plant's state at the same time; what a controller sees may be delayed or predicted."""
+    """Reference minus the plant's state at the same time; what a controller sees may be delayed, noisy, or predicted."""
     return run["true_error"] if "true_error" in run.layout else run["error"]
 
 
@@ -82,7 +82,8 @@ def _settling(run: Run, coordinate: str) -> float:
     """Time from which |error| stays within the band; 0 when it never left it, NaN when it ends outside."""
     if run.stop is not None or not run.cycles:
         return float("nan")
-    error, reference = np.abs(run[f"error.{coordinate}"]), run[f"reference.{coordinate}"]
+    place = run.layout["error"].elements.index(coordinate)
+    error, reference = np.abs(true_errors(run)[:, place]), run[f"reference.{coordinate}"]
     band = SETTLED * max(float(np.ptp(reference)), float(error[0]), 1e-12)
     outside = np.flatnonzero(error > band)
     if not outside.size:

@@ -19,6 +19,7 @@ from fpirhc.integrate import Integrator, RungeKutta4
 from fpirhc.limits import Limits
 from fpirhc.plant import Plant
 from fpirhc.reference import Reference
+from fpirhc.sensing.sensing import Sensing
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,7 @@ class Problem:
         limits: of inputs and states. disturbances: by name of the input or coordinate they add to.
         horizon, cost: what a receding-horizon controller looks ahead with.
         dead_time: of inputs and measurement; what a controller believes of it is the controller's.
+        sensing: what the controller is given of the plant; ideal unless something else is given.
         integrator: how the simulated plant moves within a cycle.
         measure_from: metrics are taken from this time on, s (the transient before it is left out).
         judged: coordinates whose errors are logged and measured; None: the plant's controlled ones.
@@ -49,6 +51,7 @@ class Problem:
     limits: Limits = field(default_factory=Limits)
     disturbances: Mapping[str, Disturbance] = field(default_factory=dict)
     dead_time: DeadTime = field(default_factory=DeadTime)
+    sensing: Sensing = field(default_factory=Sensing)
     horizon: Horizon | None = None
     cost: Cost | None = None
     integrator: Integrator = field(default_factory=RungeKutta4)
@@ -66,6 +69,7 @@ class Problem:
             lambda: self.limits.check(plant),
             lambda: self.reference.function(plant),
             lambda: self.dead_time.check(plant, self.period),
+            lambda: self.sensing.check(plant),
         )
         for check in checks:
             try:
@@ -90,6 +94,20 @@ class Problem:
     def start_state(self) -> np.ndarray:
         """First state, shape (nx,)."""
         return np.array([float(self.start.get(e, 0.0)) for e in self.plant.state.elements])
+
+    @property
+    def response_delay(self) -> float:
+        """Cycles from a request to its estimated response, beyond the one of every loop: `Paired(map, cycles=...)`.
+
+        Dead time and estimator together; of several inputs or coordinates the slowest.
+        """
+        waiting = max(self.dead_time.inputs.values(), default=0.0) + self.dead_time.measurement
+        return waiting / self.period + self.sensing.delay(self.plant, self.period)
+
+    @property
+    def blind_cycles(self) -> int:
+        """Number of the first cycle whose realised response may be used; before it nothing is deformed."""
+        return self.sensing.blind(self.plant, self.dead_time.measurement / self.period)
 
 
 def _check_times(problem: Problem, mistakes: Mistakes) -> None:

@@ -26,7 +26,7 @@ class Run:
     """The log of one closed-loop run.
 
     Parameters:
-        problem, controller: their names. seed: what the disturbances were drawn with. period: s.
+        problem, controller: their names. seed: what disturbances and noise were drawn with. period: s.
         layout: the logged signals. log: shape (cycles, layout.size), read-only.
         stop: why the run ended early, None when it did not.
         compiled: whether the loop ran as compiled C. settings: of problem and controller, as plain data.

@@ -1,7 +1,8 @@
 """Runs a closed loop and logs every signal.
 
 The loop's one-cycle Function is accumulated over a chunk of cycles inside CasADi (compiled when a C compiler is found),
-so Python is entered once per chunk: to fill in disturbances, to check that all signals are finite, to report progress.
+so Python is entered once per chunk: to fill in disturbances and noise, to check that all signals are finite, to report
+progress.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ def simulate(
 ) -> Run:
     """Run the closed loop of problem and controller and return every signal.
 
-    Parameters: `seed` of the disturbances' noise; `name` of the controller in the results; `compiled`: use C when there
-    is a compiler; `progress` is called with (cycles done, cycles in all).
+    Parameters: `seed` of the disturbances' and the sensors' noise; `name` of the controller in the results; `compiled`: use C
+    when there is a compiler; `progress` is called with (cycles done, cycles in all).
 
     A signal that becomes NaN or infinite ends the run at that cycle; the finite part is kept and `Run.stop` says why.
     """
@@ -73,17 +74,23 @@ def disturbance_table(problem: Problem, seed: int, cycles: int) -> np.ndarray:
     return np.column_stack(columns) if columns else np.zeros((cycles, 0))
 
 
+def sensing_table(problem: Problem, seed: int, cycles: int) -> np.ndarray:
+    """Return the sensors' random series of every cycle, shape (cycles, number of series); each has its own stream."""
+    return problem.sensing.table(np.arange(cycles) * problem.period, seed)
+
+
 def _run_chunks(
     problem: Problem, memory: Layout, trace: Layout, evaluator: Evaluator, seed: int, progress: Progress | None
 ) -> tuple[np.ndarray, str | None]:
     cycles = problem.cycles
     padded = -(-cycles // CHUNK) * CHUNK
-    table = disturbance_table(problem, seed, padded)
+    drawn = disturbance_table(problem, seed, padded), sensing_table(problem, seed, padded)
+    tables = [table for table in drawn if table.shape[1]]
     log = np.empty((padded, trace.size))
     evaluator.arguments[0][:] = memory.start()
     for at in range(0, cycles, CHUNK):
-        if table.shape[1]:
-            evaluator.arguments[1].reshape(CHUNK, -1)[:] = table[at : at + CHUNK]
+        for argument, table in zip(evaluator.arguments[1:], tables, strict=True):
+            argument.reshape(CHUNK, -1)[:] = table[at : at + CHUNK]
         evaluator.redirect(1, log[at : at + CHUNK])
         evaluator.evaluate()
         rows = log[at : min(at + CHUNK, cycles)]

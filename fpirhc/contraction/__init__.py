@@ -5,6 +5,7 @@ parameters) computes for r. With J = df/dr and the effective gain a of a deforma
 multiplied by I - a J in every cycle, so the iteration converges when |1 - a lambda| < 1 for every eigenvalue of J.
 """
 
+from fpirhc.contraction.delayed import delayed_limit
 from fpirhc.contraction.gains import linear_limit, optimal_gain, predicted_factor, sector_limit
 from fpirhc.contraction.identified import identified_factor
 from fpirhc.contraction.report import ContractionReport, assess_gain, check_gain
@@ -22,6 +23,7 @@ __all__ = [
     "assess_gain",
     "check_gain",
     "contraction_along",
+    "delayed_limit",
     "identified_factor",
     "linear_limit",
     "optimal_gain",

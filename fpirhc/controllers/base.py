@@ -20,8 +20,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.gain_check import check_gain_sign
+from fpirhc.controllers.gain_check import check_gain_sign, check_response_delay
 from fpirhc.deformation.base import Deformation
+from fpirhc.errors import NotSupported
 from fpirhc.plant import Plant
 from fpirhc.problem import Problem
 from fpirhc.status import Status
@@ -75,12 +76,20 @@ def prepared(problem: Problem, controller: Controller) -> Controller:
     """Return the controller with its automatic settings chosen, checked against the problem.
 
     Raises:
-        NotContractive: a deformation with a gain of the wrong sign. And what the controller's own check raises.
+        NotContractive: a deformation with a gain of the wrong sign, or one that its estimator or filter makes
+            unstable. NotSupported: own responses behind sensors. And what the controller's own check raises.
     """
     chosen = controller.resolved(problem)
     chosen.check(problem)
-    if chosen.response(problem) is None:
+    if chosen.response(problem) is not None:
+        if not problem.sensing.ideal:
+            raise NotSupported(
+                f"{type(chosen).__name__} reads responses of its own, which the problem's sensors do not measure; "
+                "leave sensing out of the problem"
+            )
+    else:
         check_gain_sign(problem, chosen.adaptive)
+        check_response_delay(problem, chosen.adaptive)
     return chosen
 
 
@@ -134,7 +143,12 @@ def closing_blocks(
 ) -> tuple[list[Block], list[Delay]]:
     """Return the blocks deform, invert, limit and judge with what they remember; `judged` are solver statuses."""
     plant = problem.plant
-    blocks = [deform_block(plant, deformation), _invert_block(plant), _limit_block(problem), _judge_block(judged)]
+    blocks = [
+        deform_block(plant, deformation, problem.blind_cycles),
+        _invert_block(plant),
+        _limit_block(problem),
+        _judge_block(judged),
+    ]
     delays = [
         Delay(scalar("started"), "_running"),
         Delay(plant.response_signal("_request_before"), "deformed"),
@@ -143,8 +157,11 @@ def closing_blocks(
     return blocks, delays
 
 
-def deform_block(plant: Plant, deformation: Deformation) -> Block:
-    """Block (request before, realised, desired) -> deformed request; without a valid pair it passes the desired one."""
+def deform_block(plant: Plant, deformation: Deformation, blind: int = 1) -> Block:
+    """Block (request before, realised, desired) -> deformed request; without a valid pair it passes the desired one.
+
+    A pair is valid after `blind` cycles, which `started` counts: one, or more where the response is estimated from more samples.
+    """
     memory = deformation.memory(plant.controlled_names)
     reads = (
         plant.response_signal("_request_before"),
@@ -156,13 +173,15 @@ def deform_block(plant: Plant, deformation: Deformation) -> Block:
     def step(s: Any) -> dict[str, Expression]:
         remembered = {m: getattr(s, m) for m in memory.names}
         deformed, following = deformation.step(s._request_before, s.realised, s.desired, remembered)
-        valid = s.started > 0.5
+        valid = s.started > blind - 0.5
         kept = {f"{m}_next": ca.if_else(valid, following[m], remembered[m]) for m in memory.names}
         shown = {name: kept[f"{source}_next"] for name, source in deformation.shown().items()}
-        return {"_deformed_wanted": ca.if_else(valid, deformed, s.desired), **shown, **kept}
+        wanted, running = ca.if_else(valid, deformed, s.desired), ca.fmin(s.started + 1, blind)
+        return {"_deformed_wanted": wanted, "_running": running, **shown, **kept}
 
     logged = tuple(scalar(name) for name in deformation.shown())
-    return Block("deform", Layout(reads), Layout((plant.response_signal("_deformed_wanted"), *logged)), step, memory)
+    writes = Layout((plant.response_signal("_deformed_wanted"), scalar("_running"), *logged))
+    return Block("deform", Layout(reads), writes, step, memory)
 
 
 def _invert_block(plant: Plant) -> Block:
@@ -187,7 +206,7 @@ def _limit_block(problem: Problem) -> Block:
         plant.parameter,
         like(plant.input, "_command_before"),
     )
-    writes = (plant.input, plant.response_signal("deformed"), scalar("clipped"), scalar("_held"), scalar("_running"))
+    writes = (plant.input, plant.response_signal("deformed"), scalar("clipped"), scalar("_held"))
 
     def step(s: Any) -> dict[str, Expression]:
         # Finiteness is asked before the clamp: fmin and fmax turn NaN into a full-scale command.
@@ -200,7 +219,6 @@ def _limit_block(problem: Problem) -> Block:
             "deformed": ca.if_else(finite, clipped_request, s.desired),
             "clipped": ca.mmax(command != s.requested),
             "_held": 1 - finite,
-            "_running": 1,
         }
 
     return Block("limit", Layout(reads), Layout(writes), step)

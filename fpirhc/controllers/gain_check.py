@@ -1,14 +1,22 @@
-"""Refuses a deformation whose gain has the wrong sign, before anything runs.
+"""Refuses a deformation that cannot converge, before anything runs.
 
-Where the response Jacobian's eigenvalues at the start have real parts of both signs, no gain converges; where they have one sign,
-gains of the other one enlarge every error. Too large a gain is not refused: it ends in a bounded oscillation that a run
-shows and the verdict explains.
+Where the response Jacobian's eigenvalues at the start have real parts of both signs, no gain converges; where they have one
+sign, gains of the other one enlarge every error. And where the response is estimated or the error filtered, the delay of that
+lowers the gain that converges. Too large a gain for the plant alone is not refused: it ends in a bounded oscillation that a
+run shows and the verdict explains.
 """
 
 from __future__ import annotations
 
-from fpirhc.contraction import assess_gain, spectrum_over_run
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fpirhc.contraction import Spectrum, assess_gain, delayed_limit, linear_limit, spectrum_over_run
 from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.delayed import Increment, Paired
+from fpirhc.deformation.filtered import Filtered
 from fpirhc.errors import InvalidValue, NotContractive
 from fpirhc.problem import Problem
 
@@ -22,13 +30,92 @@ def check_gain_sign(problem: Problem, deformation: Deformation) -> None:
     gain = deformation.effective_gain()
     if gain == 0:
         return
+    spectrum = _at_start(problem)
+    if spectrum is None:
+        return
+    report = assess_gain(deformation, spectrum)
+    if sum(report.linear_limit) * gain <= 0:
+        raise NotContractive(report.text)
+
+
+def check_response_delay(problem: Problem, deformation: Deformation) -> None:
+    """Raise if a gain that the plant itself allows is too large for the delay of estimator and filter.
+
+    The dead time of the problem is counted, where all inputs have the same; dead time alone, without estimator and filter, is
+    not judged.
+
+    Raises:
+        NotContractive: with the limit, the gain, and what to do.
+    """
+    gain, form = deformation.effective_gain(), _form(deformation)
+    orders = {problem.plant.orders[k] for k in problem.plant.controlled_indices} if gain else set()
+    weights = {order: problem.sensing.estimator.weights(order, problem.period) for order in orders}
+    waits = {problem.dead_time.inputs.get(name, 0.0) for name in problem.plant.inputs}
+    plain = form.pole == 0 and all(w.size == 1 for w in weights.values())
+    spectrum = None if plain or len(waits) > 1 else _at_start(problem)
+    if spectrum is None:
+        return
+    waiting = (waits.pop() + problem.dead_time.measurement) / problem.period
+    eigenvalues = np.unique(np.round(spectrum.eigenvalues.ravel() * math.copysign(1, gain), 12))
+    limit = min(
+        delayed_limit(_late(w, waiting), pairing=form.pairing, pole=form.pole, eigenvalue=complex(v))
+        for w in weights.values()
+        for v in eigenvalues
+    )
+    if limit <= abs(gain) < max(map(abs, linear_limit(spectrum.eigenvalues))):
+        raise NotContractive(_too_late(problem, deformation, form, limit))
+
+
+@dataclass(frozen=True)
+class _Form:
+    """Which request the map is given, and the pole of the filter of its error."""
+
+    pairing: float
+    pole: float
+
+
+def _form(deformation: Deformation) -> _Form:
+    pairing, pole = 0.0, 0.0
+    inner: Deformation | None = deformation
+    while inner is not None:
+        if isinstance(inner, Paired | Increment):
+            pairing = inner.cycles
+        if isinstance(inner, Filtered):
+            pole = inner.pole
+        inner = getattr(inner, "map", None)
+    return _Form(pairing, pole)
+
+
+def _late(weights: np.ndarray, cycles: float) -> np.ndarray:
+    """The weights after a dead time, interpolated as the queues do."""
+    whole = math.floor(cycles + 1e-9)
+    share = max(cycles - whole, 0.0)
+    return np.convolve(weights, np.append(np.zeros(whole), [1 - share, share]))
+
+
+def _too_late(problem: Problem, deformation: Deformation, form: _Form, limit: float) -> str:
+    gain, estimator = abs(deformation.effective_gain()), problem.sensing.estimator
+    own = getattr(deformation, deformation.gain_name, None)
+    name = deformation.gain_name if own is not None else "effective gain"
+    value = float(own) if own is not None else deformation.effective_gain()
+    delay = problem.response_delay
+    wholes = [f"the response comes {delay:.4g} cycles late ({estimator})"] if delay else []
+    wholes += [f"the error is filtered with the pole {form.pole:g}"] if form.pole else []
+    remedies = [f"0 < |{name}| < {limit / gain * abs(value):.3g}"] if limit else []
+    remedies += [f"Paired(map, cycles={delay:.4g})"] if abs(form.pairing - delay) > 1e-6 else []
+    remedies += ["a shorter window or time constant"]
+    return (
+        f"{type(deformation).__name__}({name}={value:.4g}): {' and '.join(wholes)}, so the iteration converges only for "
+        f"effective gains below {limit:.3g}, and this is {gain:.3g}; use {', or '.join(remedies)}"
+    )
+
+
+def _at_start(problem: Problem) -> Spectrum | None:
+    """Eigenvalues of the response Jacobian at the start; None where it is singular and nothing can be said."""
     plant = problem.plant
     state = problem.start_state[None, :]
     response = plant.controlled_response_function(problem.start_state, [0] * plant.input.size, plant.approximate)
     try:
-        spectrum = spectrum_over_run(plant, state, response.full().T)
+        return spectrum_over_run(plant, state, response.full().T)
     except InvalidValue:
-        return  # singular at the start: nothing can be said before the run
-    report = assess_gain(deformation, spectrum)
-    if sum(report.linear_limit) * gain <= 0:
-        raise NotContractive(report.text)
+        return None

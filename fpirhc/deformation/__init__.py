@@ -5,6 +5,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.blended import Blended
 from fpirhc.deformation.damped import Damped
 from fpirhc.deformation.delayed import Increment, Paired
+from fpirhc.deformation.filtered import Filtered
 from fpirhc.deformation.guarded import Guarded
 from fpirhc.deformation.identity import Identity
 from fpirhc.deformation.rfpt import Rfpt
@@ -21,6 +22,7 @@ __all__ = [
     "Damped",
     "Deformation",
     "DelayWatched",
+    "Filtered",
     "Guarded",
     "Identity",
     "Increment",

@@ -1,0 +1,19 @@
+"""Sensing: what a controller is given of the plant, through imperfect sensors and an estimator of what is not measured."""
+
+from fpirhc.sensing.estimator import Estimator
+from fpirhc.sensing.measured import Measured
+from fpirhc.sensing.positions import PositionDifference, SavitzkyGolay
+from fpirhc.sensing.sensing import Sensing
+from fpirhc.sensing.sensor import Sensor
+from fpirhc.sensing.velocities import LowPassDifference, VelocityDifference
+
+__all__ = [
+    "Estimator",
+    "LowPassDifference",
+    "Measured",
+    "PositionDifference",
+    "SavitzkyGolay",
+    "Sensing",
+    "Sensor",
+    "VelocityDifference",
+]

@@ -1,0 +1,48 @@
+"""Everything is measured: the state, and the response by an accelerometer or its like."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fpirhc.plant import Plant
+from fpirhc.sensing.estimator import Array, Estimator, response_names
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.layout import Expression, Layout, Signal
+
+
+@dataclass(frozen=True)
+class Measured(Estimator):
+    """State and response as the sensors show them: no delay."""
+
+    def measures(self, plant: Plant) -> tuple[str, ...]:
+        """The whole state and every controlled coordinate's highest derivative."""
+        return plant.state.elements + response_names(plant)
+
+    def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
+        """Block that names the measured quantities."""
+        del period, start
+        realised = plant.response_signal("realised")
+
+        def step(s: Any) -> dict[str, Expression]:
+            both = getattr(s, seen.name)
+            return {"state": both[: plant.state.size], "realised": both[plant.state.size :]}
+
+        return Block("estimate", Layout((seen,)), Layout((plant.state, realised)), step)
+
+    def weights(self, order: int, period: float) -> Array:
+        """One: the response to the last request."""
+        del order, period
+        return np.ones(1)
+
+    def delay(self, order: int, period: float) -> float:
+        """None."""
+        del order, period
+        return 0.0
+
+    def fills(self, order: int) -> int:
+        """One: in the first cycle nothing was asked yet."""
+        del order
+        return 1

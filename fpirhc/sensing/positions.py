@@ -1,0 +1,173 @@
+"""State and response from positions alone, by finite formulas over the last samples.
+
+    y^(s)_k = sum_i c_{s,i} y_{k-i} / T^s,     s = 0 ... n.
+
+The samples before the first are the start's motion continued backwards, so the first estimates are those of the start.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import InvalidValue
+from fpirhc.plant import Plant
+from fpirhc.sensing.estimator import Array, Estimator, backward_difference, combine, spline_weights
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.layout import Expression, Layout, Signal
+
+LONGEST = 1001  # samples: what is remembered is static
+
+
+class _Finite(Estimator):
+    """What the formulas have in common."""
+
+    @abstractmethod
+    def coefficients(self, order: int) -> Array:
+        """Rows c_0 ... c_n, newest sample first, shape (order + 1, samples); the last row gives the response."""
+
+    def measures(self, plant: Plant) -> tuple[str, ...]:
+        """The coordinates themselves."""
+        return plant.names
+
+    def weights(self, order: int, period: float) -> Array:
+        """The response's formula as an average of n-th differences, each with its B-spline of requests."""
+        del period
+        average = self.coefficients(order)[-1]
+        for _ in range(order):
+            average = np.cumsum(average)
+        # Division by (1 - 1/z)^n leaves nothing: an n-th derivative ignores polynomials below degree n.
+        return np.convolve(average[: average.size - order], spline_weights(order))
+
+    def fills(self, order: int) -> int:
+        """One less than the samples of the response's formula."""
+        return int(self.coefficients(order).shape[1]) - 1
+
+    def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
+        """Block (positions) -> (state, response)."""
+        rows = [self.coefficients(r) / period ** np.arange(r + 1)[:, None] for r in plant.orders]
+        queue = _queue(plant, period, start, [row.shape[1] - 1 for row in rows])
+        realised = plant.response_signal("realised")
+
+        def step(s: Any) -> dict[str, Expression]:
+            newest, past, at = getattr(s, seen.name), s.estimate_past, 0
+            known: dict[str, Expression] = {}
+            kept, responses = [], []
+            for k, (name, row) in enumerate(zip(plant.names, rows, strict=True)):
+                count = row.shape[1] - 1
+                samples = [newest[k], *(past[at + i] for i in range(count))]
+                at += count
+                kept += samples[:count]
+                known |= {name + "'" * d: combine(row[d], samples) for d in range(plant.orders[k])}
+                responses.append(combine(row[-1], samples))
+            state = ca.vertcat(*(known[e] for e in plant.state.elements))
+            realised = ca.vertcat(*(responses[k] for k in plant.controlled_indices))
+            return {"state": state, "realised": realised, "estimate_past_next": ca.vertcat(*kept)}
+
+        return Block("estimate", Layout((seen,)), Layout((plant.state, realised)), step, Layout((queue,)))
+
+
+def _queue(plant: Plant, period: float, start: Array, counts: list[int]) -> Signal:
+    """Past positions of every coordinate, newest first, filled with y(-iT) = sum_s y^(s)(0) (-iT)^s / s!."""
+    names, values = [], []
+    for name, order, count in zip(plant.names, plant.orders, counts, strict=True):
+        first = [start[plant.state.elements.index(name + "'" * s)] / math.factorial(s) for s in range(order)]
+        names += [f"{name}@{i}" for i in range(1, count + 1)]
+        values += [float(sum(c * (-i * period) ** s for s, c in enumerate(first))) for i in range(1, count + 1)]
+    return Signal("estimate_past", tuple(names), start=tuple(values))
+
+
+@dataclass(frozen=True)
+class PositionDifference(_Finite):
+    """The s-th backward difference over T^s for every derivative; it is late by s T / 2.
+
+    The response averages the last n requests, so its delay beyond the ideal pair is (n - 1) / 2 cycles. White noise of
+    deviation sigma becomes sigma sqrt(binomial(2 n, n)) / T^n: 2.4 sigma / T^2 for n = 2, 8.4 sigma / T^4 for n = 4.
+    """
+
+    def coefficients(self, order: int) -> Array:
+        """Alternating binomial coefficients."""
+        rows = np.zeros((order + 1, order + 1))
+        for s in range(order + 1):
+            rows[s, : s + 1] = backward_difference(s)
+        return rows
+
+    def delay(self, order: int, period: float) -> float:
+        """(n - 1) / 2."""
+        del period
+        return (order - 1) / 2
+
+
+@dataclass(frozen=True)
+class SavitzkyGolay(_Finite):
+    """A polynomial fitted to the window by least squares: the response at its centre, the state at its newest sample.
+
+    At the centre a derivative has the least noise and a known delay, (window - 1) / 2 - 1 / 2 cycles beyond the ideal pair;
+    the state is wanted now, and at the window's end it is noisier but late by nothing on polynomials up to the degree.
+
+    Parameters:
+        window: number of samples, odd. degree: of the polynomial, at least the plant's order.
+
+    Raises:
+        InvalidValue: a window that is even, not longer than the degree, or longer than 1001 samples.
+
+    References:
+        A. Savitzky, M. J. E. Golay, Smoothing and differentiation of data by simplified least squares procedures, Analytical
+        Chemistry 36(8), 1964.
+    """
+
+    window: int
+    degree: int
+
+    def __post_init__(self) -> None:
+        what = f"SavitzkyGolay(window={self.window!r}, degree={self.degree!r})"
+        if (
+            not all(isinstance(v, int) and not isinstance(v, bool) for v in (self.window, self.degree))
+            or self.degree < 1
+        ):
+            raise InvalidValue(f"{what}: expected whole numbers, the degree at least 1")
+        if self.window % 2 == 0:
+            raise InvalidValue(
+                f"{what}: expected an odd window, whose centre is a sample; use {self.window - 1} or {self.window + 1}"
+            )
+        if not self.degree < self.window <= LONGEST:
+            raise InvalidValue(
+                f"{what}: expected more samples than the degree, and at most {LONGEST}; "
+                f"use a window of at least {self.degree + 1 + self.degree % 2}"
+            )
+
+    def check(self, plant: Plant) -> None:
+        """Raise if the polynomial has no n-th derivative.
+
+        Raises:
+            InvalidValue: a degree below the plant's order.
+        """
+        highest = max(plant.orders)
+        if self.degree < highest:
+            raise InvalidValue(
+                f"SavitzkyGolay(degree={self.degree}): the response is a derivative of order {highest}, which a polynomial of "
+                f"degree {self.degree} does not have; use a degree of at least {highest}"
+            )
+
+    def coefficients(self, order: int) -> Array:
+        """Rows of the pseudo-inverse of the Vandermonde matrix, moved to where they are wanted."""
+        half = (self.window - 1) // 2
+        # Time in half windows, 0 at the centre: the powers stay of size one.
+        unit = max(half, 1)
+        fit = np.linalg.pinv(np.vander(-np.arange(-half, half + 1) / unit, self.degree + 1, increasing=True))
+        rows = [self._derivative(fit, s, half / unit) / float(unit) ** s for s in range(order)]
+        return np.vstack([*rows, math.factorial(order) * fit[order] / float(unit) ** order])
+
+    def _derivative(self, fit: Array, order: int, place: float) -> Array:
+        powers = range(order, self.degree + 1)
+        return np.asarray(sum(math.perm(k, order) * place ** (k - order) * fit[k] for k in powers))
+
+    def delay(self, order: int, period: float) -> float:
+        """(window - 1) / 2 - 1 / 2."""
+        del order, period
+        return (self.window - 1) / 2 - 0.5

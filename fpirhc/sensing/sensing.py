@@ -1,0 +1,160 @@
+"""The way from the plant to the controller: sensors, their dead time, and an estimator of what is not measured.
+
+    true plant -> sensors -> measurement dead time -> estimator -> controller
+
+With anything but ideal sensing the controller's `state` and `realised` are what it is given; the true ones are in the run as
+`plant_state` and `plant_realised`, the sensors' output is `measured`, and a run is judged by `true_error`. Random series are
+drawn before the run, so the loop itself stays a function.
+
+A response that is estimated from samples before the run would deform by what never happened. So the deformation waits:
+`blind` cycles pass, in which the request is the desired response, until the estimator's window holds samples of this run
+alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.dead_time import delay_block
+from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.plant import Plant
+from fpirhc.sensing.estimator import Array, Estimator, response_names
+from fpirhc.sensing.measured import Measured
+from fpirhc.sensing.sensor import Sensor
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
+
+_STREAM = 1  # keeps the sensors' random series apart from those of disturbances
+
+
+@dataclass(frozen=True, eq=False)
+class Sensing:
+    """What stands between plant and controller; ideal unless something is given.
+
+    Parameters:
+        sensors: by the measured quantity: a state element ("q1", "q1'"), or the highest derivative of a controlled coordinate
+            ("q1''") where the estimator has it measured. Quantities that are not named are measured perfectly.
+        estimator: what makes state and response of them: Measured, VelocityDifference, LowPassDifference, PositionDifference,
+            SavitzkyGolay.
+    """
+
+    sensors: Mapping[str, Sensor] = field(default_factory=dict)
+    estimator: Estimator = field(default_factory=Measured)
+
+    @property
+    def ideal(self) -> bool:
+        """Whether the controller is given the true state and response."""
+        return not self.sensors and isinstance(self.estimator, Measured)
+
+    def check(self, plant: Plant) -> None:
+        """Raise if a sensor's quantity is unknown or not measured, or the estimator cannot serve the plant.
+
+        Raises:
+            InvalidProblem: all mistakes together.
+        """
+        mistakes = Mistakes("sensing")
+        if not isinstance(self.estimator, Estimator):
+            mistakes.add(f"estimator must be one such as VelocityDifference(), got {self.estimator!r}")
+            mistakes.raise_if_any()
+        measures, every = self.estimator.measures(plant), plant.state.elements + response_names(plant)
+        mistakes.unknown("sensors: quantity", self.sensors, every)
+        for name, sensor in self.sensors.items():
+            if name in every and name not in measures:
+                what = f"'{name}' is estimated by {type(self.estimator).__name__}, not measured"
+                mistakes.add(f"sensors: {what}; sensors are those of {', '.join(measures)}")
+            if not isinstance(sensor, Sensor):
+                mistakes.add(f"'{name}' must have a Sensor(noise=..., quantum=..., dropout=...), got {sensor!r}")
+        try:
+            self.estimator.check(plant)
+        except InvalidValue as error:
+            mistakes.add(str(error))
+        mistakes.raise_if_any()
+
+    def delay(self, plant: Plant, period: float) -> float:
+        """Delay of the estimated response in cycles beyond the ideal pair; the largest of the controlled coordinates."""
+        return max(self.estimator.delay(plant.orders[k], period) for k in plant.controlled_indices)
+
+    def blind(self, plant: Plant, late: float) -> int:
+        """Number of the first cycle whose response may be used, when samples arrive `late` cycles after they were taken."""
+        if isinstance(self.estimator, Measured):
+            return 1
+        return math.ceil(late) + max(self.estimator.fills(plant.orders[k]) for k in plant.controlled_indices)
+
+    @property
+    def drawn(self) -> tuple[Signal, ...]:
+        """The signal of all random series, or nothing when there are none."""
+        columns = self._columns()
+        return (Signal("sensing", columns),) if columns else ()
+
+    def table(self, times: Array, seed: int) -> Array:
+        """Noise and lost samples (1: lost) of every cycle, shape (cycles, size of `drawn`); each has its own stream."""
+        streams = np.random.SeedSequence((seed, _STREAM)).spawn(2 * len(self.sensors))
+        columns = []
+        for k, sensor in enumerate(self.sensors.values()):
+            noise, lost = (np.random.default_rng(s) for s in streams[2 * k : 2 * k + 2])
+            columns += [sensor.noise.values(times, noise)] if sensor.noise is not None else []
+            columns += [(lost.random(times.size) < sensor.dropout).astype(float)] if sensor.dropout else []
+        return np.column_stack(columns) if columns else np.zeros((times.size, 0))
+
+    def blocks(
+        self, plant: Plant, period: float, start: Array, late: float, true: tuple[Signal, Signal]
+    ) -> list[Block]:
+        """Blocks from the true state and response to 'state' and 'realised'; `late` is the measurement's dead time in cycles."""
+        names = self.estimator.measures(plant)
+        first = _start(plant, start, names)
+        measured = vector("measured", names, [_unit(plant, n) for n in names])
+        sensors = self._sensor_block(plant, true, measured, first)
+        if not late:
+            return [sensors, self.estimator.block(plant, period, start, measured)]
+        arrived = replace(measured, name="_arrived", start=tuple(map(float, first)))
+        waiting = delay_block("see", measured, arrived, [late] * len(names))
+        return [sensors, waiting, self.estimator.block(plant, period, start, replace(arrived, start=()))]
+
+    def _columns(self) -> tuple[str, ...]:
+        noisy = [(n, "noise", s.noise is not None) for n, s in self.sensors.items()]
+        lossy = [(n, "lost", s.dropout > 0) for n, s in self.sensors.items()]
+        pairs = [p for both in zip(noisy, lossy, strict=True) for p in both]
+        return tuple(f"{n} {what}" for n, what, there in pairs if there)
+
+    def _sensor_block(self, plant: Plant, true: tuple[Signal, Signal], measured: Signal, first: Array) -> Block:
+        """Block (true state, true response, random series) -> measured quantities."""
+        every = plant.state.elements + response_names(plant)
+        columns, drawn = self._columns(), self.drawn
+        lossy = [n for n in measured.elements if f"{n} lost" in columns]
+        starts = [float(first[measured.elements.index(n)]) for n in lossy]
+        memory = (Signal("sensor_last", tuple(lossy), start=tuple(starts)),) if lossy else ()
+
+        def step(s: Any) -> dict[str, Expression]:
+            both = ca.vertcat(getattr(s, true[0].name), getattr(s, true[1].name))
+            seen = {n: both[every.index(n)] for n in measured.elements}
+            for name, sensor in self.sensors.items():
+                if sensor.noise is not None:
+                    seen[name] = seen[name] + s.sensing[columns.index(f"{name} noise")]
+                if sensor.quantum is not None:
+                    seen[name] = sensor.quantum * ca.floor(seen[name] / sensor.quantum + 0.5)
+                if sensor.dropout:
+                    lost = s.sensing[columns.index(f"{name} lost")] > 0.5
+                    seen[name] = ca.if_else(lost, s.sensor_last[lossy.index(name)], seen[name])
+            found = {"measured": ca.vertcat(*(seen[n] for n in measured.elements))}
+            return {**found, "sensor_last_next": ca.vertcat(*(seen[n] for n in lossy))} if lossy else found
+
+        return Block("sensors", Layout((*true, *drawn)), Layout((measured,)), step, Layout(memory))
+
+
+def _start(plant: Plant, start: Array, names: tuple[str, ...]) -> Array:
+    """What an ideal sensor shows at the problem's start, at rest with zero inputs."""
+    resting = plant.controlled_response_function(start, np.zeros(plant.input.size), plant.exact).full().ravel()
+    known = dict(zip(plant.state.elements + response_names(plant), np.concatenate([start, resting]), strict=True))
+    return np.array([known[n] for n in names])
+
+
+def _unit(plant: Plant, name: str) -> str:
+    if name in plant.state.elements:
+        return plant.state.entry_units[plant.state.elements.index(name)]
+    return plant.response_units[plant.names.index(name.rstrip("'"))]

@@ -1,0 +1,47 @@
+"""A sensor: what it makes of one measured quantity.
+
+seen = Q round((true + noise) / Q);   in a cycle whose sample is lost, what was seen last is seen again.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from fpirhc.disturbance import Disturbance
+from fpirhc.errors import InvalidValue
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """Noise, quantisation and lost samples of one measured quantity; each absent unless given.
+
+    Parameters:
+        noise: what adds to the true value, in its unit: Noise, ColouredNoise, Sine (hum), Step (bias), Formula (drift).
+        quantum: Q, the distance of two values that the sensor can tell apart (an encoder's), in the quantity's unit.
+        dropout: probability that a cycle's sample is lost.
+
+    Raises:
+        InvalidValue: noise that is no disturbance, a quantum that is not positive, a probability outside [0, 1).
+    """
+
+    noise: Disturbance | None = None
+    quantum: float | None = None
+    dropout: float = 0.0
+
+    def __post_init__(self) -> None:
+        wrong = []
+        if self.noise is not None and not isinstance(self.noise, Disturbance):
+            wrong.append(f"noise={self.noise!r}: expected a signal such as Noise(deviation=...)")
+        if self.quantum is not None and not _within(self.quantum, 0.0, math.inf):
+            wrong.append(
+                f"quantum={self.quantum!r}: expected a positive number in the unit of what is measured, or None"
+            )
+        if self.dropout != 0 and not _within(self.dropout, 0.0, 1.0):
+            wrong.append(f"dropout={self.dropout!r}: expected a probability from 0 to below 1")
+        if wrong:
+            raise InvalidValue(f"Sensor: {'; '.join(wrong)}")
+
+
+def _within(value: object, lower: float, upper: float) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and lower < value < upper

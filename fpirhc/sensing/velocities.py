@@ -1,0 +1,129 @@
+"""The response from the highest measured derivative: the state is measured, the response is not.
+
+A request is held for one cycle, so the difference of y^(n-1) over the period is the mean response to the last request
+exactly: the ideal pair, without delay. Noise of deviation sigma becomes sqrt(2) sigma / T; a first-order low-pass with the
+time constant tau, pole p = exp(-T / tau), takes (1 - p) / sqrt(1 + p) of that, at the price of a delay of p / (1 - p) cycles,
+
+    f_k = p f_{k-1} + (1 - p) (y^(n-1)_k - y^(n-1)_{k-1}) / T.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import InvalidValue
+from fpirhc.plant import Plant
+from fpirhc.sensing.estimator import Array, Estimator
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+
+_TAIL = 1e-9  # share of the low-pass's weights that is left out
+
+
+@dataclass(frozen=True)
+class VelocityDifference(Estimator):
+    """Backward difference of the highest measured derivative over the period."""
+
+    def measures(self, plant: Plant) -> tuple[str, ...]:
+        """The whole state."""
+        return plant.state.elements
+
+    def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
+        """Block (state) -> (state, its difference)."""
+        return _difference_block(plant, period, start, seen, 0.0)
+
+    def weights(self, order: int, period: float) -> Array:
+        """One: the mean response to the last request."""
+        del order, period
+        return np.ones(1)
+
+    def delay(self, order: int, period: float) -> float:
+        """None."""
+        del order, period
+        return 0.0
+
+    def fills(self, order: int) -> int:
+        """One: two samples."""
+        del order
+        return 1
+
+
+@dataclass(frozen=True)
+class LowPassDifference(Estimator):
+    """The same difference through a first-order low-pass, which begins with the first difference.
+
+    Where the response is filtered and the desired one is not, their difference is late. `Filtered` filters the difference
+    itself; `Paired(cycles=...)` compares with the request that the response belongs to.
+
+    Parameters:
+        time_constant: tau, s.
+
+    Raises:
+        InvalidValue: a time constant that is not positive.
+    """
+
+    time_constant: float
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.time_constant, int | float) and 0 < self.time_constant < math.inf):
+            raise InvalidValue(
+                f"LowPassDifference(time_constant={self.time_constant!r}): expected a positive number of seconds; "
+                "without a filter use VelocityDifference()"
+            )
+
+    def pole(self, period: float) -> float:
+        """P = exp(-T / tau)."""
+        return math.exp(-period / self.time_constant)
+
+    def measures(self, plant: Plant) -> tuple[str, ...]:
+        """The whole state."""
+        return plant.state.elements
+
+    def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
+        """Block (state) -> (state, its filtered difference)."""
+        return _difference_block(plant, period, start, seen, self.pole(period))
+
+    def weights(self, order: int, period: float) -> Array:
+        """(1 - p) p^(j-1), as far as they matter."""
+        del order
+        pole = self.pole(period)
+        count = max(1, math.ceil(math.log(_TAIL) / math.log(pole))) if pole > 0 else 1
+        return np.asarray((1 - pole) * pole ** np.arange(count))
+
+    def delay(self, order: int, period: float) -> float:
+        """P / (1 - p)."""
+        del order
+        return self.pole(period) / (1 - self.pole(period))
+
+    def fills(self, order: int) -> int:
+        """One: the filter begins with the first difference."""
+        del order
+        return 1
+
+
+def _difference_block(plant: Plant, period: float, start: Array, seen: Signal, pole: float) -> Block:
+    """Block (state) -> (state, p f + (1 - p) difference over the period)."""
+    places = [
+        plant.state.elements.index(plant.names[k] + "'" * (plant.orders[k] - 1)) for k in plant.controlled_indices
+    ]
+    before = Signal("estimate_before", tuple(seen.elements[p] for p in places), start=tuple(map(float, start[places])))
+    realised, smooth = plant.response_signal("realised"), Signal("estimate_smooth", plant.controlled_names)
+    memory = (before, smooth, scalar("estimate_cycles")) if pole else (before,)
+
+    def step(s: Any) -> dict[str, Expression]:
+        state = getattr(s, seen.name)
+        newest = state[places]
+        response = (newest - s.estimate_before) / period
+        found = {"state": state, "realised": response, "estimate_before_next": newest}
+        if not pole:
+            return found
+        response = ca.if_else(s.estimate_cycles < 1.5, response, pole * s.estimate_smooth + (1 - pole) * response)
+        counted = ca.fmin(s.estimate_cycles + 1, 2)
+        return {**found, "realised": response, "estimate_smooth_next": response, "estimate_cycles_next": counted}
+
+    return Block("estimate", Layout((seen,)), Layout((plant.state, realised)), step, Layout(memory))
