@@ -23,6 +23,7 @@ from fpirhc.deformation import (
     Damped,
     Deformation,
     DelayWatched,
+    Filtered,
     Guarded,
     Identity,
     Increment,
@@ -64,6 +65,7 @@ DELAYED = (
     Paired(Sigmoid(gain=-0.5, scale=1.0), cycles=3),
     Increment(Affine(gain=-0.5), cycles=2.5),
     SelfPaired(Affine(gain=-0.5), most=5),
+    Filtered(Sigmoid(gain=-0.5, scale=1.0), pole=0.5),
 )
 MAPS = (Identity(), *ITERATING)
 NEARLY_LINEAR = (
