@@ -36,7 +36,7 @@ def simulate(
 ) -> Run:
     """Run the closed loop of problem and controller and return every signal.
 
-    Parameters: `seed` of the disturbances' and the sensors' noise; `name` of the controller in the results; `compiled`: use C
+    Parameters: `seed` of the noise of disturbances and sensors; `name` of the controller in the results; `compiled`: use C
     when there is a compiler; `progress` is called with (cycles done, cycles in all).
 
     A signal that becomes NaN or infinite ends the run at that cycle; the finite part is kept and `Run.stop` says why.

@@ -41,8 +41,7 @@ def check_gain_sign(problem: Problem, deformation: Deformation) -> None:
 def check_response_delay(problem: Problem, deformation: Deformation) -> None:
     """Raise if a gain that the plant itself allows is too large for the delay of estimator and filter.
 
-    The dead time of the problem is counted, where all inputs have the same; dead time alone, without estimator and filter, is
-    not judged.
+    The dead time of the problem is counted, where all inputs have the same; dead time alone is not judged.
 
     Raises:
         NotContractive: with the limit, the gain, and what to do.
@@ -57,13 +56,17 @@ def check_response_delay(problem: Problem, deformation: Deformation) -> None:
         return
     waiting = (waits.pop() + problem.dead_time.measurement) / problem.period
     eigenvalues = np.unique(np.round(spectrum.eigenvalues.ravel() * math.copysign(1, gain), 12))
-    limit = min(
-        delayed_limit(_late(w, waiting), pairing=form.pairing, pole=form.pole, eigenvalue=complex(v))
-        for w in weights.values()
-        for v in eigenvalues
-    )
-    if limit <= abs(gain) < max(map(abs, linear_limit(spectrum.eigenvalues))):
-        raise NotContractive(_too_late(problem, deformation, form, limit))
+
+    def limit(pairing: float) -> float:
+        every = [(_late(w, waiting), complex(v)) for w in weights.values() for v in eigenvalues]
+        return min(delayed_limit(w, pairing=pairing, pole=form.pole, eigenvalue=v) for w, v in every)
+
+    if limit(form.pairing) <= abs(gain) < max(map(abs, linear_limit(spectrum.eigenvalues))):
+        # A fraction of a cycle damps requests that alternate, which a window does not see.
+        delay = problem.response_delay
+        tried = {d: limit(d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0}
+        best = next((d for d, reached in tried.items() if abs(gain) < reached), None)
+        raise NotContractive(_too_late(problem, deformation, form, limit(form.pairing), best))
 
 
 @dataclass(frozen=True)
@@ -93,7 +96,7 @@ def _late(weights: np.ndarray, cycles: float) -> np.ndarray:
     return np.convolve(weights, np.append(np.zeros(whole), [1 - share, share]))
 
 
-def _too_late(problem: Problem, deformation: Deformation, form: _Form, limit: float) -> str:
+def _too_late(problem: Problem, deformation: Deformation, form: _Form, limit: float, pairing: float | None) -> str:
     gain, estimator = abs(deformation.effective_gain()), problem.sensing.estimator
     own = getattr(deformation, deformation.gain_name, None)
     name = deformation.gain_name if own is not None else "effective gain"
@@ -102,7 +105,7 @@ def _too_late(problem: Problem, deformation: Deformation, form: _Form, limit: fl
     wholes = [f"the response comes {delay:.4g} cycles late ({estimator})"] if delay else []
     wholes += [f"the error is filtered with the pole {form.pole:g}"] if form.pole else []
     remedies = [f"0 < |{name}| < {limit / gain * abs(value):.3g}"] if limit else []
-    remedies += [f"Paired(map, cycles={delay:.4g})"] if abs(form.pairing - delay) > 1e-6 else []
+    remedies += [f"Paired(map, cycles={pairing:.4g})"] if pairing is not None else []
     remedies += ["a shorter window or time constant"]
     return (
         f"{type(deformation).__name__}({name}={value:.4g}): {' and '.join(wholes)}, so the iteration converges only for "

@@ -2,8 +2,8 @@
 
     g_k = p g_{k-1} + (1 - p) (f_k - d_k),     r_{k+1} = G(r_k, d_k + g_k, d_k).
 
-The error is filtered, not the response: a filtered response compared with an unfiltered desired one differs from it wherever
-the task moves, and the map would correct what is no error. On f = lambda r with the effective gain a the loop is
+The error is filtered, not the response: a filtered response compared with an unfiltered desired one differs from it
+wherever the task moves, and the map would correct what is no error. On f = lambda r with the effective gain a the loop is
 
     z^2 - (1 + p - a lambda (1 - p)) z + p = 0,
 

@@ -57,7 +57,8 @@ class _Finite(Estimator):
         def step(s: Any) -> dict[str, Expression]:
             newest, past, at = getattr(s, seen.name), s.estimate_past, 0
             known: dict[str, Expression] = {}
-            kept, responses = [], []
+            kept: list[Expression] = []
+            responses: list[Expression] = []
             for k, (name, row) in enumerate(zip(plant.names, rows, strict=True)):
                 count = row.shape[1] - 1
                 samples = [newest[k], *(past[at + i] for i in range(count))]
@@ -108,7 +109,7 @@ class SavitzkyGolay(_Finite):
     """A polynomial fitted to the window by least squares: the response at its centre, the state at its newest sample.
 
     At the centre a derivative has the least noise and a known delay, (window - 1) / 2 - 1 / 2 cycles beyond the ideal pair;
-    the state is wanted now, and at the window's end it is noisier but late by nothing on polynomials up to the degree.
+    the state is wanted now, and at the window's end it is noisier but not late on polynomials up to the degree.
 
     Parameters:
         window: number of samples, odd. degree: of the polynomial, at least the plant's order.

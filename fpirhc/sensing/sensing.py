@@ -7,8 +7,7 @@ With anything but ideal sensing the controller's `state` and `realised` are what
 drawn before the run, so the loop itself stays a function.
 
 A response that is estimated from samples before the run would deform by what never happened. So the deformation waits:
-`blind` cycles pass, in which the request is the desired response, until the estimator's window holds samples of this run
-alone.
+`blind` cycles pass, in which the request is the desired response, until the estimator's window holds this run's samples alone.
 """
 
 from __future__ import annotations

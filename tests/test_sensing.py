@@ -1,0 +1,415 @@
+"""Honest sensing: what noise, quanta, lost samples and estimators do to the loop, and what is refused before a run."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from plants import chain, linear
+
+import fpirhc as fp
+from fpirhc.controllers import base
+from fpirhc.errors import InvalidProblem, InvalidValue, NotContractive
+from fpirhc.loop import close_loop
+from fpirhc.symbolic.layout import Signal
+
+ESTIMATORS = (
+    fp.Measured(),
+    fp.VelocityDifference(),
+    fp.LowPassDifference(time_constant=0.05),
+    fp.PositionDifference(),
+    fp.SavitzkyGolay(window=7, degree=4),
+    fp.SavitzkyGolay(window=11, degree=5),
+)
+NOISE = fp.Sensor(noise=fp.Noise(1.0))
+GENTLE = fp.Exponential(rate=0.01, integral=False)
+
+
+def resting(plant, **others):
+    """A plant to be held at zero."""
+    settings = {
+        "reference": fp.Trajectory(lambda t: {"y": 0 * t}),
+        "start": {"y": 0.0},
+        "period": 1e-3,
+        "duration": 0.1,
+    }
+    return fp.Problem(plant=plant, **(settings | others))
+
+
+def swinging(**others):
+    """A plant with a wrong model on a sine."""
+    motion = fp.Trajectory(lambda t: {"y": 0.5 * ca.sin(2 * t)})
+    return resting(linear(1.0, 0.7), reference=motion, start={"y": 0.0, "y'": 1.0}, **others)
+
+
+ADAPTIVE = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Affine(gain=-0.5))
+
+
+def run(problem, controller=ADAPTIVE, seed=0, compiled=False):
+    return fp.simulate(problem, controller, seed=seed, compiled=compiled)
+
+
+# --- laws of noise ---
+
+
+@pytest.mark.parametrize("gain", [0.2, 0.5, 1.0])
+def test_noise_gain_of_the_closed_loop(gain):
+    """Var r = a/(2 - a) sigma^2 and lag-1 correlation -a/2 of the seen error: bounds are four standard deviations."""
+    problem = resting(linear(1.0, 1.0), duration=20.0, sensing=fp.Sensing({"y''": NOISE}))
+    found = run(problem, fp.ComputedTorque(GENTLE, fp.Affine(gain=-2 * gain)))
+    requests, error = found["deformed.y"][100:], (found["realised.y"] - found["desired.y"])[100:]
+    memory = 1 - gain
+    spread = 4 * math.sqrt(2 / requests.size * (1 + memory**2) / (1 - memory**2))
+    assert np.var(requests) == pytest.approx(gain / (2 - gain), rel=spread)
+    assert np.corrcoef(error[1:], error[:-1])[0, 1] == pytest.approx(-gain / 2, abs=4 / math.sqrt(error.size))
+
+
+def test_acceleration_noise_does_not_disturb_tracking():
+    """1 m/s^2 on both accelerometers: forces are rougher, the true tracking error stays within 10 %."""
+    task = fp.load_problem("two_mass")
+    ideal = replace(task.problem, duration=4.0, measure_from=2.0)
+    noisy = replace(ideal, sensing=fp.Sensing({"q1''": NOISE, "q2''": NOISE}))
+    runs = [fp.simulate(p, task.controllers["CTC+FPI (eq 6)"], seed=0) for p in (ideal, noisy)]
+    without, with_noise = (fp.measure(ideal, r).rms_error for r in runs)
+    for name, error in without.items():
+        assert with_noise[name] == pytest.approx(error, rel=0.1)
+    rough = [np.std(np.diff(r["command.Q1"])) for r in runs]
+    assert rough[1] > 2 * rough[0]
+
+
+def test_motor_turns_as_wanted():
+    """Mean within 0.1 rpm of 60 (published with eq. (3): 59.94), and less than a third of the scatter without adaptation."""
+    task = fp.load_problem("noisy_motor")
+    problem, rpm = replace(task.problem, duration=12.0), 2 * math.pi / 60
+    speeds = {}
+    for name in ("RHC", "RHC+FPI", "RHC+FPI (eq 3)"):
+        found = fp.simulate(problem, task.controllers[name], seed=0)
+        speeds[name] = found["plant_state.speed"][found.time >= problem.measure_from] / rpm
+    for name in ("RHC+FPI", "RHC+FPI (eq 3)"):
+        assert speeds[name].mean() == pytest.approx(60, abs=0.1)
+        assert speeds[name].std() < speeds["RHC"].std() / 3
+
+
+def test_coloured_noise_has_its_deviation_and_memory():
+    """Standard deviation and correlation exp(-T / correlation time), within four standard deviations."""
+    times = 1e-3 * np.arange(200_000)
+    values = fp.ColouredNoise(deviation=2.0, correlation_time=5e-3).values(times, np.random.default_rng(0))
+    kept = math.exp(-0.2)
+    spread = 4 * math.sqrt(2 / times.size * (1 + kept**2) / (1 - kept**2))
+    assert np.var(values) == pytest.approx(4.0, rel=spread)
+    assert np.corrcoef(values[1:], values[:-1])[0, 1] == pytest.approx(kept, abs=4 / math.sqrt(times.size))
+
+
+# --- sensors in the loop ---
+
+
+def test_nothing_and_zero_noise_are_the_ideal_loop():
+    """The default, and sensors that add zero, give the ideal run bit by bit."""
+    ideal = run(swinging())
+    assert np.array_equal(run(swinging(sensing=fp.Sensing())).log, ideal.log)
+    zero = run(swinging(sensing=fp.Sensing({"y''": fp.Sensor(noise=fp.Noise(0.0)), "y": fp.Sensor()})))
+    for name in ("state", "realised", "deformed", "command", "error"):
+        assert np.array_equal(zero[name], ideal[name])
+    assert np.array_equal(zero["plant_state"], ideal["state"])
+
+
+def test_quantised_values_are_multiples_of_the_quantum():
+    """And the nearest ones."""
+    found = run(swinging(sensing=fp.Sensing({"y": fp.Sensor(quantum=1 / 1024)})))
+    counts = found["state.y"] * 1024
+    np.testing.assert_array_equal(counts, np.round(counts))
+    assert np.abs(found["state.y"] - found["plant_state.y"]).max() <= 0.5 / 1024
+    assert np.unique(counts).size > 10
+
+
+def test_lost_samples_repeat_the_last():
+    """As often as asked for, the first one being the start."""
+    found = run(swinging(sensing=fp.Sensing({"y'": fp.Sensor(dropout=0.3)}), duration=2.0))
+    seen, true = found["state.y'"], found["plant_state.y'"]
+    lost = seen != true
+    assert np.array_equal(seen[1:][lost[1:]], seen[:-1][lost[1:]])
+    assert lost.mean() == pytest.approx(0.3, abs=4 * math.sqrt(0.3 * 0.7 / lost.size))
+
+
+def test_series_belong_to_the_seed_and_to_the_sensor():
+    """Same seed same run, other seed other noise; another sensor or disturbance leaves a sensor's noise as it is."""
+    noisy = swinging(sensing=fp.Sensing({"y": NOISE}))
+    first = run(noisy, seed=1)
+    assert np.array_equal(run(noisy, seed=1).log, first.log)
+    drawn = first["measured.y"] - first["plant_state.y"]
+    other = run(noisy, seed=2)
+    assert not np.allclose(other["measured.y"] - other["plant_state.y"], drawn)
+    more = replace(noisy, disturbances={"u": fp.Noise(0.1)}, sensing=fp.Sensing({"y": NOISE, "y'": NOISE}))
+    third = run(more, seed=1)
+    np.testing.assert_allclose(third["measured.y"] - third["plant_state.y"], drawn, atol=1e-12)
+    assert not np.allclose(third["measured.y'"] - third["plant_state.y'"], drawn)
+
+
+def test_compiled_loop_is_the_same():
+    """Noise, quanta, lost samples, dead time and a window: C and the virtual machine agree to rounding."""
+    sensor = fp.Sensor(noise=fp.ColouredNoise(1e-3, 1e-2), quantum=1e-4, dropout=0.1)
+    sensing = fp.Sensing({"y": sensor}, fp.SavitzkyGolay(window=5, degree=3))
+    problem = swinging(sensing=sensing, dead_time=fp.DeadTime(measurement=2e-3), period=1e-2)
+    controller = fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Filtered(fp.Affine(gain=-0.1), pole=0.5))
+    slow, fast = (run(problem, controller, compiled=c) for c in (False, True))
+    assert fast.compiled
+    np.testing.assert_allclose(fast.log, slow.log, rtol=1e-9, atol=1e-9)
+
+
+def test_order_of_sensor_dead_time_and_controller():
+    """The controller is given what the sensor showed three cycles ago; the run is judged by the true error."""
+    problem = swinging(sensing=fp.Sensing({"y": NOISE}), dead_time=fp.DeadTime(measurement=3e-3))
+    found = run(problem)
+    assert np.array_equal(found["state.y"][3:], found["measured.y"][:-3])
+    assert found["true_error.y"] == pytest.approx(found["reference.y"] - found["plant_state.y"])
+    assert fp.measure(problem, found).max_error["y"] == np.abs(found["true_error.y"]).max()
+
+
+def test_stepper_replays_a_noisy_run():
+    """A controller stepped by hand with what it was given computes the same commands, the wait at the start included."""
+    problem = swinging(sensing=fp.Sensing({"y": fp.Sensor(quantum=1e-6)}, fp.PositionDifference()))
+    found, stepper = run(problem), fp.Stepper(problem, ADAPTIVE, compiled=False)
+    memory = stepper.start()
+    for k in range(20):
+        command, memory = stepper.step(found.time[k], found["state"][k], found["realised"][k], memory)
+        assert command == pytest.approx(found["command"][k])
+
+
+# --- estimators ---
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+@pytest.mark.parametrize("estimator", ESTIMATORS[1:], ids=str)
+def test_response_is_the_stated_average_of_requests(estimator, order):
+    """On y^(n) = held requests the estimate is sum w_j r_{k-j}, the weights sum to one, and their centre is the delay."""
+    period, plant = 0.1, chain(order)
+    requests = np.random.default_rng(order).normal(size=200)
+    weights = estimator.weights(order, period)
+    assert weights.sum() == pytest.approx(1.0)
+    assert (weights * np.arange(weights.size)).sum() == pytest.approx(estimator.delay(order, period), abs=1e-6)
+    found = estimated(estimator, plant, period, trajectory(plant, period, requests))[1]
+    expected = np.convolve(requests, weights)[: requests.size]
+    first = weights.size if isinstance(estimator, fp.LowPassDifference) else estimator.fills(order)
+    np.testing.assert_allclose(found[first:], expected[first - 1 : -1], atol=1e-6)
+
+
+def trajectory(plant, period, requests):
+    """States before every request and after the last one, from rest."""
+    step = fp.RungeKutta4().step(plant, period)
+    rows = [np.zeros(plant.state.size)]
+    for request in requests[:-1]:
+        rows.append(step(rows[-1], request, plant.exact, 0).full().ravel())
+    return np.array(rows)
+
+
+def estimated(estimator, plant, period, states):
+    """States and responses that the estimator makes of true states, given where it measures them."""
+    measures = estimator.measures(plant)
+    block = estimator.block(plant, period, states[0], Signal("seen", measures))
+    memory = [s.start_vector() for s in block.memory.signals]
+    places, found = [plant.state.elements.index(m) for m in measures], []
+    for row in states:
+        state, response, *memory = block.function.call([row[places], *memory])
+        found.append((state.full().ravel(), float(response)))
+    return np.array([s for s, _ in found]), np.array([r for _, r in found])
+
+
+@pytest.mark.parametrize(
+    ("estimator", "degree"),
+    [
+        (fp.PositionDifference(), 2),
+        (fp.SavitzkyGolay(7, 2), 2),
+        (fp.SavitzkyGolay(9, 3), 3),
+        (fp.SavitzkyGolay(21, 5), 5),
+    ],
+    ids=str,
+)
+def test_polynomials_up_to_the_degree_are_met_exactly(estimator, degree):
+    """The response at the window's centre; Savitzky-Golay also the state at the newest sample, without any delay."""
+    plant, period, size = chain(2), 0.05, 40
+    motion = np.polynomial.Polynomial(np.random.default_rng(degree).normal(size=degree + 1))
+    times = period * np.arange(size)
+    states = np.column_stack([motion(times), motion.deriv()(times)])
+    state, response = estimated(estimator, plant, period, states)
+    first = estimator.fills(2)
+    # Half a cycle less: a difference over a window belongs to its middle, the ideal pair to half a cycle ago.
+    middle = times[first:] - (estimator.delay(2, period) + 0.5) * period
+    np.testing.assert_allclose(response[first:], motion.deriv(2)(middle), atol=1e-8)
+    if isinstance(estimator, fp.SavitzkyGolay):
+        np.testing.assert_allclose(state[first:], states[first:], atol=1e-9)
+
+
+def test_noise_of_an_nth_difference():
+    """White noise of deviation sigma becomes sigma sqrt(binomial(2 n, n)) / T^n."""
+    for order in (1, 2, 4):
+        row = fp.PositionDifference().coefficients(order)[-1]
+        assert np.linalg.norm(row) == pytest.approx(math.sqrt(math.comb(2 * order, order)))
+
+
+@pytest.mark.parametrize("estimator", [e for e in ESTIMATORS[1:] if not isinstance(e, fp.LowPassDifference)], ids=str)
+def test_deformation_waits_for_the_window(estimator):
+    """Until the window holds samples of the run alone the request is the desired response; estimates are finite from the first."""
+    problem = swinging(sensing=fp.Sensing(estimator=estimator), duration=0.05)
+    controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Affine(gain=-0.05))
+    found, blind = run(problem, controller), problem.blind_cycles
+    assert blind == estimator.fills(2)
+    assert np.array_equal(found["deformed"][:blind], found["desired"][:blind])
+    assert (found["deformed"][blind:] != found["desired"][blind:]).all()
+    # The start's velocity of 1 m/s is known from the first cycle on.
+    assert found["state.y'"][0] == pytest.approx(1.0)
+
+
+# --- stability ---
+
+
+def modes(problem, controller):
+    """Eigenvalues of the closed loop's step, after its start."""
+    loop = close_loop(problem, controller)
+    memory, step = ca.MX.sym("memory", loop.memory.size), loop.function
+    jacobian = ca.Function("jacobian", [memory], [ca.jacobian(step(memory)[0], memory)])
+    at = loop.memory.start()
+    for _ in range(problem.blind_cycles + 60):
+        at = step(at)[0]
+    return np.linalg.eigvals(jacobian(at).full())
+
+
+FASTEST = 6 - 4 * math.sqrt(2)  # 0.343, where the two roots meet
+
+
+@pytest.mark.parametrize("gain", [0.1, FASTEST, 1.0, 1.9])
+def test_second_difference_of_position(gain):
+    """z^2 - (1 - a/2) z + a/2 with the limit 2; fastest is a = 0.343 with the factor 0.414."""
+    problem = resting(
+        linear(1.0, 1.0), period=1e-4, duration=1e-2, sensing=fp.Sensing(estimator=fp.PositionDifference())
+    )
+    found = modes(problem, fp.ComputedTorque(GENTLE, fp.Affine(gain=-2 * gain)))
+    expected = np.roots([1, -(1 - gain / 2), gain / 2])
+    for root in expected:
+        assert np.abs(found - root).min() < 5e-3
+    if gain == FASTEST:
+        assert np.abs(expected).max() == pytest.approx(0.414, abs=1e-3)
+        radii = [np.abs(np.roots([1, -(1 - a / 2), a / 2])).max() for a in np.linspace(0.05, 1.5, 30)]
+        assert min(radii) >= 0.414 - 1e-3
+
+
+@pytest.mark.parametrize("pole", [0.0, 0.3, 0.8])
+@pytest.mark.parametrize("share", [0.1, 0.97, 1.03])
+def test_filtered_error(pole, share):
+    """z^2 - (1 + p - a (1 - p)) z + p, stable up to a = 2 (1 + p)/(1 - p)."""
+    limit = 2 * (1 + pole) / (1 - pole)
+    assert fp.delayed_limit(np.ones(1), pole=pole) == pytest.approx(limit, rel=1e-4)
+    gain = share * limit
+    problem = resting(linear(1.0, 1.0), period=1e-4, duration=1e-2)
+    controller = fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Filtered(fp.Affine(gain=-2 * gain), pole))
+    found = modes(problem, controller)
+    for root in np.roots([1, -(1 + pole - gain * (1 - pole)), pole]):
+        assert np.abs(found - root).min() < 2e-3
+    assert (np.abs(found).max() > 1 + 1e-4) == (share > 1)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS[2:], ids=str)
+@pytest.mark.parametrize("paired", [False, True])
+def test_limit_is_that_of_the_loop(estimator, paired, monkeypatch):
+    """3 % below the computed limit no mode of the real closed loop grows, 3 % above one does."""
+    monkeypatch.setattr(base, "check_response_delay", lambda *_: None)
+    problem = resting(linear(1.0, 0.8), period=1e-3, duration=1e-2, sensing=fp.Sensing(estimator=estimator))
+    cycles = problem.response_delay if paired else 0.0
+    weights = estimator.weights(2, problem.period)
+    limit = fp.delayed_limit(weights, pairing=cycles, eigenvalue=1 / 0.8)
+    assert limit > 0
+    for share in (0.97, 1.03):
+        pair = fp.Paired(fp.Affine(gain=-2 * share * limit), cycles=cycles)
+        tracking = fp.Exponential(rate=0.01, integral=False)
+        assert (np.abs(modes(problem, fp.ComputedTorque(tracking, pair))).max() > 1 + 1e-4) == (share > 1)
+
+
+@pytest.mark.parametrize("cycles", [1, 2, 5, 20])
+def test_limit_of_pure_delay(cycles):
+    """2 sin(pi / (2 (2 d + 1))) unpaired, 2 paired."""
+    weights = np.append(np.zeros(cycles), 1.0)
+    assert fp.delayed_limit(weights) == pytest.approx(2 * math.sin(math.pi / (2 * (2 * cycles + 1))), rel=1e-4)
+    assert fp.delayed_limit(weights, pairing=cycles) == pytest.approx(2.0, rel=1e-6)
+
+
+def test_pairing_that_damps_nothing_has_no_limit():
+    """The mean of two requests does not see a request that alternates, which the pair of two cycles ago keeps."""
+    assert fp.delayed_limit(np.array([0.5, 0.5]), pairing=1.0) == 0.0
+
+
+# --- what is refused ---
+
+WINDOW = fp.Sensing(estimator=fp.SavitzkyGolay(window=31, degree=2))
+
+
+def test_delay_that_makes_the_loop_unstable_is_refused():
+    """Before the run, with the limit, the gain and three remedies; each of them is accepted."""
+    problem, tracking = swinging(sensing=WINDOW), fp.Exponential(rate=6.0)
+    gain = 0.3  # lambda = 1 / 0.7; the limit of a lambda is 0.1207
+    limit = fp.delayed_limit(WINDOW.estimator.weights(2, 1e-3), eigenvalue=1 / 0.7)
+    with pytest.raises(NotContractive) as refused:
+        run(problem, fp.ComputedTorque(tracking, fp.Affine(gain=-2 * gain)))
+    text = str(refused.value)
+    for part in ("14.5 cycles late", f"below {limit:.3g}", "this is 0.3", "Paired(map, cycles=14.5)", "shorter window"):
+        assert part in text
+    smaller = fp.Affine(gain=-2 * 0.9 * limit)
+    paired = fp.Paired(fp.Affine(gain=-2 * gain), cycles=problem.response_delay)
+    shorter = replace(problem, sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window=5, degree=2)))
+    chosen = ((problem, smaller), (problem, paired), (shorter, fp.Affine(gain=-2 * gain)))
+    for accepted, deformation in chosen:
+        assert run(accepted, fp.ComputedTorque(tracking, deformation)).stop is None
+
+
+def test_dead_time_counts_but_is_not_judged_alone():
+    """With ideal sensing nothing is refused; with an estimator the pairing has to cover both delays."""
+    late = swinging(dead_time=fp.DeadTime(measurement=1e-2))
+    wild = fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Affine(gain=-1.0))
+    close_loop(late, wild)
+    window = replace(late, sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window=5, degree=2)))
+    assert window.response_delay == pytest.approx(11.5)
+    with pytest.raises(NotContractive, match=r"11.5 cycles late.*Paired\(map, cycles=11.5\)"):
+        close_loop(window, wild)
+    close_loop(window, fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Paired(fp.Affine(gain=-1.0), cycles=11.5)))
+
+
+def test_all_mistakes_of_sensing_are_told_at_once():
+    """Unknown names with the nearest, quantities that are not measured, sensors that are none, a polynomial that is too low."""
+    sensing = fp.Sensing({"yy": NOISE, "y'": NOISE, "y": 3.0}, fp.SavitzkyGolay(window=5, degree=1))
+    with pytest.raises(InvalidProblem) as refused:
+        swinging(sensing=sensing, measure_from=-1.0)
+    text = str(refused.value)
+    for part in (
+        "measure_from",
+        "quantity 'yy' is unknown. Did you mean 'y",
+        "'y'' is estimated by SavitzkyGolay, not measured; sensors are those of y",
+        "'y' must have a Sensor(noise=..., quantum=..., dropout=...), got 3.0",
+        "use a degree of at least 2",
+    ):
+        assert part in text
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: fp.Noise(-1.0), "Noise.*deviation=-1.0.*at least 0"),
+        (lambda: fp.Noise(math.nan), "deviation=nan"),
+        (lambda: fp.ColouredNoise(math.inf, 1.0), "ColouredNoise.*deviation=inf"),
+        (lambda: fp.ColouredNoise(1.0, 0.0), "correlation_time=0.0.*positive"),
+        (lambda: fp.Sensor(noise=0.1), r"expected a signal such as Noise\(deviation=...\)"),
+        (lambda: fp.Sensor(quantum=0.0), "quantum=0.0: expected a positive number"),
+        (lambda: fp.Sensor(quantum=-1.0, dropout=1.0), "quantum=-1.0.*dropout=1.0: expected a probability"),
+        (lambda: fp.Sensor(dropout=math.nan), "dropout=nan"),
+        (lambda: fp.SavitzkyGolay(window=10, degree=2), "odd window.*use 9 or 11"),
+        (lambda: fp.SavitzkyGolay(window=3, degree=3), "more samples than the degree.*at least 5"),
+        (lambda: fp.SavitzkyGolay(window=5.0, degree=2), "whole numbers"),
+        (lambda: fp.LowPassDifference(time_constant=0.0), r"positive number of seconds.*VelocityDifference\(\)"),
+        (lambda: fp.Filtered(fp.Affine(gain=-1.0), pole=1.0), "pole=1.0.*below 1"),
+        (lambda: fp.Filtered(fp.Affine(gain=-1.0), pole=math.nan), "pole=nan"),
+    ],
+)
+def test_wrong_values_are_refused(make, message):
+    """Each says what is wrong and what is expected."""
+    with pytest.raises(InvalidValue, match=message):
+        make()
