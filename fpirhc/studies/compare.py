@@ -219,7 +219,9 @@ def _contraction(problem: Problem, controller: Controller, run: Run) -> Contract
         problem.plant, run["state"][rows], run["deformed"][rows], approximate=controller.parameters(problem.plant)
     )
     report = assess_gain(deformation, spectrum)
-    measured = identified_factor(run["deformed"], run["realised"], deformation.effective_gain())
+    # What the plant did, where the controller was given something later or noisier.
+    realised = run["plant_realised" if "plant_realised" in run.layout else "realised"]
+    measured = identified_factor(run["deformed"], realised, deformation.effective_gain())
     return Contraction(report.predicted, measured, report, spectrum)
 
 
