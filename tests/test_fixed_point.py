@@ -305,6 +305,34 @@ def test_a_poisoned_memory_is_forgotten(poison):
     assert statuses[-1] == fp.Status.OK
 
 
+def test_single_iterations_get_out_of_a_bad_plan():
+    """A plan whose full, short and plain steps are all too long, one iteration per call: what is learned lasts over calls."""
+    plant = fp.Plant(
+        coordinates={"height": "m"},
+        inputs={"thrust": "N"},
+        order=2,
+        response=lambda q, v, u, p: {"height": (u.thrust - 0.3 * v.height * ca.fabs(v.height)) / p.mass - 9.81},
+        parameters={"mass": fp.Parameter(0.2, 0.2, "kg")},
+    )
+    reference = fp.Trajectory(lambda t: {"height": 2 + 1.5 * ca.sin(1.2 * t)})
+    cost = fp.Quadratic(states={"height": 1e3, "height'": 1.0}, correction={"thrust": 1e-2})
+    horizon, limits = fp.Horizon(stages=20, step=2e-2), fp.Limits(inputs={"thrust": (0.0, 40.0)})
+    ocp = transcribe(plant, reference, horizon, cost, limits)
+    data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate).full()
+    optimiser, memory = fp.FixedPoint(iterations=1, tolerance=1e-6), None
+    first = np.array([2.0, 0.0])
+    best = fp.solve(ocp, fp.InteriorPoint(), first, data)
+    # As after a plan for another model: nearly all thrust at once.
+    memory = optimiser.memory(ocp).start()
+    memory[optimiser.memory(ocp).slice("plan_inputs")] = np.linspace(40.0, 0.0, horizon.stages)
+    statuses = []
+    for _ in range(40):
+        inputs, told, memory = call(optimiser, ocp, data, first, ocp.input_lower, ocp.input_upper, memory)
+        statuses.append(int(told.ravel()[4]))
+    assert statuses[-1] == fp.Status.OK
+    np.testing.assert_allclose(inputs, best.inputs, atol=1e-4)
+
+
 def test_overflowing_models_are_told_and_survived():
     """A model that overflows in every plan: NON_FINITE with a finite plan; then a good first state is solved."""
     plant = fp.Plant(

@@ -30,20 +30,26 @@ class Informed(Controller):
 
     def resolved(self, problem: Problem) -> Informed:
         """Return the wrapped controller resolved."""
-        return replace(self, controller=self.controller.resolved(problem))
+        return replace(self, controller=self.controller.resolved(_told(problem)))
 
     def response(self, problem: Problem) -> Response | None:
         """The wrapped controller's."""
-        return self.controller.response(problem)
+        return self.controller.response(_told(problem))
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
         """The wrapped controller's."""
-        return self.controller.notes(problem)
+        return self.controller.notes(_told(problem))
 
     def check(self, problem: Problem) -> None:
         """Raise what the wrapped controller raises."""
-        self.controller.check(problem)
+        self.controller.check(_told(problem))
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Blocks of the wrapped controller."""
-        return self.controller.blocks(problem)
+        return self.controller.blocks(_told(problem))
+
+
+def _told(problem: Problem) -> Problem:
+    """The problem as one sees it who knows the plant: what is prepared before a run has the exact parameters too."""
+    exact = {name: replace(p, approximate=p.exact) for name, p in problem.plant.parameters.items()}
+    return replace(problem, plant=replace(problem.plant, parameters=exact))

@@ -23,7 +23,7 @@ typedef struct {
   Plan plans[2];
   casadi_real v[N * NU], k[N * NU * NS], t[N * NU], planned[N * NS];
   casadi_real a[N * NS * NS], b[N * NS * NU], ls[N * NS], lu[N * NU], lambda[(N + 1) * NS], final[NS * NS];
-  casadi_real envelope, reach, tau, gamma;
+  casadi_real envelope, reach, tau, gamma, resume;
   casadi_real w[WORK + 1];
   casadi_int iw[INTEGERS + 1];
 } Search;
@@ -131,7 +131,7 @@ INLINE casadi_real plain_step(Search* s, const Plan* plan, In lower, In upper, c
 /* Accept the tried plan and return 1, or draw in and return 0. */
 INLINE int judged(Search* s, Plan* best, Plan* plan, int ok, In lower, In upper) {
   int i, untried = best->value >= UNTRIED, bold = s->tau >= SHORTEST;
-  casadi_real slack = ROUNDING * (1 + fabs(best->value)), reach, envelope = 0, descent = 0;
+  casadi_real slack = ROUNDING * (1 + fabs(best->value)), reach, envelope = 0, descent = 0, rise = 0;
   if (ok && !untried) {
     if (bold) {
       casadi_real kept[N * NU];
@@ -145,16 +145,18 @@ INLINE int judged(Search* s, Plan* best, Plan* plan, int ok, In lower, In upper)
     } else {
       for (i = 0; i < N * NU; ++i) descent += best->g[i] * (s->t[i] - best->u[i]);
       ok = plan->value <= best->value + descent + SHARE * s->reach + slack;
+      rise = (plan->value - best->value - descent) / (SHARE * s->reach);
     }
   }
   if (ok) {
     s->envelope = plan->value + plain_step(s, plan, lower, upper, &s->reach) + s->reach;
     for (i = 0; i < N * NS; ++i) s->planned[i] = plan->x[i];
-    if (!untried) s->tau = 1;
+    s->tau = untried ? s->resume : 1;
     return 1;
   }
   if (!untried && !bold) {
-    s->gamma *= 0.5;
+    /* The quadratic that the cost followed along T - U says which gamma would have been short enough. */
+    s->gamma *= rise > 2 ? fmax(1 / rise, DRAWN_IN) : 0.5;
     s->envelope = best->value + plain_step(s, best, lower, upper, &s->reach) + s->reach;
   }
   s->tau = untried ? SHORTEST * SHORTER : SHORTER * s->tau;
@@ -310,8 +312,10 @@ INLINE void begin(Search* s, Plan* best, In memory, In lower, In upper) {
   for (i = 0; i < N * NU * NS; ++i) s->k[i] = known ? memory[N * (NU + NS) + i] : 0;
   best->value = s->envelope = 10 * UNTRIED;
   s->reach = 0;
-  s->gamma = gamma > 0 ? fmin(2 * gamma, FIRST_GAMMA) : FIRST_GAMMA;
-  s->tau = tau > 0 ? tau : 1;
+  s->tau = 1;
+  s->resume = tau > 0 ? fmin(tau, 1) : 1;
+  /* After a rejected T a longer gamma would be rejected again, in every call of one iteration. */
+  s->gamma = gamma > 0 ? fmin((s->resume < SHORTEST ? 1 : 2) * gamma, FIRST_GAMMA) : FIRST_GAMMA;
 }
 
 INLINE void remember(const Search* s, const Plan* best, Out memory) {

@@ -19,7 +19,7 @@ step and gamma < 1 / L, a new plan must decrease the forward-backward envelope
 
 by a share of |T - U|^2 (a short step: V by a share of what it promises), and raise neither phi nor V; else the step is shortened,
 and at last T itself is taken, which always decreases phi. T is tested for the quadratic upper bound that gamma promises; where
-it fails gamma is halved. D = 1/(step c) is the scale of `OptimalControl`.
+it fails gamma is shortened, at least to its half. D = 1/(step c) is the scale of `OptimalControl`.
 
 A call evaluates the remembered plan, rolled out with its remembered feedback, which answers to first order for a new initial
 state; an iteration finds a direction by one Riccati sweep and evaluates the plan there: one rollout with Jacobians and one
@@ -59,6 +59,7 @@ from fpirhc.optimisers.base import (
 from fpirhc.optimisers.constrained import constrained_step, shifted_multipliers, with_multipliers
 from fpirhc.optimisers.search import (
     ARMIJO,
+    DRAWN_IN,
     ROUNDING,
     SHARE,
     SHORTER,
@@ -224,6 +225,7 @@ class FixedPoint(Optimiser):
             "ARMIJO": ARMIJO,
             "SHORTER": SHORTER,
             "SHORTEST": SHORTEST,
+            "DRAWN_IN": DRAWN_IN,
             "ROUNDING": ROUNDING,
             "UNTRIED": UNTRIED,
             "FINITE": FINITE,
@@ -276,8 +278,10 @@ class FixedPoint(Optimiser):
         inputs = clip(ca.reshape(kept["plan_inputs"], nu, n), given.lower, given.upper)
         none = ca.MX.zeros(nu, n)
         first = first_gamma(ocp)
-        gamma = ca.if_else(kept["plan_gamma"] > 0, ca.fmin(2 * kept["plan_gamma"], first), first)
-        step = ca.if_else(kept["plan_step"] > 0, kept["plan_step"], 1)
+        resume = ca.if_else(kept["plan_step"] > 0, ca.fmin(kept["plan_step"], 1), 1)
+        # After a rejected T a longer gamma would be rejected again, in every call of one iteration.
+        longer = ca.if_else(resume < SHORTEST, 1, 2) * kept["plan_gamma"]
+        gamma = ca.if_else(kept["plan_gamma"] > 0, ca.fmin(longer, first), first)
         return Anchor(
             inputs=inputs,
             states=ca.reshape(kept["plan_states"], ns, n),
@@ -287,8 +291,9 @@ class FixedPoint(Optimiser):
             slope=none,
             value=ca.MX(10 * UNTRIED),
             envelope=ca.MX(10 * UNTRIED),
-            step=step,
+            step=ca.MX(1),
             gamma=gamma,
+            resume=resume,
         )
 
     def _finish(

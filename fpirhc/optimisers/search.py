@@ -20,8 +20,10 @@ from fpirhc.symbolic.layout import Expression
 SHARE = 0.95  # gamma L, and the share of the guaranteed decrease that is asked for
 ARMIJO = 1e-2  # share of the first-order decrease that is asked of a short step
 SHORTER = 0.25  # factor of the step after a plan that did not decrease the envelope
+DRAWN_IN = 0.01  # least factor of gamma after a plain step that was rejected
 SHORTEST = 0.05  # below it the plain fixed-point step is taken
 ROUNDING = 1e-13  # relative to the cost: differences below it say nothing
+TINY = 1e-300
 UNTRIED = 1e299  # a cost from which on an anchor counts as not evaluated
 
 
@@ -47,6 +49,7 @@ class Anchor(NamedTuple):
     envelope: Expression  # phi
     step: Expression  # tau; below SHORTEST the next plan is T
     gamma: Expression
+    resume: Expression  # tau that follows the evaluation of a remembered plan
 
 
 class Expanded(NamedTuple):
@@ -168,7 +171,7 @@ def _judgement(ocp: OptimalControl) -> ca.Function:
     inputs, states = ca.MX.sym("U", nu, n), ca.MX.sym("X", ns, n + 1)
     value, slope = ca.MX.sym("V"), ca.MX.sym("g", nu, n)
     lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
-    shapes = [(nu, n), (ns, n), (nu, n), (nu, ns * n), (nu, n), (nu, n), (1, 1), (1, 1), (1, 1), (1, 1)]
+    shapes = [(nu, n), (ns, n), (nu, n), (nu, ns * n), (nu, n), (nu, n), (1, 1), (1, 1), (1, 1), (1, 1), (1, 1)]
     old = Anchor(*(ca.MX.sym(name, *shape) for name, shape in zip(Anchor._fields, shapes, strict=True)))
     scale = ca.repmat(ca.DM(1 / (ocp.step * ocp.curvature)), 1, n)
 
@@ -189,22 +192,28 @@ def _judgement(ocp: OptimalControl) -> ca.Function:
     # Far away gamma may be too long for the envelope to bound V from below, so V itself must not rise; it does not at T.
     falls = ca.logic_and(envelope <= old.envelope + slack, value <= old.value + slack)
     decreases = ca.logic_and(falls, ca.logic_or(enough, fair))
-    bounded = value <= old.value + ca.dot(old.slope, old.plain - old.inputs) + SHARE * reach + slack
+    promised = old.value + ca.dot(old.slope, old.plain - old.inputs)
+    bounded = value <= promised + SHARE * reach + slack
     finite = is_finite(ca.vertcat(value, ca.vec(slope), ca.vec(states)))
     accepted = ca.logic_and(finite, ca.logic_or(untried, ca.if_else(bold, decreases, bounded)))
     # A rejected T means that gamma was too long; a rejected warm start, that a plan without memory is next.
-    halved = ca.if_else(ca.logic_or(untried, bold), old.gamma, 0.5 * old.gamma)
+    # The quadratic that the cost followed along T - U says which gamma would have been short enough.
+    rise = ca.if_else(finite, (value - promised) / (SHARE * reach + TINY), 0)
+    drawn_in = ca.if_else(rise > 2, ca.fmax(1 / ca.fmax(rise, 1), DRAWN_IN), 0.5)
+    shorter = ca.if_else(ca.logic_or(untried, bold), old.gamma, drawn_in * old.gamma)
     retreat = old._replace(
-        gamma=halved,
+        gamma=shorter,
         step=ca.if_else(untried, SHORTEST * SHORTER, SHORTER * old.step),
-        plain=ca.if_else(untried, old.plain, plain_step(old.inputs, old.slope, halved)),
+        plain=ca.if_else(untried, old.plain, plain_step(old.inputs, old.slope, shorter)),
     )
-    shrunk = size(retreat.plain - old.inputs) / (2 * halved)
+    shrunk = size(retreat.plain - old.inputs) / (2 * shorter)
     retreat = retreat._replace(
         envelope=ca.if_else(untried, old.envelope, old.value + ca.dot(old.slope, retreat.plain - old.inputs) + shrunk)
     )
-    step = ca.if_else(untried, old.step, 1)
-    advance = Anchor(inputs, states[:, :n], old.move, old.gains, plain, slope, value, envelope, step, old.gamma)
+    step = ca.if_else(untried, old.resume, 1)
+    advance = Anchor(
+        inputs, states[:, :n], old.move, old.gains, plain, slope, value, envelope, step, old.gamma, old.resume
+    )
     kept = [ca.if_else(accepted, new, back) for new, back in zip(advance, retreat, strict=True)]
     return ca.Function("fpirhc_judgement", [inputs, states, value, slope, lower, upper, *old], [*kept, accepted])
 
