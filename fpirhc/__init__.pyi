@@ -1,14 +1,21 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
 from .contraction import assess_gain, check_gain, response_jacobian, spectrum_over_box, spectrum_over_run
+from .controllers.acceleration_feedback import AccelerationFeedback
+from .controllers.backstepping_mrac import BacksteppingMrac
 from .controllers.computed_torque import ComputedTorque
 from .controllers.floquet import Floquet, floquet_radius
+from .controllers.force_mrac import ForceMrac
 from .controllers.informed import Informed
+from .controllers.lyapunov_mrac import LyapunovMrac
 from .controllers.nominal import OpenPlan, Restart, RestartAndTrack
 from .controllers.on_failure import Feedforward, HoldPlan, StopRun
+from .controllers.pid import Pid
 from .controllers.predicted import ByDesired, ByModel, Predicted
 from .controllers.receding_horizon import RecedingHorizon
+from .controllers.resolved_rate import ResolvedAccelerationRate
 from .controllers.schedules import ByError, ByLookAhead, FixedSchedule, Periodic
+from .controllers.sliding_mode import SlidingMode
 from .controllers.slot import Slot
 from .controllers.slotted import Slotted
 from .dead_time import DeadTime
@@ -57,8 +64,10 @@ from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
 
 __all__ = [
+    "AccelerationFeedback",
     "Affine",
     "Anderson",
+    "BacksteppingMrac",
     "Blended",
     "ByDesired",
     "ByError",
@@ -79,6 +88,7 @@ __all__ = [
     "FixedPoint",
     "FixedSchedule",
     "Floquet",
+    "ForceMrac",
     "Formula",
     "FpirhcError",
     "Fractional",
@@ -95,6 +105,7 @@ __all__ = [
     "InteriorPoint",
     "Limits",
     "LqrTerminal",
+    "LyapunovMrac",
     "Metrics",
     "Noise",
     "OpenPlan",
@@ -104,6 +115,7 @@ __all__ = [
     "Parameter",
     "Path",
     "Periodic",
+    "Pid",
     "Plan",
     "Plant",
     "Predicted",
@@ -113,6 +125,7 @@ __all__ = [
     "Quadratic",
     "RecedingHorizon",
     "ReducedGradient",
+    "ResolvedAccelerationRate",
     "Restart",
     "RestartAndTrack",
     "Rfpt",
@@ -124,6 +137,7 @@ __all__ = [
     "SequentialQuadratic",
     "Sigmoid",
     "Sine",
+    "SlidingMode",
     "Slot",
     "Slotted",
     "Status",

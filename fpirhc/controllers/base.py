@@ -134,13 +134,18 @@ def closing_blocks(
 ) -> tuple[list[Block], list[Delay]]:
     """Return the blocks deform, invert, limit and judge with what they remember; `judged` are solver statuses."""
     plant = problem.plant
-    blocks = [deform_block(plant, deformation), _invert_block(plant), _limit_block(problem), _judge_block(judged)]
-    delays = [
-        Delay(scalar("started"), "_running"),
-        Delay(plant.response_signal("_request_before"), "deformed"),
-        Delay(like(plant.input, "_command_before"), "command"),
-    ]
-    return blocks, delays
+    closing, delays = commanding_blocks(problem, judged)
+    blocks = [deform_block(plant, deformation), invert_block(plant), *closing]
+    return blocks, [*delays, Delay(plant.response_signal("_request_before"), "deformed")]
+
+
+def commanding_blocks(problem: Problem, judged: Sequence[Signal] = ()) -> tuple[list[Block], list[Delay]]:
+    """Return the blocks limit and judge with what they remember, for a controller that gives 'requested' itself.
+
+    It also gives 'desired', and '_deformed_wanted': the response that its model expects of the requested command.
+    """
+    delays = [Delay(scalar("started"), "_running"), Delay(like(problem.plant.input, "_command_before"), "command")]
+    return [_limit_block(problem), _judge_block(judged)], delays
 
 
 def deform_block(plant: Plant, deformation: Deformation) -> Block:
@@ -165,7 +170,8 @@ def deform_block(plant: Plant, deformation: Deformation) -> Block:
     return Block("deform", Layout(reads), Layout((plant.response_signal("_deformed_wanted"), *logged)), step, memory)
 
 
-def _invert_block(plant: Plant) -> Block:
+def invert_block(plant: Plant) -> Block:
+    """Block (state, _deformed_wanted, parameters) -> the command that the model needs for it."""
     reads = Layout((plant.state, plant.response_signal("_deformed_wanted"), plant.parameter))
     inverse = plant.inverse_function
 
