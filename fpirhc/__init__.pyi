@@ -38,6 +38,7 @@ from .horizon.expansion import ExactHessian, GaussNewton
 from .horizon.problem import Horizon
 from .integrate import Cvodes, Euler, RungeKutta4
 from .limits import Limits, Path
+from .lyapunov import LyapunovView, lyapunov_view
 from .metrics import Metrics, measure
 from .optimisers.anderson import Anderson
 from .optimisers.certificate import Certificate, certify
@@ -106,6 +107,7 @@ __all__ = [
     "Limits",
     "LqrTerminal",
     "LyapunovMrac",
+    "LyapunovView",
     "Metrics",
     "Noise",
     "OpenPlan",
@@ -155,6 +157,7 @@ __all__ = [
     "floquet_radius",
     "load_problem",
     "load_run",
+    "lyapunov_view",
     "measure",
     "output_chain",
     "response_jacobian",
