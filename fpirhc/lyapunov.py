@@ -1,7 +1,7 @@
 """Lyapunov's view of a run with an exponential tracking law: V = S^2 / 2, and the bound that the response error sets.
 
-With S = (d/dt + rate)^n e_int (without integral: (d/dt + rate)^(n-1) e) the law prescribes S' = -rate S. The plant answers with the
-response error h = q^(n) - q^(n),Des, so S' = -rate S - h and
+With S = (d/dt + rate)^n e_int (without integral: (d/dt + rate)^(n-1) e) the law prescribes S' = -rate S. The plant answers
+with the response error h = q^(n) - q^(n),Des, so S' = -rate S - h and
 
     V' <= -2 rate V + |h| (2 V)^(1/2),     ultimately |S| <= sup|h| / rate.
 
@@ -32,7 +32,8 @@ class LyapunovView:
     """S and h along a run.
 
     Parameters:
-        surface: S, shape (cycles, controlled coordinates). response_error: h, shape (cycles - 1, controlled coordinates). rate: 1/s. since: first cycle of the measured part.
+        surface: S, shape (cycles, controlled coordinates). response_error: h, shape (cycles - 1, controlled coordinates).
+        rate: of the law, 1/s. since: first cycle of the measured part.
     """
 
     surface: np.ndarray

@@ -1,4 +1,4 @@
-"""Rivals: each law does what its textbook says, fits or is refused before a run, and runs alike in C and in the virtual machine."""
+"""Rivals: each law does what its textbook says, fits or is refused before a run, and is one step in C as in CasADi."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_pid_starts_without_a_jump_and_its_integral_waits_for_the_actuator():
 @pytest.mark.parametrize(("order", "derivative"), [(1, {}), (3, {"y": (12.0, 6.0)})])
 def test_pid_serves_other_relative_orders(order, derivative):
     """The chain of errors goes as far as the state."""
-    run = simulate(resting(chain(order), duration=8.0), fp.Pid({"y": 8.0}, {"y": 2.0}, derivative, bumpless=False))
+    run = simulate(resting(chain(order), duration=12.0), fp.Pid({"y": 8.0}, {"y": 2.0}, derivative, bumpless=False))
     assert abs(run["error.y"][-1]) < 0.05
 
 
@@ -203,7 +203,7 @@ def test_force_mrac_believes_in_the_reference_model():
 
 
 def test_force_mrac_is_computed_torque_with_a_deformed_command():
-    """Without a deformation they are one; with it the automatic scale, in units of the input, serves as well as a given one."""
+    """Without a deformation they are one; with it the automatic scale, in units of the input, serves as well."""
     problem = swing()
     plain = [simulate(problem, c) for c in (fp.ForceMrac(TRACK, fp.Identity()), fp.ComputedTorque(TRACK))]
     np.testing.assert_allclose(plain[0]["command"], plain[1]["command"], atol=1e-9)
@@ -257,16 +257,25 @@ def adapted(period, gain, duration=20.0):
 
 @pytest.mark.parametrize("gain", [2.0, -2.0])
 def test_lyapunov_function_falls_and_the_error_goes_to_zero(gain):
-    """In the limit of small periods V never rises: what it rises halves with the period, and is nothing beside what it falls."""
+    """In the limit of small periods V never rises: what it rises shrinks with the period and is little beside its fall."""
     rises = []
     for period in (4e-3, 2e-3):
         function, run = adapted(period, gain)
         changes = np.diff(function)
         rises.append(changes[changes > 0].sum() / -changes[changes < 0].sum())
     assert rises[0] < 0.02
-    assert rises[1] < 0.6 * rises[0] or rises[1] < 1e-4
+    assert rises[1] < 0.6 * rises[0]
     deviation = np.abs(run["model.y"] - run["state.y"])
     assert deviation[-500:].max() < 0.05 * deviation.max()
+
+
+@pytest.mark.parametrize(("share", "grows"), [(0.8, False), (1.25, True)])
+def test_adaptation_has_the_computed_limit(share, grows):
+    """At rest only the bias is adapted, |phi| = 1: stable below gamma |B| period / 2 = rate."""
+    law = fp.LyapunovMrac(RATE, adaptation=share * 2 * RATE / 1e-2)
+    load = {"y": fp.Pulse(at=0.1, duration=0.1, size=1e-6)}
+    moved = np.abs(simulate(resting(chain(2), 0.0, disturbances=load), law)["state.y'"])
+    assert (moved[200:].max() > moved[:60].max()) == grows
 
 
 def test_leakage_binds_the_gains_to_the_model():
@@ -280,7 +289,7 @@ def test_leakage_binds_the_gains_to_the_model():
 
 
 def test_lyapunov_mrac_on_a_coupled_plant():
-    """Two joints with a symmetric inertia: each law's error goes down although the model knows neither inertia nor coupling."""
+    """Two joints with a symmetric inertia: the deviation goes down although the model knows neither inertia nor coupling."""
     plant = fp.Plant(
         {"a": "rad", "b": "rad"},
         {"A": "N m", "B": "N m"},
@@ -289,7 +298,7 @@ def test_lyapunov_mrac_on_a_coupled_plant():
     )
     moving = fp.Trajectory(lambda t: {"a": ca.sin(t), "b": ca.cos(1.7 * t)})
     problem = fp.Problem(plant, moving, {"a": 0.0, "b": 1.0}, 4e-3, 40.0)
-    run = simulate(problem, fp.LyapunovMrac(4.0, adaptation=50.0))
+    run = simulate(problem, fp.LyapunovMrac(4.0, adaptation=10.0))
     deviation = np.abs(run["model"] - run["state"])[:, :2].max(axis=1)
     assert deviation[-500:].max() < 0.1 * deviation.max()
 
@@ -323,7 +332,7 @@ def test_view_is_shown_where_there_is_one():
     found = compare(task, seed=0, compiled=False)
     assert found["CTC"].notes[-1] == found["CTC"].lyapunov.text
     assert found["PID"].lyapunov is None
-    assert "Lyapunov&#x27;s view" in render(found) or "Lyapunov's view" in render(found)
+    assert "Lyapunov's view" in render(found)
 
 
 # What fits, and what does not
@@ -342,6 +351,7 @@ MISFITS = {
     "too many gains": (swing, fp.Pid({"angle": 1.0}, {}, {"angle": (1.0, 1.0)}), "at most 1 gains of e'"),
     "wrong order": (swing, fp.BacksteppingMrac(RATE, (1.0, 1.0, 1.0), SIGMOID), "relative order 2, but rates has 3"),
     "unknown parameter": (swing, fp.ForceMrac(TRACK, SIGMOID, {"mass": 1.0}), "parameter 'mass' is unknown"),
+    "no number": (swing, fp.ForceMrac(TRACK, SIGMOID, {"m": float("nan")}), "'m' must be a finite number"),
     "chattering": (swing, fp.SlidingMode(RATE, 500.0, 0.2), "chatters with any model"),
 }
 

@@ -1,7 +1,8 @@
 """Computed torque with feedback of the measured response: u = model(q^Des) + K (q^Des - q^(n)).
 
 K is kappa times the model's inertia: the request is r_k = d_k - kappa h_k with h_k = f_k - d_k, f_k the response to the last
-request and d_k the desired one; h may be low-passed with the pole p = exp(-period / time_constant). Where the response is f = J r + c with constant eigenvalues of J,
+request and d_k the desired one; h may be low-passed with the pole p = exp(-period / time_constant). Where the response is
+f = J r + c with constant eigenvalues of J,
 
     error left by a constant residual w = c - (1 - J) d:  h = w / (1 + kappa J),
     stable for  kappa lambda_max(J) < (1 + p) / (1 - p).
@@ -9,9 +10,9 @@ request and d_k the desired one; h may be low-passed with the pole p = exp(-peri
 So without a filter the error can at most be halved, and with one it is divided by as much as the filter is slow: a
 proportional law on the response, where a deformation is a summing one. Nothing is remembered but the filter.
 
-References: J. Studenny, P. R. Bélanger, Robot manipulator control by acceleration feedback, IEEE CDC 1984.
-B. de Jager, Acceleration assisted tracking control, IEEE Control Systems 14(5), 1994. In their spirit: there K and the filter are
-designed in continuous time.
+References: J. Studenny, P. R. Bélanger, Robot manipulator control by acceleration feedback, IEEE CDC 1984. B. de Jager,
+Acceleration assisted tracking control, IEEE Control Systems 14(5), 1994. In their spirit: there K and the filter are designed
+in continuous time.
 """
 
 from __future__ import annotations

@@ -4,12 +4,12 @@ With e = y - q, y the reference model's motion, and rates k_1 ... k_n the nested
 
     z_1 = e,    z_{i+1} = z_i' + k_i z_i + z_{i-1}   (z_0 = 0),    and    z_n' = -k_n z_n - z_{n-1}
 
-gives q^(n),Des. Then V = (z_1^2 + ... + z_n^2) / 2 has V' = -sum k_i z_i^2 - z_n h: it falls for a realised response without error,
-and the deformation keeps the response error h small, where the textbook adapts parameters by a Lyapunov function. (Every z is
-counted in the unit of the coordinate, time in seconds; so z_{i-1} stands with a factor of 1 1/s^2.)
+gives q^(n),Des. Then V = (z_1^2 + ... + z_n^2) / 2 has V' = -sum k_i z_i^2 - z_n h: it falls for a realised response without
+error, and the deformation keeps the response error h small, where the textbook adapts parameters by a Lyapunov function.
+(Every z is counted in the unit of the coordinate, time in seconds; so z_{i-1} stands with a factor of 1 1/s^2.)
 
-References: M. Krstić, I. Kanellakopoulos, P. Kokotović, Nonlinear and Adaptive Control Design, Wiley 1995, ch. 2 (nested errors).
-With a fixed-point iteration in place of the adaptation it is in the spirit of the group of J. K. Tar.
+References: M. Krstić, I. Kanellakopoulos, P. Kokotović, Nonlinear and Adaptive Control Design, Wiley 1995, ch. 2 (nested
+errors). With a fixed-point iteration in place of the adaptation it is in the spirit of the group of J. K. Tar.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class BacksteppingMrac(Controller):
         mistakes.raise_if_any()
 
     def nested(self) -> np.ndarray:
-        """Nested errors as sums over (e, e', ..., e^(n)): row i is z_{i+1}, the last row the left side of the prescription = 0."""
+        """Nested errors as sums over (e, e', ..., e^(n)), one per row; the last row is what is made zero."""
         size = len(self.rates)
         rows = np.zeros((size + 1, size + 1))
         rows[0, 0] = 1.0

@@ -10,12 +10,13 @@ the reference model would under Q^Des: the outer loop cannot tell them apart, al
 Q^Def -> Q^Rec is M_r M^-1, with the eigenvalues of M^-1 M_r, so gains and limits are those of a deformed response; scales are
 forces.
 
-In the spirit of J. K. Tar, J. F. Bitó, I. Rudas, Replacement of Lyapunov's direct method in model reference adaptive control with
-robust fixed point transformations, IEEE INES 2010.
+In the spirit of J. K. Tar, J. F. Bitó, I. Rudas, Replacement of Lyapunov's direct method in model reference adaptive control
+with robust fixed point transformations, IEEE INES 2010.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -63,13 +64,16 @@ class ForceMrac(Controller):
         return replace(self, deformation=scaled_for_command(self.deformation, problem, values))
 
     def check(self, problem: Problem) -> None:
-        """Raise if the reference model names parameters that the plant does not have.
+        """Raise if the reference model has parameters that the plant does not have, or values that are no numbers.
 
         Raises:
             InvalidProblem: all mistakes together.
         """
         mistakes = Mistakes("ForceMrac")
         mistakes.unknown("model: parameter", self.model, problem.plant.parameters)
+        for name, value in self.model.items():
+            if not isinstance(value, int | float) or not math.isfinite(value):
+                mistakes.add(f"model: '{name}' must be a finite number, got {value!r}")
         mistakes.raise_if_any()
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
@@ -88,7 +92,7 @@ class ForceMrac(Controller):
         return blocks, [*delays, *self.tracking.delays(plant)]
 
     def _force_block(self, plant: Plant) -> Block:
-        """Block (state, desired, realised, last command) -> Q^Des, Q^Rec, Q^Def, and what the reference model makes of Q^Def."""
+        """Block (state, desired, realised, last command) -> Q^Des, Q^Rec, Q^Def, and the model's response to it."""
         memory = self.deformation.memory(plant.input.elements)
         inverse, response = plant.inverse_function, plant.controlled_response_function
 

@@ -4,8 +4,8 @@ With e = q^N - q of a controlled coordinate and the integral of its error,
 
     u = k_i e_int + k_p e + k_d e' + ...,
 
-the k-th input for the k-th controlled coordinate. The chain may go on to e^(n-1), all that is measured for the relative order n;
-without it no PID stabilises a chain of three or more integrators. On n integrators with the gain b the error obeys
+the k-th input for the k-th controlled coordinate. The chain may go on to e^(n-1), all that is measured for the relative order
+n; without it no PID stabilises a chain of three or more integrators. On n integrators with the gain b the error obeys
 e^(n+1) + b (... + k_d e'' + k_p e' + k_i e) = 0 (Routh: b k_d k_p > k_i for n = 2).
 
 The integral stands still while some command is clipped (conditional integration), and starts where the first command is zero.
@@ -64,7 +64,7 @@ class Pid(Controller):
         """Raise if the gains do not fit the plant.
 
         Raises:
-            InvalidProblem: unknown, missing or odd gains, or an input that does not reach its coordinate; all mistakes together.
+            InvalidProblem: all mistakes together: gains by name, and inputs that do not bring their coordinates back.
         """
         plant, mistakes = problem.plant, Mistakes("Pid")
         names = plant.controlled_names
@@ -87,7 +87,7 @@ class Pid(Controller):
                 mistakes.add(f"the gains of '{name}' must be finite numbers, got {gains!r}")
             elif float(at_start[k, k]) * self.proportional[name] <= 0:
                 mistakes.add(
-                    f"input '{plant.input.elements[k]}' moves '{name}' by {float(at_start[k, k]):.3g} per unit at the start, so "
+                    f"input '{plant.input.elements[k]}' moves '{name}' by {float(at_start[k, k]):.3g} per unit at the start: "
                     f"proportional = {self.proportional[name]:g} does not bring it back; pair inputs and coordinates in order"
                 )
         mistakes.raise_if_any()

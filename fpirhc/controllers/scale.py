@@ -56,7 +56,7 @@ def scaled_for_plan(deformation: Deformation, problem: Problem) -> Deformation:
 
 
 def scaled_for_command(deformation: Deformation, problem: Problem, parameters: np.ndarray) -> Deformation:
-    """Return the deformation with S = max(1, 2 period max|dQ/dt|), Q the model's command along the reference, unless S is given."""
+    """Return the deformation with S = max(1, 2 period max|dQ/dt|), Q the model's command along the reference."""
     if isinstance(deformation, Wrapper):
         return replace(deformation, map=scaled_for_command(deformation.map, problem, parameters))
     if not _is_open(deformation):

@@ -9,8 +9,8 @@ makes S' = -K tanh(S / w) - h with the response error h = q^(n) - q^(n),Des of t
 error, while a deformation sums its errors and leaves none. In control cycles S is multiplied by 1 - K period / w near
 zero: from K period / w = 2 on it chatters, with a model whose gain is wrong by J from K period J / w = 2 on.
 
-References: V. I. Utkin, Variable structure systems with sliding modes, IEEE Trans. Automatic Control 22(2), 1977.
-J.-J. E. Slotine, W. Li, Applied Nonlinear Control, Prentice Hall 1991, ch. 7 (boundary layer; there a saturation instead of tanh).
+References: V. I. Utkin, Variable structure systems with sliding modes, IEEE Trans. Automatic Control 22(2), 1977. J.-J. E.
+Slotine, W. Li, Applied Nonlinear Control, Prentice Hall 1991, ch. 7 (boundary layer; there a saturation instead of tanh).
 """
 
 from __future__ import annotations
@@ -70,7 +70,8 @@ class SlidingMode(Controller):
         if product >= 2:
             mistakes.add(
                 f"gain x period / width = {product:.3g} chatters with any model; "
-                f"take a width above {0.5 * self.gain * problem.period:.3g} or a gain below {2 * self.width / problem.period:.3g}"
+                f"take a width above {0.5 * self.gain * problem.period:.3g} "
+                f"or a gain below {2 * self.width / problem.period:.3g}"
             )
         mistakes.raise_if_any()
 
