@@ -135,10 +135,9 @@ def lyapunov_figure(comparison: Comparison) -> Figure | None:
     figure = _figure(11, 3.4, "")
     axis = figure.subplots()
     for k, (entry, view) in enumerate(views):
-        color = PALETTE[k % len(PALETTE)]
-        axis.semilogy(
-            _thin(entry.run.time), _thin(np.maximum(view.function, 1e-20)), color=color, lw=1, label=entry.name
-        )
+        color, values = PALETTE[k % len(PALETTE)], np.maximum(view.function, 1e-20)
+        times = entry.run.period * np.arange(values.size)
+        axis.semilogy(_thin(times), _thin(values), color=color, lw=1, label=entry.name)
         axis.axhline(max(0.5 * view.bound**2, 1e-20), color=color, lw=0.8, ls="--")
     axis.set_xlabel("time [s]")
     axis.set_ylabel("V")
