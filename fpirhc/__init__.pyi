@@ -1,14 +1,21 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
 from .contraction import assess_gain, check_gain, delayed_limit, response_jacobian, spectrum_over_box, spectrum_over_run
+from .controllers.acceleration_feedback import AccelerationFeedback
+from .controllers.backstepping_mrac import BacksteppingMrac
 from .controllers.computed_torque import ComputedTorque
 from .controllers.floquet import Floquet, floquet_radius
+from .controllers.force_mrac import ForceMrac
 from .controllers.informed import Informed
+from .controllers.lyapunov_mrac import LyapunovMrac
 from .controllers.nominal import OpenPlan, Restart, RestartAndTrack
 from .controllers.on_failure import Feedforward, HoldPlan, StopRun
+from .controllers.pid import Pid
 from .controllers.predicted import ByDesired, ByModel, Predicted
 from .controllers.receding_horizon import RecedingHorizon
+from .controllers.resolved_rate import ResolvedAccelerationRate
 from .controllers.schedules import ByError, ByLookAhead, FixedSchedule, Periodic
+from .controllers.sliding_mode import SlidingMode
 from .controllers.slot import Slot
 from .controllers.slotted import Slotted
 from .dead_time import DeadTime
@@ -32,6 +39,7 @@ from .horizon.expansion import ExactHessian, GaussNewton
 from .horizon.problem import Horizon
 from .integrate import Cvodes, Euler, RungeKutta4
 from .limits import Limits, Path
+from .lyapunov import LyapunovView, lyapunov_view
 from .metrics import Metrics, measure
 from .optimisers.anderson import Anderson
 from .optimisers.certificate import Certificate, certify
@@ -59,8 +67,10 @@ from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
 
 __all__ = [
+    "AccelerationFeedback",
     "Affine",
     "Anderson",
+    "BacksteppingMrac",
     "Blended",
     "ByDesired",
     "ByError",
@@ -83,6 +93,7 @@ __all__ = [
     "FixedPoint",
     "FixedSchedule",
     "Floquet",
+    "ForceMrac",
     "Formula",
     "FpirhcError",
     "Fractional",
@@ -100,6 +111,8 @@ __all__ = [
     "Limits",
     "LowPassDifference",
     "LqrTerminal",
+    "LyapunovMrac",
+    "LyapunovView",
     "Measured",
     "Metrics",
     "Noise",
@@ -110,6 +123,7 @@ __all__ = [
     "Parameter",
     "Path",
     "Periodic",
+    "Pid",
     "Plan",
     "Plant",
     "PositionDifference",
@@ -120,6 +134,7 @@ __all__ = [
     "Quadratic",
     "RecedingHorizon",
     "ReducedGradient",
+    "ResolvedAccelerationRate",
     "Restart",
     "RestartAndTrack",
     "Rfpt",
@@ -134,6 +149,7 @@ __all__ = [
     "SequentialQuadratic",
     "Sigmoid",
     "Sine",
+    "SlidingMode",
     "Slot",
     "Slotted",
     "Status",
@@ -153,6 +169,7 @@ __all__ = [
     "floquet_radius",
     "load_problem",
     "load_run",
+    "lyapunov_view",
     "measure",
     "output_chain",
     "response_jacobian",

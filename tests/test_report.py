@@ -62,11 +62,12 @@ def test_verdict_comes_first_then_table_charts_and_pictures(comparison):
         "<h2>Signals over time",
         "<h2>Without | with",
         "<h2>Contraction",
+        "<h2>Lyapunov's view",
         "<h2>Settings",
     ]
     places = [page.index(m) for m in marks]
     assert places == sorted(places)
-    assert page.count("<img alt='") == 6
+    assert page.count("<img alt='") == 7
 
 
 def test_hostile_names_are_only_text(comparison):

@@ -143,18 +143,27 @@ def closing_blocks(
 ) -> tuple[list[Block], list[Delay]]:
     """Return the blocks deform, invert, limit and judge with what they remember; `judged` are solver statuses."""
     plant = problem.plant
-    blocks = [
-        deform_block(plant, deformation, problem.blind_cycles),
-        _invert_block(plant),
-        _limit_block(problem),
-        _judge_block(judged),
-    ]
-    delays = [
-        Delay(scalar("started"), "_running"),
-        Delay(plant.response_signal("_request_before"), "deformed"),
-        Delay(like(plant.input, "_command_before"), "command"),
-    ]
-    return blocks, delays
+    closing, delays = commanding_blocks(problem, judged)
+    blocks = [deform_block(plant, deformation, problem.blind_cycles), invert_block(plant), *closing]
+    return blocks, [*delays, Delay(plant.response_signal("_request_before"), "deformed")]
+
+
+def commanding_blocks(problem: Problem, judged: Sequence[Signal] = ()) -> tuple[list[Block], list[Delay]]:
+    """Return the blocks limit, judge and running with what they remember, for a controller that gives 'requested' itself.
+
+    It also gives 'desired', and '_deformed_wanted': the response that its model expects of the requested command.
+    """
+    delays = [Delay(scalar("started"), "_running"), Delay(like(problem.plant.input, "_command_before"), "command")]
+    return [_limit_block(problem), _judge_block(judged), _running_block(problem.blind_cycles)], delays
+
+
+def _running_block(blind: int) -> Block:
+    """Block that counts the cycles of a run up to `blind`, after which the response may be used."""
+
+    def step(s: Any) -> dict[str, Expression]:
+        return {"_running": ca.fmin(s.started + 1, blind)}
+
+    return Block("running", Layout((scalar("started"),)), Layout((scalar("_running"),)), step)
 
 
 def deform_block(plant: Plant, deformation: Deformation, blind: int = 1) -> Block:
@@ -176,15 +185,14 @@ def deform_block(plant: Plant, deformation: Deformation, blind: int = 1) -> Bloc
         valid = s.started > blind - 0.5
         kept = {f"{m}_next": ca.if_else(valid, following[m], remembered[m]) for m in memory.names}
         shown = {name: kept[f"{source}_next"] for name, source in deformation.shown().items()}
-        wanted, running = ca.if_else(valid, deformed, s.desired), ca.fmin(s.started + 1, blind)
-        return {"_deformed_wanted": wanted, "_running": running, **shown, **kept}
+        return {"_deformed_wanted": ca.if_else(valid, deformed, s.desired), **shown, **kept}
 
     logged = tuple(scalar(name) for name in deformation.shown())
-    writes = Layout((plant.response_signal("_deformed_wanted"), scalar("_running"), *logged))
-    return Block("deform", Layout(reads), writes, step, memory)
+    return Block("deform", Layout(reads), Layout((plant.response_signal("_deformed_wanted"), *logged)), step, memory)
 
 
-def _invert_block(plant: Plant) -> Block:
+def invert_block(plant: Plant) -> Block:
+    """Block (state, _deformed_wanted, parameters) -> the command that the model needs for it."""
     reads = Layout((plant.state, plant.response_signal("_deformed_wanted"), plant.parameter))
     inverse = plant.inverse_function
 

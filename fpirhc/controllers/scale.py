@@ -55,6 +55,19 @@ def scaled_for_plan(deformation: Deformation, problem: Problem) -> Deformation:
     return _with_scale(deformation, max(1.0, jump / replace_scale(deformation, 1.0).largest_step()))
 
 
+def scaled_for_command(deformation: Deformation, problem: Problem, parameters: np.ndarray) -> Deformation:
+    """Return the deformation with S = max(1, 2 period max|dQ/dt|), Q the model's command along the reference."""
+    if isinstance(deformation, Wrapper):
+        return replace(deformation, map=scaled_for_command(deformation.map, problem, parameters))
+    if not _is_open(deformation):
+        return deformation
+    reference, inverse = problem.reference.function(problem.plant), problem.plant.inverse_function
+    t, p = ca.MX.sym("t"), ca.DM(parameters)
+    state, response = reference(t)
+    command = ca.Function("c", [t], [inverse(state, response[list(problem.plant.controlled_indices)], p)])
+    return _with_scale(deformation, max(1.0, 2 * problem.period * _slew(command, problem.duration)))
+
+
 def replace_scale(deformation: Deformation, scale: float) -> Deformation:
     """Return the same sigmoid with another scale."""
     assert isinstance(deformation, Sigmoid)
@@ -71,7 +84,13 @@ def _with_scale(deformation: Deformation, scale: float) -> Deformation:
 
 def _reference_slew(problem: Problem) -> float:
     """Largest |d/dt r^N| over the run, sampled."""
-    function = problem.reference.function(problem.plant)
-    times = np.linspace(0.0, problem.duration, _SAMPLES)
-    responses = np.asarray(function.map(_SAMPLES)(times[None, :])[1].full())[list(problem.plant.controlled_indices)]
-    return float(np.max(np.linalg.norm(np.diff(responses, axis=1), axis=0)) / (times[1] - times[0]))
+    t = ca.MX.sym("t")
+    responses = problem.reference.function(problem.plant)(t)[1][list(problem.plant.controlled_indices)]
+    return _slew(ca.Function("r", [t], [responses]), problem.duration)
+
+
+def _slew(function: ca.Function, duration: float) -> float:
+    """Largest |d/dt| of a Function of time over the run, sampled."""
+    times = np.linspace(0.0, duration, _SAMPLES)
+    values = np.asarray(function.map(_SAMPLES)(times[None, :]).full())
+    return float(np.max(np.linalg.norm(np.diff(values, axis=1), axis=0)) / (times[1] - times[0]))

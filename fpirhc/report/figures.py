@@ -127,6 +127,25 @@ def contraction_figure(comparison: Comparison) -> Figure | None:
     return figure
 
 
+def lyapunov_figure(comparison: Comparison) -> Figure | None:
+    """V = |S|^2 / 2 over time and its ultimate bound, for controllers with an exponential tracking law."""
+    views = [(e, e.lyapunov) for e in comparison.entries if e.lyapunov is not None]
+    if not views:
+        return None
+    figure = _figure(11, 3.4, "")
+    axis = figure.subplots()
+    for k, (entry, view) in enumerate(views):
+        color, values = PALETTE[k % len(PALETTE)], np.maximum(view.function, 1e-20)
+        times = entry.run.period * np.arange(values.size)
+        axis.semilogy(_thin(times), _thin(values), color=color, lw=1, label=entry.name)
+        axis.axhline(max(0.5 * view.bound**2, 1e-20), color=color, lw=0.8, ls="--")
+    axis.set_xlabel("time [s]")
+    axis.set_ylabel("V")
+    axis.grid(visible=True, alpha=0.25)
+    _legend(axis)
+    return figure
+
+
 def headline_figure(comparison: Comparison, plain: Entry, adaptive: Entry) -> Figure:
     """The picture for a title page: position and error of the pair."""
     figure = _figure(11, 4.2, comparison.title)

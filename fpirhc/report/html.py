@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fpirhc.errors import OutputError
-from fpirhc.report.figures import PALETTE, contraction_figure, pair_figures
+from fpirhc.report.figures import PALETTE, contraction_figure, lyapunov_figure, pair_figures
 from fpirhc.report.series import chart_data
 
 if TYPE_CHECKING:
@@ -61,6 +61,7 @@ def render(comparison: Comparison) -> str:
         _charts(comparison),
         *_pictures(comparison),
         _contraction(comparison),
+        _lyapunov(comparison),
         _settings(comparison),
     ]
     scripts = (
@@ -201,6 +202,18 @@ def _contraction(comparison: Comparison) -> str:
     )
     picture = _picture(figure, "Predicted contraction factor against the gain, and the response error's decay", "")
     return f"<section><h2>Contraction</h2>{picture}<ul>{texts}</ul></section>"
+
+
+def _lyapunov(comparison: Comparison) -> str:
+    figure = lyapunov_figure(comparison)
+    if figure is None:
+        return ""
+    caption = (
+        "V = |S|^2 / 2 of the tracking law, dashed: its ultimate bound (sup|h| / rate)^2 / 2 by the response error h of the "
+        "measured part. A small response error keeps V near zero."
+    )
+    picture = _picture(figure, "Lyapunov function over time with its ultimate bound", caption)
+    return f"<section><h2>Lyapunov's view</h2>{picture}</section>"
 
 
 def _picture(figure: Figure, alt: str, caption: str) -> str:

@@ -15,6 +15,7 @@ from fpirhc.controllers.base import Controller, prepared
 from fpirhc.deformation.identity import Identity
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, nearest
+from fpirhc.lyapunov import LyapunovView, lyapunov_view
 from fpirhc.metrics import Metrics, measure
 from fpirhc.problem import Problem
 from fpirhc.run import Run
@@ -50,6 +51,7 @@ class Entry:
     contraction: Contraction | None
     optimality: Optimality | None = None
     notes: tuple[str, ...] = ()
+    lyapunov: LyapunovView | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +180,7 @@ def _entry(
     run = simulate(problem, resolved, seed=seed, name=name, compiled=compiled, progress=report)
     run = replace(run, problem=task.name)
     adaptive = not isinstance(resolved.adaptive, Identity)
+    view = lyapunov_view(problem, resolved, run)
     return Entry(
         name=name,
         run=run,
@@ -187,7 +190,8 @@ def _entry(
         pair=_pair(chosen, name) if adaptive else None,
         contraction=_contraction(problem, resolved, run) if adaptive else None,
         optimality=measure_optimality(problem, resolved, run, compiled=compiled),
-        notes=(*_notes(controller, resolved), *resolved.notes(problem)),
+        notes=(*_notes(controller, resolved), *resolved.notes(problem), *([view.text] if view else [])),
+        lyapunov=view,
     )
 
 

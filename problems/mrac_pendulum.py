@@ -1,0 +1,71 @@
+"""Inverted pendulum: model reference adaptive control by fixed-point iteration, by Lyapunov's rule, and its rivals.
+
+A pendulum on a motor, the angle measured from upright,
+
+    m l^2 angle'' = m g l sin(angle) - c angle' - f tanh(angle' / 0.05 rad/s) + torque,
+
+with friction that the model does not know and a reference model that is twice as heavy as the plant (m_r = 2 kg, m = 1 kg);
+from 8 s to 11 s a load of 1 N m pulls. The motion swings through upright, and the pendulum starts 0.3 rad beside it. Every
+law prescribes the same rate of 6 1/s, so that they differ by what they do about the wrong model; without noise and dead time
+any of them could buy precision with a higher gain.
+
+Measured (rms error of the angle from 3 s on, rad): PID 4.0e-2, computed torque 3.3e-2, acceleration rate 3.4e-2, acceleration
+feedback 5.7e-3, Lyapunov MRAC 2.2e-3, sliding mode 1.8e-3, backstepping MRAC 1.0e-3 (0.12 without the iteration), computed
+torque with FPI and force MRAC 2.7e-4. The backstepping pair follows a reference model and has no integral. Lyapunov's rule is
+given the best of the adaptations 1, 5, 20, 100 and 300; its leakage hardly matters here.
+"""
+
+import casadi as ca
+
+import fpirhc as fp
+
+
+def response(q, v, u, p):
+    friction = p.c * v.angle + p.f * ca.tanh(v.angle / 0.05)
+    return {"angle": (p.m * p.g * p.l * ca.sin(q.angle) - friction + u.torque) / (p.m * p.l**2)}
+
+
+plant = fp.Plant(
+    coordinates={"angle": "rad"},
+    inputs={"torque": "N m"},
+    order=2,
+    response=response,
+    parameters={
+        "m": fp.Parameter(approximate=2.0, exact=1.0, unit="kg"),
+        "l": fp.Parameter(approximate=0.5, exact=0.55, unit="m"),
+        "c": fp.Parameter(approximate=0.0, exact=0.2, unit="N m s"),
+        "f": fp.Parameter(approximate=0.0, exact=0.3, unit="N m"),
+        "g": fp.Parameter(approximate=9.81, exact=9.81, unit="m/s^2"),
+    },
+)
+
+problem = fp.Problem(
+    plant=plant,
+    reference=fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(1.5 * t)}),
+    start={"angle": 0.3},
+    period=1e-3,  # s
+    duration=15.0,  # s
+    limits=fp.Limits(inputs={"torque": (-20.0, 20.0)}),  # N m
+    disturbances={"torque": fp.Pulse(at=8.0, duration=3.0, size=-1.0)},
+    measure_from=3.0,  # s
+)
+
+RATE = 6.0  # 1/s, of every law
+track = fp.Exponential(RATE)
+sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=50.0)  # scale in rad/s^2
+inertia = 0.5  # kg m^2, of the model: the PID has the gains that computed torque has there
+
+controllers = {
+    "PID": fp.Pid({"angle": 108 * inertia}, {"angle": 216 * inertia}, {"angle": 18 * inertia}),
+    "CTC": fp.ComputedTorque(track),
+    "CTC+FPI": fp.ComputedTorque(track, sigmoid),
+    "sliding mode": fp.SlidingMode(rate=RATE, gain=500.0, width=1.0),  # rad/s^2, rad/s: chatters from 4 ms on
+    "acceleration feedback": fp.AccelerationFeedback(track, gain=5.0, time_constant=0.02),
+    "acceleration rate": fp.ResolvedAccelerationRate(RATE),
+    "force MRAC, no FPI": fp.ForceMrac(track, fp.Identity()),
+    "force MRAC": fp.ForceMrac(track, fp.Sigmoid(gain=-0.5, shift=0.3, scale=25.0)),  # scale in N m
+    "backstepping, no FPI": fp.BacksteppingMrac(RATE, (RATE, RATE), fp.Identity()),
+    "backstepping MRAC": fp.BacksteppingMrac(RATE, (RATE, RATE), sigmoid),
+    "Lyapunov MRAC": fp.LyapunovMrac(RATE, adaptation=300.0, leakage=0.02),
+}
+headline = ("CTC", "CTC+FPI")
