@@ -2,6 +2,7 @@
 
 from .contraction import assess_gain, check_gain, response_jacobian, spectrum_over_box, spectrum_over_run
 from .controllers.computed_torque import ComputedTorque
+from .controllers.estimating import Estimating
 from .controllers.floquet import Floquet, floquet_radius
 from .controllers.informed import Informed
 from .controllers.nominal import OpenPlan, Restart, RestartAndTrack
@@ -26,6 +27,11 @@ from .deformation.sigmoid import Sigmoid
 from .deformation.tuned import Tuned
 from .disturbance import Formula, Noise, Pulse, Sine, Step
 from .errors import FpirhcError
+from .estimation.disturbance_kalman import DisturbanceKalman
+from .estimation.disturbed import disturbed
+from .estimation.moving_horizon import MovingHorizon
+from .estimation.recursive_least_squares import RecursiveLeastSquares
+from .estimation.uncertain import Uncertain
 from .horizon.cost import General, LqrTerminal, Quadratic
 from .horizon.expansion import ExactHessian, GaussNewton
 from .horizon.problem import Horizon
@@ -71,6 +77,8 @@ __all__ = [
     "Damped",
     "DeadTime",
     "DelayWatched",
+    "DisturbanceKalman",
+    "Estimating",
     "Euler",
     "ExactHessian",
     "Exponential",
@@ -96,6 +104,7 @@ __all__ = [
     "Limits",
     "LqrTerminal",
     "Metrics",
+    "MovingHorizon",
     "Noise",
     "OpenPlan",
     "Osqp",
@@ -112,6 +121,7 @@ __all__ = [
     "Qrqp",
     "Quadratic",
     "RecedingHorizon",
+    "RecursiveLeastSquares",
     "ReducedGradient",
     "Restart",
     "RestartAndTrack",
@@ -133,11 +143,13 @@ __all__ = [
     "Table",
     "Trajectory",
     "Tuned",
+    "Uncertain",
     "assess_gain",
     "certify",
     "check_deformation",
     "check_gain",
     "compare",
+    "disturbed",
     "floquet_radius",
     "load_problem",
     "load_run",
