@@ -26,18 +26,18 @@ plant = fp.Plant(
 problem = fp.Problem(
     plant=plant,
     reference=fp.Trajectory(lambda t: {"q": ca.sin(1.5 * t)}),
-    start={"q": 0.0},
+    start={"q": 0.0, "q'": 1.5},
     period=2e-3,  # s
     duration=12.0,  # s
     limits=fp.Limits(inputs={"u": (-40.0, 40.0)}),
     horizon=fp.Horizon(stages=25, step=2e-2),
-    cost=fp.Quadratic(states={"q": 1e2, "q'": 1.0}, correction={"u": 1e-2}),
+    cost=fp.Quadratic(states={"q": 1e2, "q'": 1.0}, correction={"u": 1e-1}),
     measure_from=4.0,  # s
 )
 
 optimiser = fp.FixedPoint(iterations=1, tolerance=1e-2)  # N
 plain = fp.RecedingHorizon(optimiser)
-sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=50.0)  # m/s^2
+sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=50.0)  # m/s^2
 known = {
     "m": fp.Uncertain(0.3, 5.0, 1.0),
     "mu": fp.Uncertain(0.0, 5.0, 1.0),
@@ -46,7 +46,7 @@ known = {
     "bias": fp.Uncertain(-10.0, 10.0, 2.0),
 }
 learners = {
-    "RHC+RLS": fp.RecursiveLeastSquares(known, noise={"q": 0.1}, time=5.0),
+    "RHC+RLS": fp.RecursiveLeastSquares(known, noise={"q": 3.0}, time=1.0),
     "RHC+MHE": fp.MovingHorizon(known, noise={"q": 0.1}, window=50, time=5.0),
 }
 controllers = {

@@ -138,9 +138,8 @@ INLINE int judged(Search* s, Plan* best, Plan* plan, int ok, In lower, In upper)
       for (i = 0; i < N * NU; ++i) kept[i] = s->t[i];
       envelope = plan->value + plain_step(s, plan, lower, upper, &reach) + reach;
       for (i = 0; i < N * NU; ++i) descent += best->g[i] * (plan->u[i] - best->u[i]);
-      ok = envelope <= s->envelope - SHARE * (1 - SHARE) * s->reach + slack ||
+      ok = (envelope <= s->envelope - SHARE * (1 - SHARE) * s->reach + slack && plan->value <= best->value + slack) ||
            plan->value <= best->value + ARMIJO * fmin(descent, 0) + slack;
-      ok = ok && envelope <= s->envelope + slack && plan->value <= best->value + slack;
       if (!ok) for (i = 0; i < N * NU; ++i) s->t[i] = kept[i];
     } else {
       for (i = 0; i < N * NU; ++i) descent += best->g[i] * (s->t[i] - best->u[i]);
@@ -311,7 +310,7 @@ INLINE void begin(Search* s, Plan* best, In memory, In lower, In upper) {
   best->value = s->envelope = 10 * UNTRIED;
   s->reach = 0;
   s->gamma = gamma > 0 ? fmin(2 * gamma, FIRST_GAMMA) : FIRST_GAMMA;
-  s->tau = tau > 0 ? tau : 1;
+  s->tau = tau > 0 ? fmax(tau, SHORTEST) : 1; /* below it the remembered plan would not be tried */
 }
 
 INLINE void remember(const Search* s, const Plan* best, Out memory) {

@@ -277,7 +277,8 @@ class FixedPoint(Optimiser):
         none = ca.MX.zeros(nu, n)
         first = first_gamma(ocp)
         gamma = ca.if_else(kept["plan_gamma"] > 0, ca.fmin(2 * kept["plan_gamma"], first), first)
-        step = ca.if_else(kept["plan_step"] > 0, kept["plan_step"], 1)
+        # Below the shortest step the remembered plan itself would not be tried, and a call of one iteration would lose it.
+        step = ca.if_else(kept["plan_step"] > 0, ca.fmax(kept["plan_step"], SHORTEST), 1)
         return Anchor(
             inputs=inputs,
             states=ca.reshape(kept["plan_states"], ns, n),

@@ -187,8 +187,7 @@ def _judgement(ocp: OptimalControl) -> ca.Function:
     # A step that a saturating map or the search made short decreases by its own measure, not by that of T.
     fair = value <= old.value + ARMIJO * ca.fmin(ca.dot(old.slope, inputs - old.inputs), 0) + slack
     # Far away gamma may be too long for the envelope to bound V from below, so V itself must not rise; it does not at T.
-    falls = ca.logic_and(envelope <= old.envelope + slack, value <= old.value + slack)
-    decreases = ca.logic_and(falls, ca.logic_or(enough, fair))
+    decreases = ca.logic_or(ca.logic_and(enough, value <= old.value + slack), fair)
     bounded = value <= old.value + ca.dot(old.slope, old.plain - old.inputs) + SHARE * reach + slack
     finite = is_finite(ca.vertcat(value, ca.vec(slope), ca.vec(states)))
     accepted = ca.logic_and(finite, ca.logic_or(untried, ca.if_else(bold, decreases, bounded)))
