@@ -53,7 +53,7 @@ controllers = {
     "RHC": plain,
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
     "RHC exact model": fp.Informed(plain),
-    "RHC offset-free": fp.Estimating(plain, fp.DisturbanceKalman(drift={"q": 30.0}, measured={"q": 1e-3, "q'": 1e-2})),
+    "RHC offset-free": fp.Estimating(plain, fp.DisturbanceKalman(drift={"q": 3e3}, measured={"q": 1e-3, "q'": 1e-2})),
     **{name: fp.Estimating(plain, e) for name, e in learners.items()},
 }
 headline = ("RHC", "RHC+FPI")

@@ -27,6 +27,7 @@ from fpirhc.errors import InvalidValue
 from fpirhc.estimation.base import Correct, Estimator, Seen
 from fpirhc.estimation.uncertain import (
     Uncertain,
+    between,
     bounds_of,
     check_learner,
     deviations,
@@ -159,7 +160,7 @@ def _newton_function(size: int) -> ca.Function:
     free = ca.diag(1 - stuck)
     matrix = free @ (before + ca.reshape(squares, size, size)) @ free + ca.diag(stuck)
     step = ca.solve(ca.densify(matrix), free @ downhill)
-    moved = ca.fmin(ca.fmax(z + step, lower), upper)
+    moved = between(z + step, lower, upper)
     return ca.Function("fpirhc_newton", [z, prior, information, squares, slopes, lower, upper], [ca.densify(moved)])
 
 

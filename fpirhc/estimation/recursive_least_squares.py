@@ -25,6 +25,7 @@ from fpirhc.errors import InvalidValue
 from fpirhc.estimation.base import Correct, Estimator, Seen
 from fpirhc.estimation.uncertain import (
     Uncertain,
+    between,
     bounds_of,
     check_learner,
     deviations,
@@ -92,7 +93,7 @@ class RecursiveLeastSquares(Estimator):
             innovation = factor * ca.DM.eye(error.numel()) + slope @ p @ slope.T
             gain = ca.solve(innovation, slope @ p).T
             lower, upper = bounds_of(problem, self.parameters, seen.parameters)
-            found = ca.fmin(ca.fmax(z + gain @ error, lower), upper)
+            found = between(z + gain @ error, lower, upper)
             left = (p - gain @ slope @ p) / factor
             left = (left + left.T) / 2 * ca.fmin(1, size / ca.trace(left))
             kept = {"least_squares_estimate": found, "least_squares_covariance": ca.vec(left)}

@@ -99,6 +99,11 @@ def bounds_of(
     return lower, upper
 
 
+def between(value: Expression, lower: Expression, upper: Expression) -> Expression:
+    """The value within its bounds; NaN stays NaN, which fmin and fmax would turn into a bound."""
+    return ca.if_else(value < lower, lower, ca.if_else(value > upper, upper, value))
+
+
 def deviations(parameters: Mapping[str, Uncertain]) -> ca.DM:
     """Deviations of the learned parameters, a column."""
     return ca.DM(np.array([known.deviation for known in parameters.values()]))
