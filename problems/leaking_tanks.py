@@ -1,4 +1,20 @@
-"""draft"""
+"""Two tanks in a row, the lower one with an unknown leak: where offset-free predictive control is the better choice.
+
+    A h1' = u - s1 sqrt(2 g h1),     A h2' = s1 sqrt(2 g h1) - s2 sqrt(2 g h2) - leak,     h2 is to follow its reference.
+
+The model is wrong in the valve between the tanks and knows of no leak. The pump acts on h1, so a deformation makes h1' what the model
+would do; the error of h2' it does not see, and the plan goes on believing that the lower tank fills as the model says. A disturbance
+model with one unknown per level explains both and the plan takes them into account:
+
+    rms error of h2, mm      RHC 29.2    RHC+FPI 32.3    offset-free RHC 0.30    exact model 0.26
+
+Written in h2 with relative order two (as in the tanks behind a long pipe) the error would be where the input acts, but the response is
+then h2'', a difference of the noisy flows of neighbouring cycles, while the filter takes the levels themselves.
+
+How the controllers were tuned: drift of 1e-5, 3e-5, 1e-4, 3e-4, 1e-3 m/s/s^0.5 by noise of the flows of 1e-5, 2e-4 (the true one),
+1e-3 m/s, for measured levels of 1e-4 m: 0.296 to 10 mm, the best is used. Gains of the sigmoid of -0.1, -0.5, -1, -2: 102, 62, 33, 32 mm.
+Areas and valves are those of the triple-tank example of do-mpc; leak, noise and motion are chosen here.
+"""
 
 import casadi as ca
 
@@ -39,9 +55,10 @@ def level(t):
 
 problem = fp.Problem(
     plant=plant,
-    reference=fp.Trajectory(lambda t: {"h1": 0.64 * level(t), "h2": level(t)}),
+    # What keeps h2 in the model keeps h1 at (s2 / s1)^2 h2; the cost asks for h2 only.
+    reference=fp.Trajectory(lambda t: {"h1": (4.0 / 5.5) ** 2 * level(t), "h2": level(t)}),
     start={"h1": 0.08, "h2": 0.12},
-    period=1.0,
+    period=1.0,  # s
     duration=300.0,  # s
     limits=fp.Limits(inputs={"u": (0.0, 200.0)}),  # ml/s
     disturbances={"h1": fp.Noise(2e-4), "h2": fp.Noise(2e-4)},  # m/s
@@ -53,7 +70,9 @@ problem = fp.Problem(
 
 plain = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-2))  # ml/s
 sigmoid = fp.Sigmoid(gain=-2.0, shift=0.3, scale=0.1)  # m/s
-filter = fp.DisturbanceKalman(drift={"h1": 1e-4, "h2": 1e-4}, measured={"h1": 1e-4, "h2": 1e-4}, noise={"h1": 2e-4, "h2": 2e-4})
+filter = fp.DisturbanceKalman(
+    drift={"h1": 1e-4, "h2": 1e-4}, measured={"h1": 1e-4, "h2": 1e-4}, noise={"h1": 2e-4, "h2": 2e-4}
+)
 
 controllers = {
     "RHC": plain,

@@ -68,9 +68,7 @@ def test_an_exact_model_is_left_alone(name):
     """Without noise and model error nothing is learned, and the plant moves as without the estimator, to rounding."""
     problem = task(pendulum())
     plain = fp.simulate(problem, fp.Informed(RHC), seed=0, compiled=False)
-    run = fp.simulate(
-        problem, fp.Informed(fp.Estimating(RHC, learners(MASS, "angle")[name])), seed=0, compiled=False
-    )
+    run = fp.simulate(problem, fp.Informed(fp.Estimating(RHC, learners(MASS, "angle")[name])), seed=0, compiled=False)
     np.testing.assert_allclose(run["state"], plain["state"], atol=1e-10)
     np.testing.assert_allclose(run["estimate"], np.broadcast_to(run["estimate"][0], run["estimate"].shape), atol=1e-9)
 
@@ -136,9 +134,7 @@ class Fed:
 
     def __init__(self, problem: fp.Problem, estimator):
         layout, plant = estimator.memory(problem), problem.plant
-        symbols = [
-            ca.MX.sym(n, k) for n, k in (("x", 2), ("u", 1), ("f", 1), ("valid", 1), ("m", layout.size))
-        ]
+        symbols = [ca.MX.sym(n, k) for n, k in (("x", 2), ("u", 1), ("f", 1), ("valid", 1), ("m", layout.size))]
         x, u, f, valid, memory = symbols
         given = Seen(x, u, f, ca.DM(plant.approximate), valid)
         correction, following = estimator.step(problem)(given, layout.split(memory))
@@ -146,6 +142,7 @@ class Fed:
         self.memory = layout.start()
 
     def __call__(self, x, u, f):
+        """The correction after one more pair."""
         correction, self.memory = self.function(x, u, f, 1, self.memory)
         return correction.full().ravel()
 
@@ -206,9 +203,7 @@ def test_moving_horizon_stops_at_the_constrained_optimum():
     scale = np.array([known.deviation for known in narrow.values()])
     lower = (np.array([v.lower for v in narrow.values()]) - plant.approximate) / scale
     upper = (np.array([v.upper for v in narrow.values()]) - plant.approximate) / scale
-    best = scipy.optimize.lsq_linear(
-        np.vstack([rows, np.eye(2)]), np.r_[right, 0, 0], bounds=(lower, upper), tol=1e-12
-    )
+    best = scipy.optimize.lsq_linear(np.vstack([rows, np.eye(2)]), np.r_[right, 0, 0], bounds=(lower, upper), tol=1e-12)
     np.testing.assert_allclose(found, scale * best.x, atol=1e-5)
     assert abs(found[1] - free[1]) > 0.05
 
@@ -267,6 +262,7 @@ def test_what_is_not_finite_is_not_learned(name):
 
 def test_a_disturbed_plant():
     """The disturbance adds to the response, and the inverse takes it away, derived or given."""
+
     def inverse(q, v, r, p):
         return {"u": (r.y + p.k * q.y) / p.b}
 
@@ -326,7 +322,12 @@ TWO_TASK = fp.Problem(
     [
         (TWO_TASK, fp.DisturbanceKalman({"a": 1.0, "b": 1.0}, {"b": 1.0}), NotSupported, "2 disturbances"),
         # What moves only b says nothing about itself in a.
-        (TWO_TASK, fp.DisturbanceKalman({"b": 1.0}, {"a": 1.0}, {"a": 1.0}), NotSupported, r"w_b cannot be told from a"),
+        (
+            TWO_TASK,
+            fp.DisturbanceKalman({"b": 1.0}, {"a": 1.0}, {"a": 1.0}),
+            NotSupported,
+            r"w_b cannot be told from a",
+        ),
         (TWO_TASK, fp.DisturbanceKalman({"a": 1.0}, {"a": 1.0, "z": 1.0}), InvalidProblem, "'z' is unknown"),
         (TWO_TASK, fp.DisturbanceKalman({"z": 1.0}, {"a": 1.0}), InvalidProblem, "'z' is unknown"),
         # Nothing is said to disturb the undamped mass a, so its filter would never forget the first error.
@@ -375,7 +376,7 @@ def errors(name: str, coordinate: str) -> dict[str, float]:
 
 
 def test_adaptation_against_tuned_rivals(duffing):
-    """RHC+FPI is as good as the exact model and clearly better than offset-free RHC; the learners are as good as the exact model."""
+    """RHC+FPI is as good as the exact model and better than offset-free RHC; the learners equal the exact model."""
     assert duffing["RHC+FPI"] <= 1.2 * duffing["RHC exact model"]
     assert duffing["RHC+FPI"] <= 0.7 * duffing["RHC offset-free"]
     assert duffing["RHC offset-free"] < 0.05 * duffing["RHC"]

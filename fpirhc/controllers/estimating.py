@@ -65,7 +65,9 @@ class Estimating(Controller):
         self.estimator.check(modelled)
         self.controller.check(modelled)
         if problem.dead_time.measurement or any(problem.dead_time.inputs.values()):
-            raise NotSupported("Estimating pairs a response with the command of one cycle before: no dead time is supported")
+            raise NotSupported(
+                "Estimating pairs a response with the command of one cycle before: no dead time is supported"
+            )
         if self.controller.response(modelled) is not None:
             raise NotSupported(
                 f"Estimating needs the response of the controlled coordinates; {type(self.controller).__name__} reads another"

@@ -12,8 +12,8 @@ Kalman filter of the model linearised on the reference at t = 0 corrects,
 A constant disturbance is found without error, whatever the tuning, if [A - I, B; C, 0] has full column rank (B: what the
 disturbances do to the state), which needs at least as many measured states as disturbances; otherwise the filter is refused.
 
-References: G. Pannocchia and J. B. Rawlings, Disturbance models for offset-free model-predictive control, AIChE Journal 49(2), 2003.
-M. Morari and U. Maeder, Nonlinear offset-free model predictive control, Automatica 48(9), 2012.
+References: G. Pannocchia and J. B. Rawlings, Disturbance models for offset-free model-predictive control, AIChE Journal 49(2),
+2003. M. Morari and U. Maeder, Nonlinear offset-free model predictive control, Automatica 48(9), 2012.
 """
 
 from __future__ import annotations
@@ -32,6 +32,8 @@ from fpirhc.integrate import RungeKutta4
 from fpirhc.plant import Plant
 from fpirhc.problem import Problem
 from fpirhc.symbolic.layout import Expression, Layout, Signal
+
+_SLOWEST = 1e-9  # a mode of the filter that decays by less per cycle does not decay
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +103,10 @@ class DisturbanceKalman(Estimator):
             found = np.linalg.solve(c @ p @ c.T + r, c @ p).T
         except np.linalg.LinAlgError:
             found = np.full((model.state.size + size, len(self.measured)), np.nan)
-        if not (np.isfinite(found).all() and np.abs(np.linalg.eigvals((np.eye(len(a)) - found @ c) @ a)).max() < 1):
+        if not (
+            np.isfinite(found).all()
+            and np.abs(np.linalg.eigvals((np.eye(len(a)) - found @ c) @ a)).max() < 1 - _SLOWEST
+        ):
             still = [n for n in model.names if n not in self.drift and n not in self.noise]
             hint = f"give noise={{{still[0]!r}: ...}}, or measure more states" if still else "measure more states"
             raise NotSupported(f"DisturbanceKalman: no stationary gain makes the filter stable; {hint}")
@@ -162,7 +167,7 @@ class DisturbanceKalman(Estimator):
                 f"{len(self.measured)} measured state(s) ({measured}): measure as many, or estimate fewer"
             )
         a, _, c = self._matrices(problem)
-        stacked = np.vstack([a - np.eye(len(a)), c])[:, :]
+        stacked = np.vstack([a - np.eye(len(a)), c])
         rows = np.abs(stacked).max(axis=1) > 0
         rank = int(np.linalg.matrix_rank(stacked[rows] / np.abs(stacked[rows]).max(axis=1, keepdims=True), tol=1e-9))
         if rank < len(a):

@@ -173,6 +173,4 @@ def _absorb_function(size: int, factor: float) -> ca.Function:
     joined = factor * left + (1 - factor) * ca.SX.eye(size) + square
     moved = prior + ca.solve(ca.densify(joined), slopes + square @ (z - prior))
     found = [ca.if_else(valid > 0.5, moved, prior), ca.if_else(valid > 0.5, ca.vec(joined), information)]
-    return ca.Function(
-        "fpirhc_absorb", [prior, information, z, squares, slopes, valid], [ca.densify(v) for v in found]
-    )
+    return ca.Function("fpirhc_absorb", [prior, information, z, squares, slopes, valid], [ca.densify(v) for v in found])
