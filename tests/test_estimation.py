@@ -1,4 +1,4 @@
-"""Learning the model: estimates agree with batch formulas, remove offsets, keep bounds, and are refused where they cannot work."""
+"""Learning the model: estimates equal batch formulas, remove offsets, keep bounds, and are refused where they cannot work."""
 
 from __future__ import annotations
 

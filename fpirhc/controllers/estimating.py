@@ -2,10 +2,10 @@
 
     command = controller(state; p + correction),      correction = estimator(state, last command, response; p).
 
-Offset-free receding-horizon control is RecedingHorizon with DisturbanceKalman; adaptive receding-horizon control in the sense of
-certainty equivalence is RecedingHorizon with RecursiveLeastSquares or MovingHorizon. They are what an engineer would use instead of
-a deformation, or with one. The correction is used where the controller evaluates its model: in the inverse every cycle, in a
-receding horizon whenever it plans.
+Offset-free receding-horizon control is RecedingHorizon with DisturbanceKalman; adaptive receding-horizon control in the
+sense of certainty equivalence is RecedingHorizon with RecursiveLeastSquares or MovingHorizon. They are what an engineer
+would use instead of a deformation, or with one. The correction is used where the controller evaluates its model: in the
+inverse every cycle, in a receding horizon whenever it plans.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The contract of estimators: a correction of the model's parameters from what was commanded and measured.
 
-At t_k an estimator sees the state, and the response that the plant gave just before t_k to the command held since t_{k-1}. It
-returns what is to be added to the parameters that it learns; everything else about the model stays as it was given. A disturbance
-is a parameter too: see `disturbed`.
+At t_k an estimator sees the state, and the response that the plant gave just before t_k to the command held since t_{k-1}.
+It returns what is to be added to the parameters that it learns; everything else about the model stays as it was given. A
+disturbance is a parameter too: see `disturbed`.
 """
 
 from __future__ import annotations

@@ -4,16 +4,17 @@ The model's responses are believed to have unknown disturbances that drift as ra
 
     q_i^(r_i) = f^_i(q, ..., u) + w_i + n_i,      w_i' = white noise,      y = C x + white noise.
 
-The state and the disturbances are estimated together: the nonlinear model predicts over one period, the stationary gain of the
-Kalman filter of the model linearised on the reference at t = 0 corrects,
+The state and the disturbances are estimated together: the nonlinear model predicts over one period, the stationary gain of
+the Kalman filter of the model linearised on the reference at t = 0 corrects,
 
     x- = F(x^, u, w^),      x^ = x- + K_x (y - C x-),      w^ <- w^ + K_w (y - C x-).
 
 A constant disturbance is found without error, whatever the tuning, if [A - I, B; C, 0] has full column rank (B: what the
-disturbances do to the state), which needs at least as many measured states as disturbances; otherwise the filter is refused.
+disturbances do to the state), which needs at least as many measured states as disturbances; otherwise the filter is
+refused.
 
-References: G. Pannocchia and J. B. Rawlings, Disturbance models for offset-free model-predictive control, AIChE Journal 49(2),
-2003. M. Morari and U. Maeder, Nonlinear offset-free model predictive control, Automatica 48(9), 2012.
+References: G. Pannocchia and J. B. Rawlings, Disturbance models for offset-free model-predictive control, AIChE Journal
+49(2), 2003. M. Morari and U. Maeder, Nonlinear offset-free model predictive control, Automatica 48(9), 2012.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ _SLOWEST = 1e-9  # a mode of the filter that decays by less per cycle does not d
 class DisturbanceKalman(Estimator):
     """Estimate constant or slowly drifting disturbances of responses.
 
-    Only ratios of the deviations matter. Those of the measurement are a tuning where the controller is given exact states: the
-    larger the drift, the faster and the noisier the estimate.
+    Only ratios of the deviations matter. Those of the measurement are a tuning where the controller is given exact states:
+    the larger the drift, the faster and the noisier the estimate.
 
     Parameters:
         drift: coordinate -> by how much the disturbance of its response wanders in one second, response unit / s^0.5.

@@ -1,16 +1,17 @@
 """Recursive least squares on the response equation, with exponential forgetting and bounds.
 
-    S = lambda I + H P H',      K = P H' S^-1,      z <- z + K e,      P <- (P - K H P) / lambda,      lambda = exp(-period / time),
+    S = lambda I + H P H',    K = P H' S^-1,    z <- z + K e,    P <- (P - K H P) / lambda,    lambda = exp(-period / time),
 
-with e and H of the last pair at the current estimate, so that a response that is not linear in its parameters is followed by an
-extended filter. For a linear one, z minimises
+with e and H of the last pair at the current estimate, so that a response that is not linear in its parameters is followed
+by an extended filter. For a linear one, z minimises
 
     lambda^k |z|^2 + sum_i lambda^(k-i) |e_i - H_i z|^2.
 
-Without excitation forgetting would let P grow for ever and the first disturbance would be blamed on parameters (wind-up): P is
-scaled back where its trace exceeds that of the prior. Estimates are clipped to their bounds.
+Without excitation forgetting would let P grow for ever and the first disturbance would be blamed on parameters (wind-up): P
+is scaled back where its trace exceeds that of the prior. Estimates are clipped to their bounds.
 
-References: K. J. Astrom and B. Wittenmark, Adaptive Control, 2nd ed., Addison-Wesley 1995, ch. 2 and 11 (forgetting, wind-up).
+References: K. J. Astrom and B. Wittenmark, Adaptive Control, 2nd ed., Addison-Wesley 1995, ch. 2 and 11 (forgetting,
+wind-up).
 """
 
 from __future__ import annotations

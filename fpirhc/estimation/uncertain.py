@@ -1,7 +1,7 @@
 """What is known beforehand of a parameter that is to be learned, and the response equation around the estimate.
 
-With z_i = (p_i - p_i given) / deviation_i, so that all unknowns are of the order of one, and residuals divided by the deviation
-of their noise, every learner here minimises a sum of |e - H dz|^2 with
+With z_i = (p_i - p_i given) / deviation_i, so that all unknowns are of the order of one, and residuals divided by the
+deviation of their noise, every learner here minimises a sum of |e - H dz|^2 with
 
     e = (f - f^(x, u, p)) / sigma,      H = (1 / sigma) df^/dp diag(deviation).
 """

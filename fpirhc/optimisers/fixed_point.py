@@ -17,9 +17,9 @@ step and gamma < 1 / L, a new plan must decrease the forward-backward envelope
 
     phi(U) = V + g'(T - U) + 1/(2 gamma) |T - U|^2
 
-by a share of |T - U|^2 (a short step: V by a share of what it promises), and raise neither phi nor V; else the step is shortened,
-and at last T itself is taken, which always decreases phi. T is tested for the quadratic upper bound that gamma promises; where
-it fails gamma is halved. D = 1/(step c) is the scale of `OptimalControl`.
+by a share of |T - U|^2 without raising V, or V by a share of the first-order decrease (phi says nothing where gamma is too long
+for the model of this call); else the step is shortened, and at last T itself is taken, which always decreases phi. T is tested
+for the quadratic upper bound that gamma promises; where it fails gamma is halved. D = 1/(step c) is the scale of `OptimalControl`.
 
 A call evaluates the remembered plan, rolled out with its remembered feedback, which answers to first order for a new initial
 state; an iteration finds a direction by one Riccati sweep and evaluates the plan there: one rollout with Jacobians and one

@@ -186,7 +186,8 @@ def _judgement(ocp: OptimalControl) -> ca.Function:
     enough = envelope <= old.envelope - SHARE * (1 - SHARE) * reach + slack
     # A step that a saturating map or the search made short decreases by its own measure, not by that of T.
     fair = value <= old.value + ARMIJO * ca.fmin(ca.dot(old.slope, inputs - old.inputs), 0) + slack
-    # Far away gamma may be too long for the envelope to bound V from below, so V itself must not rise; it does not at T.
+    # Far away, or with another model than the remembered gamma was found for, gamma may be too long for the envelope to bound V
+    # from below: then it must neither let V rise nor hold back a step that lowers V.
     decreases = ca.logic_or(ca.logic_and(enough, value <= old.value + slack), fair)
     bounded = value <= old.value + ca.dot(old.slope, old.plain - old.inputs) + SHARE * reach + slack
     finite = is_finite(ca.vertcat(value, ca.vec(slope), ca.vec(states)))
