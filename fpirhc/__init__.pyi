@@ -4,6 +4,7 @@ from .contraction import assess_gain, check_gain, delayed_limit, response_jacobi
 from .controllers.acceleration_feedback import AccelerationFeedback
 from .controllers.backstepping_mrac import BacksteppingMrac
 from .controllers.computed_torque import ComputedTorque
+from .controllers.estimating import Estimating
 from .controllers.floquet import Floquet, floquet_radius
 from .controllers.force_mrac import ForceMrac
 from .controllers.informed import Informed
@@ -34,6 +35,11 @@ from .deformation.sigmoid import Sigmoid
 from .deformation.tuned import Tuned
 from .disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
 from .errors import FpirhcError
+from .estimation.disturbance_kalman import DisturbanceKalman
+from .estimation.disturbed import disturbed
+from .estimation.moving_horizon import MovingHorizon
+from .estimation.recursive_least_squares import RecursiveLeastSquares
+from .estimation.uncertain import Uncertain
 from .horizon.cost import General, LqrTerminal, Quadratic
 from .horizon.expansion import ExactHessian, GaussNewton
 from .horizon.problem import Horizon
@@ -84,6 +90,8 @@ __all__ = [
     "Damped",
     "DeadTime",
     "DelayWatched",
+    "DisturbanceKalman",
+    "Estimating",
     "Euler",
     "ExactHessian",
     "Exponential",
@@ -115,6 +123,7 @@ __all__ = [
     "LyapunovView",
     "Measured",
     "Metrics",
+    "MovingHorizon",
     "Noise",
     "OpenPlan",
     "Osqp",
@@ -133,6 +142,7 @@ __all__ = [
     "Qrqp",
     "Quadratic",
     "RecedingHorizon",
+    "RecursiveLeastSquares",
     "ReducedGradient",
     "ResolvedAccelerationRate",
     "Restart",
@@ -159,6 +169,7 @@ __all__ = [
     "Table",
     "Trajectory",
     "Tuned",
+    "Uncertain",
     "VelocityDifference",
     "assess_gain",
     "certify",
@@ -166,6 +177,7 @@ __all__ = [
     "check_gain",
     "compare",
     "delayed_limit",
+    "disturbed",
     "floquet_radius",
     "load_problem",
     "load_run",

@@ -107,6 +107,19 @@ def compose_controller(problem: Problem, controller: Controller) -> Composite:
     return compose("controller", controller_reads(problem, chosen), blocks, delays, outputs=("command",))
 
 
+def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block:
+    """A composed step as one block; `feeds` renames what it reads."""
+    reads = tuple(feeds.get(s.name, s) for s in composite.reads.signals)
+
+    def step(s: Any) -> dict[str, Expression]:
+        memory = composite.memory.join({m: getattr(s, m) for m in composite.memory.names})
+        following, trace, *_ = composite.function(memory, *(getattr(s, r.name) for r in reads))
+        kept = {f"{m}_next": v for m, v in composite.memory.split(following).items()}
+        return {**composite.trace.split(trace), **kept}
+
+    return Block(name, Layout(reads), composite.trace, step, composite.memory, opaque=True)
+
+
 def reference_block(problem: Problem) -> Block:
     """Block (time, state) -> (reference state, response of the controlled coordinates, error of the judged ones)."""
     plant = problem.plant

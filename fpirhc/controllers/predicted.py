@@ -21,14 +21,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, Response, compose_controller, like
+from fpirhc.controllers.base import Controller, Response, compose_controller, embedded, like
 from fpirhc.dead_time import MOST
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.integrate import RungeKutta4
 from fpirhc.plant import Plant
 from fpirhc.problem import Problem
-from fpirhc.symbolic.block import Block, Composite, Delay
+from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 
@@ -241,16 +241,3 @@ def _residual(plant: Plant, time: float, period: float) -> ca.Function:
     seen[list(plant.controlled_indices)] = f - plant.controlled_response_function(x, u, p)
     share = 1 - float(np.exp(-period / time))
     return ca.Function("fpirhc_residual", [old, x, u, f, p], [old + share * (seen - old)])
-
-
-def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block:
-    """A composed step as one block; `feeds` renames what it reads."""
-    reads = tuple(feeds.get(s.name, s) for s in composite.reads.signals)
-
-    def step(s: Any) -> dict[str, Expression]:
-        memory = composite.memory.join({m: getattr(s, m) for m in composite.memory.names})
-        following, trace, *_ = composite.function(memory, *(getattr(s, r.name) for r in reads))
-        kept = {f"{m}_next": v for m, v in composite.memory.split(following).items()}
-        return {**composite.trace.split(trace), **kept}
-
-    return Block(name, Layout(reads), composite.trace, step, composite.memory, opaque=True)

@@ -1,0 +1,81 @@
+"""A van der Pol-Duffing oscillator with a wrong model: adaptation against what else an engineer would use.
+
+    m q'' = u + mu (1 - q^2) q' - k q - l q^3 + bias,        nominal motion  q^N = sin 1.5 t.
+
+The plan is renewed every 20 ms, a control cycle is 2 ms; nothing is noisy. Rivals of RHC+FPI with the same optimiser and
+cost: offset-free RHC (a disturbance of the response, estimated by a Kalman filter and used in every plan), RHC that learns
+all five parameters by recursive least squares or over a moving horizon, and RHC with the exact parameters as the bound.
+
+    rms error, mm      RHC 90.5    offset-free 0.76    RHC+FPI 0.29    least squares 0.32    moving horizon 0.32    exact 0.32
+
+How they were tuned, on this very task. Only ratios matter in the filter: with noise of q of 1e-3 m, drifts of 1, 3, 10,
+..., 3000 m/s^2/s^0.5 by noises of q' of 1e-3, 1e-2, 1e-1 m/s were tried. The error falls with drift over noise of q' until
+the filter finds the disturbance in one cycle, and stays at 0.757 mm. Gains of the sigmoid of -0.3, -0.5, -1, -2 give 0.64,
+0.43, 0.29 and 0.25 mm. Least squares: noise of 0.1, 0.3, 1, 3, 10 m/s^2 by times of 1 s, 5 s and infinity give 0.31 to 1.8
+mm, but hundreds with 0.1, which trusts the first responses, far from linear in m. Moving horizon: noise of 0.1, 1, 10 gives
+0.32, 0.32, 1.0 mm.
+
+What the numbers do not say. The disturbance acts through the plan, ten times less often than the deformation: with a
+control cycle of 20 ms RHC+FPI (2.1 mm) is hardly better than offset-free RHC (2.3 mm). And the learners are as good as the
+exact model because its structure is exact: 2 m/s^2 from 6 s on that no parameter stands for give 205 mm with least squares,
+65 mm with the moving horizon, 59 mm with the exact model, 1.2 mm with offset-free RHC and 0.30 mm with RHC+FPI. Parameters
+and motion are chosen here.
+"""
+
+import casadi as ca
+
+import fpirhc as fp
+
+
+def response(q, v, u, p):
+    return {"q": (u.u + p.mu * (1 - q.q**2) * v.q - p.k * q.q - p.l * q.q**3 + p.bias) / p.m}
+
+
+plant = fp.Plant(
+    coordinates={"q": "m"},
+    inputs={"u": "N"},
+    order=2,
+    response=response,
+    parameters={
+        "m": fp.Parameter(approximate=1.6, exact=1.0, unit="kg"),
+        "mu": fp.Parameter(approximate=0.6, exact=1.0, unit="N s/m"),
+        "k": fp.Parameter(approximate=2.0, exact=3.0, unit="N/m"),
+        "l": fp.Parameter(approximate=1.0, exact=2.0, unit="N/m^3"),
+        "bias": fp.Parameter(approximate=0.0, exact=2.0, unit="N"),
+    },
+)
+
+problem = fp.Problem(
+    plant=plant,
+    reference=fp.Trajectory(lambda t: {"q": ca.sin(1.5 * t)}),
+    start={"q": 0.0, "q'": 1.5},
+    period=2e-3,  # s
+    duration=12.0,  # s
+    limits=fp.Limits(inputs={"u": (-40.0, 40.0)}),  # N
+    horizon=fp.Horizon(stages=25, step=2e-2),
+    cost=fp.Quadratic(states={"q": 1e2, "q'": 1.0}, correction={"u": 1e-1}),
+    measure_from=4.0,  # s
+)
+
+plain = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-2))  # N
+sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=50.0)  # scale in m/s^2
+filter = fp.DisturbanceKalman(drift={"q": 3e3}, measured={"q": 1e-3, "q'": 1e-2})
+known = {
+    "m": fp.Uncertain(lower=0.3, upper=5.0, deviation=1.0),
+    "mu": fp.Uncertain(lower=0.0, upper=5.0, deviation=1.0),
+    "k": fp.Uncertain(lower=0.0, upper=20.0, deviation=2.0),
+    "l": fp.Uncertain(lower=0.0, upper=20.0, deviation=2.0),
+    "bias": fp.Uncertain(lower=-10.0, upper=10.0, deviation=2.0),
+}
+recursive = fp.RecursiveLeastSquares(known, noise={"q": 3.0}, time=1.0)
+window = fp.MovingHorizon(known, noise={"q": 0.1}, window=50, time=5.0)
+
+controllers = {
+    "RHC": plain,
+    "RHC+FPI": fp.RecedingHorizon(plain.optimiser, sigmoid),
+    "RHC offset-free": fp.Estimating(plain, filter),
+    "RHC+RLS": fp.Estimating(plain, recursive),
+    "RHC+MHE": fp.Estimating(plain, window),
+    "RHC exact model": fp.Informed(plain),
+}
+headline = ("RHC", "RHC+FPI")

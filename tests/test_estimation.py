@@ -1,0 +1,392 @@
+"""Learning the model: estimates equal batch formulas, remove offsets, keep bounds, and are refused where they cannot work."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.optimize
+from plants import linear, pendulum
+
+import fpirhc as fp
+from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
+from fpirhc.estimation.base import Seen
+
+PERIOD = 1e-2
+
+
+def spring(k: float = 3.0, b: float = 1.0, believed: tuple[float, float] = (2.0, 1.5)) -> fp.Plant:
+    """Y'' = b u - k y, linear in its parameters."""
+    return fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "N"},
+        parameters={"k": fp.Parameter(believed[0], k, "1/s^2"), "b": fp.Parameter(believed[1], b, "1/kg")},
+        response=lambda q, v, u, p: {"y": p.b * u.u - p.k * q.y},
+    )
+
+
+def task(plant: fp.Plant, **changes) -> fp.Problem:
+    """Follow a sine (or what `changes` say) with a short horizon."""
+    name, force = plant.names[0], next(iter(plant.inputs))
+    settings = {
+        "plant": plant,
+        "reference": fp.Trajectory(lambda t: {name: 0.3 * ca.sin(2 * t)}),
+        "start": {name: 0.05},
+        "period": PERIOD,
+        "duration": 2.0,
+        "limits": fp.Limits(inputs={force: (-20.0, 20.0)}),
+        "horizon": fp.Horizon(stages=10, step=2 * PERIOD),
+        "cost": fp.Quadratic(states={name: 1e2, f"{name}'": 1.0}, correction={force: 0.1}),
+    }
+    return fp.Problem(**(settings | changes))
+
+
+RHC = fp.RecedingHorizon(fp.FixedPoint(iterations=2, tolerance=1e-6))
+SPRING = {"k": fp.Uncertain(0.0, 10.0, 1.0), "b": fp.Uncertain(0.1, 5.0, 0.5)}
+MASS = {"m": fp.Uncertain(0.2, 5.0, 0.5)}
+NOISE = {"y": 0.1}
+
+
+def kalman(name: str = "y") -> fp.DisturbanceKalman:
+    return fp.DisturbanceKalman(drift={name: 10.0}, measured={name: 1e-3, f"{name}'": 1e-2})
+
+
+def learners(parameters, name: str) -> dict[str, fp.RecursiveLeastSquares | fp.MovingHorizon | fp.DisturbanceKalman]:
+    return {
+        "Kalman": kalman(name),
+        "RLS": fp.RecursiveLeastSquares(parameters, noise={name: 0.1}, time=5.0),
+        "MHE": fp.MovingHorizon(parameters, noise={name: 0.1}, window=10, time=5.0),
+    }
+
+
+@pytest.mark.parametrize("name", ["Kalman", "RLS", "MHE"])
+def test_an_exact_model_is_left_alone(name):
+    """Without noise and model error nothing is learned, and the plant moves as without the estimator, to rounding."""
+    problem = task(pendulum())
+    plain = fp.simulate(problem, fp.Informed(RHC), seed=0, compiled=False)
+    run = fp.simulate(problem, fp.Informed(fp.Estimating(RHC, learners(MASS, "angle")[name])), seed=0, compiled=False)
+    np.testing.assert_allclose(run["state"], plain["state"], atol=1e-10)
+    np.testing.assert_allclose(run["estimate"], np.broadcast_to(run["estimate"][0], run["estimate"].shape), atol=1e-9)
+
+
+def test_a_constant_disturbance_leaves_no_offset():
+    """Plain RHC, u = -K y near rest, stays where b K y = w; the disturbance model leaves nothing and finds w."""
+    push = 1.5
+    rest = task(
+        linear(1.0, 1.0),
+        reference=fp.Trajectory(lambda t: {"y": 0 * t}),
+        disturbances={"y": fp.Step(0.0, push)},
+        duration=5.0,
+        start={"y": 0.0},
+    )
+    plain = fp.simulate(rest, RHC, seed=0, compiled=False)
+    free = fp.simulate(rest, fp.Estimating(RHC, kalman()), seed=0, compiled=False)
+    assert plain["state.y"][-1] == pytest.approx(push / feedback(rest), rel=1e-3)
+    assert abs(plain["state.y"][-1]) > 0.02
+    assert abs(free["state.y"][-1]) < 1e-6
+    assert free["estimate"][-1, 0] == pytest.approx(push, rel=1e-6)
+
+
+def feedback(problem: fp.Problem) -> float:
+    """K of u = -K y, from the plan's first input a little off the reference."""
+    from fpirhc.horizon.problem import stage_data, transcribe
+
+    parts = problem.plant, problem.reference, problem.horizon, problem.cost
+    data = stage_data(*parts)(0.0, problem.plant.approximate).full()
+    plan = fp.solve(transcribe(*parts, problem.limits), RHC.optimiser, np.array([1e-3, 0.0]), data)
+    return -float(plan.inputs[0, 0]) / 1e-3
+
+
+def test_the_gain_is_that_of_the_stationary_filter():
+    """Against the Riccati equation of a double integrator written out by hand, solved by scipy and by iterating it."""
+    problem = task(linear(1.0, 1.0))
+    filter = fp.DisturbanceKalman(drift={"y": 2.0}, measured={"y": 1e-3}, noise={"y": 0.5})
+    h = PERIOD
+    a = np.array([[1, h, h**2 / 2], [0, 1, h], [0, 0, 1]])
+    b, c = np.array([[h**2 / 2], [h], [0]]), np.array([[1.0, 0, 0]])
+    q, r = 0.5**2 * b @ b.T + np.diag([0, 0, 2.0**2 * h]), np.array([[1e-6]])
+    p = scipy.linalg.solve_discrete_are(a.T, c.T, q, r)
+    found = filter.gain(replace(problem, plant=filter.model(problem.plant)))
+    np.testing.assert_allclose(found, p @ c.T / (c @ p @ c.T + r), rtol=1e-8)
+    s = np.eye(3)
+    for _ in range(3000):
+        gain = s @ c.T @ np.linalg.inv(c @ s @ c.T + r)
+        s = a @ (s - gain @ c @ s) @ a.T + q
+    np.testing.assert_allclose(found, gain, rtol=1e-6)
+
+
+def test_the_disturbance_is_seen_through_a_nonlinear_model():
+    """A wrong mass and length act as a slowly varying disturbance: RHC with the filter tracks ten times better."""
+    problem = task(pendulum(), duration=4.0, measure_from=2.0, start={"angle": 0.0, "angle'": 0.6})
+    errors = [
+        fp.measure(problem, fp.simulate(problem, c, seed=0, compiled=False)).rms_error["angle"]
+        for c in (RHC, fp.Estimating(RHC, kalman("angle")))
+    ]
+    assert errors[1] < 0.1 * errors[0]
+
+
+class Fed:
+    """An estimator stepped over given pairs by hand."""
+
+    def __init__(self, problem: fp.Problem, estimator):
+        layout, plant = estimator.memory(problem), problem.plant
+        symbols = [ca.MX.sym(n, k) for n, k in (("x", 2), ("u", 1), ("f", 1), ("valid", 1), ("m", layout.size))]
+        x, u, f, valid, memory = symbols
+        given = Seen(x, u, f, ca.DM(plant.approximate), valid)
+        correction, following = estimator.step(problem)(given, layout.split(memory))
+        self.function = ca.Function("fed", symbols, [correction, layout.join(following)])
+        self.memory = layout.start()
+
+    def __call__(self, x, u, f):
+        """The correction after one more pair."""
+        correction, self.memory = self.function(x, u, f, 1, self.memory)
+        return correction.full().ravel()
+
+
+def pairs(count: int, plant: fp.Plant, seed: int = 3):
+    """Random states and inputs, and the plant's responses with noise."""
+    random = np.random.default_rng(seed)
+    for _ in range(count):
+        x, u = random.normal(size=2), random.normal(size=1)
+        f = plant.response_function(x, u, plant.exact).full().ravel()
+        yield x, u, f + 0.1 * random.normal(size=1)
+
+
+def batch(plant, data, weights, prior):
+    """The regularised weighted least squares of corrections of (k, b), by the normal equations."""
+    scale = np.array([known.deviation for known in SPRING.values()])
+    rows = np.array([[-x[0], u[0]] for x, u, _ in data]) * scale / NOISE["y"]
+    right = np.array([f[0] - plant.response_function(x, u, plant.approximate).full()[0, 0] for x, u, f in data])
+    right = right / NOISE["y"]
+    z = np.linalg.solve(prior * np.eye(2) + rows.T @ (weights[:, None] * rows), rows.T @ (weights * right))
+    return scale * z, rows, right
+
+
+@pytest.mark.parametrize("time", [math.inf, 0.5])
+def test_recursive_least_squares_are_the_batch_ones(time):
+    """After every pair, with and without forgetting."""
+    plant = spring()
+    problem, factor = task(plant), math.exp(-PERIOD / time)
+    fed, data = Fed(problem, fp.RecursiveLeastSquares(SPRING, NOISE, time)), list(pairs(60, plant))
+    for k, pair in enumerate(data, 1):
+        found = fed(*pair)
+        expected, *_ = batch(plant, data[:k], factor ** np.arange(k - 1, -1, -1), factor**k)
+        np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-10)
+
+
+@pytest.mark.parametrize("window", [60, 7])
+def test_moving_horizon_is_the_batch_estimate_of_a_linear_model(window):
+    """With a window of all pairs, and with a short one whose prior holds what has left it."""
+    plant = spring()
+    fed = Fed(task(plant), fp.MovingHorizon(SPRING, NOISE, window, math.inf))
+    data = list(pairs(60, plant))
+    for k, pair in enumerate(data, 1):
+        found = fed(*pair)
+        expected, *_ = batch(plant, data[:k], np.ones(k), 1.0)
+        np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-10)
+
+
+def test_moving_horizon_stops_at_the_constrained_optimum():
+    """Not at the clipped unconstrained one: the free parameter makes up for the one at its bound."""
+    plant = spring()
+    narrow = {"k": replace(SPRING["k"], upper=2.5), "b": SPRING["b"]}
+    # Inputs that go with the positions make both parameters explain the same responses.
+    data = [(x, 0.8 * x[:1] + 0.2 * u, f) for x, u, f in pairs(40, plant)]
+    fed = Fed(task(plant), fp.MovingHorizon(narrow, NOISE, 40, math.inf, iterations=3))
+    for pair in data:
+        found = fed(*pair)
+    free, rows, right = batch(plant, data, np.ones(40), 1.0)
+    scale = np.array([known.deviation for known in narrow.values()])
+    lower = (np.array([v.lower for v in narrow.values()]) - plant.approximate) / scale
+    upper = (np.array([v.upper for v in narrow.values()]) - plant.approximate) / scale
+    best = scipy.optimize.lsq_linear(np.vstack([rows, np.eye(2)]), np.r_[right, 0, 0], bounds=(lower, upper), tol=1e-12)
+    np.testing.assert_allclose(found, scale * best.x, atol=1e-5)
+    assert abs(found[1] - free[1]) > 0.05
+
+
+@pytest.mark.parametrize("build", [fp.RecursiveLeastSquares, lambda p, n, t: fp.MovingHorizon(p, n, 10, t)])
+def test_forgetting_follows_a_jump(build):
+    """The gain b doubles: with forgetting the estimate is there soon, without it stays in between."""
+    before, after = spring(b=1.0), spring(b=2.0)
+    found = {}
+    for time in (0.3, math.inf):
+        fed = Fed(task(before), build(SPRING, NOISE, time))
+        for pair in [*pairs(300, before), *pairs(150, after, seed=4)]:
+            found[time] = fed(*pair) + before.approximate
+    assert found[0.3][1] == pytest.approx(2.0, abs=0.1)
+    assert found[math.inf][1] < 1.6
+
+
+@pytest.mark.parametrize("build", [fp.RecursiveLeastSquares, lambda p, n, t: fp.MovingHorizon(p, n, 10, t)])
+def test_bounds_are_kept(build):
+    """Whatever the pairs say; and without excitation nothing winds up."""
+    plant = spring(k=30.0, b=0.01)
+    fed = Fed(task(plant), build(SPRING, NOISE, 0.1))
+    for pair in pairs(50, plant):
+        k, b = fed(*pair) + plant.approximate
+        assert 0.0 <= k <= 10.0
+        assert 0.1 <= b <= 5.0
+    for _ in range(2000):
+        fed(np.zeros(2), np.zeros(1), np.zeros(1))
+    assert np.abs(np.asarray(fed.memory)).max() < 1e6
+
+
+@pytest.mark.parametrize("name", ["Kalman", "RLS", "MHE"])
+def test_compiled_and_interpreted_runs_agree(name):
+    """Every estimator becomes C, and the C does the same."""
+    problem = task(spring(), duration=0.5)
+    controller = fp.Estimating(fp.ComputedTorque(fp.Exponential(rate=5.0)), learners(SPRING, "y")[name])
+    runs = [fp.simulate(problem, controller, seed=0, compiled=c) for c in (True, False)]
+    assert runs[0].compiled
+    np.testing.assert_allclose(runs[0]["estimate"], runs[1]["estimate"], rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["Kalman", "RLS", "MHE"])
+def test_what_is_not_finite_is_not_learned(name):
+    """One broken measurement leaves the model as it was, and learning goes on."""
+    problem = task(spring())
+    stepper = fp.Stepper(problem, fp.Estimating(RHC, learners(SPRING, "y")[name]), compiled=False)
+    memory, estimates = stepper.start(), []
+    for k, value in enumerate([0.0, 1.0, math.nan, 1.0, 1.0]):
+        state = np.array([0.1, value if name == "Kalman" else 0.2 * k])
+        _, memory = stepper.step(k * PERIOD, state, np.array([value]), memory)
+        estimates.append(stepper.trace()["estimate"].copy())
+    np.testing.assert_array_equal(estimates[2], estimates[1])
+    assert np.isfinite(estimates[-1]).all()
+    assert np.any(estimates[-1] != estimates[2])
+
+
+def test_a_disturbed_plant():
+    """The disturbance adds to the response, and the inverse takes it away, derived or given."""
+
+    def inverse(q, v, r, p):
+        return {"u": (r.y + p.k * q.y) / p.b}
+
+    for plant in (spring(), replace(spring(), inverse=inverse)):
+        found = fp.disturbed(plant, ("y",))
+        assert found.parameters["w_y"] == fp.Parameter(0.0, 0.0, "m/s^2")
+        x, u, p = np.array([0.3, 0.1]), np.array([0.7]), np.array([2.0, 1.5, 0.4])
+        r = found.response_function(x, u, p)
+        assert float(r) == pytest.approx(1.5 * 0.7 - 2.0 * 0.3 + 0.4)
+        assert float(found.inverse_function(x, r, p)) == pytest.approx(0.7)
+    with pytest.raises(InvalidProblem, match="parameter 'w_y' already"):
+        fp.disturbed(found, ("y",))
+    with pytest.raises(InvalidProblem, match=r"'z' is unknown.*Valid: y"):
+        fp.disturbed(plant, ("z",))
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: fp.Uncertain(2.0, 1.0, 1.0), "lower < upper"),
+        (lambda: fp.Uncertain(1.0, 2.0, 0.0), "deviation=0.0"),
+        (lambda: fp.RecursiveLeastSquares({}, NOISE, 1.0), "at least one parameter"),
+        (lambda: fp.RecursiveLeastSquares(SPRING, {"y": -1.0}, 1.0), "y=-1.0"),
+        (lambda: fp.RecursiveLeastSquares(SPRING, NOISE, 0.0), "number of seconds"),
+        (lambda: fp.MovingHorizon(SPRING, NOISE, 0, 1.0), "window=0"),
+        (lambda: fp.MovingHorizon(SPRING, NOISE, 5, 1.0, iterations=0), "iterations=0"),
+        (lambda: fp.MovingHorizon({}, NOISE, 5, 1.0), "at least one parameter"),
+        (lambda: fp.DisturbanceKalman({}, {"y": 1.0}), "drift"),
+        (lambda: fp.DisturbanceKalman({"y": 1.0}, {"y": math.nan}), "y=nan"),
+    ],
+)
+def test_bad_settings_are_refused(build, message):
+    with pytest.raises(InvalidValue, match=message):
+        build()
+
+
+TWO = fp.Plant(
+    coordinates={"a": "m", "b": "m"},
+    inputs={"u": "N"},
+    parameters={"k": fp.Parameter(1.0, 1.0, "1/s^2")},
+    controlled=("a",),
+    response=lambda q, v, u, p: {"a": u.u - p.k * q.a, "b": p.k * q.a - p.k * q.b},
+)
+TWO_TASK = fp.Problem(
+    plant=TWO,
+    reference=fp.Trajectory(lambda t: {"a": 0 * t, "b": 0 * t}),
+    start={"a": 0.0, "b": 0.0},
+    period=PERIOD,
+    duration=1.0,
+    horizon=fp.Horizon(stages=5, step=PERIOD),
+    cost=fp.Quadratic(states={"b": 1.0}, effort={"u": 1.0}),
+)
+
+
+@pytest.mark.parametrize(
+    ("problem", "estimator", "error", "message"),
+    [
+        (TWO_TASK, fp.DisturbanceKalman({"a": 1.0, "b": 1.0}, {"b": 1.0}), NotSupported, "2 disturbances"),
+        # What moves only b says nothing about itself in a.
+        (
+            TWO_TASK,
+            fp.DisturbanceKalman({"b": 1.0}, {"a": 1.0}, {"a": 1.0}),
+            NotSupported,
+            r"w_b cannot be told from a",
+        ),
+        (TWO_TASK, fp.DisturbanceKalman({"a": 1.0}, {"a": 1.0, "z": 1.0}), InvalidProblem, "'z' is unknown"),
+        (TWO_TASK, fp.DisturbanceKalman({"z": 1.0}, {"a": 1.0}), InvalidProblem, "'z' is unknown"),
+        # Nothing is said to disturb the undamped mass a, so its filter would never forget the first error.
+        (TWO_TASK, fp.DisturbanceKalman({"b": 1.0}, {"a": 1.0, "b": 1.0}), NotSupported, r"give noise=\{'a'"),
+        (task(spring()), fp.RecursiveLeastSquares({"q": SPRING["k"]}, NOISE, 1.0), InvalidProblem, "'q' is unknown"),
+        (task(spring()), fp.RecursiveLeastSquares(SPRING, {}, 1.0), InvalidProblem, "add 'y'"),
+        (
+            task(spring(believed=(20.0, 1.0))),
+            fp.MovingHorizon(SPRING, NOISE, 5, 1.0),
+            InvalidProblem,
+            r"'k' is 20 in the model, outside \[0, 10\]",
+        ),
+        (
+            task(spring(), dead_time=fp.DeadTime(inputs={"u": PERIOD})),
+            fp.RecursiveLeastSquares(SPRING, NOISE, 1.0),
+            NotSupported,
+            "no dead time",
+        ),
+    ],
+)
+def test_estimators_that_do_not_fit_are_refused(problem, estimator, error, message):
+    """Before the run, with the reason."""
+    with pytest.raises(error, match=message):
+        fp.Estimating(RHC, estimator).check(problem)
+
+
+def test_one_iteration_survives_a_change_of_the_model():
+    """A plan prepared with one model and followed with another: one iteration per cycle finds back to the optimum."""
+    shipped = fp.load_problem("van_der_pol_duffing")
+    problem = replace(shipped.problem, duration=2.0, measure_from=1.0)
+    run = fp.simulate(problem, shipped.controllers["RHC exact model"], seed=0)
+    assert run["solve.stationarity"][200:].max() < 1e-2
+    assert fp.measure(problem, run).rms_error["q"] < 1e-3
+
+
+@pytest.fixture(scope="module")
+def duffing() -> dict[str, float]:
+    return errors("van_der_pol_duffing", "q")
+
+
+def errors(name: str, coordinate: str) -> dict[str, float]:
+    """The rms errors of all controllers of a shipped problem."""
+    shipped = fp.load_problem(name)
+    runs = {n: fp.simulate(shipped.problem, c, seed=0) for n, c in shipped.controllers.items()}
+    return {n: fp.measure(shipped.problem, r).rms_error[coordinate] for n, r in runs.items()}
+
+
+def test_adaptation_against_tuned_rivals(duffing):
+    """RHC+FPI is as good as the exact model and better than offset-free RHC; the learners equal the exact model."""
+    assert duffing["RHC+FPI"] <= 1.2 * duffing["RHC exact model"]
+    assert duffing["RHC+FPI"] <= 0.7 * duffing["RHC offset-free"]
+    assert duffing["RHC offset-free"] < 0.05 * duffing["RHC"]
+    for learner in ("RHC+RLS", "RHC+MHE"):
+        assert duffing[learner] <= 1.2 * duffing["RHC exact model"]
+
+
+def test_where_offset_free_control_is_the_better_choice():
+    """An error of the model where the input does not act: a deformation cannot reach it, a disturbance model can."""
+    found = errors("leaking_tanks", "h2")
+    assert found["RHC offset-free"] <= 1.3 * found["RHC exact model"]
+    assert found["RHC offset-free"] < 0.05 * found["RHC"]
+    assert found["RHC+FPI"] > 0.5 * found["RHC"]
