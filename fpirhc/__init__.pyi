@@ -1,6 +1,9 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
+from .adaptation.lyapunov_rule import LyapunovRule
+from .adaptation.projection import Projection
 from .contraction import assess_gain, check_gain, response_jacobian, spectrum_over_box, spectrum_over_run
+from .controllers.adaptive_inverse_dynamics import AdaptiveInverseDynamics
 from .controllers.computed_torque import ComputedTorque
 from .controllers.floquet import Floquet, floquet_radius
 from .controllers.informed import Informed
@@ -10,6 +13,7 @@ from .controllers.predicted import ByDesired, ByModel, Predicted
 from .controllers.receding_horizon import RecedingHorizon
 from .controllers.schedules import ByError, ByLookAhead, FixedSchedule, Periodic
 from .controllers.slot import Slot
+from .controllers.slotine_li import SlotineLi
 from .controllers.slotted import Slotted
 from .dead_time import DeadTime
 from .deformation.affine import Affine
@@ -43,6 +47,7 @@ from .optimisers.reduced_gradient import ReducedGradient
 from .plant import Parameter, Plant, structural_order
 from .problem import Problem
 from .reference import Table, Trajectory
+from .regressor import Combination, Regressor, linear_parameters
 from .relative_order import OutputChain, output_chain
 from .report.html import write_report
 from .run import Run, load_run
@@ -57,6 +62,7 @@ from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
 
 __all__ = [
+    "AdaptiveInverseDynamics",
     "Affine",
     "Anderson",
     "Blended",
@@ -65,6 +71,7 @@ __all__ = [
     "ByLookAhead",
     "ByModel",
     "Certificate",
+    "Combination",
     "Comparison",
     "ComputedTorque",
     "Cvodes",
@@ -95,6 +102,7 @@ __all__ = [
     "InteriorPoint",
     "Limits",
     "LqrTerminal",
+    "LyapunovRule",
     "Metrics",
     "Noise",
     "OpenPlan",
@@ -108,11 +116,13 @@ __all__ = [
     "Plant",
     "Predicted",
     "Problem",
+    "Projection",
     "Pulse",
     "Qrqp",
     "Quadratic",
     "RecedingHorizon",
     "ReducedGradient",
+    "Regressor",
     "Restart",
     "RestartAndTrack",
     "Rfpt",
@@ -125,6 +135,7 @@ __all__ = [
     "Sigmoid",
     "Sine",
     "Slot",
+    "SlotineLi",
     "Slotted",
     "Status",
     "Step",
@@ -139,6 +150,7 @@ __all__ = [
     "check_gain",
     "compare",
     "floquet_radius",
+    "linear_parameters",
     "load_problem",
     "load_run",
     "measure",
