@@ -5,6 +5,7 @@ from .adaptation.projection import Projection
 from .contraction import assess_gain, check_gain, response_jacobian, spectrum_over_box, spectrum_over_run
 from .controllers.adaptive_inverse_dynamics import AdaptiveInverseDynamics
 from .controllers.computed_torque import ComputedTorque
+from .controllers.encoder import ByEncoder
 from .controllers.floquet import Floquet, floquet_radius
 from .controllers.informed import Informed
 from .controllers.nominal import OpenPlan, Restart, RestartAndTrack
@@ -67,6 +68,7 @@ __all__ = [
     "Anderson",
     "Blended",
     "ByDesired",
+    "ByEncoder",
     "ByError",
     "ByLookAhead",
     "ByModel",

@@ -29,9 +29,9 @@ def close_loop(problem: Problem, controller: Controller) -> Composite:
     chosen = prepared(problem, controller)
     blocks, delays = chosen.blocks(problem)
     disturbed = disturbance_signals(problem)
-    seeing = _sense_blocks(
-        problem, chosen.response(problem), predicts="state_ahead" in [n for b in blocks for n in b.writes.names]
-    )
+    # A controller that works with another state than the measured one is judged by the true error.
+    own = {"state_ahead", "state_seen"} & {n for b in blocks for n in b.writes.names}
+    seeing = _sense_blocks(problem, chosen.response(problem), predicts=bool(own))
     around = [_clock_block(problem.period), *seeing, *blocks, *_actuate(problem, disturbed)]
     return compose("loop", Layout(disturbed), around, [*_plant_delays(problem, chosen), *delays])
 

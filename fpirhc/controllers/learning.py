@@ -116,7 +116,9 @@ def learning_delays() -> list[Delay]:
 
 
 def fed(block: Block, name: str, source: Signal) -> Block:
-    """The block, reading `source` where it would read the signal `name`."""
+    """The block, reading `source` where it would read the signal `name`, if it does."""
+    if name not in block.reads:
+        return block
     reads = tuple(source if s.name == name else s for s in block.reads.signals)
 
     def step(s: Any) -> Any:
