@@ -1,5 +1,7 @@
 """A two-link arm with friction that drops part of its load: computed torque, adaptive inverse dynamics, Slotine and Li."""
 
+from types import SimpleNamespace
+
 import casadi as ca
 
 import fpirhc as fp
@@ -76,7 +78,7 @@ def relief(joint):
         q = ca.vertcat(*motion(t).values())
         v = ca.jacobian(q, t)
         only = dict.fromkeys(plant.parameters, 0.0) | {"load": DROPPED}
-        part = fp.Named(tuple(only), ca.DM(list(only.values())), "parameter")
+        part = SimpleNamespace(**only)
         whole = mass(q, part) @ ca.jacobian(v, t) + forces(q, v, part)
         return 0.5 * (1 + ca.tanh(50 * (t - AT))) * whole[joint]
 

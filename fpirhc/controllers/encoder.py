@@ -9,7 +9,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import expm
 
 from fpirhc.controllers.base import Controller, Response, compose_controller, like
 from fpirhc.controllers.predicted import embedded
@@ -23,12 +22,13 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 @dataclass(frozen=True)
 class ByEncoder(Controller):
-    """The wrapped controller with positions rounded to whole encoder counts, and velocity and acceleration filtered from them,
+    """The wrapped controller with positions q_c rounded to whole encoder counts, and velocity and acceleration filtered from them,
 
-        f'' = bandwidth^2 (q_counted - f) - 2 bandwidth f',     q' seen as f',  q'' seen as f''  (the state-variable filter).
+        f1' = w (q_c - f1),   f2' = w (f1 - f2),     q' seen as w (f1 - f2),   q'' seen as w^2 (q_c - 2 f1 + f2),
 
-    The filter is discretised exactly for a position held over the control cycle. What it sees comes late, q' and q'' by about
-    2 / bandwidth, and q'' jumps by resolution x bandwidth^2 at every count: a wide filter is noisy, a narrow one late.
+    w the bandwidth (a state-variable filter, discretised by the trapezoidal rule, so that constant velocities and accelerations
+    are seen as they are). What it sees comes late by about 2 / w, and q'' jumps by resolution x w^2 at every count: a wide filter
+    is noisy, a narrow one late.
 
     Parameters:
         controller: any controller.
@@ -78,10 +78,14 @@ class ByEncoder(Controller):
         """
         plant = problem.plant
         if set(plant.orders) != {2} or plant.controlled_names != plant.names:
-            raise NotSupported("ByEncoder sees positions, velocities and accelerations: every coordinate controlled, of order 2")
+            raise NotSupported(
+                "ByEncoder sees positions, velocities and accelerations: every coordinate controlled, of order 2"
+            )
         odd = sorted(set(self.resolution) ^ set(plant.names))
         if odd:
-            raise InvalidValue(f"ByEncoder: resolution must name every coordinate and no other; '{odd[0]}' is on one side only")
+            raise InvalidValue(
+                f"ByEncoder: resolution must name every coordinate and no other; '{odd[0]}' is on one side only"
+            )
         self.controller.check(problem)
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
@@ -97,22 +101,31 @@ class ByEncoder(Controller):
         plant, pole = problem.plant, self.bandwidth
         at, moving = list(plant.indices(0)), list(plant.indices(1))
         counts = ca.DM([self.resolution[name] for name in plant.names])
-        # (f, f', q) with q held: the last column of the exponential is the input's.
-        joined = expm(np.array([[0, 1, 0], [-(pole**2), -2 * pole, pole**2], [0, 0, 0]]) * problem.period)
-        names = tuple(f"{name}{mark}" for mark in ("", "'") for name in plant.names)
-        start = tuple(float(problem.start_state[k]) for k in (*at, *moving))
-        memory, size = Signal("encoder_filter", names, start=start), len(plant.names)
+        kept, new = (2 / problem.period - pole) / (2 / problem.period + pole), pole / (2 / problem.period + pole)
+        place, speed = problem.start_state[at], problem.start_state[moving]
+        # As if the plant had moved at its first velocity for long.
+        parts = {
+            "encoder_first": place - speed * (problem.period + 1 / pole),
+            "encoder_second": place - speed * (problem.period + 2 / pole),
+            "encoder_first_input": place - speed * problem.period,
+            "encoder_second_input": place - speed * (problem.period + 1 / pole),
+        }
+        memory = Layout(tuple(Signal(n, plant.names, start=tuple(map(float, v))) for n, v in parts.items()))
 
         def step(s: Any) -> dict[str, Expression]:
             position = counts * ca.floor(s.state[at] / counts + 0.5)
-            low, slope = s.encoder_filter[:size], s.encoder_filter[size:]
-            following = [row[0] * low + row[1] * slope + row[2] * position for row in joined[:2]]
-            seen = dict(zip([*at, *moving], [*ca.vertsplit(position), *ca.vertsplit(slope)], strict=True))
+            first = kept * s.encoder_first + new * (position + s.encoder_first_input)
+            second = kept * s.encoder_second + new * (first + s.encoder_second_input)
+            velocity = pole * (first - second)
+            seen = dict(zip([*at, *moving], [*ca.vertsplit(position), *ca.vertsplit(velocity)], strict=True))
             return {
-                "state_seen": ca.vertcat(*(seen[k] for k in range(2 * size))),
-                "response_seen": pole**2 * (position - low) - 2 * pole * slope,
-                "encoder_filter_next": ca.vertcat(*following),
+                "state_seen": ca.vertcat(*(seen[k] for k in range(len(seen)))),
+                "response_seen": pole**2 * (position - 2 * first + second),
+                "encoder_first_next": first,
+                "encoder_second_next": second,
+                "encoder_first_input_next": position,
+                "encoder_second_input_next": first,
             }
 
         reads = Layout((plant.state,))
-        return Block("encode", reads, Layout(writes), step, Layout((memory,)))
+        return Block("encode", reads, Layout(writes), step, memory)
