@@ -121,7 +121,6 @@ tracking = fp.Exponential(rate=8.0)
 sigmoid = fp.Sigmoid(gain=-0.8, shift=0.3, scale=50.0)
 adaptation = fp.LyapunovRule({name: (upper - lower) ** 2 for name, (lower, upper) in bounds.items()})  # 1/s, in squared widths
 slow = fp.LyapunovRule({name: 0.1 * gain for name, gain in adaptation.gains.items()})
-projection = fp.Projection(gain=5e-3, dead_zone=0.3)  # dead zone in rad/s^2
 damping = {"q1": 8.0, "q2": 3.0, "q3": 0.5}  # N m s
 
 
@@ -134,7 +133,7 @@ controllers = {
     "CT+FPI": seen(fp.ComputedTorque(tracking, sigmoid)),
     "CT+FPI, half gain": seen(fp.ComputedTorque(tracking, sigmoid.with_effective_gain(sigmoid.effective_gain() / 2))),
     "AID": seen(fp.AdaptiveInverseDynamics(tracking, slow, bounds)),
-    "AID+FPI": seen(fp.AdaptiveInverseDynamics(tracking, projection, bounds, deformation=sigmoid)),
+    "AID+FPI": seen(fp.AdaptiveInverseDynamics(tracking, slow, bounds, deformation=sigmoid)),
     "Slotine-Li": seen(fp.SlotineLi(8.0, damping, adaptation, bounds)),
     "CT+FPI, response known": fp.ComputedTorque(tracking, sigmoid),
     "Slotine-Li, state known": fp.SlotineLi(8.0, damping, adaptation, bounds),
