@@ -129,7 +129,9 @@ bounds = {
 tracking = fp.Exponential(rate=6.0)
 sigmoid = fp.Sigmoid(gain=-0.8, shift=0.3, scale=50.0)
 
-adaptation = fp.LyapunovRule({name: (upper - lower) ** 2 for name, (lower, upper) in bounds.items()})  # 1/s, in squared widths
+adaptation = fp.LyapunovRule(
+    {name: (upper - lower) ** 2 for name, (lower, upper) in bounds.items()}
+)  # 1/s, in squared widths
 projection = fp.Projection(gain=5e-3, dead_zone=0.3)  # dead zone in rad/s^2
 damping = {"q1": 30.0, "q2": 15.0}  # N m s
 

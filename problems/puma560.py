@@ -60,7 +60,10 @@ def torques(q, v, a, p):
     """Recursive Newton-Euler: accelerations outwards, forces inwards."""
     masses, axis = (0.0, p.m2, p.m3, 0.82, 0.34, 0.09), ca.DM([0, 0, 1])
     turns = [rotation(q[k], FRAMES[k][0]) for k in range(6)]
-    arms = [ca.DM([length, offset * float(ca.sin(twist)), offset * float(ca.cos(twist))]) for twist, length, offset in FRAMES]
+    arms = [
+        ca.DM([length, offset * float(ca.sin(twist)), offset * float(ca.cos(twist))])
+        for twist, length, offset in FRAMES
+    ]
     spin, twirl, lift = ca.SX.zeros(3), ca.SX.zeros(3), ca.SX([0, 0, GRAVITY])
     pushes, couples = [], []
     for k in range(6):
@@ -160,7 +163,9 @@ for _k in range(6):
 
 tracking = fp.Exponential(rate=10.0)
 sigmoid = fp.Sigmoid(gain=-0.8, shift=0.3, scale=50.0)
-adaptation = fp.LyapunovRule({name: (upper - lower) ** 2 for name, (lower, upper) in bounds.items()})  # 1/s, in squared widths
+adaptation = fp.LyapunovRule(
+    {name: (upper - lower) ** 2 for name, (lower, upper) in bounds.items()}
+)  # 1/s, in squared widths
 projection = fp.Projection(gain=1e-2, dead_zone=0.3)  # dead zone in rad/s^2
 damping = {"q1": 40.0, "q2": 40.0, "q3": 15.0, "q4": 2.0, "q5": 2.0, "q6": 2.0}  # N m s
 

@@ -1,9 +1,9 @@
 """A three-link arm that sees itself through encoders of 4096 counts: where Slotine and Li do better than fixed-point iteration.
 
-The arm hangs in a vertical plane and has the size of a human one. Lengths (0.186, 0.146, 0.108 of the height), masses (0.028, 0.016,
-0.006 of the body's), centres of mass and radii of gyration are those of D. A. Winter, Biomechanics and Motor Control of Human
-Movement (2009), table 4.1 (from memory), for 1.75 m and 75 kg; it holds 1 kg in the hand. Friction is chosen here. The model's masses
-are a quarter too small, and it knows a fifth of the load.
+The arm hangs in a vertical plane and has the size of a human one. Lengths (0.186, 0.146, 0.108 of the height), masses (0.028,
+0.016, 0.006 of the body's), centres of mass and radii of gyration are those of D. A. Winter, Biomechanics and Motor Control of
+Human Movement (2009), table 4.1 (from memory), for 1.75 m and 75 kg; it holds 1 kg in the hand. Friction is chosen here. The
+model's masses are a quarter too small, and it knows a fifth of the load.
 
 Every controller but the last two gets positions rounded to 2 pi / 4096 rad, and velocities and accelerations that a filter of
 300 rad/s makes of them. One count makes the acceleration jump by 140 rad/s^2, where the motion itself has 8. Fixed-point iteration
@@ -12,13 +12,13 @@ rms change of tau1 per cycle (N m):
 
     computed torque      44  140  380    0.26          Slotine-Li           1.6  2.9  4.0    0.35
     CT+FPI              2.0  3.3  5.0    6.0           adaptive inverse     4.0  4.9  4.5    0.54
-    CT+FPI, half gain   2.0  4.3  9.7    3.1
+    CT+FPI, half gain   2.0  4.3  9.7    3.1           the same with FPI    2.1  3.3  1.9    6.4
 
-So Slotine-Li is more precise than FPI, with a torque that is 17 times smoother. Of the gains -0.1, -0.2, -0.4, -0.8 and -1.6 of FPI,
--0.8 is the best one here: less is too slow, more is too noisy (25 mrad). FPI keeps the first second (4, 7, 22 mrad at most, against
-9, 11, 31), because it need not learn. With acceleration and state known exactly, FPI has 0.5, 2.2, 6.7 mrad and Slotine-Li 0.4, 0.6,
-1.2: on this motion, which excites all that matters, having learned the arm is worth more than correcting it. Inverse dynamics with
-FPI and projection learns from the noise that it is meant not to see: its estimate of the load ends at zero.
+So Slotine-Li is more precise than FPI, with a torque that is 17 times smoother. Of the gains -0.1, -0.2, -0.4, -0.8 and -1.6 of
+FPI, -0.8 is the best one here: less is too slow, more is too noisy (25 mrad at most). What learns and iterates is as precise as
+Slotine-Li, but as rough as FPI. FPI keeps the first second (4, 7, 22 mrad at most, against 9, 11, 31), because it need not learn.
+With acceleration and state known exactly, FPI has 0.5, 2.2, 6.7 mrad and Slotine-Li 0.4, 0.6, 1.2: on this motion, which excites
+all that matters, having learned the arm is worth more than correcting it.
 """
 
 import casadi as ca
@@ -119,7 +119,9 @@ bounds = {
 encoders = dict.fromkeys(plant.coordinates, 6.283185 / 4096)  # rad
 tracking = fp.Exponential(rate=8.0)
 sigmoid = fp.Sigmoid(gain=-0.8, shift=0.3, scale=50.0)
-adaptation = fp.LyapunovRule({name: (upper - lower) ** 2 for name, (lower, upper) in bounds.items()})  # 1/s, in squared widths
+adaptation = fp.LyapunovRule(
+    {name: (upper - lower) ** 2 for name, (lower, upper) in bounds.items()}
+)  # 1/s, in squared widths
 slow = fp.LyapunovRule({name: 0.1 * gain for name, gain in adaptation.gains.items()})
 damping = {"q1": 8.0, "q2": 3.0, "q3": 0.5}  # N m s
 

@@ -54,7 +54,9 @@ def test_regressor_is_the_inverse_dynamics(name, values):
     chosen, x, r, _, p, theta = drawn(values, name)
     y, rest = chosen.function(x, r, p)
     wanted = chosen.plant.inverse_function(x, r, p).full().ravel()
-    np.testing.assert_allclose((y @ theta + rest).full().ravel(), wanted, rtol=1e-8, atol=1e-8 * (1 + np.abs(wanted).max()))
+    np.testing.assert_allclose(
+        (y @ theta + rest).full().ravel(), wanted, rtol=1e-8, atol=1e-8 * (1 + np.abs(wanted).max())
+    )
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -120,7 +122,7 @@ def test_published_inertia_and_gravity_load_of_the_puma():
 
 
 def test_more_combinations_than_parameters():
-    """A pendulum with mass m and length l: the inertia m l^2 and the weight m l are two combinations, and more points are needed."""
+    """A pendulum of mass m and length l: inertia m l^2 and weight m l; three functions of two parameters need two points."""
     plant = pendulum()
     combinations = {
         "inertia": fp.Combination(lambda p: p.m * p.l**2, "kg m^2"),
@@ -163,7 +165,9 @@ def test_plants_without_a_regressor_are_refused():
     """Fewer inputs than coordinates; an inverse that only a root finder has."""
     with pytest.raises(NotSupported, match="fully actuated"):
         fp.Regressor(fp.load_problem("cart_pole").problem.plant, ("m",))
-    bent = fp.Plant({"y": "m"}, {"u": "N"}, {"m": fp.Parameter(1, 1, "kg")}, lambda q, v, u, p: {"y": ca.sinh(u.u) / p.m})
+    bent = fp.Plant(
+        {"y": "m"}, {"u": "N"}, {"m": fp.Parameter(1, 1, "kg")}, lambda q, v, u, p: {"y": ca.sinh(u.u) / p.m}
+    )
     with pytest.raises(NotSupported, match="root finder"):
         fp.Regressor(bent, ("m",))
     assert fp.linear_parameters(chain(1)) == ("m",)
