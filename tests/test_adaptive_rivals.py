@@ -343,12 +343,11 @@ def test_planar_arm():
 
 def test_slotine_li_is_the_better_choice_behind_coarse_encoders():
     """More precise, and the torque changes a tenth as much per cycle; 4096 counts are seen as 140 rad/s^2."""
-    found = settled("three_link_arm", ("CT+FPI", "Slotine-Li", "CT+FPI, response known"), 9.0, 5.0)
+    found = settled("three_link_arm", ("CT+FPI", "Slotine-Li"), 7.0, 4.0)
     precise = {name: value for name, (value, _) in found.items()}
     rough = {name: np.std(np.diff(run["command.tau1"])) for name, (_, run) in found.items()}
     assert precise["Slotine-Li"] < 0.9 * precise["CT+FPI"]
     assert rough["Slotine-Li"] < 0.1 * rough["CT+FPI"]
-    assert rough["CT+FPI, response known"] < 0.01 * rough["CT+FPI"]
 
 
 def test_puma_learns_its_load():
@@ -390,6 +389,25 @@ def test_encoder_sees_constant_motions_as_they_are():
 
 
 # What does not fit is refused before the run.
+
+
+def crossed():
+    """The input named first pushes the second mass, which is three times as heavy."""
+    return fp.Plant(
+        coordinates={"x": "m", "y": "m"},
+        inputs={"u": "N", "w": "N"},
+        parameters={"m": fp.Parameter(1.0, 1.0, "kg")},
+        response=lambda q, v, u, p: {"x": u.w / p.m, "y": u.u / (3 * p.m)},
+    )
+
+
+def relativistic():
+    return fp.Plant(
+        coordinates={"x": "m"},
+        inputs={"u": "N"},
+        parameters={"m": fp.Parameter(1.0, 1.0, "kg")},
+        response=lambda q, v, u, p: {"x": u.u / (p.m * (1 + v.x**2))},
+    )
 
 
 REFUSED = {
@@ -446,6 +464,18 @@ REFUSED = {
         replace(AID, bounds={"m": (0.1, 1.0)}, rule=fp.Projection(0.1)),
         NotSupported,
         "fully actuated",
+    ),
+    "inputs that work along the other coordinate": (
+        fp.Problem(crossed(), fp.Trajectory(lambda t: {"x": t, "y": t}), {"x": 0, "y": 0}, period=1e-3, duration=1.0),
+        fp.SlotineLi(1.0, {"x": 1.0, "y": 1.0}, fp.Projection(0.1), {"m": (0.1, 2.0)}),
+        NotSupported,
+        "not symmetric",
+    ),
+    "inertia that depends on velocity": (
+        fp.Problem(relativistic(), fp.Trajectory(lambda t: {"x": t}), {"x": 0}, period=1e-3, duration=1.0),
+        fp.SlotineLi(1.0, {"x": 1.0}, fp.Projection(0.1), {"m": (0.1, 2.0)}),
+        NotSupported,
+        "not independent of q'",
     ),
     "nonlinear parameters": (
         fp.Problem(pendulum(), fp.Trajectory(lambda t: {"angle": t}), {"angle": 0}, period=1e-3, duration=1.0),

@@ -67,8 +67,9 @@ class Learning:
                 "LyapunovRule and no deformation, or a controller that does not learn"
             )
         states = _states(problem)
+        resting = states * [name in problem.plant.coordinates for name in problem.plant.state.elements]
         coefficients = _mass_coefficients(regressor, states)
-        _check_symmetric(coefficients)
+        _check_mechanical(coefficients, _mass_coefficients(regressor, resting))
         if inverts or self.rule.reads_response:
             _check_definite(self.bounds, coefficients)
 
@@ -176,12 +177,14 @@ def _mass_coefficients(regressor: Regressor, states: np.ndarray) -> np.ndarray:
     return np.stack([f.T.reshape((-1, n, n)) for f in found])
 
 
-def _check_symmetric(coefficients: np.ndarray) -> None:
+def _check_mechanical(coefficients: np.ndarray, resting: np.ndarray) -> None:
     skew = np.abs(coefficients - coefficients.transpose(0, 1, 3, 2)).max()
-    if not skew <= 1e-6 * np.abs(coefficients).max():
+    moving = np.abs(coefficients - resting).max()
+    if not max(skew, moving) <= 1e-6 * np.abs(coefficients).max():
+        what = "symmetric" if moving <= skew else "independent of q'"
         raise NotSupported(
-            "learning inverse dynamics is for mechanics, but the matrix dQ/dq'' of this plant is not symmetric; write the "
-            "response so that input k does work along coordinate k"
+            f"learning inverse dynamics is for mechanics, but the matrix dQ/dq'' of this plant is not {what}; write the "
+            "response so that input k does work along coordinate k and inertia does not depend on velocity"
         )
 
 
