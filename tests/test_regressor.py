@@ -92,7 +92,7 @@ def test_coriolis_matrix_makes_the_change_of_mass_skew(name, values):
 
 
 def test_published_regressor_of_the_two_link_arm():
-    """Slotine and Li (1991), section 9.2: a = (3.34, 0.97, 1.04, 0.6), and the regressor they print."""
+    """Slotine and Li (1991), section 9.2 (from memory): a = (3.34, 0.97, 1.04, 0.6), and their regressor."""
     chosen = regressor("two_link_arm")
     theta = chosen.theta_function(chosen.plant.exact).full().ravel()
     np.testing.assert_allclose(theta[:4], [3.34, 0.97, 1.0392, 0.6], atol=5e-5)
@@ -109,7 +109,7 @@ def test_published_regressor_of_the_two_link_arm():
 
 
 def test_published_inertia_and_gravity_load_of_the_puma():
-    """At the posture (0, 45, 180, 0, 45, 0) deg without load; numbers as printed by P. Corke's toolbox."""
+    """At the posture (0, 45, 180, 0, 45, 0) deg without load; numbers as P. Corke's toolbox prints them (from memory)."""
     chosen = regressor("puma560")
     p = chosen.plant.exact * [n != "load" for n in chosen.plant.parameters]
     x = np.zeros(12)
