@@ -17,12 +17,12 @@ rms change of tau1 per cycle (N m):
 So Slotine-Li is more precise than FPI, with a torque that is 17 times smoother. Of the gains -0.1, -0.2, -0.4, -0.8 and -1.6 of
 FPI, -0.8 is the best one here: less is too slow, more is too noisy (25 mrad at most). What learns and iterates is as precise as
 Slotine-Li, but as rough as FPI. FPI keeps the first second (4, 7, 22 mrad at most, against 9, 11, 31), because it need not learn.
-The encoder was chosen to show this. Of four sensors tried, Slotine-Li tracks better only with this one: with 16384 counts or more
-and the same filter both are about equally precise (2, 7, 8 to 13 mrad at most) and only the torque is rougher, 16 times; with 16384
-counts and a filter of 100 rad/s FPI with gain -0.4 is the more precise one (6, 17, 24 mrad against 11, 21, 31), also with the rougher
-torque. Slotine-Li's gain is the best of three, its damping the second that was tried; the first one, higher, chattered.
-With acceleration and state known exactly, FPI has 0.5, 2.2, 6.7 mrad and Slotine-Li 0.4, 0.6, 1.2: on this motion, which excites
-all that matters, having learned the arm is worth more than correcting it.
+The encoder was chosen to show this. Of four sensors tried, Slotine-Li tracks better only with this one: with 16384 counts
+or more and the same filter both are about equally precise (2, 7, 8 to 13 mrad at most) and only the torque is rougher, 16
+times; with 16384 counts and a filter of 100 rad/s FPI with gain -0.4 is the more precise one (6, 17, 24 mrad against 11,
+21, 31), also with the rougher torque. Slotine-Li's gain is the best of three, its damping the second that was tried; the
+first one, higher, chattered. With acceleration and state known exactly, FPI has 0.5, 2.2, 6.7 mrad and Slotine-Li 0.4, 0.6,
+1.2: on this motion, which excites all that matters, having learned the arm is worth more than correcting it.
 """
 
 import casadi as ca
