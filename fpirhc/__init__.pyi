@@ -1,7 +1,10 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
+from .adaptation.lyapunov_rule import LyapunovRule
+from .adaptation.projection import Projection
 from .contraction import assess_gain, check_gain, delayed_limit, response_jacobian, spectrum_over_box, spectrum_over_run
 from .controllers.acceleration_feedback import AccelerationFeedback
+from .controllers.adaptive_inverse_dynamics import AdaptiveInverseDynamics
 from .controllers.backstepping_mrac import BacksteppingMrac
 from .controllers.computed_torque import ComputedTorque
 from .controllers.estimating import Estimating
@@ -18,6 +21,7 @@ from .controllers.resolved_rate import ResolvedAccelerationRate
 from .controllers.schedules import ByError, ByLookAhead, FixedSchedule, Periodic
 from .controllers.sliding_mode import SlidingMode
 from .controllers.slot import Slot
+from .controllers.slotine_li import SlotineLi
 from .controllers.slotted import Slotted
 from .dead_time import DeadTime
 from .deformation.affine import Affine
@@ -58,10 +62,20 @@ from .optimisers.reduced_gradient import ReducedGradient
 from .plant import Parameter, Plant, structural_order
 from .problem import Problem
 from .reference import Table, Trajectory
+from .regressor import Combination, Regressor, linear_parameters
 from .relative_order import OutputChain, output_chain
 from .report.html import write_report
 from .run import Run, load_run
-from .sensing import LowPassDifference, Measured, PositionDifference, SavitzkyGolay, Sensing, Sensor, VelocityDifference
+from .sensing import (
+    LowPassDifference,
+    Measured,
+    PositionDifference,
+    SavitzkyGolay,
+    Sensing,
+    Sensor,
+    StateVariableFilter,
+    VelocityDifference,
+)
 from .simulation import simulate
 from .status import Status
 from .stepper import Stepper
@@ -74,6 +88,7 @@ from .tracking.fractional import Fractional
 
 __all__ = [
     "AccelerationFeedback",
+    "AdaptiveInverseDynamics",
     "Affine",
     "Anderson",
     "BacksteppingMrac",
@@ -84,6 +99,7 @@ __all__ = [
     "ByModel",
     "Certificate",
     "ColouredNoise",
+    "Combination",
     "Comparison",
     "ComputedTorque",
     "Cvodes",
@@ -120,6 +136,7 @@ __all__ = [
     "LowPassDifference",
     "LqrTerminal",
     "LyapunovMrac",
+    "LyapunovRule",
     "LyapunovView",
     "Measured",
     "Metrics",
@@ -138,12 +155,14 @@ __all__ = [
     "PositionDifference",
     "Predicted",
     "Problem",
+    "Projection",
     "Pulse",
     "Qrqp",
     "Quadratic",
     "RecedingHorizon",
     "RecursiveLeastSquares",
     "ReducedGradient",
+    "Regressor",
     "ResolvedAccelerationRate",
     "Restart",
     "RestartAndTrack",
@@ -161,7 +180,9 @@ __all__ = [
     "Sine",
     "SlidingMode",
     "Slot",
+    "SlotineLi",
     "Slotted",
+    "StateVariableFilter",
     "Status",
     "Step",
     "Stepper",
@@ -179,6 +200,7 @@ __all__ = [
     "delayed_limit",
     "disturbed",
     "floquet_radius",
+    "linear_parameters",
     "load_problem",
     "load_run",
     "lyapunov_view",

@@ -23,6 +23,7 @@ ESTIMATORS = (
     fp.PositionDifference(),
     fp.SavitzkyGolay(window=7, degree=4),
     fp.SavitzkyGolay(window=11, degree=5),
+    fp.StateVariableFilter(bandwidth=300.0),
 )
 NOISE = fp.Sensor(noise=fp.Noise(1.0))
 GENTLE = fp.Exponential(rate=0.01, integral=False)
@@ -413,3 +414,18 @@ def test_wrong_values_are_refused(make, message):
     """Each says what is wrong and what is expected."""
     with pytest.raises(InvalidValue, match=message):
         make()
+
+
+def test_state_variable_filter_sees_constant_motions_as_they_are():
+    """On q = a t^2 / 2: velocity late by 2 / bandwidth, acceleration a."""
+    problem = fp.Problem(
+        chain(2),
+        fp.Trajectory(lambda t: {"y": 1.5 * t**2}),
+        {"y": 0.0},
+        period=1e-3,
+        duration=0.5,
+        sensing=fp.Sensing({}, fp.StateVariableFilter(bandwidth=100.0)),
+    )
+    found = run(problem, fp.Informed(fp.ComputedTorque(fp.Exponential(rate=5.0))))
+    assert found["realised"][450, 0] == pytest.approx(found["plant_realised"][450, 0], rel=1e-2)
+    assert found["state"][450, 1] == pytest.approx(found["plant_state"][430, 1], rel=1e-2)

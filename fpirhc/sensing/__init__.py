@@ -5,6 +5,7 @@ from fpirhc.sensing.measured import Measured
 from fpirhc.sensing.positions import PositionDifference, SavitzkyGolay
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.sensing.sensor import Sensor
+from fpirhc.sensing.state_filter import StateVariableFilter
 from fpirhc.sensing.velocities import LowPassDifference, VelocityDifference
 
 __all__ = [
@@ -15,5 +16,6 @@ __all__ = [
     "SavitzkyGolay",
     "Sensing",
     "Sensor",
+    "StateVariableFilter",
     "VelocityDifference",
 ]

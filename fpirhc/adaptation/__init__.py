@@ -1,0 +1,1 @@
+"""Adaptation rules: how estimated parameters follow from what a controller sees."""

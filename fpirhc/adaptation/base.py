@@ -1,0 +1,48 @@
+"""The contract of adaptation rules: how far the estimated parameters move in one cycle."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from fpirhc.symbolic.layout import Expression
+
+Pair = tuple[Expression, Expression]
+Bounds = Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What a controller offers a rule in one cycle; a rule asks for the pair that it uses, and only that is computed.
+
+    Parameters:
+        gradient: the controller's Lyapunov function falls along p' = Gamma G^T w: returns (G (n x m), w (n)).
+        equation: the model error h = G (p - p_hat) of the response, exact without disturbances: returns (G (n x m), h (n)).
+        clipped: 1 where the last command was clipped, so that the gradient does not hold.
+    """
+
+    gradient: Callable[[], Pair]
+    equation: Callable[[], Pair]
+    clipped: Expression
+
+
+class Rule(ABC):
+    """Contract: a frozen value that moves the estimate."""
+
+    @property
+    @abstractmethod
+    def reads_response(self) -> bool:
+        """Whether the rule asks for the equation, which needs the measured response."""
+
+    @abstractmethod
+    def check(self, bounds: Bounds) -> None:
+        """Raise if the rule does not fit the parameters' bounds.
+
+        Raises:
+            InvalidValue: names or intervals that do not fit.
+        """
+
+    @abstractmethod
+    def change(self, evidence: Evidence, bounds: Bounds, period: float) -> Expression:
+        """Return the change of the estimate (m) in one cycle, before it is kept inside the bounds."""

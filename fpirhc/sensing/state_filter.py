@@ -1,0 +1,126 @@
+"""State and response from positions alone, by a filter whose own states are the derivatives.
+
+    y_0 = q,   y_j' = w (y_{j-1} - y_j),   j = 1 ... n,      q^(s) seen as w^s sum_i (-1)^i C(s, i) y_{n-s+i},
+
+the s-th derivative of the position q through n low-passes of bandwidth w; the position itself is not filtered. Discretised by
+the trapezoidal rule with p = (2 - w T) / (2 + w T), so that derivatives which are constant are seen as they are. It is late by
+about n / w; a count of an encoder makes the response jump by w^n counts: a wide filter is noisy, a narrow one late.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from scipy.special import comb
+
+from fpirhc.errors import InvalidValue
+from fpirhc.plant import Plant
+from fpirhc.sensing.estimator import Array, Estimator, spline_weights
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.layout import Expression, Layout, Signal
+
+_TAIL = 1e-16  # of a low-pass: what the weights leave out
+
+
+@dataclass(frozen=True)
+class StateVariableFilter(Estimator):
+    """Derivatives of filtered positions.
+
+    The filter begins as if the plant had moved at its first velocities for long.
+
+    Parameters:
+        bandwidth: w, rad/s.
+
+    Raises:
+        InvalidValue: a bandwidth that is not positive.
+
+    References:
+        P. C. Young, Process parameter estimation and self adaptive control, in Theory of Self-Adaptive Control Systems,
+        Plenum 1966.
+    """
+
+    bandwidth: float
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.bandwidth, int | float) and 0 < self.bandwidth < math.inf):
+            raise InvalidValue(
+                f"StateVariableFilter(bandwidth={self.bandwidth!r}): expected a positive number of rad/s"
+            )
+
+    def measures(self, plant: Plant) -> tuple[str, ...]:
+        """The coordinates themselves."""
+        return plant.names
+
+    def weights(self, order: int, period: float) -> Array:
+        """The B-spline of an n-th difference through n low-passes (1 - p) / (1 - p / z), as far as they matter."""
+        pole, _ = self._coefficients(period)
+        count = math.ceil(math.log(_TAIL) / math.log(abs(pole))) + 10 * order if pole else 1
+        after = np.arange(count)
+        return np.convolve(
+            (1 - pole) ** order * comb(after + order - 1, order - 1) * pole**after, spline_weights(order)
+        )
+
+    def delay(self, order: int, period: float) -> float:
+        """N p / (1 - p) + (n - 1) / 2, about n / (w T) - 1/2."""
+        pole, _ = self._coefficients(period)
+        return order * pole / (1 - pole) + (order - 1) / 2
+
+    def fills(self, order: int) -> int:
+        """One: the filter begins in the start's motion."""
+        del order
+        return 1
+
+    def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
+        """Block (positions) -> (state, response)."""
+        keep, new = self._coefficients(period)
+        memory = tuple(self._memory(plant, period, start, kind) for kind in ("filter_stages", "filter_inputs"))
+
+        def step(s: Any) -> dict[str, Expression]:
+            positions, at = getattr(s, seen.name), 0
+            known: dict[str, Expression] = {}
+            stages: list[Expression] = []
+            inputs: list[Expression] = []
+            responses: list[Expression] = []
+            for k, (name, order) in enumerate(zip(plant.names, plant.orders, strict=True)):
+                chain = [positions[k]]
+                for j in range(order):
+                    inputs.append(chain[j])
+                    chain.append(keep * s.filter_stages[at] + new * (chain[j] + s.filter_inputs[at]))
+                    at += 1
+                stages += chain[1:]
+                known[name] = chain[0]
+                known |= {name + "'" * d: self._derivative(chain, order, d) for d in range(1, order)}
+                responses.append(self._derivative(chain, order, order))
+            return {
+                "state": ca.vertcat(*(known[e] for e in plant.state.elements)),
+                "realised": ca.vertcat(*(responses[k] for k in plant.controlled_indices)),
+                "filter_stages_next": ca.vertcat(*stages),
+                "filter_inputs_next": ca.vertcat(*inputs),
+            }
+
+        writes = Layout((plant.state, plant.response_signal("realised")))
+        return Block("estimate", Layout((seen,)), writes, step, Layout(memory))
+
+    def _coefficients(self, period: float) -> tuple[float, float]:
+        """Of y_j(k) = keep y_j(k-1) + new (y_{j-1}(k) + y_{j-1}(k-1))."""
+        double = 2 / period
+        return (double - self.bandwidth) / (double + self.bandwidth), self.bandwidth / (double + self.bandwidth)
+
+    def _derivative(self, chain: list[Any], order: int, degree: int) -> Any:
+        terms = ((-1.0) ** i * math.comb(degree, i) * chain[order - degree + i] for i in range(degree + 1))
+        return self.bandwidth**degree * sum(terms)
+
+    def _memory(self, plant: Plant, period: float, start: Array, kind: str) -> Signal:
+        """The stages, or what came into them, one cycle before the first; stage j is late by j / w."""
+        names, values = [], []
+        for name, order in zip(plant.names, plant.orders, strict=True):
+            place = start[plant.state.elements.index(name)]
+            speed = start[plant.state.elements.index(name + "'")] if order > 1 else 0.0
+            late = 1 if kind == "filter_stages" else 0
+            names += [f"{name}@{j + 1}" for j in range(order)]
+            values += [float(place - speed * (period + (j + late) / self.bandwidth)) for j in range(order)]
+        return Signal(kind, tuple(names), start=tuple(values))

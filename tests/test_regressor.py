@@ -1,0 +1,173 @@
+"""Parameter regressors: Y theta + Q0 is the inverse dynamics, C is Christoffel's, and what is not linear is refused by name."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plants import chain, pendulum
+
+import fpirhc as fp
+from fpirhc.errors import InvalidName, InvalidValue, NotSupported
+
+INERTIAS = {
+    "a1": fp.Combination(lambda p: p.I1 + p.m1 * p.lc1**2 + p.Ie + p.me * (p.lce**2 + p.l1**2), "kg m^2"),
+    "a2": fp.Combination(lambda p: p.Ie + p.me * p.lce**2, "kg m^2"),
+    "a3": fp.Combination(lambda p: p.me * p.l1 * p.lce * ca.cos(p.delta), "kg m^2"),
+    "a4": fp.Combination(lambda p: p.me * p.l1 * p.lce * ca.sin(p.delta), "kg m^2"),
+}
+
+
+@cache
+def regressor(name):
+    """The shipped arms' regressors; the two-link arm's model is nonlinear in its parameters and needs combinations."""
+    plant = fp.load_problem(name).problem.plant
+    if name == "two_link_arm":
+        return fp.Regressor(plant, (*INERTIAS, "b"), INERTIAS)
+    nonlinear = {"planar_arm": {"vs"}}.get(name, set())
+    return fp.Regressor(plant, [n for n in plant.parameters if n not in nonlinear])
+
+
+ARMS = ("two_link_arm", "planar_arm", "three_link_arm", "puma560")
+numbers = st.lists(st.floats(-2, 2), min_size=80, max_size=80)
+
+
+def drawn(values, name):
+    """State, response, a second velocity, theta and parameters from one list of numbers."""
+    chosen = regressor(name)
+    n, plant = len(chosen.plant.names), chosen.plant
+    values = np.array(values)
+    x, r, v = values[: 2 * n], 5 * values[20 : 20 + n], values[30 : 30 + n]
+    p = plant.exact * (1 + 0.2 * values[40 : 40 + plant.exact.size])
+    return chosen, x, r, v, p, chosen.theta_function(p).full().ravel()
+
+
+@pytest.mark.parametrize("name", ARMS)
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(values=numbers)
+def test_regressor_is_the_inverse_dynamics(name, values):
+    """Y theta + Q0 = Q at any state, response and parameters, to rounding."""
+    chosen, x, r, _, p, theta = drawn(values, name)
+    y, rest = chosen.function(x, r, p)
+    wanted = chosen.plant.inverse_function(x, r, p).full().ravel()
+    np.testing.assert_allclose(
+        (y @ theta + rest).full().ravel(), wanted, rtol=1e-8, atol=1e-8 * (1 + np.abs(wanted).max())
+    )
+
+
+@pytest.mark.parametrize("name", ARMS)
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(values=numbers)
+def test_split_with_the_actual_velocity_is_the_inverse_dynamics(name, values):
+    """Y_s(q, q', q', q'') = Y(q, q', q''), and it is linear in v with slope C."""
+    chosen, x, r, v, p, theta = drawn(values, name)
+    own = x[list(chosen.plant.indices(1))]
+
+    def force(velocity):
+        y, rest = chosen.split_function(x, velocity, r, p)
+        return (y @ theta + rest).full().ravel()
+
+    wanted = chosen.plant.inverse_function(x, r, p).full().ravel()
+    scale = 1e-8 * (1 + np.abs(wanted).max())
+    np.testing.assert_allclose(force(own), wanted, atol=scale)
+    coriolis = chosen.coriolis_function(x, theta, p).full()
+    np.testing.assert_allclose(force(own + v) - wanted, coriolis @ v, atol=scale + 1e-8 * np.abs(coriolis).max())
+
+
+@pytest.mark.parametrize("name", ARMS)
+@settings(max_examples=10, deadline=None, derandomize=True)
+@given(values=numbers)
+def test_coriolis_matrix_makes_the_change_of_mass_skew(name, values):
+    """M' - 2 C + (M' - 2 C)^T = 0, with M' by a central difference along q' (error of order h^2 = 1e-10)."""
+    chosen, x, _, _, p, theta = drawn(values, name)
+    n, h = len(chosen.plant.names), 1e-5
+    along = np.concatenate([x[n:], np.zeros(n)])
+    ahead, behind = (chosen.mass_function(x + s * h * along, theta, p).full() for s in (1, -1))
+    skew = (ahead - behind) / (2 * h) - 2 * chosen.coriolis_function(x, theta, p).full()
+    np.testing.assert_allclose(skew + skew.T, 0, atol=1e-6 * (1 + np.abs(skew).max()))
+
+
+def test_published_regressor_of_the_two_link_arm():
+    """Slotine and Li (1991), section 9.2 (from memory): a = (3.34, 0.97, 1.04, 0.6), and their regressor."""
+    chosen = regressor("two_link_arm")
+    theta = chosen.theta_function(chosen.plant.exact).full().ravel()
+    np.testing.assert_allclose(theta[:4], [3.34, 0.97, 1.0392, 0.6], atol=5e-5)
+    q, w, v, s = np.random.default_rng(0).standard_normal((4, 2))
+    y, rest = (m.full() for m in chosen.split_function([*q, *w], v, s, chosen.plant.approximate))
+    cosine, sine = np.cos(q[1]), np.sin(q[1])
+    cross = w[1] * v[0] + w[0] * v[1] + w[1] * v[1]
+    printed = [
+        [s[0], s[1], (2 * s[0] + s[1]) * cosine - cross * sine, (2 * s[0] + s[1]) * sine + cross * cosine],
+        [0, s[0] + s[1], s[0] * cosine + w[0] * v[0] * sine, s[0] * sine - w[0] * v[0] * cosine],
+    ]
+    np.testing.assert_allclose(y[:, :4], printed, atol=1e-10)
+    np.testing.assert_allclose(rest, 0, atol=1e-10)
+
+
+def test_published_inertia_and_gravity_load_of_the_puma():
+    """At the posture (0, 45, 180, 0, 45, 0) deg without load; numbers as P. Corke's toolbox prints them (from memory)."""
+    chosen = regressor("puma560")
+    p = chosen.plant.exact * [n != "load" for n in chosen.plant.parameters]
+    x = np.zeros(12)
+    x[[1, 2, 4]] = np.pi / 4, np.pi, np.pi / 4
+    mass = chosen.mass_function(x, chosen.theta_function(p), p).full()
+    np.testing.assert_allclose(np.diag(mass), [3.6594, 4.4137, 0.9378, 0.1925, 0.1713, 0.1941], atol=6e-5)
+    np.testing.assert_allclose([mass[0, 1], mass[0, 2], mass[1, 2]], [-0.4044, 0.1006, 0.3509], atol=6e-5)
+    gravity = chosen.plant.inverse_function(x, np.zeros(6), p).full().ravel()
+    np.testing.assert_allclose(gravity, [0, 31.6399, 6.0351, 0, 0.0283, 0], atol=6e-5)
+
+
+def test_more_combinations_than_parameters():
+    """A pendulum of mass m and length l: inertia m l^2 and weight m l; three functions of two parameters need two points."""
+    plant = pendulum()
+    combinations = {
+        "inertia": fp.Combination(lambda p: p.m * p.l**2, "kg m^2"),
+        "weight": fp.Combination(lambda p: p.m * p.l, "kg m"),
+        "square": fp.Combination(lambda p: p.m**2, "kg^2"),
+    }
+    found = fp.Regressor(plant, ("inertia", "weight"), combinations)
+    y, rest = (m.full() for m in found.function([0.3, 0.7], [2.0], plant.approximate))
+    np.testing.assert_allclose(y, [[2.0, 9.81 * np.sin(0.3)]], atol=1e-9)
+    np.testing.assert_allclose(rest, [[0.07]], atol=1e-9)
+    with pytest.raises(InvalidValue, match="'square' does not enter"):
+        fp.Regressor(plant, ("inertia", "weight", "square"), combinations)
+    with pytest.raises(InvalidValue, match=r"not linear in inertia.*'l' enter"):
+        fp.Regressor(plant, ("inertia",), combinations)
+
+
+def test_linear_parameters_are_found():
+    """Linear jointly with all others; a Stribeck level is one only where its velocity is not learned."""
+    assert fp.linear_parameters(pendulum()) == ()
+    found = fp.linear_parameters(fp.load_problem("planar_arm").problem.plant)
+    assert found == ("J1", "k1", "m2", "I2", "load", "b1", "b2", "c1", "c2")
+    assert fp.linear_parameters(fp.load_problem("two_link_arm").problem.plant) == ("I1", "Ie", "b")
+
+
+def test_parameters_that_enter_nonlinearly_are_refused_by_name():
+    """With the products they appear in, and what to do."""
+    with pytest.raises(InvalidValue, match=r"'l' enter\(s\) nonlinearly; in products: 'm' with 'l'.*Combination"):
+        fp.Regressor(pendulum(), ("m", "l"))
+    plant = fp.load_problem("planar_arm").problem.plant
+    with pytest.raises(InvalidValue, match=r"'vs' enter.*'s1' with 'vs'"):
+        fp.Regressor(plant, tuple(plant.parameters))
+    with pytest.raises(InvalidName, match="Did you mean 'load'"):
+        fp.Regressor(plant, ("lod",))
+    double = {"twice": fp.Combination(lambda p: 2 * p.load, "kg")}
+    with pytest.raises(InvalidValue, match="depend on each other"):
+        fp.Regressor(plant, ("load", "twice"), double)
+
+
+def test_plants_without_a_regressor_are_refused():
+    """Fewer inputs than coordinates; an inverse that only a root finder has."""
+    with pytest.raises(NotSupported, match="fully actuated"):
+        fp.Regressor(fp.load_problem("cart_pole").problem.plant, ("m",))
+    bent = fp.Plant(
+        {"y": "m"}, {"u": "N"}, {"m": fp.Parameter(1, 1, "kg")}, lambda q, v, u, p: {"y": ca.sinh(u.u) / p.m}
+    )
+    with pytest.raises(NotSupported, match="root finder"):
+        fp.Regressor(bent, ("m",))
+    assert fp.linear_parameters(chain(1)) == ("m",)
