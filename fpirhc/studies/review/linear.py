@@ -10,8 +10,8 @@ integrator as they are - and differentiated at rest:
 
     z+ = F z + G w,        v = C z,
 
-z all that the loop remembers, w what is added to the plant's inputs, v the commands that arrive there. Everything that only counts
-or stays what it is has been left out of z.
+z all that the loop remembers, w what is added to the plant's inputs, v the commands that arrive there. What only counts, stays what
+it is, or is read by nothing else has been left out of z.
 """
 
 from __future__ import annotations
@@ -75,7 +75,19 @@ class LoopMatrices:
         f, g, c = (np.asarray(m.full()) for m in self.function(memory, np.zeros(self.function.size1_in(1))))
         moving = np.any(f != np.eye(len(f)), axis=1)
         moving[self.exact] = moving[self.believed] = False
-        return LinearLoop(f[np.ix_(moving, moving)], g[moving], c[:, moving], self.period)
+        kept = _read(f, c, moving)
+        return LinearLoop(f[np.ix_(kept, kept)], g[kept], c[:, kept], self.period)
+
+
+def _read(f: np.ndarray, c: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """Those entries that another one or the command depends on: an integral that no law uses is none of the loop's modes."""
+    kept = among.copy()
+    others = (f != 0) & ~np.eye(len(f), dtype=bool)
+    while True:
+        used = kept & (others[kept].any(axis=0) | (c != 0).any(axis=0))
+        if (used == kept).all():
+            return kept
+        kept = used
 
 
 def linear_parameters(

@@ -1,0 +1,65 @@
+"""Eigenvalues of the response Jacobian on the reference and near it.
+
+The deformation works from the first request, r = d, to the fixed point r*, and the state begins where the problem says; so J is
+asked for at requests from d to r* and a little beyond, and at states that are displaced by the first tracking error.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from fpirhc.contraction import Spectrum, response_jacobian
+from fpirhc.studies.review.along import Along
+
+_SHARES = (-0.25, 0.5, 1.0, 1.25)  # of the way from the nominal response to the request that the plant needs
+_SAMPLES = 2000
+
+
+def eigenvalues_near(al: Along, believed: np.ndarray, draws: np.ndarray, seed: int, *, near: bool) -> np.ndarray:
+    """Return eigenvalues of J, shape (samples, n): on the reference at r*, or also near it; rows that are not finite are left out.
+
+    Parameters: `draws` of the exact parameters, shape (draws, np), of which as many are used as the samples allow.
+    """
+    states, requests = _near(al, believed) if near else (al.states, al.requests(believed))
+    count = max(1, min(len(draws), _SAMPLES // len(states)))
+    rows = draws[np.unique(np.linspace(0, len(draws) - 1, count).astype(int))]
+    random = np.random.default_rng(seed)
+    if len(states) > _SAMPLES:
+        chosen = random.choice(len(states), _SAMPLES, replace=False)
+        states, requests = states[chosen], requests[chosen]
+    function = response_jacobian(al.problem.plant)
+    found = [_eigenvalues(function, states, requests, exact, believed) for exact in rows]
+    return np.vstack(found)
+
+
+def spectrum_near(al: Along, believed: np.ndarray, draws: np.ndarray, seed: int, *, near: bool) -> Spectrum:
+    """Return `eigenvalues_near` as a spectrum.
+
+    Raises:
+        InvalidValue: none is finite.
+    """
+    return Spectrum(eigenvalues_near(al, believed, draws, seed, near=near))
+
+
+def _near(al: Along, believed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    first = al.problem.start_state - al.states[0]
+    wanted, needed = al.responses, al.requests(believed)
+    states, requests = [], []
+    for sign in (-1.0, 0.0, 1.0):
+        for share in _SHARES:
+            states.append(al.states + sign * first)
+            requests.append(wanted + share * (needed - wanted))
+    return np.vstack(states), np.vstack(requests)
+
+
+def _eigenvalues(
+    function: Any, states: np.ndarray, requests: np.ndarray, exact: np.ndarray, believed: np.ndarray
+) -> np.ndarray:
+    m, n = requests.shape
+    columns = (np.repeat(p[:, None], m, axis=1) for p in (exact, believed))
+    table = np.asarray(function.map(m)(states.T, requests.T, *columns).full())
+    jacobians = table.reshape((n, m, n)).transpose(1, 0, 2)
+    finite = np.isfinite(jacobians).all(axis=(1, 2))
+    return np.linalg.eigvals(jacobians[finite]).reshape(-1, n)
