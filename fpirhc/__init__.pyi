@@ -51,6 +51,8 @@ from .status import Status
 from .stepper import Stepper
 from .studies.compare import Comparison, compare
 from .studies.problem_file import load_problem
+from .studies.review.answer import Answer, Review
+from .studies.review.review import review
 from .symbolic.functions import signed_power
 from .testing import check_deformation
 from .tracking.exponential import Exponential
@@ -59,6 +61,7 @@ from .tracking.fractional import Fractional
 __all__ = [
     "Affine",
     "Anderson",
+    "Answer",
     "Blended",
     "ByDesired",
     "ByError",
@@ -115,6 +118,7 @@ __all__ = [
     "ReducedGradient",
     "Restart",
     "RestartAndTrack",
+    "Review",
     "Rfpt",
     "RfptVector",
     "Rotation",
@@ -144,6 +148,7 @@ __all__ = [
     "measure",
     "output_chain",
     "response_jacobian",
+    "review",
     "signed_power",
     "simulate",
     "solve",

@@ -42,7 +42,11 @@ def random_case(seed: int) -> Case:
     )
     law = fp.Exponential(rate=float(random.uniform(2.0, 5.0)), integral=bool(random.integers(2)))
     deformation = _deformation(random, _largest(problem), cycles)
-    return Case(f"{seed}: n={n} order={order} bend={bend} d={cycles} {deformation}", problem, fp.ComputedTorque(law, deformation))
+    return Case(
+        f"{seed}: n={n} order={order} bend={bend} d={cycles} {deformation}",
+        problem,
+        fp.ComputedTorque(law, deformation),
+    )
 
 
 def _motion(random: np.random.Generator, n: int):
@@ -96,7 +100,9 @@ def _plant(random: np.random.Generator, n: int, order: int, bend: float) -> fp.P
 def _largest(problem: fp.Problem) -> float:
     """Largest eigenvalue of J at the start, in size."""
     plant = problem.plant
-    jacobian = fp.response_jacobian(plant)(problem.start_state, np.zeros(len(plant.names)), plant.exact, plant.approximate)
+    jacobian = fp.response_jacobian(plant)(
+        problem.start_state, np.zeros(len(plant.names)), plant.exact, plant.approximate
+    )
     return float(np.abs(np.linalg.eigvals(jacobian.full())).max())
 
 

@@ -76,10 +76,7 @@ def parameter_box(problem: Problem, mismatch: float) -> dict[str, tuple[float, f
     """Return the interval of every parameter of the plant."""
     share = mismatch / 100
     return {
-        name: (
-            min(p.approximate, p.exact - share * abs(p.exact)),
-            max(p.approximate, p.exact + share * abs(p.exact)),
-        )
+        name: (min(p.approximate, p.exact - share * abs(p.exact)), max(p.approximate, p.exact + share * abs(p.exact)))
         for name, p in problem.plant.parameters.items()
     }
 

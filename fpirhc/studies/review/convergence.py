@@ -6,10 +6,11 @@ The linear closed loop decides: with rho the largest |pole| at a point of the re
     rho^N > 100 at every point                  diverges
     else                                        unknown.
 
-What linear loops do not show makes a convergence unknown: the steepest secant of the map beyond its limit (large errors may end in a
-bounded oscillation), response Jacobians near the reference that leave the limit, a map that is too slow or whose range is too short for
-the requests, commands outside their limits, a gain or a pairing that changes on line, and a loop that another draw of the parameters
-makes diverge.
+What linear loops do not show makes a convergence unknown: the steepest secant of the map beyond its limit, on or near the
+reference (large errors may end in a bounded oscillation), a map that is too slow or whose range is too short for the requests,
+commands outside their limits, and a gain or a pairing that changes on line.
+
+The verdict is about the plant with its exact parameters; `box_converges` asks for those of the box.
 """
 
 from __future__ import annotations
@@ -48,13 +49,32 @@ def converges(al: Along, controller: Controller, loops: Loops, doubts: list[str]
         return Answer(QUESTION, Verdict.UNKNOWN, f"{found} ({where})", _mend(loops), numbers)
     against = [*_steep(al, controller, seed), *doubts]
     if against:
-        return Answer(QUESTION, Verdict.UNKNOWN, f"{found}, but {'; '.join(against)}", "See the questions named.", numbers)
+        return Answer(
+            QUESTION, Verdict.UNKNOWN, f"{found}, but {'; '.join(against)}", "See the questions named.", numbers
+        )
     return Answer(QUESTION, Verdict.YES, found, "", numbers)
+
+
+def box_converges(loops: Loops) -> Answer:
+    """Return in how many draws of the parameters the linear loop converges; where it does not in all, nobody knows which is true."""
+    question = "Does it converge all over the box of parameters?"
+    if not loops.drawn:
+        why = loops.reason or "the approximate parameters are the exact ones"
+        return Answer(question, Verdict.UNKNOWN, f"no linear loops over the box: {why}")
+    radii = np.array([one.radius for one in loops.drawn])
+    share, worst = float((radii < 1).mean()), float(radii.max())
+    text = f"in {100 * share:.3g} % of {len(radii)} draws; the worst mode changes by {worst:.6g} per cycle"
+    numbers = {"share": share, "radius": worst}
+    if share == 1:
+        return Answer(question, Verdict.YES, text, "", numbers)
+    return Answer(question, Verdict.UNKNOWN, text, "Lower the gain, or know the parameters better.", numbers)
 
 
 def _mend(loops: Loops) -> str:
     if loops.ideal is not None and loops.ideal.radius >= 1:
-        return "The outer loop does not converge even with the right model: lower its rate, or predict over the dead time."
+        return (
+            "The outer loop does not converge even with the right model: lower its rate, or predict over the dead time."
+        )
     return "Change the gain as the question about it says; under dead time pair the deformation."
 
 
@@ -69,4 +89,6 @@ def _steep(al: Along, controller: Controller, seed: int) -> list[str]:
     limit = largest_product(deformation, dead_cycles(al.problem))
     if (deformation.secant_gain() * eigenvalues.real).min() <= 0:
         return ["near the reference the response Jacobian changes its sign"]
-    return [f"its steepest secant makes {reached:.3g} of the {limit:.3g} that converge near the reference"] if reached > limit else []
+    if reached <= limit:
+        return []
+    return [f"its steepest secant makes {reached:.3g} of the {limit:.3g} that converge near the reference"]

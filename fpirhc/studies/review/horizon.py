@@ -8,7 +8,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.studies.review.along import Along
 from fpirhc.studies.review.answer import Answer, Verdict
 from fpirhc.studies.review.linear import linear_parameters
-from fpirhc.studies.review.plan_feedback import longer, plan_gain
+from fpirhc.studies.review.plan_feedback import longer, plan_gains
 from fpirhc.studies.review.state_matrix import state_matrices
 
 QUESTION = "Is the horizon long enough?"
@@ -22,12 +22,11 @@ def horizon_long_enough(al: Along) -> Answer | None:
         return None
     reach = problem.horizon.stages * problem.horizon.step
     try:
-        first, second = (
-            plan_gain(problem, h, problem.cost, 0.0, plant.approximate) for h in (problem.horizon, longer(problem.horizon))
-        )
+        [first] = plan_gains(problem, problem.horizon, problem.cost, [0.0], plant.approximate)
+        [second] = plan_gains(problem, longer(problem.horizon), problem.cost, [0.0], plant.approximate)
     except (FpirhcError, np.linalg.LinAlgError) as error:
         return Answer(QUESTION, Verdict.UNKNOWN, f"{reach:g} s; the plan's feedback is not known: {error}")
-    change = float(np.linalg.norm(first - second) / max(np.linalg.norm(second), 1e-300))
+    change = float(np.linalg.norm(first - second)) / max(float(np.linalg.norm(second)), 1e-300)
     grows = _fastest(al, first)
     slowest = _slowest(al)
     text = f"{reach:g} s; twice as long changes the plan's feedback by {100 * change:.3g} %; slowest time constant {slowest:.3g} s"
@@ -36,13 +35,17 @@ def horizon_long_enough(al: Along) -> Answer | None:
         text += f"; the model under the plan's feedback diverges at {grows:.3g} 1/s"
         return Answer(QUESTION, Verdict.NO, text, "Lengthen the horizon, or weigh its end (LqrTerminal).", numbers)
     if change > _SAME:
-        return Answer(QUESTION, Verdict.UNKNOWN, text, "A longer horizon, or a weight of its end, plans differently.", numbers)
+        return Answer(
+            QUESTION, Verdict.UNKNOWN, text, "A longer horizon, or a weight of its end, plans differently.", numbers
+        )
     return Answer(QUESTION, Verdict.YES, text, "", numbers)
 
 
 def _slowest(al: Along) -> float:
     """Longest time constant of the model alone, s; infinite where a mode neither decays nor grows."""
-    rates = np.abs(np.linalg.eigvals(_generator(al, np.zeros((len(al.problem.plant.inputs), al.problem.plant.state.size)))).real)
+    rates = np.abs(
+        np.linalg.eigvals(_generator(al, np.zeros((len(al.problem.plant.inputs), al.problem.plant.state.size)))).real
+    )
     return float(1 / rates.min()) if rates.min() > 1e-9 else float("inf")
 
 

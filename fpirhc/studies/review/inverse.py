@@ -34,7 +34,9 @@ def inverse_exists(al: Along) -> Answer:
     if np.unique(signs[0]).size > 1 or not condition < _SINGULAR:
         return Answer(QUESTION, Verdict.NO, f"{text}; it vanishes on the way", _CHANGE, numbers)
     if np.unique(signs[1]).size > 1 or bad.any():
-        return Answer(QUESTION, Verdict.UNKNOWN, f"{text}; it changes sign within the box of the parameters", _CHANGE, numbers)
+        return Answer(
+            QUESTION, Verdict.UNKNOWN, f"{text}; it changes sign within the box of the parameters", _CHANGE, numbers
+        )
     if condition > _DOUBTFUL or share < _VANISHING:
         return Answer(QUESTION, Verdict.UNKNOWN, text, _CHANGE, numbers)
     return Answer(QUESTION, Verdict.YES, text, "", numbers)

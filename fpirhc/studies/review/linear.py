@@ -40,11 +40,12 @@ LARGEST = 1500  # entries of the loop's memory, beyond which its eigenvalues tak
 
 @dataclass(frozen=True, eq=False)
 class LinearLoop:
-    """One cycle of the loop, z+ = F z + G w, v = C z."""
+    """One cycle of the loop, z+ = F z + G w, v = C z; `state` are the places of the plant's state in z."""
 
     dynamics: np.ndarray
     entry: np.ndarray
     arriving: np.ndarray
+    state: np.ndarray
     period: float
 
     @property
@@ -66,6 +67,7 @@ class LoopMatrices:
     rest: np.ndarray
     exact: slice
     believed: slice
+    state: slice
     period: float
 
     def at(self, exact: np.ndarray, believed: np.ndarray) -> LinearLoop:
@@ -75,8 +77,11 @@ class LoopMatrices:
         f, g, c = (np.asarray(m.full()) for m in self.function(memory, np.zeros(self.function.size1_in(1))))
         moving = np.any(f != np.eye(len(f)), axis=1)
         moving[self.exact] = moving[self.believed] = False
+        moving[self.state] = True
         kept = _read(f, c, moving)
-        return LinearLoop(f[np.ix_(kept, kept)], g[kept], c[:, kept], self.period)
+        kept[self.state] = True
+        state = np.cumsum(kept)[self.state] - 1
+        return LinearLoop(f[np.ix_(kept, kept)], g[kept], c[:, kept], state, self.period)
 
 
 def _read(f: np.ndarray, c: np.ndarray, among: np.ndarray) -> np.ndarray:
@@ -147,8 +152,8 @@ def loop_matrices(problem: Problem, controller: Controller) -> LoopMatrices:
     following, trace = loop.function(z, w)
     results = [ca.jacobian(following, z), ca.jacobian(following, w), ca.jacobian(trace[arriving], z)]
     function = ca.Function("fpirhc_loop_matrices", [z, w], [ca.densify(r) for r in results])
-    exact, believed = loop.memory.slice("_exact"), loop.memory.slice("parameters")
-    return LoopMatrices(function, _at_rest(loop.function, loop.memory.start()), exact, believed, problem.period)
+    exact, believed, state = (loop.memory.slice(name) for name in ("_exact", "parameters", "_state_before"))
+    return LoopMatrices(function, _at_rest(loop.function, loop.memory.start()), exact, believed, state, problem.period)
 
 
 def _linear_problem(problem: Problem, controller: Controller) -> Problem:
@@ -156,7 +161,7 @@ def _linear_problem(problem: Problem, controller: Controller) -> Problem:
     integrator = RungeKutta4() if problem.integrator.opaque else problem.integrator
     return Problem(
         plant=plant,
-        reference=Trajectory(lambda t: {c: 0 * t for c in plant.names}),
+        reference=Trajectory(lambda t: dict.fromkeys(plant.names, 0 * t)),
         start=dict.fromkeys(plant.names, 0.0),
         period=problem.period,
         duration=problem.duration,

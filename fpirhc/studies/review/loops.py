@@ -18,22 +18,25 @@ from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.problem import Problem
 from fpirhc.studies.review.along import Along
 from fpirhc.studies.review.linear import LinearLoop, linear_parameters, loop_matrices
-from fpirhc.studies.review.plan_feedback import PlanFeedback, plan_gain
+from fpirhc.studies.review.plan_feedback import PlanFeedback, plan_gains
 
 _WORK = 2e7  # entries^3 of all loops together: eigenvalues of large ones are asked for at fewer points
 _FEWEST = 3
+_DRAWN = 24  # draws of the parameters, of all points together
 
 
 @dataclass(frozen=True, eq=False)
 class Loops:
     """Linear loops with the exact parameters at points (indices into the reference's points), or the reason for none.
 
-    `ideal` is the loop of a controller without deformation whose model is the plant: what the outer loop does by itself.
+    `ideal` is the loop of a controller without deformation whose model is the plant: what the outer loop does by itself. `drawn`
+    are loops of plants from the box of parameters.
     """
 
     places: tuple[int, ...]
     loops: tuple[LinearLoop, ...]
     ideal: LinearLoop | None
+    drawn: tuple[LinearLoop, ...] = ()
     reason: str = ""
 
     @property
@@ -47,9 +50,9 @@ def loops_along(al: Along, controller: Controller) -> Loops:
     try:
         return _loops(al, controller)
     except FpirhcError as error:
-        return Loops((), (), None, str(error))
+        return Loops((), (), None, reason=str(error))
     except np.linalg.LinAlgError as error:
-        return Loops((), (), None, f"the linear loop has no eigenvalues: {error}")
+        return Loops((), (), None, reason=f"the linear loop has no eigenvalues: {error}")
 
 
 def _loops(al: Along, controller: Controller) -> Loops:
@@ -61,13 +64,27 @@ def _loops(al: Along, controller: Controller) -> Loops:
     if not usable:
         raise NotSupported("the inverse does not exist along the reference")
     places = _thinned(usable, int(_WORK / max(len(matrices.rest), 1) ** 3))
-    found = []
-    for k in places:
-        gain = _gain(problem, plan, float(al.times[k]), believed)
-        exact, model = (linear_parameters(plant, al.states[k], al.commands[0, k], p, gain) for p in (plant.exact, believed))
-        found.append(matrices.at(exact, model))
+    gains = dict(zip(places, _gains(problem, plan, [float(al.times[k]) for k in places], believed), strict=True))
+
+    def at(place: int, draw: int) -> LinearLoop:
+        here = (al.states[place], al.commands[draw, place])
+        own, model = (linear_parameters(plant, *here, p, gains[place]) for p in (al.draws[draw], believed))
+        return matrices.at(own, model)
+
+    first = (al.states[places[0]], al.commands[0, places[0]])
+    model = linear_parameters(plant, *first, believed, gains[places[0]])
     ideal = loop_matrices(problem, without_deformation(stand_in)).at(model, model)
-    return Loops(tuple(places), tuple(found), ideal)
+    drawn = [at(k, d) for k, d in _pairs(al, places) if np.isfinite(al.commands[d, k]).all()]
+    return Loops(tuple(places), tuple(at(k, 0) for k in places), ideal, tuple(drawn))
+
+
+def _pairs(al: Along, places: list[int]) -> list[tuple[int, int]]:
+    """Points and draws, each point with draws of its own; few where the loops are large and the points few."""
+    count = min(len(al.draws) - 1, _DRAWN, 2 * len(places))
+    if count <= 0:
+        return []
+    draws = np.unique(np.linspace(1, len(al.draws) - 1, count).astype(int))
+    return [(places[i % len(places)], int(d)) for i, d in enumerate(draws)]
 
 
 def _thinned(places: list[int], most: int) -> list[int]:
@@ -75,13 +92,15 @@ def _thinned(places: list[int], most: int) -> list[int]:
     return [places[int(k)] for k in np.unique(np.linspace(0, len(places) - 1, count).astype(int))]
 
 
-def _gain(problem: Problem, plan: RecedingHorizon | None, time: float, believed: np.ndarray) -> np.ndarray:
+def _gains(
+    problem: Problem, plan: RecedingHorizon | None, times: list[float], believed: np.ndarray
+) -> list[np.ndarray]:
     if plan is None:
-        return np.zeros((len(problem.plant.inputs), problem.plant.state.size))
+        return [np.zeros((len(problem.plant.inputs), problem.plant.state.size))] * len(times)
     cost = plan.cost or problem.cost
     assert problem.horizon is not None
     assert cost is not None
-    return plan_gain(problem, problem.horizon, cost, time, believed)
+    return plan_gains(problem, problem.horizon, cost, times, believed)
 
 
 def linear_stand_in(controller: Controller) -> tuple[Controller, RecedingHorizon | None]:

@@ -12,9 +12,9 @@ References: K. J. Astrom, R. M. Murray, Feedback Systems, 2008, section 9.3, for
 from __future__ import annotations
 
 import math
-import warnings
 
 import numpy as np
+import scipy.linalg
 
 from fpirhc.problem import Problem
 from fpirhc.studies.review.answer import Answer, Verdict
@@ -24,7 +24,9 @@ from fpirhc.studies.review.loops import Loops
 QUESTION = "Has the linear loop enough margin?"
 LEAST_GAIN = 1.4  # as a factor, up or down
 LEAST_PHASE = 25.0  # degrees
-_LARGEST = 120  # states of a loop whose margins are computed
+_LARGEST = 400  # states of a loop whose margins are computed
+_FREQUENCIES = 400
+_LOWEST = 1e-5  # of the Nyquist frequency
 
 
 def margins_enough(problem: Problem, loops: Loops) -> Answer:
@@ -32,8 +34,9 @@ def margins_enough(problem: Problem, loops: Loops) -> Answer:
     if not loops.loops:
         return Answer(QUESTION, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
     if len(loops.loops[0].dynamics) > _LARGEST:
-        text = f"largest |pole| {loops.radii.max():.6g}; margins of a loop of {len(loops.loops[0].dynamics)} states are not computed"
-        return Answer(QUESTION, Verdict.UNKNOWN, text, "", {"radius": float(loops.radii.max())})
+        radius = float(loops.radii.max())
+        text = f"largest |pole| {radius:.6g}; no margins of a loop of {len(loops.loops[0].dynamics)} states"
+        return Answer(QUESTION, Verdict.UNKNOWN, text, "", {"radius": radius})
     chosen = {0, len(loops.loops) // 2, len(loops.loops) - 1}
     found = [margins(loops.loops[k], i) for k in sorted(chosen) for i in range(len(problem.plant.inputs))]
     gain, phase, delay = (min(column) for column in zip(*found, strict=True))
@@ -44,7 +47,12 @@ def margins_enough(problem: Problem, loops: Loops) -> Answer:
         f"({delay / problem.period:.3g} cycles)"
     )
     if radius >= 1:
-        return Answer(QUESTION, Verdict.NO, f"{text}; a pole is outside the unit circle", "See the convergence and the rates.", numbers)
+        everywhere = float(loops.radii.min()) >= 1
+        text += (
+            f"; a pole is outside the unit circle {'all along' if everywhere else 'at some points of'} the reference"
+        )
+        verdict = Verdict.NO if everywhere else Verdict.UNKNOWN
+        return Answer(QUESTION, verdict, text, "See the convergence and the rates.", numbers)
     good = gain >= LEAST_GAIN and phase >= LEAST_PHASE
     change = "" if good else "Lower the map's gain or the rate."
     return Answer(QUESTION, Verdict.YES if good else Verdict.UNKNOWN, text, change, numbers)
@@ -54,12 +62,27 @@ def margins(loop: LinearLoop, place: int) -> tuple[float, float, float]:
     """Return (gain margin as a factor >= 1 up or down, phase margin in degrees, delay margin in s) of one input's loop."""
     import control  # slow to import, and only margins need it
 
-    g, c = loop.entry[:, [place]], loop.arriving[[place], :]
-    opened = control.ss(loop.dynamics - g @ c, g, -c, np.zeros((1, 1)), loop.period)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # crossings at the Nyquist frequency are reported as warnings
-        gains, phases, _, _, crossings, _ = control.stability_margins(opened, returnall=True)
-    factors = [max(m, 1 / m) for m in np.atleast_1d(gains) if m > 0 and math.isfinite(m)]
-    angles = [abs(float(p)) for p in np.atleast_1d(phases)]
-    delays = [math.radians(p % 360) / w for p, w in zip(np.atleast_1d(phases), np.atleast_1d(crossings), strict=True) if w > 0]
+    nyquist = math.pi / loop.period
+    frequencies = nyquist * np.geomspace(_LOWEST, 0.9999, _FREQUENCIES)
+    values = _response(loop, place, np.append(frequencies, nyquist))
+    opened = control.FrequencyResponseData(values[:-1], frequencies, loop.period)
+    gains, phases, _, _, crossings, _ = control.stability_margins(opened, returnall=True)
+    # At the Nyquist frequency, where most sampled loops leave the unit circle, L is real and crosses no phase.
+    ends = [-1 / values[-1].real] if values[-1].real < 0 else []
+    factors = [max(m, 1 / m) for m in [*np.atleast_1d(gains), *ends] if m > 0 and math.isfinite(m)]
+    pairs = [
+        (float(p), float(w)) for p, w in zip(np.atleast_1d(phases), np.atleast_1d(crossings), strict=True) if w > 0
+    ]
+    angles = [abs((p + 180) % 360 - 180) for p, _ in pairs]
+    delays = [math.radians(p % 360) / w for p, w in pairs]
     return min(factors, default=math.inf), min(angles, default=math.inf), min(delays, default=math.inf)
+
+
+def _response(loop: LinearLoop, place: int, frequencies: np.ndarray) -> np.ndarray:
+    """L_i on the unit circle; from the matrices, because polynomials of so many states lose all digits."""
+    g, c = loop.entry[:, place], loop.arriving[place]
+    generator = loop.dynamics - np.outer(g, c)
+    points = np.exp(1j * frequencies * loop.period)
+    form, turn = scipy.linalg.schur(generator, output="complex")
+    left, right, unit = c @ turn, turn.conj().T @ g, np.eye(len(form))
+    return np.array([-left @ scipy.linalg.solve_triangular(point * unit - form, right) for point in points])

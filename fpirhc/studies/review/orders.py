@@ -16,8 +16,12 @@ def relative_orders(al: Along) -> Answer:
     given = {c: plant.orders[k] for c, k in zip(plant.controlled_names, plant.controlled_indices, strict=True)}
     text = ", ".join(f"{c} {r}" for c, r in found.items())
     inside = plant.state.size - sum(given.values())
-    text += f"; {inside} of {plant.state.size} states move by themselves" if inside else "; they make up the whole state"
+    text += (
+        f"; {inside} of {plant.state.size} states move by themselves" if inside else "; they make up the whole state"
+    )
     numbers = {**{f"order_{c}": float(r or 0) for c, r in found.items()}, "internal_states": float(inside)}
     if found != given:
-        return Answer(QUESTION, Verdict.NO, text, "Write the response of the derivative that the input reaches.", numbers)
+        return Answer(
+            QUESTION, Verdict.NO, text, "Write the response of the derivative that the input reaches.", numbers
+        )
     return Answer(QUESTION, Verdict.YES, text, "", numbers)

@@ -1,8 +1,8 @@
 """What a plan does near the reference: it feeds the state back, u = u* + K (x - x^N).
 
-K is the first gain of the Riccati recursion over the horizon, with the model linearised along the reference and the cost's own second
-derivatives; bounds are left out. `PlanFeedback` is the tracking law with which a plan that restarts from the measured state
-enters the linear loop,
+K is the first gain of the Riccati recursion over the horizon, with the model linearised along the reference and the cost's own
+second derivatives; bounds are left out. `PlanFeedback` is the tracking law with which a plan that restarts from the measured
+state enters the linear loop,
 
     q^Des = (A^ + B^ K) x      in deviations from the reference,
 
@@ -11,6 +11,7 @@ as if the plan were renewed in every cycle.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -52,7 +53,9 @@ class PlanFeedback(Tracking):
         """Block of no consequence: nothing is remembered."""
         del plant, period
         writes = Layout((scalar("_plan_followed"),))
-        return Block("tracking_update", Layout((scalar("clipped"),)), writes, lambda s: {"_plan_followed": 1 - s.clipped})
+        return Block(
+            "tracking_update", Layout((scalar("clipped"),)), writes, lambda s: {"_plan_followed": 1 - s.clipped}
+        )
 
     def delays(self, plant: Plant) -> tuple[Delay, ...]:
         """Nothing is remembered."""
@@ -60,8 +63,10 @@ class PlanFeedback(Tracking):
         return ()
 
 
-def plan_gain(problem: Problem, horizon: Horizon, cost: Cost, time: float, believed: np.ndarray) -> np.ndarray:
-    """Return K of the plan that starts on the reference at `time`, shape (nu, nx).
+def plan_gains(
+    problem: Problem, horizon: Horizon, cost: Cost, times: Sequence[float], believed: np.ndarray
+) -> list[np.ndarray]:
+    """Return K of the plans that start on the reference at these times, shape (nu, nx) each.
 
     Raises:
         NotSupported: the stage's state holds more than the plant's (rates of inputs, an end that must be met).
@@ -69,16 +74,22 @@ def plan_gain(problem: Problem, horizon: Horizon, cost: Cost, time: float, belie
     plant = problem.plant
     ocp = transcribe(plant, problem.reference, horizon, cost, Limits())
     if ocp.state.size != plant.state.size:
-        raise NotSupported("a plan that weighs the rate of its inputs, or must meet an end, has no feedback of the state alone")
-    data = np.asarray(stage_data(plant, problem.reference, horizon, cost)(time, believed).full())
-    states = data[ocp.data.slice("reference")]
-    chosen = list(plant.controlled_indices)
-    function = problem.reference.function(plant)
-    inputs = [
-        plant.inverse_function(states[:, k], function(time + k * horizon.step)[1][chosen], believed).full()[:, 0]
-        for k in range(horizon.stages)
-    ]
-    return _first_gain(ocp, states, inputs, data)
+        raise NotSupported(
+            "a plan that weighs the rate of inputs, or must meet an end, has no feedback of the state alone"
+        )
+    given = stage_data(plant, problem.reference, horizon, cost)
+    function, chosen = problem.reference.function(plant), list(plant.controlled_indices)
+    linear, bent, end = linear_stage(ocp), bent_stage(ocp, GaussNewton()), bent_end(ocp)
+    found = []
+    for time in times:
+        data = np.asarray(given(time, believed).full())
+        states = data[ocp.data.slice("reference")]
+        clock = time + horizon.step * np.arange(horizon.stages)
+        wanted = np.asarray(function.map(horizon.stages)(clock[None, :])[1].full())[chosen]
+        repeated = np.repeat(believed[:, None], horizon.stages, axis=1)
+        inputs = np.asarray(plant.inverse_function.map(horizon.stages)(states[:, :-1], wanted, repeated).full())
+        found.append(_first_gain((linear, bent, end), states, inputs, data))
+    return found
 
 
 def longer(horizon: Horizon) -> Horizon:
@@ -86,14 +97,17 @@ def longer(horizon: Horizon) -> Horizon:
     return replace(horizon, stages=2 * horizon.stages)
 
 
-def _first_gain(ocp: Any, states: np.ndarray, inputs: list[np.ndarray], data: np.ndarray) -> np.ndarray:
-    linear, bent = linear_stage(ocp), bent_stage(ocp, GaussNewton())
-    value = np.asarray(bent_end(ocp)(states[:, -1], data[:, -1])[2].full())
-    gain = np.zeros((ocp.input.size, ocp.state.size))
-    for k in reversed(range(ocp.stages)):
-        at = (states[:, k], inputs[k], data[:, k])
+def _first_gain(
+    stages: tuple[ca.Function, ca.Function, ca.Function], states: np.ndarray, inputs: np.ndarray, data: np.ndarray
+) -> np.ndarray:
+    linear, bent, end = stages
+    value = np.asarray(end(states[:, -1], data[:, -1])[2].full())
+    gain = np.zeros((len(inputs), len(states)))
+    for k in reversed(range(inputs.shape[1])):
+        at = (states[:, k], inputs[:, k], data[:, k])
         a, b = (np.asarray(m.full()) for m in linear(*at)[2:4])
-        q, s, r = (np.asarray(m.full()) for m in bent(*at, np.zeros(ocp.state.size)))
-        gain = -np.linalg.solve(r + b.T @ value @ b, s + b.T @ value @ a)
-        value = q + a.T @ value @ a + (s + b.T @ value @ a).T @ gain
+        q, s, r = (np.asarray(m.full()) for m in bent(*at, np.zeros(len(states))))
+        coupled = s + b.T @ value @ a
+        gain = -np.linalg.solve(r + b.T @ value @ b, coupled)
+        value = q + a.T @ value @ a + coupled.T @ gain
     return gain

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.informed import Informed
 from fpirhc.controllers.slotted import Slotted
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import FpirhcError, InvalidValue
@@ -14,7 +14,7 @@ from fpirhc.problem import Problem
 from fpirhc.studies.review.along import Along, along
 from fpirhc.studies.review.answer import Answer, Review, Verdict
 from fpirhc.studies.review.commands import commands_inside
-from fpirhc.studies.review.convergence import converges
+from fpirhc.studies.review.convergence import box_converges, converges
 from fpirhc.studies.review.gain import gain_admissible
 from fpirhc.studies.review.horizon import horizon_long_enough
 from fpirhc.studies.review.inverse import inverse_exists
@@ -59,8 +59,9 @@ def _of(al: Along, controller: Controller, general: list[Answer], seed: int) -> 
         chosen.check(al.problem)
     except FpirhcError as error:
         return (Answer("Does the controller fit the problem?", Verdict.NO, str(error), "See the message."),)
-    if isinstance(chosen, Slotted):
-        return (schedule_stable(al.problem, chosen),)
+    inside = chosen.controller if isinstance(chosen, Informed) else chosen
+    if isinstance(inside, Slotted):
+        return (schedule_stable(al.problem, inside),)
     loops = loops_along(al, chosen)
     outer = [rates_inside(al, chosen, loops), zero_dynamics(zero_dynamics_rate(al), is_planned(chosen), loops)]
     inner = [] if isinstance(chosen.adaptive, Identity) else _of_map(al, chosen, loops, general, seed)
@@ -75,9 +76,15 @@ def _of_map(al: Along, controller: Controller, loops: Loops, general: list[Answe
     except InvalidValue as error:
         return [Answer("Do the eigenvalues of the response Jacobian have one sign?", Verdict.UNKNOWN, str(error))]
     limit = largest_product(deformation, dead_cycles(al.problem))
-    found = [one_sign(own, boxed), gain_admissible(deformation, own, boxed, limit), slew_enough(al, deformation, believed)]
+    ideal = loops.ideal if is_planned(controller) else None
+    found = [
+        one_sign(own, boxed),
+        gain_admissible(deformation, own, boxed, limit),
+        slew_enough(al, deformation, believed, ideal),
+    ]
     ranged = range_enough(al, deformation, believed)
     if ranged is not None:
         found.append(ranged)
     doubtful = [a for a in [*general, *found[2:]] if a.verdict == Verdict.NO]
-    return [converges(al, controller, loops, [f"'{a.question}' is answered no" for a in doubtful], seed), *found]
+    doubts = [f"'{a.question}' is answered no" for a in doubtful]
+    return [converges(al, controller, loops, doubts, seed), box_converges(loops), *found]

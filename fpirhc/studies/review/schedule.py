@@ -18,7 +18,11 @@ def schedule_stable(problem: Problem, controller: Slotted) -> Answer:
     except FpirhcError as error:
         return Answer(QUESTION, Verdict.UNKNOWN, str(error))
     if found.radius is None:
-        return Answer(QUESTION, Verdict.UNKNOWN, f"no Floquet radius: {found.reason}", "Use a periodic schedule to know one.")
+        return Answer(
+            QUESTION, Verdict.UNKNOWN, f"no Floquet radius: {found.reason}", "Use a periodic schedule to know one."
+        )
     text = f"near the set-point errors change by {found.radius:.3g} per period of {found.period:g} s, with ideal deformations"
     change = "" if found.radius < 1 else "Change the slots' durations or rates; see floquet_radius."
-    return Answer(QUESTION, decided(found.radius < 1), text, change, {"floquet_radius": found.radius, "period": found.period})
+    return Answer(
+        QUESTION, decided(found.radius < 1), text, change, {"floquet_radius": found.radius, "period": found.period}
+    )

@@ -1,9 +1,14 @@
-"""Is the map fast enough? Its largest step per cycle against how fast the request must change."""
+"""Is the map fast enough? Its largest step per cycle against how fast the request must change.
+
+Along the reference it changes by |d r*/dt|. After a start off the reference a plan asks for more: what the linear loop of
+plant = model does from there, B^ (v_{k+1} - v_k) in the commands v, must fit the step as well.
+"""
 
 from __future__ import annotations
 
 import math
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.deformation.base import Deformation
@@ -11,21 +16,29 @@ from fpirhc.disturbance import Disturbance, Noise, Pulse, Sine, Step
 from fpirhc.problem import Problem
 from fpirhc.studies.review.along import Along
 from fpirhc.studies.review.answer import Answer, Verdict
+from fpirhc.studies.review.linear import LinearLoop
 
 QUESTION = "Is the map fast enough for reference and disturbances?"
 _SPARE = 2.0  # how many times faster than the reference it should be
 _POINTS = 2001
+_CYCLES = 1000  # after the start
 
 
-def slew_enough(al: Along, deformation: Deformation, believed: np.ndarray) -> Answer:
-    """Return the slew limit of the map beside max |d r*/dt| along the reference and what disturbances add to it."""
+def slew_enough(al: Along, deformation: Deformation, believed: np.ndarray, ideal: LinearLoop | None) -> Answer:
+    """Return the slew limit of the map beside what reference, disturbances and the start ask for.
+
+    Parameters: `ideal`: the linear loop of a plan with the right model; None where no plan is in the loop.
+    """
     problem = al.problem
-    speed = _speed(al, believed)
+    begun = 0.0 if ideal is None else _speed_after_start(al, believed, ideal)
+    speed = max(_speed(al, believed), begun)
     sudden = max((abs(_jump(d)) * _effect(al, name) for name, d in problem.disturbances.items()), default=0.0)
     steady = sum(_swing(d) * _effect(al, name) for name, d in problem.disturbances.items())
     needed, step = speed + steady, deformation.largest_step()
     numbers = {"needed": needed, "limit": step / problem.period, "jump": sudden}
     text = f"the request changes by up to {needed:.3g} per second"
+    if begun == speed > 0:
+        text += " after the start"
     if not math.isfinite(step):
         return Answer(QUESTION, Verdict.YES, f"{text}; the map's step has no bound", "", numbers)
     text += f", the map by {step / problem.period:.3g}"
@@ -35,7 +48,9 @@ def slew_enough(al: Along, deformation: Deformation, believed: np.ndarray) -> An
     change = f"Raise the map's scale at least {_SPARE / ratio:.2g} times, or leave it out to have it chosen."
     if ratio < 1:
         return Answer(QUESTION, Verdict.NO, text, change, numbers)
-    return Answer(QUESTION, Verdict.YES if ratio >= _SPARE else Verdict.UNKNOWN, text, "" if ratio >= _SPARE else change, numbers)
+    return Answer(
+        QUESTION, Verdict.YES if ratio >= _SPARE else Verdict.UNKNOWN, text, "" if ratio >= _SPARE else change, numbers
+    )
 
 
 def _speed(al: Along, believed: np.ndarray) -> float:
@@ -48,6 +63,25 @@ def _speed(al: Along, believed: np.ndarray) -> float:
     requests = np.asarray(plant.controlled_response_function.map(_POINTS)(states, commands, model).full())
     speeds = np.linalg.norm(np.diff(requests, axis=1), axis=0) / (times[1] - times[0])
     return float(speeds[np.isfinite(speeds)].max(initial=0.0))
+
+
+def _speed_after_start(al: Along, believed: np.ndarray, ideal: LinearLoop) -> float:
+    """Largest |d r/dt| that the plan's feedback asks for from the problem's start."""
+    plant = al.problem.plant
+    z = np.zeros(len(ideal.dynamics))
+    z[ideal.state] = al.problem.start_state - al.states[0]
+    commands = np.empty((_CYCLES, len(plant.inputs)))
+    for k in range(_CYCLES):
+        commands[k] = ideal.arriving @ z
+        z = ideal.dynamics @ z
+    x, u, p = plant._symbols()
+    slope = ca.jacobian(plant.controlled_response_function(x, u, p), u)
+    gain = ca.Function("fpirhc_input_gain", [x, u, p], [slope])(
+        al.states[0], np.nan_to_num(al.commands[0, 0]), believed
+    )
+    return float(
+        np.linalg.norm(np.diff(commands, axis=0) @ np.asarray(gain.full()).T, axis=1).max() / al.problem.period
+    )
 
 
 def _jump(disturbance: Disturbance) -> float:

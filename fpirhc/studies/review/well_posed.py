@@ -25,8 +25,14 @@ def well_posed(al: Along) -> Answer:
     if not own.all():
         when = al.times[int(np.argmin(own))]
         found = f"plant or model has no finite command for the reference at t = {when:g} s"
-        return Answer(QUESTION, Verdict.NO, found, "Keep the reference away from states where the response is singular.", numbers)
+        return Answer(
+            QUESTION, Verdict.NO, found, "Keep the reference away from states where the response is singular.", numbers
+        )
     if share < 1:
         found = f"finite commands at {100 * share:.3g} % of the points and draws of the parameters"
-        return Answer(QUESTION, Verdict.UNKNOWN, found, "Narrow the box of the parameters, or move the reference.", numbers)
-    return Answer(QUESTION, Verdict.YES, f"finite at {len(al.times)} points with {len(al.draws)} parameter draws", "", numbers)
+        return Answer(
+            QUESTION, Verdict.UNKNOWN, found, "Narrow the box of the parameters, or move the reference.", numbers
+        )
+    return Answer(
+        QUESTION, Verdict.YES, f"finite at {len(al.times)} points with {len(al.draws)} parameter draws", "", numbers
+    )

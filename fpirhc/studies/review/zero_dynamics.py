@@ -1,13 +1,15 @@
 """Are the zero dynamics stable? What the other states do while the controlled coordinates are held on the reference.
 
-With x' = A x + B u and the responses y^(r) = A_c x + B_c u of the controlled coordinates at zero, u = -B_c^-1 A_c x, the states that are no
-derivative of a controlled coordinate move by themselves.
+With x' = A x + B u and the responses y^(r) = A_c x + B_c u of the controlled coordinates at zero, u = -B_c^-1 A_c x, the states
+that are no derivative of a controlled coordinate move by themselves.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from fpirhc.controllers.base import Controller
+from fpirhc.errors import FpirhcError
 from fpirhc.plant import Plant
 from fpirhc.studies.review.along import Along
 from fpirhc.studies.review.answer import Answer, Verdict, decided
@@ -57,16 +59,14 @@ def zero_dynamics(rate: float | None, planned: bool, loops: Loops) -> Answer:
     if not np.isfinite(rate) or planned or abs(rate) <= _STILL:
         change = "Undamped or not known: look at the coordinates that are not controlled in a run."
         return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
-    change = "" if rate < 0 else "Let a plan carry those states in its cost, use time slots, or control another coordinate."
+    change = (
+        "" if rate < 0 else "Let a plan carry those states in its cost, use time slots, or control another coordinate."
+    )
     return Answer(QUESTION, decided(rate < 0), text, change, numbers)
 
 
-def is_planned(controller: object) -> bool:
+def is_planned(controller: Controller) -> bool:
     """Whether the controller plans over a horizon that it restarts from the measured state."""
-    from fpirhc.controllers.base import Controller
-    from fpirhc.errors import FpirhcError
-
-    assert isinstance(controller, Controller)
     try:
         return linear_stand_in(controller)[1] is not None
     except FpirhcError:
