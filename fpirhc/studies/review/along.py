@@ -43,15 +43,22 @@ class Along:
     @cached_property
     def commands(self) -> np.ndarray:
         """Inputs that the reference needs, per draw and point, shape (draws, m, nu); NaN where there is no inverse."""
-        return np.array([self.needed(p) for p in self.draws])
+        m, k = len(self.times), len(self.draws)
+        states, responses = (np.tile(rows, (k, 1)) for rows in (self.states, self.responses))
+        given = each(self.problem.plant.inverse_function, states, responses, np.repeat(self.draws, m, axis=0))
+        return given.reshape(k, m, -1)
 
     def needed(self, parameters: np.ndarray) -> np.ndarray:
         """Inputs that the reference needs with these parameters, shape (m, nu)."""
-        return _each(self.problem.plant.inverse_function, self.states, self.responses, parameters)
+        return each(self.problem.plant.inverse_function, self.states, self.responses, self._rows(parameters))
 
     def requests(self, believed: np.ndarray, draw: int = 0) -> np.ndarray:
         """What a controller with the believed parameters must ask for along the reference, shape (m, n)."""
-        return _each(self.problem.plant.controlled_response_function, self.states, self.commands[draw], believed)
+        function = self.problem.plant.controlled_response_function
+        return each(function, self.states, self.commands[draw], self._rows(believed))
+
+    def _rows(self, parameters: np.ndarray) -> np.ndarray:
+        return np.tile(parameters, (len(self.times), 1))
 
 
 def along(problem: Problem, mismatch: float, seed: int) -> Along:
@@ -96,7 +103,7 @@ def _draws(lower: np.ndarray, upper: np.ndarray, random: np.random.Generator) ->
     return rows
 
 
-def _each(function: ca.Function, states: np.ndarray, others: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-    m = len(states)
-    table: Any = function.map(m)(states.T, others.T, np.repeat(parameters[:, None], m, axis=1))
-    return np.asarray(table.full()).reshape(-1, m).T
+def each(function: ca.Function, *arguments: np.ndarray) -> np.ndarray:
+    """Return a Function of columns at every row of its arguments, shape (rows, size)."""
+    table: Any = function.map(len(arguments[0]))(*(rows.T for rows in arguments))
+    return np.asarray(table.full()).T

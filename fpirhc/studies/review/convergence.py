@@ -56,7 +56,7 @@ def converges(al: Along, controller: Controller, loops: Loops, doubts: list[str]
 
 
 def box_converges(loops: Loops) -> Answer:
-    """Return in how many draws of the parameters the linear loop converges; where it does not in all, nobody knows which is true."""
+    """Return in how many draws of the parameters the linear loop converges; unknown where it is not all of them."""
     question = "Does it converge all over the box of parameters?"
     if not loops.drawn:
         why = loops.reason or "the approximate parameters are the exact ones"

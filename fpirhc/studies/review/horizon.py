@@ -7,7 +7,7 @@ import numpy as np
 from fpirhc.errors import FpirhcError
 from fpirhc.studies.review.along import Along
 from fpirhc.studies.review.answer import Answer, Verdict
-from fpirhc.studies.review.linear import linear_parameters
+from fpirhc.studies.review.linear import response_slopes
 from fpirhc.studies.review.plan_feedback import longer, plan_gains
 from fpirhc.studies.review.state_matrix import state_matrices
 
@@ -58,5 +58,6 @@ def _generator(al: Along, gain: np.ndarray) -> np.ndarray:
     """A + B K of the model's state at the start of the reference."""
     plant = al.problem.plant
     needed = al.needed(plant.approximate)[0]
-    a, b = state_matrices(plant, linear_parameters(plant, al.states[0], needed, plant.approximate, gain))
+    slopes = response_slopes(plant)(al.states[0], needed, plant.approximate)
+    a, b = state_matrices(plant, *(np.asarray(m.full()) for m in slopes))
     return a + b @ gain

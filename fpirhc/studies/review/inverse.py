@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from fpirhc.studies.review.along import Along
+from fpirhc.studies.review.along import Along, each
 from fpirhc.studies.review.answer import Answer, Verdict
 
 QUESTION = "Does the inverse exist along the reference?"
@@ -50,11 +50,9 @@ def _gains(al: Along) -> np.ndarray:
     plant = al.problem.plant
     x, u, p = plant._symbols()
     slope = ca.densify(ca.jacobian(plant.controlled_response_function(x, u, p), u))
-    function = ca.Function("fpirhc_input_gain", [x, u, p], [slope])
+    function = ca.Function("fpirhc_input_gain", [x, u, p], [ca.vec(slope)])
     m, n = len(al.times), len(plant.inputs)
-    sets = [*zip(al.draws, al.commands, strict=True), (plant.approximate, al.needed(plant.approximate))]
-    found = []
-    for parameters, commands in sets:
-        table = function.map(m)(al.states.T, commands.T, np.repeat(parameters[:, None], m, axis=1))
-        found.append(np.asarray(table.full()).reshape((n, m, n)).transpose(1, 0, 2))
-    return np.array(found)
+    sets = np.vstack([al.draws, plant.approximate])
+    commands = np.concatenate([al.commands, al.needed(plant.approximate)[None]]).reshape(-1, n)
+    found = each(function, np.tile(al.states, (len(sets), 1)), commands, np.repeat(sets, m, axis=0))
+    return found.reshape(len(sets), m, n, n).transpose(0, 1, 3, 2)

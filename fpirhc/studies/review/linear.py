@@ -95,13 +95,18 @@ def _read(f: np.ndarray, c: np.ndarray, among: np.ndarray) -> np.ndarray:
         kept = used
 
 
-def linear_parameters(
-    plant: Plant, state: np.ndarray, command: np.ndarray, parameters: np.ndarray, feedback: np.ndarray
-) -> np.ndarray:
-    """Return what `linear_plant` takes as parameters: A, B of the responses at a point, and a plan's feedback (n, nx)."""
+def response_slopes(plant: Plant) -> ca.Function:
+    """Function (state, input, parameters) -> A (n, nx), B (n, nu) of the responses."""
     x, u, p = plant._symbols()
     response = plant.response_function(x, u, p)
-    slopes = ca.Function("fpirhc_slopes", [x, u, p], [ca.jacobian(response, x), ca.jacobian(response, u)])
+    slopes = [ca.densify(ca.jacobian(response, v)) for v in (x, u)]
+    return ca.Function("fpirhc_slopes", [x, u, p], slopes)
+
+
+def linear_parameters(
+    slopes: ca.Function, state: np.ndarray, command: np.ndarray, parameters: np.ndarray, feedback: np.ndarray
+) -> np.ndarray:
+    """Return what `linear_plant` takes as parameters: A, B of the responses at a point, and a plan's feedback (nu, nx)."""
     a, b = (np.asarray(m.full()) for m in slopes(state, command, parameters))
     return np.concatenate([a.ravel(), b.ravel(), feedback.ravel()])
 

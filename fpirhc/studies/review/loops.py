@@ -17,7 +17,7 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.problem import Problem
 from fpirhc.studies.review.along import Along
-from fpirhc.studies.review.linear import LinearLoop, linear_parameters, loop_matrices
+from fpirhc.studies.review.linear import LinearLoop, linear_parameters, loop_matrices, response_slopes
 from fpirhc.studies.review.plan_feedback import PlanFeedback, plan_gains
 
 _WORK = 2e7  # entries^3 of all loops together: eigenvalues of large ones are asked for at fewer points
@@ -66,13 +66,15 @@ def _loops(al: Along, controller: Controller) -> Loops:
     places = _thinned(usable, int(_WORK / max(len(matrices.rest), 1) ** 3))
     gains = dict(zip(places, _gains(problem, plan, [float(al.times[k]) for k in places], believed), strict=True))
 
+    slopes = response_slopes(plant)
+
     def at(place: int, draw: int) -> LinearLoop:
         here = (al.states[place], al.commands[draw, place])
-        own, model = (linear_parameters(plant, *here, p, gains[place]) for p in (al.draws[draw], believed))
+        own, model = (linear_parameters(slopes, *here, p, gains[place]) for p in (al.draws[draw], believed))
         return matrices.at(own, model)
 
     first = (al.states[places[0]], al.commands[0, places[0]])
-    model = linear_parameters(plant, *first, believed, gains[places[0]])
+    model = linear_parameters(slopes, *first, believed, gains[places[0]])
     ideal = loop_matrices(problem, without_deformation(stand_in)).at(model, model)
     drawn = [at(k, d) for k, d in _pairs(al, places) if np.isfinite(al.commands[d, k]).all()]
     return Loops(tuple(places), tuple(at(k, 0) for k in places), ideal, tuple(drawn))

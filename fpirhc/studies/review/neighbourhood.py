@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.contraction import Spectrum, response_jacobian
-from fpirhc.studies.review.along import Along
+from fpirhc.studies.review.along import Along, each
 
 _SHARES = (-0.25, 0.5, 1.0, 1.25)  # of the way from the nominal response to the request that the plant needs
 _SAMPLES = 2000
@@ -29,9 +30,12 @@ def eigenvalues_near(al: Along, believed: np.ndarray, draws: np.ndarray, seed: i
     if len(states) > _SAMPLES:
         chosen = random.choice(len(states), _SAMPLES, replace=False)
         states, requests = states[chosen], requests[chosen]
-    function = response_jacobian(al.problem.plant)
-    found = [_eigenvalues(function, states, requests, exact, believed) for exact in rows]
-    return np.vstack(found)
+    m, n = requests.shape
+    known = (np.repeat(rows, m, axis=0), np.tile(believed, (m * len(rows), 1)))
+    jacobians = each(_stacked(al), np.tile(states, (len(rows), 1)), np.tile(requests, (len(rows), 1)), *known)
+    finite = jacobians[np.isfinite(jacobians).all(axis=1)]
+    # The transposed Jacobian has the same eigenvalues.
+    return np.linalg.eigvals(finite.reshape(-1, n, n)).reshape(-1, n)
 
 
 def spectrum_near(al: Along, believed: np.ndarray, draws: np.ndarray, seed: int, *, near: bool) -> Spectrum:
@@ -54,12 +58,9 @@ def _near(al: Along, believed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.vstack(states), np.vstack(requests)
 
 
-def _eigenvalues(
-    function: Any, states: np.ndarray, requests: np.ndarray, exact: np.ndarray, believed: np.ndarray
-) -> np.ndarray:
-    m, n = requests.shape
-    columns = (np.repeat(p[:, None], m, axis=1) for p in (exact, believed))
-    table = np.asarray(function.map(m)(states.T, requests.T, *columns).full())
-    jacobians = table.reshape((n, m, n)).transpose(1, 0, 2)
-    finite = np.isfinite(jacobians).all(axis=(1, 2))
-    return np.linalg.eigvals(jacobians[finite]).reshape(-1, n)
+def _stacked(al: Along) -> ca.Function:
+    """The response Jacobian as one column."""
+    function = response_jacobian(al.problem.plant)
+    kind: Any = ca.MX if al.problem.plant.inverse_opaque else ca.SX
+    given = [kind.sym(f"v{k}", function.size1_in(k)) for k in range(function.n_in())]
+    return ca.Function("fpirhc_stacked_jacobian", given, [ca.vec(function(*given))])

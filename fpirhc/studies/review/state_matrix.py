@@ -7,10 +7,9 @@ import numpy as np
 from fpirhc.plant import Plant
 
 
-def state_matrices(plant: Plant, entries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return A (nx, nx) and B (nx, nu) of x' = A x + B u from `linear_parameters`."""
-    n, nx, nu = len(plant.names), plant.state.size, len(plant.inputs)
-    rows, gains = entries[: n * nx].reshape(n, nx), entries[n * nx : n * (nx + nu)].reshape(n, nu)
+def state_matrices(plant: Plant, rows: np.ndarray, gains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return A (nx, nx) and B (nx, nu) of x' = A x + B u from those of the responses, (n, nx) and (n, nu)."""
+    nx, nu = plant.state.size, len(plant.inputs)
     a, b = np.zeros((nx, nx)), np.zeros((nx, nu))
     for k, element in enumerate(plant.state.elements):
         higher = element + "'"

@@ -6,6 +6,7 @@ that are no derivative of a controlled coordinate move by themselves.
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
@@ -13,7 +14,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.plant import Plant
 from fpirhc.studies.review.along import Along
 from fpirhc.studies.review.answer import Answer, Verdict, decided
-from fpirhc.studies.review.linear import linear_parameters
+from fpirhc.studies.review.linear import response_slopes
 from fpirhc.studies.review.loops import Loops, linear_stand_in
 from fpirhc.studies.review.state_matrix import state_matrices
 
@@ -27,21 +28,18 @@ def zero_dynamics_rate(al: Along) -> float | None:
     inside = [k for k, e in enumerate(plant.state.elements) if e.rstrip("'") not in plant.controlled_names]
     if not inside:
         return None
-    rates = []
+    rates, slopes = [], response_slopes(plant)
     for state, command in zip(al.states, al.commands[0], strict=True):
         if np.isfinite(command).all():
-            rates.append(_rate(plant, state, command, inside))
+            rates.append(_rate(plant, slopes(state, command, plant.exact), inside))
     return max(rates, default=float("nan"))
 
 
-def _rate(plant: Plant, state: np.ndarray, command: np.ndarray, inside: list[int]) -> float:
-    n, nx, nu = len(plant.names), plant.state.size, len(plant.inputs)
-    entries = linear_parameters(plant, state, command, plant.exact, np.zeros((nu, nx)))
+def _rate(plant: Plant, slopes: tuple[ca.DM, ca.DM], inside: list[int]) -> float:
+    rows, gains = (np.asarray(m.full()) for m in slopes)
     chosen = list(plant.controlled_indices)
-    rows = entries[: n * nx].reshape(n, nx)[chosen]
-    gains = entries[n * nx : n * (nx + nu)].reshape(n, nu)[chosen]
-    a, b = state_matrices(plant, entries)
-    moving = (a - b @ np.linalg.solve(gains, rows))[np.ix_(inside, inside)]
+    a, b = state_matrices(plant, rows, gains)
+    moving = (a - b @ np.linalg.solve(gains[chosen], rows[chosen]))[np.ix_(inside, inside)]
     return float(np.linalg.eigvals(moving).real.max())
 
 
