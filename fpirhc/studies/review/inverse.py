@@ -31,7 +31,7 @@ def inverse_exists(al: Along) -> Answer:
     numbers = {"condition": condition, "smallest_share": share}
     signs = [np.sign(np.linalg.det(g)) for g in (gains[0], usual)]
     text = f"condition at most {condition:.3g}, the smallest gain is {share:.3g} of its largest"
-    if np.unique(signs[0]).size > 1 or not condition < _SINGULAR:
+    if np.unique(signs[0]).size > 1 or not np.linalg.cond(gains[0]).max() < _SINGULAR:
         return Answer(QUESTION, Verdict.NO, f"{text}; it vanishes on the way", _CHANGE, numbers)
     if np.unique(signs[1]).size > 1 or bad.any():
         return Answer(

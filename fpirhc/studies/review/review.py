@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.informed import Informed
@@ -53,6 +54,20 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
     return Review(tuple(general), {name: _of(al, one, general, seed) for name, one in controllers.items()}, mismatch)
 
 
+def predict(problem: Problem, controller: Controller, *, seed: int) -> Answer:
+    """Return the verdict alone: whether the deformation of a controller converges on the plant with its exact parameters.
+
+    Raises:
+        NotInvertible: see `review`. And what the controller raises about the problem.
+    """
+    al = along(problem, 0.0, seed)
+    own = replace(al, draws=al.draws[:1])
+    chosen = controller.resolved(problem)
+    general = [well_posed(own), inverse_exists(own), commands_inside(own)]
+    loops = loops_along(own, chosen)
+    return converges(own, chosen, loops, _doubts([*general, *_speed_and_range(own, chosen, loops)]), seed)
+
+
 def _of(al: Along, controller: Controller, general: list[Answer], seed: int) -> tuple[Answer, ...]:
     try:
         chosen = controller.resolved(al.problem)
@@ -76,15 +91,18 @@ def _of_map(al: Along, controller: Controller, loops: Loops, general: list[Answe
     except InvalidValue as error:
         return [Answer("Do the eigenvalues of the response Jacobian have one sign?", Verdict.UNKNOWN, str(error))]
     limit = largest_product(deformation, dead_cycles(al.problem))
+    suited = _speed_and_range(al, controller, loops)
+    verdict = converges(al, controller, loops, _doubts([*general, *suited]), seed)
+    gains = [one_sign(own, boxed), gain_admissible(deformation, own, boxed, limit)]
+    return [verdict, box_converges(loops), *gains, *suited]
+
+
+def _speed_and_range(al: Along, controller: Controller, loops: Loops) -> list[Answer]:
+    deformation, believed = controller.adaptive, controller.parameters(al.problem.plant)
     ideal = loops.ideal if is_planned(controller) else None
-    found = [
-        one_sign(own, boxed),
-        gain_admissible(deformation, own, boxed, limit),
-        slew_enough(al, deformation, believed, ideal),
-    ]
-    ranged = range_enough(al, deformation, believed)
-    if ranged is not None:
-        found.append(ranged)
-    doubtful = [a for a in [*general, *found[2:]] if a.verdict == Verdict.NO]
-    doubts = [f"'{a.question}' is answered no" for a in doubtful]
-    return [converges(al, controller, loops, doubts, seed), box_converges(loops), *found]
+    found = [slew_enough(al, deformation, believed, ideal), range_enough(al, deformation, believed)]
+    return [a for a in found if a is not None]
+
+
+def _doubts(answers: list[Answer]) -> list[str]:
+    return [f"'{a.question}' is answered no" for a in answers if a.verdict == Verdict.NO]
