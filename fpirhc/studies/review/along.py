@@ -10,7 +10,6 @@ so that f(r*) = r^N: r* is the fixed point that a deformation is to find.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -38,7 +37,6 @@ class Along:
     states: np.ndarray
     responses: np.ndarray
     draws: np.ndarray
-    box: Mapping[str, tuple[float, float]]
 
     @cached_property
     def commands(self) -> np.ndarray:
@@ -52,10 +50,10 @@ class Along:
         """Inputs that the reference needs with these parameters, shape (m, nu)."""
         return each(self.problem.plant.inverse_function, self.states, self.responses, self._rows(parameters))
 
-    def requests(self, believed: np.ndarray, draw: int = 0) -> np.ndarray:
-        """What a controller with the believed parameters must ask for along the reference, shape (m, n)."""
+    def requests(self, believed: np.ndarray) -> np.ndarray:
+        """What a controller with the believed parameters must ask for along the reference, shape (m, n): r*."""
         function = self.problem.plant.controlled_response_function
-        return each(function, self.states, self.commands[draw], self._rows(believed))
+        return each(function, self.states, self.commands[0], self._rows(believed))
 
     def _rows(self, parameters: np.ndarray) -> np.ndarray:
         return np.tile(parameters, (len(self.times), 1))
@@ -76,7 +74,7 @@ def along(problem: Problem, mismatch: float, seed: int) -> Along:
     lower, upper = (np.array([box[name][k] for name in plant.parameters]) for k in (0, 1))
     draws = _draws(lower, upper, np.random.default_rng(seed))
     rows = np.vstack([plant.exact[None, :], draws])
-    return Along(problem, times, states, responses[:, list(plant.controlled_indices)], rows, box)
+    return Along(problem, times, states, responses[:, list(plant.controlled_indices)], rows)
 
 
 def parameter_box(problem: Problem, mismatch: float) -> dict[str, tuple[float, float]]:

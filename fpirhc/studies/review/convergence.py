@@ -30,7 +30,7 @@ QUESTION = "Does the deformation converge?"
 _SURE = math.log(100)
 
 
-def converges(al: Along, controller: Controller, loops: Loops, doubts: list[str], seed: int) -> Answer:
+def converges(al: Along, controller: Controller, loops: Loops, doubts: list[str]) -> Answer:
     """Return whether the deformation of a controller converges; `doubts` are other answers that speak against it."""
     if not loops.loops:
         return Answer(QUESTION, Verdict.UNKNOWN, f"no linear loop: {loops.reason}", "Run it and look at the factor.")
@@ -47,7 +47,7 @@ def converges(al: Along, controller: Controller, loops: Loops, doubts: list[str]
     if growth.max() > -_SURE:
         where = f"between {loops.radii.min():.6g} and {worst:.6g} along the reference"
         return Answer(QUESTION, Verdict.UNKNOWN, f"{found} ({where})", _mend(loops), numbers)
-    against = [*_steep(al, controller, seed), *doubts]
+    against = [*_steep(al, controller), *doubts]
     if against:
         return Answer(
             QUESTION, Verdict.UNKNOWN, f"{found}, but {'; '.join(against)}", "See the questions named.", numbers
@@ -58,10 +58,10 @@ def converges(al: Along, controller: Controller, loops: Loops, doubts: list[str]
 def box_converges(loops: Loops) -> Answer:
     """Return in how many draws of the parameters the linear loop converges; unknown where it is not all of them."""
     question = "Does it converge all over the box of parameters?"
-    if not loops.drawn:
-        why = loops.reason or "the approximate parameters are the exact ones"
-        return Answer(question, Verdict.UNKNOWN, f"no linear loops over the box: {why}")
-    radii = np.array([one.radius for one in loops.drawn])
+    if not loops.loops:
+        return Answer(question, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
+    # Without draws the box is a point: approximate and exact parameters are the same.
+    radii = np.array([one.radius for one in loops.drawn or loops.loops])
     share, worst = float((radii < 1).mean()), float(radii.max())
     text = f"in {100 * share:.3g} % of {len(radii)} draws; the worst mode changes by {worst:.6g} per cycle"
     numbers = {"share": share, "radius": worst}
@@ -78,11 +78,11 @@ def _mend(loops: Loops) -> str:
     return "Change the gain as the question about it says; under dead time pair the deformation."
 
 
-def _steep(al: Along, controller: Controller, seed: int) -> list[str]:
+def _steep(al: Along, controller: Controller) -> list[str]:
     """Whether the steepest secant of the map leaves its limit near the reference."""
     deformation = controller.adaptive
     believed = controller.parameters(al.problem.plant)
-    eigenvalues = eigenvalues_near(al, believed, al.draws[:1], seed, near=True).ravel()
+    eigenvalues = eigenvalues_near(al, believed, al.draws[:1], near=True).ravel()
     if not eigenvalues.size:
         return ["the response Jacobian is not finite near the reference"]
     reached = float((deformation.secant_gain() * np.abs(eigenvalues) ** 2 / eigenvalues.real).max())

@@ -1,7 +1,7 @@
 """Eigenvalues of the response Jacobian on the reference and near it.
 
 The deformation works from the first request, r = d, to the fixed point r*, and the state begins where the problem says; so J is
-asked for at requests from d to r* and a little beyond, and at states that are displaced by the first tracking error.
+asked for at requests from d to r* and a little beyond both, and at states that are displaced by the first tracking error.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _SHARES = (-0.25, 0.5, 1.0, 1.25)  # of the way from the nominal response to the
 _SAMPLES = 2000
 
 
-def eigenvalues_near(al: Along, believed: np.ndarray, draws: np.ndarray, seed: int, *, near: bool) -> np.ndarray:
+def eigenvalues_near(al: Along, believed: np.ndarray, draws: np.ndarray, *, near: bool) -> np.ndarray:
     """Return eigenvalues of J, shape (samples, n): on the reference at r*, or also near it; rows that are not finite are left out.
 
     Parameters: `draws` of the exact parameters, shape (draws, np), of which as many are used as the samples allow.
@@ -26,10 +26,6 @@ def eigenvalues_near(al: Along, believed: np.ndarray, draws: np.ndarray, seed: i
     states, requests = _near(al, believed) if near else (al.states, al.requests(believed))
     count = max(1, min(len(draws), _SAMPLES // len(states)))
     rows = draws[np.unique(np.linspace(0, len(draws) - 1, count).astype(int))]
-    random = np.random.default_rng(seed)
-    if len(states) > _SAMPLES:
-        chosen = random.choice(len(states), _SAMPLES, replace=False)
-        states, requests = states[chosen], requests[chosen]
     m, n = requests.shape
     known = (np.repeat(rows, m, axis=0), np.tile(believed, (m * len(rows), 1)))
     jacobians = each(_stacked(al), np.tile(states, (len(rows), 1)), np.tile(requests, (len(rows), 1)), *known)
@@ -38,13 +34,13 @@ def eigenvalues_near(al: Along, believed: np.ndarray, draws: np.ndarray, seed: i
     return np.linalg.eigvals(finite.reshape(-1, n, n)).reshape(-1, n)
 
 
-def spectrum_near(al: Along, believed: np.ndarray, draws: np.ndarray, seed: int, *, near: bool) -> Spectrum:
+def spectrum_near(al: Along, believed: np.ndarray, draws: np.ndarray, *, near: bool) -> Spectrum:
     """Return `eigenvalues_near` as a spectrum.
 
     Raises:
         InvalidValue: none is finite.
     """
-    return Spectrum(eigenvalues_near(al, believed, draws, seed, near=near))
+    return Spectrum(eigenvalues_near(al, believed, draws, near=near))
 
 
 def _near(al: Along, believed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

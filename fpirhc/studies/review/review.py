@@ -51,24 +51,24 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
     far = horizon_long_enough(al)
     if far is not None:
         general.append(far)
-    return Review(tuple(general), {name: _of(al, one, general, seed) for name, one in controllers.items()}, mismatch)
+    return Review(tuple(general), {name: _of(al, one, general) for name, one in controllers.items()}, mismatch)
 
 
-def predict(problem: Problem, controller: Controller, *, seed: int) -> Answer:
+def predict(problem: Problem, controller: Controller) -> Answer:
     """Return the verdict alone: whether the deformation of a controller converges on the plant with its exact parameters.
 
     Raises:
         NotInvertible: see `review`. And what the controller raises about the problem.
     """
-    al = along(problem, 0.0, seed)
-    own = replace(al, draws=al.draws[:1])
+    al = along(problem, 0.0, 0)
+    own = replace(al, draws=al.draws[:1])  # the box does not matter
     chosen = controller.resolved(problem)
     general = [well_posed(own), inverse_exists(own), commands_inside(own)]
     loops = loops_along(own, chosen)
-    return converges(own, chosen, loops, _doubts([*general, *_speed_and_range(own, chosen, loops)]), seed)
+    return converges(own, chosen, loops, _doubts([*general, *_speed_and_range(own, chosen, loops)]))
 
 
-def _of(al: Along, controller: Controller, general: list[Answer], seed: int) -> tuple[Answer, ...]:
+def _of(al: Along, controller: Controller, general: list[Answer]) -> tuple[Answer, ...]:
     try:
         chosen = controller.resolved(al.problem)
         chosen.check(al.problem)
@@ -79,20 +79,20 @@ def _of(al: Along, controller: Controller, general: list[Answer], seed: int) -> 
         return (schedule_stable(al.problem, inside),)
     loops = loops_along(al, chosen)
     outer = [rates_inside(al, chosen, loops), zero_dynamics(zero_dynamics_rate(al), is_planned(chosen), loops)]
-    inner = [] if isinstance(chosen.adaptive, Identity) else _of_map(al, chosen, loops, general, seed)
+    inner = [] if isinstance(chosen.adaptive, Identity) else _of_map(al, chosen, loops, general)
     return (*inner, *outer, margins_enough(al.problem, loops))
 
 
-def _of_map(al: Along, controller: Controller, loops: Loops, general: list[Answer], seed: int) -> list[Answer]:
+def _of_map(al: Along, controller: Controller, loops: Loops, general: list[Answer]) -> list[Answer]:
     deformation = controller.adaptive
     believed = controller.parameters(al.problem.plant)
     try:
-        own, boxed = (spectrum_near(al, believed, draws, seed, near=False) for draws in (al.draws[:1], al.draws))
+        own, boxed = (spectrum_near(al, believed, draws, near=False) for draws in (al.draws[:1], al.draws))
     except InvalidValue as error:
         return [Answer("Do the eigenvalues of the response Jacobian have one sign?", Verdict.UNKNOWN, str(error))]
     limit = largest_product(deformation, dead_cycles(al.problem))
     suited = _speed_and_range(al, controller, loops)
-    verdict = converges(al, controller, loops, _doubts([*general, *suited]), seed)
+    verdict = converges(al, controller, loops, _doubts([*general, *suited]))
     gains = [one_sign(own, boxed), gain_admissible(deformation, own, boxed, limit)]
     return [verdict, box_converges(loops), *gains, *suited]
 

@@ -12,8 +12,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.deformation.base import Deformation
-from fpirhc.disturbance import Disturbance, Noise, Pulse, Sine, Step
-from fpirhc.problem import Problem
+from fpirhc.disturbance import Disturbance, Pulse, Sine, Step
 from fpirhc.studies.review.along import Along
 from fpirhc.studies.review.answer import Answer, Verdict
 from fpirhc.studies.review.linear import LinearLoop
@@ -46,11 +45,9 @@ def slew_enough(al: Along, deformation: Deformation, believed: np.ndarray, ideal
         text += f"; a jump of a disturbance takes it {math.ceil(sudden / step)} cycles"
     ratio = step / problem.period / max(needed, 1e-300)
     change = f"Raise the map's scale at least {_SPARE / ratio:.2g} times, or leave it out to have it chosen."
-    if ratio < 1:
-        return Answer(QUESTION, Verdict.NO, text, change, numbers)
-    return Answer(
-        QUESTION, Verdict.YES if ratio >= _SPARE else Verdict.UNKNOWN, text, "" if ratio >= _SPARE else change, numbers
-    )
+    if ratio >= _SPARE:
+        return Answer(QUESTION, Verdict.YES, text, "", numbers)
+    return Answer(QUESTION, Verdict.NO if ratio < 1 else Verdict.UNKNOWN, text, change, numbers)
 
 
 def _speed(al: Along, believed: np.ndarray) -> float:
@@ -76,12 +73,10 @@ def _speed_after_start(al: Along, believed: np.ndarray, ideal: LinearLoop) -> fl
         z = ideal.dynamics @ z
     x, u, p = plant._symbols()
     slope = ca.jacobian(plant.controlled_response_function(x, u, p), u)
-    gain = ca.Function("fpirhc_input_gain", [x, u, p], [slope])(
-        al.states[0], np.nan_to_num(al.commands[0, 0]), believed
-    )
-    return float(
-        np.linalg.norm(np.diff(commands, axis=0) @ np.asarray(gain.full()).T, axis=1).max() / al.problem.period
-    )
+    function = ca.Function("fpirhc_input_gain", [x, u, p], [slope])
+    gain = np.asarray(function(al.states[0], np.nan_to_num(al.commands[0, 0]), believed).full())
+    changes = np.linalg.norm(np.diff(commands, axis=0) @ gain.T, axis=1)
+    return float(changes.max() / al.problem.period)
 
 
 def _jump(disturbance: Disturbance) -> float:
@@ -90,15 +85,14 @@ def _jump(disturbance: Disturbance) -> float:
 
 def _swing(disturbance: Disturbance) -> float:
     """How fast it changes, per second; noise is no motion that a map should follow."""
-    if isinstance(disturbance, Noise) or not isinstance(disturbance, Sine):
+    if not isinstance(disturbance, Sine):
         return 0.0
     return abs(2 * math.pi * disturbance.frequency * disturbance.amplitude)
 
 
 def _effect(al: Along, name: str) -> float:
     """What one unit of a disturbance changes in the responses: 1 on a coordinate, the exact gain on an input."""
-    problem: Problem = al.problem
-    plant = problem.plant
+    plant = al.problem.plant
     if name not in plant.inputs:
         return 1.0
     unit = np.array([1.0 if i == name else 0.0 for i in plant.inputs])
