@@ -1,7 +1,7 @@
 """Where a review looks: points of the reference, and draws of the exact parameters from their box.
 
-The box of a parameter spans its approximate and its exact value and a margin of P percent around the exact one. At every point the
-input u* that the reference needs and the request r* that means it to the model are known from the symbols:
+The box of a parameter spans its approximate and its exact value and a margin of P percent around the exact one. At every point
+the input u* that the reference needs and the request r* that means it to the model are known from the symbols:
 
     u* = inverse(x^N, r^N; exact),        r* = response(x^N, u*; approximate),
 

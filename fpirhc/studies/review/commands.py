@@ -39,7 +39,7 @@ def _range(al: Along) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _used(commands: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """How much of the way from the middle to its limit a command needs, or from zero where one side is free; above 1: beyond."""
+    """How much of the way from the middle to its limit a command needs, 0 or 2 where one side is free; above 1: beyond."""
     both = np.isfinite(lower) & np.isfinite(upper)
     middle = np.where(both, 0.5 * (np.where(both, lower, 0) + np.where(both, upper, 0)), 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -7,8 +7,8 @@ The linear closed loop decides: with rho the largest |pole| at a point of the re
     else                                        unknown.
 
 What linear loops do not show makes a convergence unknown: the steepest secant of the map beyond its limit, on or near the
-reference (large errors may end in a bounded oscillation), a map that is too slow or whose range is too short for the requests,
-commands outside their limits, and a gain or a pairing that changes on line.
+reference (large errors may end in a bounded oscillation), a map that is too slow or whose range is too short for the
+requests, commands outside their limits, and a gain or a pairing that changes on line.
 
 The verdict is about the plant with its exact parameters; `box_converges` asks for those of the box.
 """

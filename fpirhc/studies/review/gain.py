@@ -12,7 +12,7 @@ QUESTION = "Is the map's gain admissible?"
 
 
 def gain_admissible(deformation: Deformation, own: Spectrum, boxed: Spectrum, limit: float) -> Answer:
-    """Return the interval and the recommended value; `limit` is that of gain times eigenvalue under the dead time (2 without)."""
+    """Return the interval and the recommended value; `limit` is that of gain times eigenvalue (2 without dead time)."""
     share = limit / 2
     near, wide = assess_gain(deformation, own), assess_gain(deformation, boxed)
     name = near.gain_name

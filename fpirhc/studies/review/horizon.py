@@ -16,7 +16,7 @@ _SAME = 0.1  # relative change of the plan's feedback
 
 
 def horizon_long_enough(al: Along) -> Answer | None:
-    """Return how the plan's feedback at the start of the reference changes with the horizon; None without a horizon and cost."""
+    """Return how the plan's feedback at the start of the reference changes with the horizon; None without one."""
     problem, plant = al.problem, al.problem.plant
     if problem.horizon is None or problem.cost is None:
         return None

@@ -1,4 +1,4 @@
-"""Does the inverse exist along the reference? The gain B = d response / d input must stay regular and keep its orientation."""
+"""Does the inverse exist along the reference? B = d response / d input must stay regular and keep its orientation."""
 
 from __future__ import annotations
 

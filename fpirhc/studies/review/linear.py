@@ -4,9 +4,9 @@ At a point of the reference plant and model are replaced by their linearisations
 
     plant   y^(r) = A x + B u   (exact parameters),        model   y^(r) = A^ x + B^ u   (believed ones),
 
-both at the input u* that the reference needs. This is a plant like any other, whose parameters are the entries of the matrices, so
-the library's own closed loop is built around it once - tracking law, deformation with what it remembers, prediction, dead time and
-integrator as they are - and differentiated at rest:
+both at the input u* that the reference needs. This is a plant like any other, whose parameters are the entries of the matrices,
+so the library's own closed loop is built around it once - tracking law, deformation with what it remembers, prediction, dead
+time and integrator as they are - and differentiated at rest:
 
     z+ = F z + G w,        v = C z,
 
@@ -114,7 +114,8 @@ def linear_parameters(
 def linear_plant(plant: Plant, sign: float) -> Plant:
     """Return a plant of the same coordinates and inputs whose parameters are the entries of A and B.
 
-    Its own values are a double integrator chain with B = 1 on the controlled coordinates, `sign` on the exact side.
+    The first n nx entries are A, the next B, the last K of a plan's feedback, which the plant itself does not use. Its own values
+    are A = 0, and B = 1 on the controlled coordinates, times `sign` on the exact side.
     """
     n, nx, nu = len(plant.names), plant.state.size, len(plant.inputs)
     gain = np.zeros((n, nu))
