@@ -14,7 +14,9 @@ from fpirhc.controllers import base
 
 PERIOD = 5e-3  # s
 DURATION = 8.0  # s; the reference rests from about 2.5 s on
-LATE = 0.05  # share of the largest response error of the first eighth below which those of the last quarter count as gone
+LATE = (
+    0.05  # share of the largest response error of the first eighth below which those of the last quarter count as gone
+)
 ROUNDING = 1e-8  # share of it from which on errors need not fall any more
 MAPS = (
     fp.Affine(gain=-0.5),

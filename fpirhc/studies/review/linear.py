@@ -19,6 +19,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -48,7 +49,7 @@ class LinearLoop:
     state: np.ndarray
     period: float
 
-    @property
+    @cached_property
     def poles(self) -> np.ndarray:
         """Eigenvalues of F."""
         return np.asarray(np.linalg.eigvals(self.dynamics))
