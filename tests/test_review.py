@@ -274,7 +274,7 @@ def test_values_that_make_no_sense_are_refused():
 def test_every_shipped_problem_can_be_reviewed(name, capsys):
     """Through the command line: one JSON object, every answer with its facts, and the exit code that its verdicts ask for."""
     task = fp.load_problem(name)
-    few = list(task.controllers)[:2]
+    few = list(task.controllers)[1:2]  # the adaptive one of the headline pair
     code = main(["review", name, "--controllers", *few, "--json"])
     found = json.loads(capsys.readouterr().out)
     assert set(found["controllers"]) == set(few)
