@@ -81,6 +81,8 @@ from .status import Status
 from .stepper import Stepper
 from .studies.compare import Comparison, compare
 from .studies.problem_file import load_problem
+from .studies.review.answer import Answer, Review
+from .studies.review.review import review
 from .symbolic.functions import signed_power
 from .testing import check_deformation
 from .tracking.exponential import Exponential
@@ -91,6 +93,7 @@ __all__ = [
     "AdaptiveInverseDynamics",
     "Affine",
     "Anderson",
+    "Answer",
     "BacksteppingMrac",
     "Blended",
     "ByDesired",
@@ -166,6 +169,7 @@ __all__ = [
     "ResolvedAccelerationRate",
     "Restart",
     "RestartAndTrack",
+    "Review",
     "Rfpt",
     "RfptVector",
     "Rotation",
@@ -207,6 +211,7 @@ __all__ = [
     "measure",
     "output_chain",
     "response_jacobian",
+    "review",
     "signed_power",
     "simulate",
     "solve",

@@ -1,6 +1,7 @@
-"""The command line: list, solve, run and compare problems.
+"""The command line: list, review, solve, run and compare problems.
 
-Exit codes: 0 finished; 2 bad input (names, values, a problem file, an option); 3 a folder or file cannot be written;
+Exit codes: 0 finished; 1 some answer of `review` is no; 2 bad input (names, values, a problem file, an option); 3 a folder
+or file cannot be written;
 4 the run ended early because a signal was not finite (`run`; `compare` reports it) or a plan did not converge (`solve`);
 130 interrupted.
 """
@@ -16,10 +17,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from fpirhc.studies.compare import Comparison, Progress
 
-OK, BAD_INPUT, NOT_WRITABLE, ENDED_EARLY, INTERRUPTED = 0, 2, 3, 4, 130
+OK, NOT_READY, BAD_INPUT, NOT_WRITABLE, ENDED_EARLY, INTERRUPTED = 0, 1, 2, 3, 4, 130
 
 _EXAMPLES = """examples:
   fpirhc list                                   shipped problems
+  fpirhc review two_mass --mismatch 20          what can be known before a run, exact parameters within 20 %
   fpirhc compare two_mass                       every controller of a problem, with a report
   fpirhc compare my_arm.py --controllers RHC RHC+FPI --out results/arm
   fpirhc compare two_mass --json                one JSON object on standard output
@@ -27,7 +29,7 @@ _EXAMPLES = """examples:
   fpirhc run two_mass "RHC+FPI" --out results   one run, saved as .npz and .png
   fpirhc solve cart_pole --optimisers fixed-point ipopt      the first horizon, open loop, with certificates
 
-exit codes: 0 finished, 2 bad input, 3 cannot write, 4 the run ended early (run)
+exit codes: 0 finished, 1 an answer of review is no, 2 bad input, 3 cannot write, 4 the run ended early (run)
 or a plan did not converge (solve), 130 interrupted
 """
 
@@ -62,12 +64,33 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="store_true", help="print the version and exit")
     parser.set_defaults(command=_no_command)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    _add_review(commands)
     _add_compare(commands)
     _add_run(commands)
     _add_solve(commands)
     listing = commands.add_parser("list", help="list the shipped problems")
     listing.set_defaults(command=_list)
     return parser
+
+
+def _add_review(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    command = commands.add_parser(
+        "review",
+        help="what can be known before a run: well posed, gains, limits, margins, convergence",
+        epilog="exit codes: 0 no answer is no, 1 some answer is no, 2 bad input",
+    )
+    command.add_argument("problem", metavar="PROBLEM", help="name of a shipped problem, or path of a problem file")
+    command.add_argument("--controllers", nargs="+", metavar="NAME", help="only these controllers (default: all)")
+    command.add_argument(
+        "--mismatch",
+        type=float,
+        default=0.0,
+        metavar="P",
+        help="margin around the exact parameters, percent (default: 0)",
+    )
+    command.add_argument("--seed", type=int, default=0, help="seed of the parameters that are drawn (default: 0)")
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of the text")
+    command.set_defaults(command=_review)
 
 
 def _add_compare(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -149,6 +172,22 @@ def _list(options: argparse.Namespace) -> int:  # noqa: ARG001
     for name, path in shipped_problems().items():
         print(f"{name:20s} {title_of(path)}")
     return OK
+
+
+def _review(options: argparse.Namespace) -> int:
+    from fpirhc.report.answers import review_to_json, show_review
+    from fpirhc.studies.compare import select
+    from fpirhc.studies.problem_file import load_problem
+    from fpirhc.studies.review.review import review
+
+    task = load_problem(options.problem)
+    chosen = select(task, options.controllers)
+    found = review(task.problem, chosen, mismatch=options.mismatch, seed=options.seed)
+    if options.json:
+        print(review_to_json(task.name, found))
+    else:
+        show_review(task.title, found)
+    return OK if found.ready else NOT_READY
 
 
 def _compare(options: argparse.Namespace) -> int:

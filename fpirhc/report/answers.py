@@ -1,0 +1,62 @@
+"""A review as text on the terminal and as one JSON object."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from fpirhc.studies.review.answer import Answer, Review
+
+_COLOURS = {"yes": "green", "no": "red", "unknown": "yellow"}
+
+
+def show_review(title: str, review: Review) -> None:
+    """Print every answer under its controller, and how many there are of each kind."""
+    console = Console()
+    console.print(title, style="bold", markup=False, highlight=False)
+    _show(console, review.problem)
+    for name, answers in review.controllers.items():
+        console.print(f"\n{name}", style="bold", markup=False, highlight=False)
+        _show(console, answers)
+    console.print(f"\n{_summary(review)}", markup=False, highlight=False)
+
+
+def review_to_json(name: str, review: Review) -> str:
+    """Return the review as JSON text; numbers that are not finite become null."""
+    facts = {
+        "problem": name,
+        "mismatch": review.mismatch,
+        "ready": review.ready,
+        "answers": [_facts(a) for a in review.problem],
+        "controllers": {c: [_facts(a) for a in answers] for c, answers in review.controllers.items()},
+    }
+    return json.dumps(facts, indent=2)
+
+
+def _show(console: Console, answers: Iterable[Answer]) -> None:
+    for one in answers:
+        console.print(Text(f"  {one.verdict:7s} ", _COLOURS[one.verdict]) + Text(one.question), highlight=False)
+        console.print(Text(f"          {one.found}"), highlight=False, soft_wrap=True)
+        if one.change:
+            console.print(Text(f"          -> {one.change}"), highlight=False, soft_wrap=True)
+
+
+def _summary(review: Review) -> str:
+    counts = {v: sum(a.verdict == v for a in review.answers) for v in _COLOURS}
+    return ", ".join(f"{count} {name}" for name, count in counts.items())
+
+
+def _facts(answer: Answer) -> dict[str, Any]:
+    return {
+        "question": answer.question,
+        "verdict": str(answer.verdict),
+        "found": answer.found,
+        "change": answer.change,
+        "numbers": {name: v if math.isfinite(v) else None for name, v in answer.numbers.items()},
+    }

@@ -1,0 +1,61 @@
+"""An answer to one question, and all answers about one problem."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+
+class Verdict(StrEnum):
+    """Yes is good in every question."""
+
+    YES = "yes"
+    NO = "no"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One answer.
+
+    Parameters:
+        question: as a reader would ask it. verdict: yes, no, unknown.
+        found: the facts in a sentence, with the deciding number and its unit. change: what to change; empty after a yes.
+        numbers: the same facts by name.
+    """
+
+    question: str
+    verdict: Verdict
+    found: str
+    change: str = ""
+    numbers: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Review:
+    """What is known before a run.
+
+    Parameters:
+        problem: its answers. controllers: each one's answers by name.
+        mismatch: margin around the exact parameters, percent.
+    """
+
+    problem: tuple[Answer, ...]
+    controllers: Mapping[str, tuple[Answer, ...]]
+    mismatch: float
+
+    @property
+    def answers(self) -> tuple[Answer, ...]:
+        """All answers, the problem's first."""
+        return (*self.problem, *(a for group in self.controllers.values() for a in group))
+
+    @property
+    def ready(self) -> bool:
+        """Whether no answer is a no."""
+        return all(a.verdict != Verdict.NO for a in self.answers)
+
+
+def decided(good: bool) -> Verdict:
+    """Yes where the condition holds, else no."""
+    return Verdict.YES if good else Verdict.NO

@@ -1,0 +1,320 @@
+"""What a review says before a run, and whether it is right."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from random_plants import dies_out, random_case
+
+import fpirhc as fp
+from fpirhc.cli import main
+from fpirhc.studies.problem_file import shipped_problems
+from fpirhc.studies.review.along import along, parameter_box
+from fpirhc.studies.review.loops import loops_along
+from fpirhc.studies.review.margins import margins
+from fpirhc.studies.review.plan_feedback import plan_gains
+from fpirhc.studies.review.review import predict
+
+PERIOD = 1e-3  # s
+
+
+def mass(**settings) -> fp.Problem:
+    """M q'' = u - k q, the model's mass 1.5 times too large."""
+    plant = fp.Plant(
+        coordinates={"q": "m"},
+        inputs={"u": "N"},
+        parameters={"m": fp.Parameter(1.5, 1.0, "kg"), "k": fp.Parameter(6.0, 10.0, "N/m")},
+        response=lambda q, v, u, p: {"q": (u.u - p.k * q.q) / p.m},
+    )
+    given = {
+        "reference": fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(3 * t)}),
+        "start": {"q": 0.0},
+        "period": PERIOD,
+        "duration": 4.0,
+    }
+    return fp.Problem(plant=plant, **(given | settings))
+
+
+def torque(gain: float = -0.5, rate: float = 6.0, scale: float = 20.0) -> fp.ComputedTorque:
+    return fp.ComputedTorque(fp.Exponential(rate=rate), fp.Sigmoid(gain=gain, scale=scale))
+
+
+def answers(problem: fp.Problem, controller=None, mismatch: float = 0.0) -> dict[str, fp.Answer]:
+    """All answers by question."""
+    chosen = {"it": torque() if controller is None else controller}
+    return {a.question: a for a in fp.review(problem, chosen, mismatch=mismatch, seed=0).answers}
+
+
+def about(found: dict[str, fp.Answer], words: str) -> fp.Answer:
+    [question] = [q for q in found if words in q]
+    return found[question]
+
+
+def predicted(seeds: range) -> tuple[int, int, int]:
+    """(right, wrong, unknown) verdicts against simulated closed loops."""
+    counts = {"right": 0, "wrong": 0, "unknown": 0}
+    for seed in seeds:
+        case = random_case(seed)
+        verdict = predict(case.problem, case.controller).verdict
+        if verdict == "unknown":
+            counts["unknown"] += 1
+        else:
+            counts["right" if (verdict == "yes") == dies_out(case) else "wrong"] += 1
+    return counts["right"], counts["wrong"], counts["unknown"]
+
+
+def test_verdicts_on_random_closed_loops():
+    """Linear and nonlinear, one to three coordinates, right and wrong signs, over-gained, with dead time: see `random_plants`."""
+    right, wrong, unknown = predicted(range(40))
+    assert wrong == 0
+    assert unknown < 0.15 * 40
+    assert right >= 30
+
+
+@pytest.mark.slow
+def test_verdicts_on_three_hundred_closed_loops():
+    """At least 98 % of the decided cases are right, and fewer than 15 % undecided."""
+    right, wrong, unknown = predicted(range(300))
+    assert right >= 0.98 * (right + wrong)
+    assert unknown < 0.15 * 300
+
+
+def test_loop_of_a_right_model_has_the_poles_of_its_tracking_law():
+    """With the exact model and no deformation (d/dt + rate)^3 e_int = 0 is what remains: three poles around e^(-rate period).
+
+    A threefold pole is soft, its mean is not.
+    """
+    problem = mass()
+    controller = fp.Informed(fp.ComputedTorque(fp.Exponential(rate=6.0)))
+    loops = loops_along(along(problem, 0.0, 0), controller)
+    slow = loops.loops[0].poles[np.abs(loops.loops[0].poles) > 0.5]
+    assert slow.size == 3
+    assert np.log(slow).mean() / PERIOD == pytest.approx(-6.0, rel=0.01)
+
+
+def test_deformation_adds_its_own_pole():
+    """J = 1.5 and a = 0.198 (gain -0.5): the fast mode of the loop is 1 - a J, as the contraction says."""
+    loops = loops_along(along(mass(), 0.0, 0), torque(rate=1.0))
+    assert np.abs(loops.loops[0].poles - (1 - 0.5 * 0.3967373 * 1.5)).min() < 5e-3
+
+
+@pytest.mark.parametrize("cycles", [0, 1, 2, 5])
+def test_dead_time_limit_is_where_the_loop_leaves_the_unit_circle(cycles):
+    """Unpaired, a lambda < 2 sin(pi / (2 (2 d + 1))), here with the slow outer loop in place; the gain question says the same."""
+    problem = mass(dead_time=fp.DeadTime(inputs={"u": cycles * PERIOD}))
+    limit = 2 * math.sin(math.pi / (2 * (2 * cycles + 1))) / 1.5
+    for share, stable in ((0.95, True), (1.05, False)):
+        controller = fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Affine(gain=-2 * share * limit))
+        loops = loops_along(along(problem, 0.0, 0), controller)
+        assert (loops.radii.max() < 1) == stable
+        verdict = about(answers(problem, controller), "gain admissible").verdict
+        assert (verdict == "yes") == stable
+
+
+def test_margins_are_where_the_loop_loses_its_stability():
+    """More gain than the gain margin, or more delay than the delay margin, puts a pole outside the unit circle, less does not."""
+    [loop, *_] = loops_along(along(mass(), 0.0, 0), torque()).loops
+    gain, phase, delay = margins(loop, 0)
+    f, g, c = loop.dynamics, loop.entry[:, [0]], loop.arriving[[0]]
+
+    def radius(matrix: np.ndarray) -> float:
+        return float(np.abs(np.linalg.eigvals(matrix)).max())
+
+    scaled = [radius(f + (k - 1) * g @ c) for k in (0.99 * gain, 1.01 * gain, 0.99 / gain, 1.01 / gain)]
+    assert (scaled[0] < 1) != (scaled[1] < 1) or (scaled[2] < 1) != (scaled[3] < 1)
+
+    def delayed(cycles: int) -> float:
+        n = len(f)
+        queue = np.zeros((n + cycles, n + cycles))
+        queue[:n, :n], queue[:n, [-1]], queue[[n], :n] = f - g @ c, g, c
+        queue[range(n + 1, n + cycles), range(n, n + cycles - 1)] = 1
+        return radius(queue)
+
+    whole = math.floor(delay / PERIOD)
+    assert delayed(whole) < 1 < delayed(whole + 1)
+    assert 30 < phase < 90
+
+
+def test_feedback_of_a_plan_is_that_of_the_riccati_equation():
+    """Far horizons of a constant problem have the stationary discrete LQ gain."""
+    problem = mass(
+        reference=fp.Trajectory(lambda t: {"q": 0 * t}),
+        horizon=fp.Horizon(stages=400, step=1e-2),
+        cost=fp.Quadratic(states={"q": 1e3, "q'": 1.0}, effort={"u": 1e-2}),
+    )
+    import control
+    import scipy.linalg
+
+    [found] = plan_gains(problem, problem.horizon, problem.cost, [0.0], problem.plant.approximate)
+    m, k = problem.plant.approximate
+    whole = scipy.linalg.expm(np.array([[0, 1, 0], [-k / m, 0, 1 / m], [0, 0, 0]]) * 1e-2)
+    stationary, *_ = control.dlqr(whole[:2, :2], whole[:2, 2:], np.diag([1e3, 1.0]), np.array([[1e-2]]))
+    assert found == pytest.approx(-stationary, rel=1e-3)
+
+
+def test_a_good_problem_is_ready():
+    """Every answer about a mild mismatch is yes."""
+    found = answers(mass(limits=fp.Limits(inputs={"u": (-20.0, 20.0)})))
+    assert {a.verdict for a in found.values()} == {"yes"}
+    assert all(not a.change for a in found.values())
+
+
+@pytest.mark.parametrize(
+    ("words", "controller", "settings"),
+    [
+        ("Does the deformation converge", torque(gain=-4.0), {}),
+        ("gain admissible", torque(gain=-4.0), {}),
+        ("gain admissible", torque(), {"dead_time": fp.DeadTime(inputs={"u": 0.06})}),
+        ("fast enough", torque(scale=1e-4), {}),
+        ("rate x dead time", torque(rate=8.0), {"dead_time": fp.DeadTime(inputs={"u": 0.06})}),
+        ("rate x period", torque(rate=900.0), {}),
+        ("range large enough", fp.ComputedTorque(fp.Exponential(6.0), fp.Rotation(fraction=0.3, radius=1.0)), {}),
+        ("commands", torque(), {"limits": fp.Limits(inputs={"u": (-0.3, 0.3)})}),
+        ("margin", torque(gain=-4.0), {}),
+    ],
+)
+def test_what_is_wrong_is_answered_no(words, controller, settings):
+    """Each question finds its own mistake, and says what to change."""
+    one = about(answers(mass(**settings), controller), words)
+    assert one.verdict == "no"
+    assert one.change
+
+
+def test_wrong_sign_is_found_before_the_run():
+    """A gain of the wrong sign, which a run refuses."""
+    found = answers(mass(), torque(gain=0.5))
+    assert about(found, "Does the deformation converge").verdict == "no"
+    gain = about(found, "gain admissible")
+    assert gain.verdict == "no"
+    assert gain.numbers["recommended"] == pytest.approx(-1 / 0.396737 / 1.25, rel=0.01)  # J from 1 to 1.5 over the box
+
+
+def test_an_inverse_that_vanishes_on_the_way_is_found():
+    """The pole's response to the cart's force passes through zero where the pole is level."""
+    plant = fp.Plant(
+        coordinates={"angle": "rad"},
+        inputs={"u": "N"},
+        parameters={"b": fp.Parameter(1.2, 1.0, "1/kg")},
+        response=lambda q, v, u, p: {"angle": p.b * ca.cos(q.angle) * u.u},
+    )
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"angle": 2 * ca.sin(t)}),
+        start={"angle": 0.0},
+        period=PERIOD,
+        duration=4.0,
+    )
+    assert about(answers(problem), "inverse exist").verdict == "no"
+
+
+def test_unstable_zero_dynamics_are_found():
+    """While the cart is controlled an upright pole falls at sqrt(g / l); a plan that carries the pole in its cost holds it."""
+    task = fp.load_problem("cart_pole")
+    alone = about(answers(task.problem, torque()), "zero dynamics")
+    assert alone.verdict == "no"
+    assert alone.numbers["rate"] == pytest.approx(math.sqrt(9.81 / 0.8), rel=0.02)
+    planned = fp.review(task.problem, {"RHC+FPI": task.controllers["RHC+FPI"]}, mismatch=0.0, seed=0)
+    assert about({a.question: a for a in planned.answers}, "zero dynamics").verdict == "yes"
+
+
+def test_box_spans_model_and_plant_and_a_margin():
+    """From the approximate to the exact value, and P percent around the latter."""
+    box = parameter_box(mass(), 20.0)
+    assert box == {"m": pytest.approx((0.8, 1.5)), "k": pytest.approx((6.0, 12.0))}
+    al = along(mass(), 20.0, 0)
+    assert al.draws[0] == pytest.approx([1.0, 10.0])
+    assert al.draws.min(axis=0) == pytest.approx([0.8, 6.0])
+    wide = answers(mass(), torque(gain=-2.2), mismatch=40.0)
+    assert about(wide, "one sign").numbers["largest_over_box"] == pytest.approx(1.5 / 0.6)
+    assert (
+        about(wide, "gain admissible").verdict == "unknown"
+    )  # good for the plant, too large for the lightest of the box
+
+
+def test_prediction_is_the_review_s_verdict():
+    """The verdict does not depend on the questions that are asked beside it."""
+    for seed in (0, 9, 20):
+        case = random_case(seed)
+        found = answers(case.problem, case.controller)
+        one = predict(case.problem, case.controller)
+        assert about(found, "Does the deformation converge").verdict == one.verdict
+
+
+def test_a_map_that_changes_on_line_is_not_judged():
+    """A tuner may mend what the linear loop of its start says."""
+    tuned = fp.Tuned(fp.Sigmoid(gain=-0.5, scale=20.0), largest_gain=1.0)
+    verdict = about(answers(mass(), fp.ComputedTorque(fp.Exponential(6.0), tuned)), "Does the deformation converge")
+    assert verdict.verdict == "unknown"
+    assert "Tuned" in verdict.change
+
+
+def test_a_plan_that_is_too_stiff_for_its_map_is_found():
+    """The case that two_mass shows failing: the start asks for more than 0.81 S per cycle."""
+    task = fp.load_problem("two_mass")
+    name = "RHC+FPI, stiff, small S"
+    found = fp.review(task.problem, {name: task.controllers[name]}, mismatch=0.0, seed=0)
+    slew = about({a.question: a for a in found.answers}, "fast enough")
+    assert slew.verdict == "no"
+    assert not found.ready
+
+
+def test_values_that_make_no_sense_are_refused():
+    """Percentages outside 0 to 100."""
+    for wrong in (-1.0, 100.0, math.nan):
+        with pytest.raises(ValueError, match="mismatch"):
+            fp.review(mass(), {}, mismatch=wrong, seed=0)
+
+
+@pytest.mark.parametrize("name", shipped_problems())
+def test_every_shipped_problem_can_be_reviewed(name, capsys):
+    """Through the command line: one JSON object, every answer with its facts, and the exit code that its verdicts ask for."""
+    task = fp.load_problem(name)
+    few = list(task.controllers)[1:2]  # the adaptive one of the headline pair
+    code = main(["review", name, "--controllers", *few, "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert set(found["controllers"]) == set(few)
+    every = [*found["answers"], *(a for group in found["controllers"].values() for a in group)]
+    assert all(a["found"] and a["question"].endswith("?") for a in every)
+    assert all(a["change"] for a in every if a["verdict"] == "no")
+    assert code == int(any(a["verdict"] == "no" for a in every))
+
+
+def test_journey_with_text(capsys):
+    """Delayed mass: the unpaired map diverges, the increment form converges, and both are told why."""
+    assert main(["review", "delayed_mass", "--controllers", "CTC+FPI unpaired"]) == 1
+    text = capsys.readouterr().out
+    assert "no      Does the deformation converge?" in text
+    assert "recommended -0.0262" in text
+    assert main(["review", "delayed_mass", "--controllers", "CTC+FPI increment"]) == 0
+    assert "yes     Does the deformation converge?" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["no_such_problem"], "unknown"),
+        (["two_mass", "--controllers", "RCH"], "Did you mean"),
+        (["two_mass", "--mismatch", "250"], "mismatch=250"),
+    ],
+)
+def test_bad_input_ends_with_2(words, said, capsys):
+    """Names and values are named; nothing is printed on standard output."""
+    assert main(["review", *words]) == 2
+    printed = capsys.readouterr()
+    assert said in printed.err
+    assert not printed.out
+
+
+def test_slots_are_judged_by_their_schedule():
+    """Crane: the published radius; a controller that does not fit is a no with its reason."""
+    task = fp.load_problem("crane_slots")
+    controller = task.controllers["slots+FPI"]
+    found = answers(task.problem, controller)
+    assert about(found, "schedule").numbers["floquet_radius"] == pytest.approx(0.0485, abs=1e-3)
+    wrong = replace(controller, slots=(replace(controller.slots[0], order=3), controller.slots[1]))
+    assert about(answers(task.problem, wrong), "fit the problem").verdict == "no"
