@@ -318,3 +318,12 @@ def test_slots_are_judged_by_their_schedule():
     assert about(found, "schedule").numbers["floquet_radius"] == pytest.approx(0.0485, abs=1e-3)
     wrong = replace(controller, slots=(replace(controller.slots[0], order=3), controller.slots[1]))
     assert about(answers(task.problem, wrong), "fit the problem").verdict == "no"
+
+
+def test_estimators_and_filters_are_part_of_the_loop():
+    """The motor's derivatives come from a window: told of its delay a deformation converges, not told it does not."""
+    task = fp.load_problem("noisy_motor")
+    told, untold = (
+        predict(task.problem, task.controllers[n]) for n in ("RHC+FPI, filtered error", "RHC+FPI, delay not told")
+    )
+    assert (told.verdict, untold.verdict) == ("yes", "no")

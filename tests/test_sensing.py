@@ -183,7 +183,7 @@ def test_stepper_replays_a_noisy_run():
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
-@pytest.mark.parametrize("estimator", (*ESTIMATORS[1:-1], fp.StateVariableFilter(bandwidth=10.0)), ids=str)
+@pytest.mark.parametrize("estimator", [*ESTIMATORS[1:-1], fp.StateVariableFilter(bandwidth=10.0)], ids=str)
 def test_response_is_the_stated_average_of_requests(estimator, order):
     """On y^(n) = held requests the estimate is sum w_j r_{k-j}, the weights sum to one, and their centre is the delay."""
     period, plant = 0.1, chain(order)

@@ -47,18 +47,14 @@ def check_response_delay(problem: Problem, deformation: Deformation) -> None:
         NotContractive: with the limit, the gain, and what to do.
     """
     gain, form = deformation.effective_gain(), _form(deformation)
-    orders = {problem.plant.orders[k] for k in problem.plant.controlled_indices} if gain else set()
-    weights = {order: problem.sensing.estimator.weights(order, problem.period) for order in orders}
-    waits = {problem.dead_time.inputs.get(name, 0.0) for name in problem.plant.inputs}
-    plain = form.pole == 0 and all(w.size == 1 for w in weights.values())
-    spectrum = None if plain or len(waits) > 1 else _at_start(problem)
+    weights = _delayed_weights(problem, form) if gain else []
+    spectrum = _at_start(problem) if weights else None
     if spectrum is None:
         return
-    waiting = (waits.pop() + problem.dead_time.measurement) / problem.period
     eigenvalues = np.unique(np.round(spectrum.eigenvalues.ravel() * math.copysign(1, gain), 12))
 
     def limit(pairing: float) -> float:
-        every = [(_late(w, waiting), complex(v)) for w in weights.values() for v in eigenvalues]
+        every = [(w, complex(v)) for w in weights for v in eigenvalues]
         return min(delayed_limit(w, pairing=pairing, pole=form.pole, eigenvalue=v) for w, v in every)
 
     if limit(form.pairing) <= abs(gain) < max(map(abs, linear_limit(spectrum.eigenvalues))):
@@ -67,6 +63,27 @@ def check_response_delay(problem: Problem, deformation: Deformation) -> None:
         tried = {d: limit(d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0}
         best = next((d for d, reached in tried.items() if abs(gain) < reached), None)
         raise NotContractive(_too_late(problem, deformation, form, limit(form.pairing), best))
+
+
+def product_limit(problem: Problem, deformation: Deformation) -> float | None:
+    """Limit of effective gain times a positive eigenvalue behind an estimator or a filter; None where there is neither.
+
+    None too where the inputs have different dead times.
+    """
+    form = _form(deformation)
+    weights = _delayed_weights(problem, form)
+    return min((delayed_limit(w, pairing=form.pairing, pole=form.pole) for w in weights), default=None)
+
+
+def _delayed_weights(problem: Problem, form: _Form) -> list[np.ndarray]:
+    """Weights of past requests in the estimated responses, dead time included, where estimator or filter have any of their own."""
+    orders = {problem.plant.orders[k] for k in problem.plant.controlled_indices}
+    weights = [problem.sensing.estimator.weights(order, problem.period) for order in orders]
+    waits = {problem.dead_time.inputs.get(name, 0.0) for name in problem.plant.inputs}
+    if (form.pole == 0 and all(w.size == 1 for w in weights)) or len(waits) > 1:
+        return []
+    waiting = (waits.pop() + problem.dead_time.measurement) / problem.period
+    return [_late(w, waiting) for w in weights]
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.studies.review.along import Along
 from fpirhc.studies.review.answer import Answer, Verdict
 from fpirhc.studies.review.loops import Loops
-from fpirhc.studies.review.maps import constant, dead_cycles, largest_product
+from fpirhc.studies.review.maps import constant, largest_product
 from fpirhc.studies.review.neighbourhood import eigenvalues_near
 
 QUESTION = "Does the deformation converge?"
@@ -86,7 +86,7 @@ def _steep(al: Along, controller: Controller) -> list[str]:
     if not eigenvalues.size:
         return ["the response Jacobian is not finite near the reference"]
     reached = float((deformation.secant_gain() * np.abs(eigenvalues) ** 2 / eigenvalues.real).max())
-    limit = largest_product(deformation, dead_cycles(al.problem))
+    limit = largest_product(al.problem, deformation)
     if (deformation.secant_gain() * eigenvalues.real).min() <= 0:
         return ["near the reference the response Jacobian changes its sign"]
     if reached <= limit:

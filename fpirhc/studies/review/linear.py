@@ -34,6 +34,7 @@ from fpirhc.loop import close_loop
 from fpirhc.plant import Parameter, Plant
 from fpirhc.problem import Problem
 from fpirhc.reference import Trajectory
+from fpirhc.sensing import Sensing
 from fpirhc.symbolic.layout import Expression
 
 LARGEST = 1500  # entries of the loop's memory, beyond which its eigenvalues take too long
@@ -174,6 +175,7 @@ def _linear_problem(problem: Problem, controller: Controller) -> Problem:
         duration=problem.duration,
         disturbances={name: Step(at=0.0, size=0.0) for name in plant.inputs},
         dead_time=DeadTime(inputs=problem.dead_time.inputs, measurement=problem.dead_time.measurement),
+        sensing=Sensing(estimator=problem.sensing.estimator),
         integrator=integrator,
         judged=plant.controlled_names,
     )

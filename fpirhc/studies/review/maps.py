@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 
+from fpirhc.controllers.gain_check import product_limit
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.delayed import Increment, Paired
+from fpirhc.deformation.filtered import Filtered
 from fpirhc.deformation.rfpt import Rfpt
 from fpirhc.deformation.rfpt_vector import RfptVector
 from fpirhc.deformation.rotation import Rotation
@@ -15,7 +17,7 @@ from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.deformation.wrapper import Wrapper
 from fpirhc.problem import Problem
 
-_CONSTANT = (Affine, Rfpt, RfptVector, Rotation, Sigmoid, Paired, Increment, DelayWatched)
+_CONSTANT = (Affine, Rfpt, RfptVector, Rotation, Sigmoid, Paired, Increment, Filtered, DelayWatched)
 
 
 def innermost(deformation: Deformation) -> Deformation:
@@ -47,13 +49,15 @@ def dead_cycles(problem: Problem) -> float:
     return (longest + problem.dead_time.measurement) / problem.period
 
 
-def largest_product(deformation: Deformation, cycles: float) -> float:
-    """Limit of effective gain times eigenvalue under a dead time, 2 without one.
+def largest_product(problem: Problem, deformation: Deformation) -> float:
+    """Limit of effective gain times eigenvalue: 2, or less under a dead time or behind an estimator or a filter.
 
-    Unpaired: 2 sin(pi / (2 (2 d + 1))), d rounded up. Paired with the true dead time: 2. Paired with an uncertainty or with
-    another dead time: 0.5, up to which the remembered requests decay.
+    Under a dead time, unpaired: 2 sin(pi / (2 (2 d + 1))), d rounded up. Paired with the true dead time: 2. Paired with an
+    uncertainty or with another dead time: 0.5, up to which the remembered requests decay.
     """
-    pairs = paired(deformation)
+    pairs, cycles, delayed = paired(deformation), dead_cycles(problem), product_limit(problem, deformation)
+    if delayed is not None and (pairs is None or pairs.uncertainty == 0):
+        return delayed
     if pairs is None:
         return 2 * math.sin(math.pi / (2 * (2 * math.ceil(cycles - 1e-9) + 1)))
     return 2.0 if pairs.uncertainty == 0 and abs(pairs.cycles - cycles) < 1e-6 else 0.5

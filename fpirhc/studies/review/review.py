@@ -20,7 +20,7 @@ from fpirhc.studies.review.gain import gain_admissible
 from fpirhc.studies.review.horizon import horizon_long_enough
 from fpirhc.studies.review.inverse import inverse_exists
 from fpirhc.studies.review.loops import Loops, loops_along
-from fpirhc.studies.review.maps import dead_cycles, largest_product
+from fpirhc.studies.review.maps import largest_product
 from fpirhc.studies.review.margins import margins_enough
 from fpirhc.studies.review.neighbourhood import spectrum_near
 from fpirhc.studies.review.orders import relative_orders
@@ -90,7 +90,7 @@ def _of_map(al: Along, controller: Controller, loops: Loops, general: list[Answe
         own, boxed = (spectrum_near(al, believed, draws, near=False) for draws in (al.draws[:1], al.draws))
     except InvalidValue as error:
         return [Answer("Do the eigenvalues of the response Jacobian have one sign?", Verdict.UNKNOWN, str(error))]
-    limit = largest_product(deformation, dead_cycles(al.problem))
+    limit = largest_product(al.problem, deformation)
     suited = _speed_and_range(al, controller, loops)
     verdict = converges(al, controller, loops, _doubts([*general, *suited]))
     gains = [one_sign(own, boxed), gain_admissible(deformation, own, boxed, limit)]
