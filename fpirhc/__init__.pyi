@@ -54,7 +54,7 @@ from .stepper import Stepper
 from .studies.compare import Comparison, compare
 from .studies.problem_file import load_problem
 from .symbolic.functions import signed_power
-from .testing import check_deformation
+from .testing import check_deformation, check_plant, check_tracking
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
 
@@ -148,6 +148,8 @@ __all__ = [
     "certify",
     "check_deformation",
     "check_gain",
+    "check_plant",
+    "check_tracking",
     "compare",
     "delayed_limit",
     "floquet_radius",
