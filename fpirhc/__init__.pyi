@@ -54,7 +54,7 @@ from .stepper import Stepper
 from .studies.compare import Comparison, compare
 from .studies.problem_file import load_problem
 from .symbolic.functions import signed_power
-from .testing import check_deformation, check_plant, check_tracking
+from .testing import check_controller, check_deformation, check_optimiser, check_plant, check_tracking
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
 
@@ -146,8 +146,10 @@ __all__ = [
     "VelocityDifference",
     "assess_gain",
     "certify",
+    "check_controller",
     "check_deformation",
     "check_gain",
+    "check_optimiser",
     "check_plant",
     "check_tracking",
     "compare",
