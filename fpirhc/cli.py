@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from fpirhc.doctor.command import add_doctor
 from fpirhc.scaffold.command import add_new
+from fpirhc.summary import printable
 
 if TYPE_CHECKING:
     from fpirhc.studies.compare import Comparison, Progress
@@ -53,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _complain(error: object, code: int) -> int:
-    print(f"fpirhc: {error}", file=sys.stderr)
+    print(f"fpirhc: {printable(str(error))}", file=sys.stderr)
     return code
 
 
@@ -154,7 +155,7 @@ def _list(options: argparse.Namespace) -> int:  # noqa: ARG001
     from fpirhc.studies.problem_file import shipped_problems, title_of
 
     for name, path in shipped_problems().items():
-        print(f"{name:20s} {title_of(path)}")
+        print(printable(f"{name:20s} {title_of(path)}"))
     return OK
 
 

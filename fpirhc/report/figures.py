@@ -75,11 +75,11 @@ def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
         for row, (one, colour) in enumerate(zip(solved, PALETTE, strict=False)):
             width = max(1.0, 3.0 - 0.7 * row)  # plans that agree lie on each other
             if is_state:
-                axis.plot(times, one.plan.states[k], color=colour, label=one.name, linewidth=width)
+                axis.plot(times, one.plan.states[k], color=colour, label=_plain(one.name), linewidth=width)
             else:
                 axis.stairs(one.plan.inputs[k - plant.state.size], times, baseline=None, color=colour, linewidth=width)
         unit = plant.state.units[k] if is_state else plant.input.units[k - plant.state.size]
-        axis.set_ylabel(f"{name} [{unit}]")
+        axis.set_ylabel(_plain(f"{name} [{unit}]"))
     _legend(axes[0])
     axes[-1].set_xlabel("time [s]")
     return figure
@@ -102,7 +102,7 @@ def pair_figures(plain: Entry, adaptive: Entry) -> dict[str, Figure]:
             draw(axis, entry.run)
             if draw is not _draw_phase:
                 _bands(axis, entry.run)
-            axis.set_title(entry.name, fontsize=10)
+            axis.set_title(_plain(entry.name), fontsize=10)
             _legend(axis)
         found[title] = figure
     return found
@@ -119,7 +119,9 @@ def contraction_figure(comparison: Comparison) -> Figure | None:
     for k, entry in enumerate(entries):
         run = entry.run
         size = np.linalg.norm(run["realised"][1:] - run["desired"][:-1], axis=1)[:150]
-        right.semilogy(np.arange(1, size.size + 1), np.maximum(size, 1e-12), color=PALETTE[k], label=entry.name, lw=1)
+        right.semilogy(
+            np.arange(1, size.size + 1), np.maximum(size, 1e-12), color=PALETTE[k], label=_plain(entry.name), lw=1
+        )
     right.set_xlabel("control cycle")
     right.set_ylabel("|realised - desired|, response units")
     right.set_title("The response error in the first cycles", fontsize=10)
@@ -136,7 +138,7 @@ def headline_figure(comparison: Comparison, plain: Entry, adaptive: Entry) -> Fi
         _draw_error(axes[1, column], entry.run)
         for row in (0, 1):
             _bands(axes[row, column], entry.run)
-        axes[0, column].set_title(entry.name, fontsize=10)
+        axes[0, column].set_title(_plain(entry.name), fontsize=10)
         axes[0, column].set_xlabel("")
         _legend(axes[0, column])
     limit = max(axes[1, 0].get_ylim(), key=abs)
@@ -146,12 +148,18 @@ def headline_figure(comparison: Comparison, plain: Entry, adaptive: Entry) -> Fi
 
 
 def _figure(width: float, height: float, title: str) -> Figure:
-    from matplotlib.figure import Figure
+    from fpirhc.report.drawing import Drawing
 
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Drawing(figsize=(width, height), layout="constrained")
     if title:
-        figure.suptitle(title, fontsize=11)
+        figure.suptitle(_plain(title), fontsize=11)
     return figure
+
+
+def _plain(text: str) -> str:
+    from fpirhc.report.drawing import plain
+
+    return plain(text)
 
 
 def _bands(axis: Axes, run: Run) -> None:
@@ -175,7 +183,9 @@ def _thin(values: np.ndarray) -> np.ndarray:
 
 
 def _line(axis: Axes, run: Run, column: str, label: str, color: str, style: str = "-") -> None:
-    axis.plot(_thin(run.time), _thin(run[column]), style, color=color, lw=1, label=f"{label} [{run.unit(column)}]")
+    axis.plot(
+        _thin(run.time), _thin(run[column]), style, color=color, lw=1, label=_plain(f"{label} [{run.unit(column)}]")
+    )
     axis.grid(visible=True, alpha=0.25)
 
 
@@ -248,7 +258,12 @@ def _draw_factor(axis: Axes, entries: list[Entry]) -> None:
         assert entry.contraction is not None
         report = entry.contraction.report
         axis.plot(
-            report.effective_gain, report.predicted, "o", color=PALETTE[k], ms=6, label=f"{entry.name}, predicted"
+            report.effective_gain,
+            report.predicted,
+            "o",
+            color=PALETTE[k],
+            ms=6,
+            label=_plain(f"{entry.name}, predicted"),
         )
         if np.isfinite(entry.contraction.measured):
             axis.plot(report.effective_gain, entry.contraction.measured, "x", color=PALETTE[k], ms=8)
