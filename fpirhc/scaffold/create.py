@@ -5,7 +5,7 @@ from __future__ import annotations
 import keyword
 import re
 import sys
-from importlib.metadata import packages_distributions
+from importlib.machinery import PathFinder
 from importlib.resources import files
 from pathlib import Path
 
@@ -78,7 +78,9 @@ def _taken(name: str) -> str:
         return "it is a word of Python"
     if name.lower().startswith("test_") or name.lower() in ("test", "conftest"):
         return "pytest would take the problem file for a test"
-    if name in sys.stdlib_module_names or name in packages_distributions():
+    # Without the folder that Python was started in: a problem that is there already is not an installed module.
+    installed = [p for p in sys.path if p and Path(p).resolve() != Path.cwd()]
+    if name in sys.stdlib_module_names or PathFinder.find_spec(name, installed):
         return "a module of that name is installed, which the file would hide from everything beside it"
     if name in shipped_problems():
         return "a shipped problem has it (see 'fpirhc list')"
