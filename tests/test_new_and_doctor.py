@@ -29,7 +29,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_new_files_work_at_once(folder, capsys):
-    """The problem loads, adaptation helps, and the written test passes as it is: the three laws that it states are run here."""
+    """The problem loads, adaptation helps, every cycle is solved, and the plant keeps its laws."""
     assert main(["new", "my_arm", "--dir", "arms/left"]) == 0
     printed = capsys.readouterr().out
     assert "fpirhc compare arms/left/my_arm.py" in printed

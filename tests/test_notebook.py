@@ -1,4 +1,4 @@
-"""Results show themselves, and names that a user chose are shown as they are: in notebooks, reports, figures and terminals."""
+"""Results show themselves, and names that a user chose are shown as they are, wherever they are shown."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def test_plots_are_pictures_and_open_no_window(comparison):
 
 
 def test_report_holds_no_foreign_tags(comparison):
-    """The page has the tags of a page without hostile names, no handler, one script end per script; the names are in its text."""
+    """No tag or handler comes from a name, no script ends early, and the names are in the text."""
     page = render(comparison)
     parsed = read(page)
     assert not {"i", "u", "s", "img "} & parsed.tags

@@ -6,8 +6,8 @@
     check_controller(MyController(...), seed=1)
     check_plant(my_plant, seed=1)
 
-Each raises one AssertionError for the first law that is broken, with the numbers; nothing is returned. The laws themselves are the
-tuples `LAWS` of the modules, one module per family.
+Each raises one AssertionError for the first law that is broken, with the numbers; nothing is returned. The laws themselves are
+the tuples `LAWS` of the modules, one module per family.
 """
 
 from fpirhc.testing.controller import check_controller

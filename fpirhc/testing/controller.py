@@ -18,6 +18,7 @@ from fpirhc.plant import Parameter, Plant
 from fpirhc.problem import Problem
 from fpirhc.reference import Trajectory
 from fpirhc.run import Run
+from fpirhc.sensing.sensing import Sensing
 from fpirhc.simulation import simulate
 from fpirhc.status import Status
 from fpirhc.stepper import Stepper
@@ -119,7 +120,7 @@ def writes_a_command_and_a_status(trial: _Trial, generator: np.random.Generator)
 
 
 def exact_model_tracks(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """With a model that is exact and nothing that disturbs, the error of every judged coordinate goes to zero."""
+    """With an exact model, ideal sensors and nothing that disturbs, the error of every judged coordinate goes to zero."""
     problem = _exact(trial.problem)
     run = trial.simulated(problem)
     hold(run.stop is None, f"with the exact model the run ends early: {run.stop}")
@@ -138,7 +139,7 @@ def _exact(problem: Problem) -> Problem:
     parameters = {
         name: Parameter(approximate=p.exact, exact=p.exact, unit=p.unit) for name, p in problem.plant.parameters.items()
     }
-    return replace(problem, plant=replace(problem.plant, parameters=parameters), disturbances={})
+    return replace(problem, plant=replace(problem.plant, parameters=parameters), disturbances={}, sensing=Sensing())
 
 
 def same_command_everywhere(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001

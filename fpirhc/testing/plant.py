@@ -22,8 +22,8 @@ _SLOPE = 1e-5  # relative, of central differences
 def check_plant(plant: Plant, *, seed: int, box: Mapping[str, tuple[float, float]] | None = None) -> None:
     """Check every law on a plant at random points.
 
-    Parameters: `seed` draws the points; `box` gives the interval of a state (q1, q1', ...) or input by name from which they are
-    drawn, (-1, 1) where none is given.
+    Parameters: `seed` draws the points; `box` gives the interval of a state (q1, q1', ...) or input by name from which they
+    are drawn, (-1, 1) where none is given.
 
     Raises:
         AssertionError: the first law that does not hold, in one sentence.
@@ -112,7 +112,7 @@ def response_is_pure(trial: _Trial, generator: np.random.Generator) -> None:
 
 
 def derivative_is_the_chain(trial: _Trial, generator: np.random.Generator) -> None:
-    """dx/dt holds the next derivative of every coordinate, and the response in the highest place, plus what is forced on it."""
+    """dx/dt holds the next derivative of every coordinate, in the highest place the response plus what is forced on it."""
     plant = trial.plant
     elements = plant.state.elements
     for x, u in trial.points(generator):
@@ -165,8 +165,8 @@ def inverse_inverts(trial: _Trial, generator: np.random.Generator) -> None:
             missed = float(np.abs(got - wanted).max())
             hold(
                 within(missed, _INVERSE * (1 + float(np.abs(wanted).max()))),
-                f"for the response {wanted} the inverse ({which} parameters) gives the input {command}, whose response is {got} "
-                f"{trial.where(x, u)}",
+                f"for the response {wanted} the inverse ({which} parameters) gives the input {command}, whose response is "
+                f"{got} {trial.where(x, u)}",
             )
 
 

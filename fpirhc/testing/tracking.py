@@ -232,8 +232,8 @@ def error_decays(trial: _Trial, generator: np.random.Generator) -> None:
         rest = float(np.abs(share[-1]))
         hold(
             within(rest, trial.left),
-            f"of an error on an ideal plant of order {order} the share {rest:.3g} is left after {trial.duration:g} s, more than "
-            f"{trial.left:g}",
+            f"of an error on an ideal plant of order {order} the share {rest:.3g} is left after {trial.duration:g} s, "
+            f"more than {trial.left:g}",
         )
         if trial.decay is not None:
             missed = np.abs(share - trial.decay(run.time, order))
