@@ -84,7 +84,7 @@ from .studies.problem_file import load_problem
 from .studies.review.answer import Answer, Review
 from .studies.review.review import review
 from .symbolic.functions import signed_power
-from .testing import check_deformation
+from .testing import check_controller, check_deformation, check_optimiser, check_plant, check_tracking
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
 
@@ -198,8 +198,12 @@ __all__ = [
     "VelocityDifference",
     "assess_gain",
     "certify",
+    "check_controller",
     "check_deformation",
     "check_gain",
+    "check_optimiser",
+    "check_plant",
+    "check_tracking",
     "compare",
     "delayed_limit",
     "disturbed",

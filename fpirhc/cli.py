@@ -1,9 +1,9 @@
-"""The command line: list, review, solve, run and compare problems.
+"""The command line: list, review, solve, run and compare problems; begin a new one; examine the installation.
 
 Exit codes: 0 finished; 1 some answer of `review` is no; 2 bad input (names, values, a problem file, an option); 3 a folder
 or file cannot be written;
 4 the run ended early because a signal was not finite (`run`; `compare` reports it) or a plan did not converge (`solve`);
-130 interrupted.
+5 a check failed (`doctor`); 130 interrupted.
 """
 
 from __future__ import annotations
@@ -13,6 +13,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from fpirhc.doctor.command import add_doctor
+from fpirhc.scaffold.command import add_new
+from fpirhc.summary import printable
 
 if TYPE_CHECKING:
     from fpirhc.studies.compare import Comparison, Progress
@@ -28,9 +32,11 @@ _EXAMPLES = """examples:
   fpirhc compare two_mass --optimisers all      the headline pair with every optimiser
   fpirhc run two_mass "RHC+FPI" --out results   one run, saved as .npz and .png
   fpirhc solve cart_pole --optimisers fixed-point ipopt      the first horizon, open loop, with certificates
+  fpirhc new my_arm                             a problem file and its test to start from
+  fpirhc doctor                                 what is installed, and known traps
 
 exit codes: 0 finished, 1 an answer of review is no, 2 bad input, 3 cannot write, 4 the run ended early (run)
-or a plan did not converge (solve), 130 interrupted
+or a plan did not converge (solve), 5 a check failed (doctor), 130 interrupted
 """
 
 
@@ -50,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _complain(error: object, code: int) -> int:
-    print(f"fpirhc: {error}", file=sys.stderr)
+    print(f"fpirhc: {printable(str(error))}", file=sys.stderr)
     return code
 
 
@@ -68,6 +74,8 @@ def _parser() -> argparse.ArgumentParser:
     _add_compare(commands)
     _add_run(commands)
     _add_solve(commands)
+    add_new(commands)
+    add_doctor(commands)
     listing = commands.add_parser("list", help="list the shipped problems")
     listing.set_defaults(command=_list)
     return parser
@@ -170,7 +178,7 @@ def _list(options: argparse.Namespace) -> int:  # noqa: ARG001
     from fpirhc.studies.problem_file import shipped_problems, title_of
 
     for name, path in shipped_problems().items():
-        print(f"{name:20s} {title_of(path)}")
+        print(printable(f"{name:20s} {title_of(path)}"))
     return OK
 
 

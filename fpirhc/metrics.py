@@ -14,6 +14,7 @@ import numpy as np
 from fpirhc.problem import Problem
 from fpirhc.run import Run
 from fpirhc.status import Status
+from fpirhc.summary import line, number, table
 
 SETTLED = 0.02  # share of the reference's range (or of the first error) that counts as settled
 
@@ -39,6 +40,23 @@ class Metrics:
     solve: Mapping[str, float]
     statuses: Mapping[str, int]
     worst_status: str
+
+    def __repr__(self) -> str:
+        errors = ", ".join(f"{name} {number(value)}" for name, value in self.rms_error.items())
+        return line(
+            self, f"rms error {errors}", f"clipped {100 * self.clipped_share:.3g} %", f"worst {self.worst_status}"
+        )
+
+    def _repr_html_(self) -> str:
+        """Errors by coordinate as a table, for notebooks."""
+        measures = (self.rms_error, self.max_error, self.iae, self.settling)
+        rows = [(name, *(number(m[name]) for m in measures)) for name in self.rms_error]
+        effort = ", ".join(f"{name} {number(value)}" for name, value in self.effort.items())
+        cost = ", ".join(f"{name} {number(value)}" for name, value in self.cost.items())
+        cycles = ", ".join(f"{count} {name}" for name, count in self.statuses.items())
+        notes = [f"rms command: {effort}", f"cost: {cost}" if cost else "", f"cycles: {cycles}"]
+        notes.append(f"clipped: {100 * self.clipped_share:.3g} % of the cycles")
+        return table("Metrics", ("coordinate", "rms error", "max error", "iae", "settled [s]"), rows, notes)
 
 
 def measure(problem: Problem, run: Run) -> Metrics:

@@ -12,6 +12,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from fpirhc.errors import InvalidName, OutputError, nearest
+from fpirhc.summary import line, number, table
 from fpirhc.symbolic.layout import Layout, Signal
 
 if TYPE_CHECKING:
@@ -43,6 +44,22 @@ class Run:
     stop: str | None
     compiled: bool
     settings: Mapping[str, Any]
+
+    def __repr__(self) -> str:
+        return line(self, f"{self.problem or 'problem'}, {self.controller}", *self._facts())
+
+    def _repr_html_(self) -> str:
+        """Extremes of errors and commands as a table, for notebooks."""
+        shown = [s for s in ("true_error", "error", "command") if s in self.layout and self.cycles]
+        columns = [c for s in shown for c in self.layout[s].columns]
+        rows = [(c, self.unit(c), number(self[c].min()), number(self[c].max()), number(self[c][-1])) for c in columns]
+        title = f"Run of {self.controller} on {self.problem or 'the problem'}"
+        return table(title, ("signal", "unit", "smallest", "largest", "last"), rows, [", ".join(self._facts())])
+
+    def _facts(self) -> tuple[str, ...]:
+        how = "compiled C" if self.compiled else "virtual machine"
+        ended = f"ended early: {self.stop}" if self.stop else "complete"
+        return f"{self.cycles} cycles of {self.period:g} s", f"seed {self.seed}", how, ended
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name in self.layout:

@@ -130,7 +130,7 @@ def test_conformance(deformation: Deformation, elements: tuple[str, ...]) -> Non
 @pytest.mark.parametrize("deformation", WRAPPERS, ids=name_of)
 def test_wrappers_keep_the_laws_of_their_map(deformation: Deformation, elements: tuple[str, ...]) -> None:
     """All but one: a guard answers a response that is not a number with the desired one, and an event."""
-    from fpirhc.testing import LAWS, _Trial, nan_shows
+    from fpirhc.testing.deformation import LAWS, _Trial, nan_shows
 
     if deformation == WRAPPERS[-1] and len(elements) > 1:
         pytest.skip("Rfpt is for one coordinate")

@@ -13,7 +13,7 @@ from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LyapunovRule(Rule):
     """p_hat' = Gamma G^T w with the G and w of the controller, Gamma diagonal; Euler's step once per cycle.
 

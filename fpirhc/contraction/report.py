@@ -11,6 +11,7 @@ from fpirhc.contraction.gains import linear_limit, optimal_gain, predicted_facto
 from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotContractive
+from fpirhc.summary import line, number, table
 
 SECTOR_SHARE = 0.8  # recommended gains keep this distance from the sector bound
 
@@ -36,6 +37,25 @@ class ContractionReport:
     contractive: bool
     within_sector: bool
     text: str
+
+    def __repr__(self) -> str:
+        return line(self, *(f"{name} {value}" for name, value in self._facts()))
+
+    def _repr_html_(self) -> str:
+        """Factor and limits as a table, for notebooks."""
+        return table("Contraction", ("", "value"), self._facts(), [self.text])
+
+    def _facts(self) -> list[tuple[str, str]]:
+        """Verdict, factor and limits, by name; the limits in the deformation's own gain."""
+        linear, sector = (f"({a:.4g}, {b:.4g})" for a, b in (self.own_linear_limit, self.own_sector_limit))
+        return [
+            ("contractive", "yes" if self.contractive else "no"),
+            ("within the sector limit", "yes" if self.within_sector else "no"),
+            ("predicted factor", number(self.predicted)),
+            (f"linear limit of {self.gain_name}", linear),
+            (f"sector limit of {self.gain_name}", sector),
+            (f"recommended {self.gain_name}", number(self.recommended)),
+        ]
 
 
 def check_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionReport:

@@ -24,7 +24,7 @@ from fpirhc.tracking.error import error_chains, integral_signal
 from fpirhc.tracking.exponential import Exponential
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AdaptiveInverseDynamics(Controller):
     """u = Y(q, q', r) p_hat + Q0 with r the desired response of the tracking law, or what a deformation makes of it.
 

@@ -94,7 +94,7 @@ class FixedSchedule(Schedule):
         return _timed(problem, channels, starts, math.inf)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Periodic(Schedule):
     """Slots in turn, again and again.
 
@@ -131,7 +131,7 @@ class Periodic(Schedule):
         return _timed(problem, channels, starts, at)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ByError(Schedule):
     """The coordinate with the largest weighted error is next.
 
@@ -173,7 +173,7 @@ class ByError(Schedule):
         return _chosen(problem, channels, score, self.dwell, self.hysteresis)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ByLookAhead(Schedule):
     """The slot that brings the state closest to the reference within one dwell, by the linearised closed loop, is next.
 

@@ -22,7 +22,7 @@ from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SlotineLi(Controller):
     """u = Y_s(q, q', v, v') p_hat + Q0_s + K_D rho,  v = q'^N + rate e,  rho = e' + rate e.
 

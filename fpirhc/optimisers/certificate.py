@@ -27,6 +27,7 @@ import numpy as np
 from fpirhc.horizon.expansion import GaussNewton, bent_end, bent_stage, linear_stage
 from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.plan import Plan
+from fpirhc.summary import line, number, table
 
 _ROUNDING = 1e-14  # relative to the trace, added to the model before it is factorised
 _AT_BOUND = 1e-9  # relative distance within which an input counts as at its bound
@@ -50,6 +51,28 @@ class Certificate:
     suboptimality: float
     free: int
     curvature: float
+
+    def __repr__(self) -> str:
+        return line(self, *(f"{name} {value}" for name, value in self._facts()))
+
+    def _repr_html_(self) -> str:
+        """The bounds as a table, for notebooks."""
+        note = (
+            "" if self.factor < 1 else "Nothing is known about the distance to the optimum: the factor is not below 1."
+        )
+        return table("Certificate", ("", "value"), self._facts(), [note])
+
+    def _facts(self) -> list[tuple[str, str]]:
+        """What is known, by name."""
+        return [
+            ("contraction factor", number(self.factor)),
+            ("error of any input at most", number(self.input_error)),
+            ("cost above the optimum at most", number(self.suboptimality)),
+            ("stationarity", number(self.stationarity)),
+            ("feasibility", number(self.feasibility)),
+            ("free inputs", str(self.free)),
+            ("least relative curvature", number(self.curvature)),
+        ]
 
 
 def certify(plan: Plan, *, gain: float = 1.0) -> Certificate:

@@ -13,6 +13,7 @@ from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.base import FEASIBLE, Optimiser, judge
 from fpirhc.optimisers.multipliers import fit_multipliers
 from fpirhc.status import Status
+from fpirhc.summary import line, number, table
 
 _WORST = 5  # violations told
 _PATIENCE = 4  # calls in a row that may leave the violation as it is
@@ -39,6 +40,25 @@ class Plan:
     problem: OptimalControl
     data: np.ndarray
     bounds: tuple[np.ndarray, np.ndarray]
+
+    def __repr__(self) -> str:
+        return line(self, self.status.name, *(f"{name} {value}" for name, value in self._facts()))
+
+    def _repr_html_(self) -> str:
+        """What was found and what is wrong with it, for notebooks."""
+        notes = [self.status.remedy, *self.violations(), self.overflow()]
+        return table(f"Plan: {self.status.name}", ("", "value"), self._facts(), notes)
+
+    def _facts(self) -> list[tuple[str, str]]:
+        """What sums up the plan, by name."""
+        steps = f"{self.iterations:g}" if self.iterations >= 0 else "unknown"
+        return [
+            ("cost", f"{self.cost:.7g}"),
+            ("stationarity", number(self.stationarity)),
+            ("feasibility", number(self.feasibility)),
+            ("stages", f"{self.problem.stages} of {self.problem.step:g} s"),
+            ("iterations", f"{steps} in {self.calls} calls"),
+        ]
 
     @cached_property
     def state_multipliers(self) -> np.ndarray:

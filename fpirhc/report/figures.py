@@ -75,11 +75,11 @@ def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
         for row, (one, colour) in enumerate(zip(solved, PALETTE, strict=False)):
             width = max(1.0, 3.0 - 0.7 * row)  # plans that agree lie on each other
             if is_state:
-                axis.plot(times, one.plan.states[k], color=colour, label=one.name, linewidth=width)
+                axis.plot(times, one.plan.states[k], color=colour, label=_plain(one.name), linewidth=width)
             else:
                 axis.stairs(one.plan.inputs[k - plant.state.size], times, baseline=None, color=colour, linewidth=width)
         unit = plant.state.units[k] if is_state else plant.input.units[k - plant.state.size]
-        axis.set_ylabel(f"{name} [{unit}]")
+        axis.set_ylabel(_plain(f"{name} [{unit}]"))
     _legend(axes[0])
     axes[-1].set_xlabel("time [s]")
     return figure
@@ -102,7 +102,7 @@ def pair_figures(plain: Entry, adaptive: Entry) -> dict[str, Figure]:
             draw(axis, entry.run)
             if draw is not _draw_phase:
                 _bands(axis, entry.run)
-            axis.set_title(entry.name, fontsize=10)
+            axis.set_title(_plain(entry.name), fontsize=10)
             _legend(axis)
         found[title] = figure
     return found
@@ -119,7 +119,9 @@ def contraction_figure(comparison: Comparison) -> Figure | None:
     for k, entry in enumerate(entries):
         run = entry.run
         size = np.linalg.norm(run["realised"][1:] - run["desired"][:-1], axis=1)[:150]
-        right.semilogy(np.arange(1, size.size + 1), np.maximum(size, 1e-12), color=PALETTE[k], label=entry.name, lw=1)
+        right.semilogy(
+            np.arange(1, size.size + 1), np.maximum(size, 1e-12), color=PALETTE[k], label=_plain(entry.name), lw=1
+        )
     right.set_xlabel("control cycle")
     right.set_ylabel("|realised - desired|, response units")
     right.set_title("The response error in the first cycles", fontsize=10)
@@ -137,7 +139,7 @@ def lyapunov_figure(comparison: Comparison) -> Figure | None:
     for k, (entry, view) in enumerate(views):
         color, values = PALETTE[k % len(PALETTE)], np.maximum(view.function, 1e-20)
         times = entry.run.period * np.arange(values.size)
-        axis.semilogy(_thin(times), _thin(values), color=color, lw=1, label=entry.name)
+        axis.semilogy(_thin(times), _thin(values), color=color, lw=1, label=_plain(entry.name))
         axis.axhline(max(0.5 * view.bound**2, 1e-20), color=color, lw=0.8, ls="--")
     axis.set_xlabel("time [s]")
     axis.set_ylabel("V")
@@ -155,7 +157,7 @@ def headline_figure(comparison: Comparison, plain: Entry, adaptive: Entry) -> Fi
         _draw_error(axes[1, column], entry.run)
         for row in (0, 1):
             _bands(axes[row, column], entry.run)
-        axes[0, column].set_title(entry.name, fontsize=10)
+        axes[0, column].set_title(_plain(entry.name), fontsize=10)
         axes[0, column].set_xlabel("")
         _legend(axes[0, column])
     limit = max(axes[1, 0].get_ylim(), key=abs)
@@ -165,12 +167,18 @@ def headline_figure(comparison: Comparison, plain: Entry, adaptive: Entry) -> Fi
 
 
 def _figure(width: float, height: float, title: str) -> Figure:
-    from matplotlib.figure import Figure
+    from fpirhc.report.drawing import Drawing
 
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Drawing(figsize=(width, height), layout="constrained")
     if title:
-        figure.suptitle(title, fontsize=11)
+        figure.suptitle(_plain(title), fontsize=11)
     return figure
+
+
+def _plain(text: str) -> str:
+    from fpirhc.report.drawing import plain
+
+    return plain(text)
 
 
 def _bands(axis: Axes, run: Run) -> None:
@@ -194,7 +202,9 @@ def _thin(values: np.ndarray) -> np.ndarray:
 
 
 def _line(axis: Axes, run: Run, column: str, label: str, color: str, style: str = "-") -> None:
-    axis.plot(_thin(run.time), _thin(run[column]), style, color=color, lw=1, label=f"{label} [{run.unit(column)}]")
+    axis.plot(
+        _thin(run.time), _thin(run[column]), style, color=color, lw=1, label=_plain(f"{label} [{run.unit(column)}]")
+    )
     axis.grid(visible=True, alpha=0.25)
 
 
@@ -220,7 +230,7 @@ def _draw_phase(axis: Axes, run: Run) -> None:
         if f"{name}'" in states:
             for signal, style in (("reference", "--"), ("state", "-")):
                 x, y = run[f"{signal}.{name}"], run[f"{signal}.{name}'"]
-                axis.plot(_thin(x), _thin(y), style, color=PALETTE[k], lw=1, label=f"{name} {signal}")
+                axis.plot(_thin(x), _thin(y), style, color=PALETTE[k], lw=1, label=_plain(f"{name} {signal}"))
     axis.set_xlabel("q")
     axis.set_ylabel("q'")
     axis.grid(visible=True, alpha=0.25)
@@ -267,7 +277,12 @@ def _draw_factor(axis: Axes, entries: list[Entry]) -> None:
         assert entry.contraction is not None
         report = entry.contraction.report
         axis.plot(
-            report.effective_gain, report.predicted, "o", color=PALETTE[k], ms=6, label=f"{entry.name}, predicted"
+            report.effective_gain,
+            report.predicted,
+            "o",
+            color=PALETTE[k],
+            ms=6,
+            label=_plain(f"{entry.name}, predicted"),
         )
         if np.isfinite(entry.contraction.measured):
             axis.plot(report.effective_gain, entry.contraction.measured, "x", color=PALETTE[k], ms=8)

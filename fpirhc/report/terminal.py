@@ -13,9 +13,11 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
 from fpirhc.metrics import measure
 from fpirhc.status import Status
+from fpirhc.summary import printable
 
 if TYPE_CHECKING:
     from fpirhc.problem import Problem
@@ -34,7 +36,7 @@ def progress_bars() -> Iterator[Report]:
 
         def report(name: str, done: int, total: int) -> None:
             if name not in known:
-                known[name] = bars.add_task(name, total=total)
+                known[name] = bars.add_task(printable(name), total=total)
             bars.update(known[name], completed=done)
 
         yield report
@@ -50,18 +52,18 @@ def announce_backend(comparison: Comparison) -> None:
 def show(comparison: Comparison, report: Path) -> None:
     """Print the verdict, the table and where the report is."""
     console = Console()
-    console.print(comparison.title, style="bold", markup=False, highlight=False)
+    _say(console, comparison.title, style="bold")
     for sentence in comparison.verdict:
-        console.print(f"- {sentence}", markup=False, highlight=False)
+        _say(console, f"- {sentence}")
     console.print(_table(comparison))
     if sum(e.optimality is not None for e in comparison.entries) > 1:
         console.print(_plans(comparison))
     for entry in comparison.entries:
         for note in entry.notes:
-            console.print(f"{entry.name}: {note}", markup=False, highlight=False)
+            _say(console, f"{entry.name}: {note}")
     for name, why in comparison.skipped.items():
-        console.print(f"skipped {name}: {why}", markup=False, highlight=False)
-    console.print(f"report: {report}", markup=False, highlight=False, soft_wrap=True)
+        _say(console, f"skipped {name}: {why}")
+    _say(console, f"report: {report}", wrap=False)
 
 
 def show_run(problem: Problem, run: Run, saved: Path) -> None:
@@ -70,17 +72,17 @@ def show_run(problem: Problem, run: Run, saved: Path) -> None:
     for name in metrics.rms_error:
         unit = run.unit(f"error.{name}")
         line = f"{name}: rms error {metrics.rms_error[name]:.4g} {unit}, max {metrics.max_error[name]:.4g} {unit}"
-        console.print(line, markup=False, highlight=False)
+        _say(console, line)
     if run.stop:
-        console.print(f"ended early: {run.stop}", markup=False, highlight=False)
-    console.print(f"saved: {saved}", markup=False, highlight=False, soft_wrap=True)
+        _say(console, f"ended early: {run.stop}")
+    _say(console, f"saved: {saved}", wrap=False)
 
 
 def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
     """Print what open-loop solves found."""
     console = Console()
     caption = "K: contraction factor; du <: error of any input at most; dV <: cost above the optimum at most"
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=f"{task}, first horizon", caption=caption)
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=_literal(f"{task}, first horizon"), caption=caption)
     table.add_column("optimiser", no_wrap=True)
     for head in ("cost", "residual", "iter", "K", "du <", "dV <", "status"):
         table.add_column(head, justify="right", no_wrap=True)
@@ -90,7 +92,7 @@ def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
             [f"{known.factor:.3f}", f"{known.input_error:.1e}", f"{known.suboptimality:.1e}"] if known else ["-"] * 3
         )
         table.add_row(
-            one.name,
+            _literal(one.name),
             f"{plan.cost:.7g}",
             f"{plan.stationarity:.0e}",
             f"{plan.iterations:.0f}" if plan.iterations >= 0 else "-",
@@ -100,28 +102,28 @@ def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
     console.print(table)
     for one in solved:
         for text in one.plan.violations():
-            console.print(f"{one.name}: {text}", markup=False, highlight=False)
+            _say(console, f"{one.name}: {text}")
         for name, price in one.plan.slacks().items():
-            console.print(f"{one.name}: soft limit '{name}' costs {price:.4g}", markup=False, highlight=False)
+            _say(console, f"{one.name}: soft limit '{name}' costs {price:.4g}")
         if one.plan.overflow():
-            console.print(f"{one.name}: {one.plan.overflow()}", markup=False, highlight=False)
+            _say(console, f"{one.name}: {one.plan.overflow()}")
         if one.plan.status != Status.OK:
-            console.print(f"{one.name}: {one.plan.status.remedy}", markup=False, highlight=False)
-    console.print(f"picture: {picture}", markup=False, highlight=False, soft_wrap=True)
+            _say(console, f"{one.name}: {one.plan.status.remedy}")
+    _say(console, f"picture: {picture}", wrap=False)
 
 
 def _table(comparison: Comparison) -> Table:
     table = Table(
         box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
-        title=f"{comparison.problem}, from t = {comparison.measure_from:g} s, seed {comparison.seed}",
+        title=_literal(f"{comparison.problem}, from t = {comparison.measure_from:g} s, seed {comparison.seed}"),
     )
     table.add_column("controller", min_width=16)
     first = comparison.entries[0] if comparison.entries else None
     names = list(first.metrics.rms_error) if first else []
     for name in names:
         unit = first.run.unit(f"error.{name}") if first else ""
-        table.add_column(f"rms {name} \\[{unit}]", justify="right")
+        table.add_column(_literal(f"rms {name} [{unit}]"), justify="right")
     for head in ("cycle us", "clipped", "factor"):
         table.add_column(head, justify="right")
     table.add_column("status", no_wrap=True)
@@ -130,14 +132,14 @@ def _table(comparison: Comparison) -> Table:
     return table
 
 
-def _row(entry: Entry, names: list[str]) -> list[str]:
+def _row(entry: Entry, names: list[str]) -> list[str | Text]:
     metrics, cycle, contraction = entry.metrics, entry.cycle, entry.contraction
     errors = [_number(metrics.rms_error[n]) for n in names]
     times = [f"{cycle.median:.2g}"] if cycle else [""]
     factor = f"{contraction.predicted:.3f}" if contraction else ""
     fine = metrics.statuses.get("OK", 0) / max(sum(metrics.statuses.values()), 1)
     status = "ended early" if entry.run.stop else "ok" if fine == 1 else f"ok {100 * fine:.3g} %"
-    return [entry.name.replace("[", "\\["), *errors, *times, f"{100 * metrics.clipped_share:.2g} %", factor, status]
+    return [_literal(entry.name), *errors, *times, f"{100 * metrics.clipped_share:.2g} %", factor, status]
 
 
 def _plans(comparison: Comparison) -> Table:
@@ -154,13 +156,22 @@ def _plans(comparison: Comparison) -> Table:
         known = solve["median_iterations"]
         times = [_micro(v) for v in (cycle.planning, cycle.p99, cycle.maximum, cycle.first)] if cycle else [""] * 4
         table.add_row(
-            entry.name.replace("[", "\\["),
+            _literal(entry.name),
             f"{known:.0f}" if known >= 0 else "-",
             f"{solve['median_stationarity']:.0e}",
             f"{excess.median:.0e}" if excess else "-",
             *times,
         )
     return table
+
+
+def _literal(text: str) -> Text:
+    """Text in which nothing is markup, an emoji code or an escape code."""
+    return Text(printable(text))
+
+
+def _say(console: Console, text: str, *, style: str = "", wrap: bool = True) -> None:
+    console.print(_literal(text), style=style, highlight=False, soft_wrap=not wrap)
 
 
 def _micro(value: float) -> str:

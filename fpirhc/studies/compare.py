@@ -24,6 +24,7 @@ from fpirhc.studies.optimality import Optimality, measure_optimality
 from fpirhc.studies.problem_file import Task
 from fpirhc.studies.timing import CycleTime, measure_cycle
 from fpirhc.studies.verdict import verdict
+from fpirhc.summary import line, number, table
 
 Progress = Callable[[str, int, int], None]
 
@@ -70,6 +71,26 @@ class Comparison:
     versions: Mapping[str, str]
     settings: Mapping[str, Any]
     elapsed: float
+
+    def __repr__(self) -> str:
+        counts = f"{len(self.entries)} controllers" + (f", {len(self.skipped)} skipped" if self.skipped else "")
+        return line(self, self.problem, f"seed {self.seed}", counts, self.verdict[0])
+
+    def _repr_html_(self) -> str:
+        """Verdict and errors as a table, for notebooks."""
+        names = list(self.entries[0].metrics.rms_error) if self.entries else []
+        rows = [
+            (
+                e.name,
+                *(number(e.metrics.rms_error[n]) for n in names),
+                number(e.cycle.median) if e.cycle else "",
+                f"{100 * e.metrics.clipped_share:.3g} %",
+                f"ended early: {e.run.stop}" if e.run.stop else e.metrics.worst_status,
+            )
+            for e in self.entries
+        ]
+        head = ("controller", *(f"rms error {n}" for n in names), "cycle [us]", "clipped", "worst status")
+        return table(self.title, head, rows, self.verdict)
 
     def __getitem__(self, name: str) -> Entry:
         for entry in self.entries:

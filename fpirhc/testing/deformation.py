@@ -1,4 +1,4 @@
-"""Laws that every deformation keeps; run them on your own map with `check_deformation`."""
+"""Laws that every deformation keeps."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from fpirhc.deformation.base import Deformation
 from fpirhc.symbolic.layout import Layout
+from fpirhc.testing.laws import hold, is_a_frozen_value, keep
 
 Array = npt.NDArray[Any]
 
@@ -32,9 +33,7 @@ def check_deformation(
         AssertionError: the first law that does not hold, in one sentence.
         FpirhcError: the map is not complete, a Sigmoid without scale for instance.
     """
-    trial = _Trial(deformation, tuple(elements), amplitude)
-    for law in LAWS:
-        law(trial, np.random.default_rng(seed))
+    keep(deformation, _Trial(deformation, tuple(elements), amplitude), LAWS, seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,16 +64,14 @@ class _Trial:
         request, response, desired = (kind.sym(name, self.size) for name in ("request", "response", "desired"))
         memory = kind.sym("memory", self.layout.size)
         deformed, following = self.deformation.step(request, response, desired, self.layout.split(memory))
-        _hold(
+        hold(
             set(following) == set(self.layout.names),
             f"step remembers {sorted(following)} but memory() lays out {sorted(self.layout.names)}",
         )
         column = kind(deformed)
-        _hold(
-            column.shape == (self.size, 1), f"step gives a request of shape {column.shape}, expected ({self.size}, 1)"
-        )
+        hold(column.shape == (self.size, 1), f"step gives a request of shape {column.shape}, expected ({self.size}, 1)")
         outputs = [ca.densify(column), ca.densify(kind(self.layout.join(following)))]
-        _hold(outputs[1].numel() == self.layout.size, "step remembers vectors of another size than memory() lays out")
+        hold(outputs[1].numel() == self.layout.size, "step remembers vectors of another size than memory() lays out")
         return ca.Function("map", [request, response, desired, memory], outputs)
 
     def __call__(self, request: Array, response: Array, desired: Array) -> Array:
@@ -84,9 +81,9 @@ class _Trial:
         return self.amplitude * generator.normal(size=self.size)
 
 
-def _hold(law: bool, sentence: str) -> None:
-    if not law:
-        raise AssertionError(sentence)
+def frozen_value(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """A deformation is a frozen value that can be hashed, copied and described."""
+    is_a_frozen_value(trial.deformation)
 
 
 def fixed_point_stays(trial: _Trial, generator: np.random.Generator) -> None:
@@ -94,7 +91,7 @@ def fixed_point_stays(trial: _Trial, generator: np.random.Generator) -> None:
     for _ in range(_TRIALS):
         request, desired = trial.vector(generator), trial.vector(generator)
         moved = np.abs(trial(request, desired, desired) - request).max()
-        _hold(moved <= 1e-12 * trial.amplitude, f"at response = desired the request moved by {moved:.3g} instead of 0")
+        hold(moved <= 1e-12 * trial.amplitude, f"at response = desired the request moved by {moved:.3g} instead of 0")
 
 
 def derivatives_are_finite(trial: _Trial, generator: np.random.Generator) -> None:
@@ -108,7 +105,7 @@ def derivatives_are_finite(trial: _Trial, generator: np.random.Generator) -> Non
         hessian = ca.jacobian(ca.vec(gradient), symbols)
         for what, expression in (("value", deformed), ("gradient", gradient), ("Hessian", hessian)):
             evaluated = ca.Function("f", [symbols], [expression])(np.concatenate([request, desired, desired]))
-            _hold(
+            hold(
                 bool(np.isfinite(evaluated.full()).all()),
                 f"the {what} is not finite at response = desired; guard the 0/0 without a division in a dead branch",
             )
@@ -120,16 +117,16 @@ def first_step_is_effective_gain(trial: _Trial, generator: np.random.Generator) 
     for _ in range(_TRIALS):
         error = 1e-7 * trial.vector(generator)
         missed = np.abs(trial(zero, error, zero) + gain * error).max() / np.abs(gain * error).max()
-        _hold(missed <= 1e-4, f"the first-order step misses effective_gain()={gain:.6g} by the share {missed:.3g}")
+        hold(missed <= 1e-4, f"the first-order step misses effective_gain()={gain:.6g} by the share {missed:.3g}")
 
 
 def gain_can_be_set(trial: _Trial, generator: np.random.Generator) -> None:
     """`with_effective_gain` returns the same kind of map with that gain, of either sign."""
     for gain in generator.uniform(0.1, 1.5, size=_TRIALS) * (-1) ** np.arange(_TRIALS):
         changed = trial.deformation.with_effective_gain(float(gain))
-        _hold(type(changed) is type(trial.deformation), f"with_effective_gain returned a {type(changed).__name__}")
+        hold(type(changed) is type(trial.deformation), f"with_effective_gain returned a {type(changed).__name__}")
         got = changed.effective_gain()
-        _hold(abs(got - gain) <= 1e-12, f"with_effective_gain({gain:.6g}) returned a map with effective gain {got:.6g}")
+        hold(abs(got - gain) <= 1e-12, f"with_effective_gain({gain:.6g}) returned a map with effective gain {got:.6g}")
 
 
 def contraction_is_predicted(trial: _Trial, generator: np.random.Generator) -> None:
@@ -142,7 +139,7 @@ def contraction_is_predicted(trial: _Trial, generator: np.random.Generator) -> N
         changed = _Trial(trial.deformation.with_effective_gain(gain), trial.elements, trial.amplitude)
         predicted = float(np.abs(1 - gain * eigenvalues).max())
         measured = _measured_factor(changed, plant, mass, generator)
-        _hold(
+        hold(
             abs(measured - predicted) <= 1e-3,
             f"the error shrinks by {measured:.5f} per cycle, predicted max|1 - a lambda| = {predicted:.5f}",
         )
@@ -152,13 +149,13 @@ def secant_is_bounded(trial: _Trial, generator: np.random.Generator) -> None:
     """From zero request no error, small or large, causes a larger step per unit than |secant_gain()|."""
     bound, zero = abs(trial.deformation.secant_gain()), np.zeros(trial.size)
     effective = abs(trial.deformation.effective_gain())
-    _hold(bound >= effective * (1 - 1e-12), f"secant_gain() {bound:.6g} is below the effective gain {effective:.6g}")
+    hold(bound >= effective * (1 - 1e-12), f"secant_gain() {bound:.6g} is below the effective gain {effective:.6g}")
     for size in np.logspace(-6, 6, 200):
         desired = trial.vector(generator) * generator.choice([0.0, 1.0, size])
         response = desired + size * trial.vector(generator)
         error = float(np.linalg.norm(response - desired))
         secant = float(np.linalg.norm(trial(zero, response, desired))) / error
-        _hold(
+        hold(
             secant <= bound * (1 + 1e-9),
             f"an error of {error:.3g} causes a step of {secant:.6g} per unit, above |secant_gain()| = {bound:.6g}",
         )
@@ -171,7 +168,7 @@ def step_is_bounded(trial: _Trial, generator: np.random.Generator) -> None:
         request, desired = trial.vector(generator), trial.vector(generator)
         response = desired + size * trial.vector(generator)
         moved = float(np.linalg.norm(trial(request, response, desired) - request))
-        _hold(moved <= bound * (1 + 1e-9), f"the request moved by {moved:.6g}, above largest_step() = {bound:.6g}")
+        hold(moved <= bound * (1 + 1e-9), f"the request moved by {moved:.6g}, above largest_step() = {bound:.6g}")
 
 
 def graphs_agree(trial: _Trial, generator: np.random.Generator) -> None:
@@ -182,7 +179,7 @@ def graphs_agree(trial: _Trial, generator: np.random.Generator) -> None:
         for one, other in zip(trial.scalar_function(*arguments), trial.matrix_function(*arguments), strict=True):
             difference = float(ca.norm_inf(one - other)) if one.numel() else 0.0
             scale = max(1.0, float(ca.norm_inf(one))) if one.numel() else 1.0
-            _hold(difference <= 1e-12 * scale, f"SX and MX graphs differ by {difference:.3g}")
+            hold(difference <= 1e-12 * scale, f"SX and MX graphs differ by {difference:.3g}")
 
 
 def nan_shows(trial: _Trial, generator: np.random.Generator) -> None:
@@ -191,10 +188,11 @@ def nan_shows(trial: _Trial, generator: np.random.Generator) -> None:
         response = trial.vector(generator)
         response[place] = np.nan
         deformed = trial(trial.vector(generator), response, trial.vector(generator))
-        _hold(bool(np.isnan(deformed).any()), "a response of NaN is hidden: the request is finite")
+        hold(bool(np.isnan(deformed).any()), "a response of NaN is hidden: the request is finite")
 
 
 LAWS = (
+    frozen_value,
     fixed_point_stays,
     derivatives_are_finite,
     first_step_is_effective_gain,
@@ -223,5 +221,5 @@ def _measured_factor(trial: _Trial, plant: Array, mass: Array, generator: np.ran
         logarithms.append(0.5 * np.log(following @ mass @ following) - np.log(small))
         request = following
     later = logarithms[200:]
-    _hold(all(b >= a - 1e-6 for a, b in pairwise(later)), "the shrinking per cycle does not settle on a linear plant")
+    hold(all(b >= a - 1e-6 for a, b in pairwise(later)), "the shrinking per cycle does not settle on a linear plant")
     return float(np.exp(np.mean(later)))

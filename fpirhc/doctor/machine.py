@@ -1,0 +1,108 @@
+"""Checks of what is installed and what may be written."""
+
+from __future__ import annotations
+
+import os
+import platform
+import stat
+import sys
+import tempfile
+from importlib.metadata import version
+from pathlib import Path
+
+import casadi as ca
+
+from fpirhc.doctor.finding import Check, Outcome, fine, judged
+from fpirhc.symbolic.native import cache_folder, find_compiler, native
+
+_LARGE_CACHE = 2e9  # bytes
+_SOLVERS = ("ipopt", "fatrop", "sqpmethod")  # of nonlinear programs, that optimisers here call
+_QUADRATIC = ("qrqp", "osqp")
+_OTHERS = ("alpaqa", "bonmin", "knitro", "madnlp", "snopt", "worhp")
+
+
+def versions() -> dict[str, str]:
+    """Versions of fpirhc and of what its numbers depend on."""
+    found = {name: version(name) for name in ("fpirhc", "casadi", "numpy", "scipy", "osqp", "control")}
+    return {**found, "python": platform.python_version(), "machine": f"{platform.system()} {platform.machine()}"}
+
+
+def solver_plugins() -> tuple[Outcome, str, str]:
+    """The solvers that the optimisers call, and others that CasADi could load."""
+    needed = {**{n: ca.has_nlpsol(n) for n in _SOLVERS}, **{n: ca.has_conic(n) for n in _QUADRATIC}}
+    missing = [name for name, there in needed.items() if not there]
+    others = [name for name in _OTHERS if ca.has_nlpsol(name)]
+    found = f"found {', '.join(n for n in needed if n not in missing)}"
+    found += f", also {', '.join(others)}" if others else ""
+    found += f"; missing {', '.join(missing)}" if missing else ""
+    return judged(
+        not missing, found, "install casadi from its wheel: pip install --force-reinstall casadi", Outcome.WARN
+    )
+
+
+def c_compiler() -> tuple[Outcome, str, str]:
+    """A small Function is compiled, loaded and evaluated; its name is one of libc on purpose."""
+    compiler = find_compiler()
+    x = ca.SX.sym("x")
+    # The name of a function of libc, in a library of its own, would be called instead of that one: it must be prefixed.
+    built = native(ca.Function("step", [x], [3 * x + 1]))
+    if not built.compiled:
+        remedy = "install gcc or clang, or name a compiler by FPIRHC_CC; without one loops run several times slower"
+        return Outcome.WARN, built.reason, remedy
+    value = float(built.function(2))
+    name = built.function.name()
+    holds = value == 7 and name.startswith("fpirhc_")
+    return judged(holds, f"{compiler}; compiled {name}: 3 * 2 + 1 = {value:g}", "name another compiler by FPIRHC_CC")
+
+
+def cache() -> tuple[Outcome, str, str]:
+    """Where compiled libraries are kept, how much there is, and who else may write there."""
+    folder = cache_folder()
+    wished = os.environ.get("FPIRHC_CACHE") or os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    files = [f for f in folder.iterdir() if f.is_file()]
+    size = sum(f.stat().st_size for f in files)
+    found = f"{folder}: {sum(f.suffix != '.sha256' for f in files)} libraries, {size / 1e6:.1f} MB"
+    if not folder.is_relative_to(Path(wished).absolute()):
+        remedy = f"make '{wished}' writable or name another folder by FPIRHC_CACHE; now every process compiles afresh"
+        return Outcome.WARN, f"'{wished}' cannot be written, so a temporary folder is used: {folder}", remedy
+    facts = folder.stat()
+    foreign = hasattr(os, "getuid") and facts.st_uid != os.getuid()
+    # What is loaded from here is run: whoever may write here may run code as this user.
+    if foreign or facts.st_mode & stat.S_IWOTH:
+        whose = "belongs to another user" if foreign else "can be written by everybody"
+        return (
+            Outcome.FAIL,
+            f"{found}; it {whose}",
+            f"chmod 700 '{folder}', or name a folder of your own by FPIRHC_CACHE",
+        )
+    remedy = f"remove old libraries from '{folder}'; they are compiled again when needed"
+    return judged(size < _LARGE_CACHE, found, remedy, Outcome.WARN)
+
+
+def cores() -> tuple[Outcome, str, str]:
+    """Cores of the machine, and those that this process may use."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return fine(f"{usable} usable of {os.cpu_count() or usable}")
+
+
+def results_folder() -> tuple[Outcome, str, str]:
+    """Whether results can be written where they go without --out."""
+    folder = next(f for f in (Path("results"), Path()) if f.is_dir())
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return fine(f"'{folder.absolute()}' can be written")
+    except OSError as error:
+        found = f"'{folder.absolute()}' cannot be written: {error.strerror}"
+        return Outcome.WARN, found, "go to a folder of your own, or give --out to run, compare and solve"
+
+
+def python_threads() -> tuple[Outcome, str, str]:
+    """A Function shared by two threads ends the process; without a global lock that happens sooner."""
+    enabled = getattr(sys, "_is_gil_enabled", lambda: True)()
+    remedy = "use a Python with its global lock, and processes instead of threads"
+    return judged(
+        enabled, f"global lock {'on' if enabled else 'off'}; run many loops in processes, never in threads", remedy
+    )
+
+
+CHECKS: tuple[Check, ...] = (solver_plugins, c_compiler, cache, cores, results_folder, python_threads)

@@ -1,0 +1,105 @@
+"""Writes a problem file and its test under a new name."""
+
+from __future__ import annotations
+
+import keyword
+import re
+import sys
+from importlib.machinery import PathFinder
+from importlib.resources import files
+from pathlib import Path
+
+from fpirhc.errors import InvalidName, OutputError
+from fpirhc.studies.problem_file import shipped_problems
+
+_LONGEST = 60  # characters of a name
+_FALLBACK = "my_plant"
+
+
+def create_problem(name: str, folder: Path) -> tuple[Path, ...]:
+    """Write NAME.py and test_NAME.py into the folder, which is made where it is missing, and return their paths.
+
+    Raises:
+        InvalidName: a name that is no plain identifier or that another module has; a usable one is offered.
+        OutputError: one of the files exists already (nothing is written then), or the folder cannot be written to.
+    """
+    check_name(name)
+    texts = {
+        folder / f"{name}.py": _template("problem.txt", name),
+        folder / f"test_{name}.py": _template("test.txt", name),
+    }
+    written: list[Path] = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, text in texts.items():
+            # Exclusive: a file or link that is there already is never written to.
+            with path.open("x", encoding="utf-8") as file:
+                written.append(path)
+                file.write(text)
+    except OSError as error:
+        for path in written:
+            path.unlink(missing_ok=True)
+        if isinstance(error, FileExistsError) and error.filename != str(folder):
+            raise OutputError(f"'{error.filename}' exists already and is kept; choose another name or --dir") from None
+        raise OutputError(
+            f"cannot write to the folder '{folder}': {error.strerror}; choose another with --dir"
+        ) from None
+    return (*written, *_baselines(written[0]))
+
+
+def _baselines(problem_file: Path) -> tuple[Path, ...]:
+    """Write what later runs of a new problem are compared with, and return the paths: nothing yet."""
+    del problem_file
+    return ()
+
+
+def check_name(name: str) -> None:
+    """Raise unless a problem can be called so.
+
+    Raises:
+        InvalidName: with a name that can be used instead.
+    """
+    usable = _usable(name)
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        raise InvalidName(
+            f"{_shown(name)} is no name for a problem: it must begin with a letter and go on with letters, digits and "
+            f"underscores. Try '{usable}'; a folder is given by --dir"
+        )
+    if len(name) > _LONGEST:
+        raise InvalidName(f"a name of {len(name)} characters is too long: at most {_LONGEST}. Try '{usable}'")
+    reason = _taken(name)
+    if reason:
+        raise InvalidName(f"'{name}' cannot be the name of a problem: {reason}. Try '{usable}'")
+
+
+def _taken(name: str) -> str:
+    """Why a well-formed name cannot be used; empty when it can."""
+    if keyword.iskeyword(name) or keyword.issoftkeyword(name):
+        return "it is a word of Python"
+    if name.lower().startswith("test_") or name.lower() in ("test", "conftest"):
+        return "pytest would take the problem file for a test"
+    # Without the folder that Python was started in: a problem that is there already is not an installed module.
+    installed = [p for p in sys.path if p and Path(p).resolve() != Path.cwd()]
+    if name in sys.stdlib_module_names or PathFinder.find_spec(name, installed):
+        return "a module of that name is installed, which the file would hide from everything beside it"
+    if name in shipped_problems():
+        return "a shipped problem has it (see 'fpirhc list')"
+    return ""
+
+
+def _usable(name: str) -> str:
+    """A name like the given one that can be used."""
+    plain = re.sub(r"[^A-Za-z0-9]+", "_", name.removesuffix(".py")).strip("_")[: _LONGEST - 8].lower()
+    if not plain:
+        return _FALLBACK
+    candidate = plain if plain[0].isalpha() else f"plant_{plain}"
+    return f"my_{candidate}" if _taken(candidate) else candidate
+
+
+def _shown(name: str) -> str:
+    """The name between quotes, with what cannot be printed written out, and not longer than a line."""
+    return ascii(name if len(name) <= _LONGEST else name[:_LONGEST] + "...")
+
+
+def _template(file: str, name: str) -> str:
+    return files("fpirhc.scaffold").joinpath(file).read_text(encoding="utf-8").replace("NAME", name)

@@ -1,0 +1,39 @@
+"""How results show themselves: one line where they are printed, a small table in a notebook.
+
+Names and reasons come from a user's files, so all of them are escaped for where they are shown.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable, Sequence
+
+
+def line(value: object, *facts: str) -> str:
+    """Return 'Class(fact, fact)' on one line."""
+    return f"{type(value).__name__}({', '.join(printable(f).replace(chr(10), ' ') for f in facts)})"
+
+
+def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]], notes: Iterable[str] = ()) -> str:
+    """Return HTML: a caption, a table whose first column names the rows, and notes under it."""
+    top = "".join(f"<th>{_escaped(h)}</th>" for h in head)
+    body = "".join(
+        f"<tr><th>{_escaped(first)}</th>{''.join(f'<td>{_escaped(cell)}</td>' for cell in others)}</tr>"
+        for first, *others in rows
+    )
+    below = "".join(f"<p>{_escaped(n)}</p>" for n in notes if n)
+    return f"<div><table><caption>{_escaped(title)}</caption><tr>{top}</tr>{body}</table>{below}</div>"
+
+
+def printable(text: str) -> str:
+    """Return the text with what cannot be printed, such as escape codes of a terminal, written out; new lines stay."""
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def number(value: float) -> str:
+    """Return a number in four digits."""
+    return f"{value:.4g}"
+
+
+def _escaped(text: str) -> str:
+    return html.escape(printable(text), quote=True)

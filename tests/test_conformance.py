@@ -1,0 +1,586 @@
+"""Every shipped member of a family keeps the public laws, and every law catches a class that breaks it."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import math
+import pkgutil
+import random
+from dataclasses import dataclass, field, replace
+from types import ModuleType
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+import fpirhc.controllers
+import fpirhc.optimisers
+import fpirhc.testing.controller as controller_laws
+import fpirhc.testing.deformation as deformation_laws
+import fpirhc.testing.optimiser as optimiser_laws
+import fpirhc.testing.plant as plant_laws
+import fpirhc.testing.tracking as tracking_laws
+import fpirhc.tracking
+from fpirhc.controllers.base import Controller
+from fpirhc.errors import InvalidProblem, InvalidValue
+from fpirhc.optimisers.base import Optimiser
+from fpirhc.studies.problem_file import shipped_problems
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.testing.laws import within
+from fpirhc.tracking.base import Tracking
+
+FINE = 1e-6  # tolerance of the optimisers, N
+TRACKING = fp.Exponential(rate=8.0)
+SIGMOID = fp.Sigmoid(gain=-0.5, scale=50.0)
+PLANNER = fp.FixedPoint(iterations=2, tolerance=1e-3)
+
+
+def members(package: ModuleType, family: type) -> set[type]:
+    """Concrete classes of a family in a package, as `tests/test_deformation.py` finds the maps."""
+    found: set[type] = set()
+    for module in pkgutil.iter_modules(package.__path__):
+        for _, member in inspect.getmembers(
+            importlib.import_module(f"{package.__name__}.{module.name}"), inspect.isclass
+        ):
+            if issubclass(member, family) and not inspect.isabstract(member):
+                found.add(member)
+    return found
+
+
+def named(values: Any) -> list[str]:
+    return [f"{type(v).__name__}-{k}" for k, v in enumerate(values)]
+
+
+def breaks(law: Any) -> str:
+    """What the message says of a broken law."""
+    return f"breaks the law '{law.__name__.replace('_', ' ')}'"
+
+
+# Tracking laws
+
+
+def promised(t: np.ndarray, order: int) -> np.ndarray:
+    """(d/dt + 2)^n e = 0 from rest."""
+    return np.exp(-2 * t) * sum((2 * t) ** k / math.factorial(k) for k in range(order))
+
+
+TRACKINGS: tuple[Tracking, ...] = (
+    fp.Exponential(rate=6.0),
+    fp.Exponential(rate=6.0, bumpless=False),
+    fp.Exponential(rate=2.0, integral=False),
+    fp.Fractional(rate=4.0, order=0.8, memory=2.0),
+    fp.Fractional(rate=4.0, order=1.2, memory=2.0),
+)
+
+
+@pytest.mark.parametrize("tracking", TRACKINGS, ids=named(TRACKINGS))
+def test_tracking_laws(tracking):
+    """Whatever is shipped decays on ideal plants of mixed order, forgets, and does not wind up."""
+    fp.check_tracking(tracking, seed=1, period=2e-3, duration=6.0)
+
+
+def test_exponential_decays_as_it_promises():
+    """Not only to zero: along the curve of its equation."""
+    fp.check_tracking(fp.Exponential(rate=2.0, integral=False), seed=2, duration=6.0, decay=promised)
+
+
+def test_every_tracking_law_is_tested():
+    """A new file must join the tuple above."""
+    assert members(fpirhc.tracking, Tracking) == {type(t) for t in TRACKINGS}
+
+
+@dataclass(frozen=True)
+class Altered(fp.Exponential):
+    """The exponential law with one change made to its step, its update, or both."""
+
+    rate: float = 6.0
+    change: str = ""
+
+    def law(self, plant, period):
+        """As the contract says, but for the change."""
+        block = super().law(plant, period)
+        reads = Layout((*block.reads.signals, scalar("cycle_time"))) if self.change == "reads" else block.reads
+
+        def step(s):
+            if self.change == "hides NaN":
+                s.state = ca.fmin(1e3, ca.fmax(-1e3, s.state))
+            if self.change == "remembers":
+                s.started = 1 + 0 * s.started
+            given = dict(block.step(s))
+            if self.change == "offset":
+                given["desired"] = given["desired"] + 1e-3
+            if self.change == "sign":
+                given["_target_error"] = -given["_target_error"]
+            if self.change == "pushes away":
+                given["desired"] = 2 * s.nominal - given["desired"]
+            if self.change == "extra":
+                given["more"] = s.started
+            return given
+
+        return Block(block.name, reads, block.writes, step, block.memory)
+
+    def update(self, plant, period):
+        """As the contract says, but for the change."""
+        block = super().update(plant, period)
+
+        def step(s):
+            if self.change == "winds up":
+                s.clipped = 0 * s.clipped
+            return block.step(s)
+
+        return Block(block.name, block.reads, block.writes, step)
+
+
+@dataclass
+class Thawed(Tracking):
+    """A law whose settings can be changed after a loop was built from them."""
+
+    rate: float = 6.0
+
+    def law(self, plant, period):
+        """As the contract says, but for the change."""
+        return fp.Exponential(self.rate).law(plant, period)
+
+    def update(self, plant, period):
+        """As the contract says, but for the change."""
+        return fp.Exponential(self.rate).update(plant, period)
+
+    def delays(self, plant):
+        """As the contract says, but for the change."""
+        return fp.Exponential(self.rate).delays(plant)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "law"),
+    [
+        (Thawed(), tracking_laws.frozen_value),
+        (Altered(change="reads"), tracking_laws.only_declared_signals),
+        (Altered(change="extra"), tracking_laws.only_declared_signals),
+        (Altered(change="sign"), tracking_laws.error_is_target_minus_state),
+        (Altered(change="offset"), tracking_laws.zero_error_asks_for_the_nominal_response),
+        (Altered(change="remembers"), tracking_laws.start_forgets),
+        (Altered(change="hides NaN"), tracking_laws.nan_shows),
+        (Altered(change="winds up"), tracking_laws.clipping_freezes),
+        (Altered(change="pushes away"), tracking_laws.error_decays),
+        (Altered(rate=0.2), tracking_laws.error_decays),
+    ],
+)
+def test_wrong_tracking_laws_are_caught(wrong, law):
+    """One message that names the class and the law."""
+    with pytest.raises(AssertionError, match=f"{type(wrong).__name__} {breaks(law)}"):
+        fp.check_tracking(wrong, seed=1, period=2e-3, duration=6.0)
+
+
+def test_a_decay_that_is_not_the_promised_one_is_caught():
+    """The numbers are told: where, how much, and what was promised."""
+    with pytest.raises(AssertionError, match=r"the error's share is 0\.\d+ at t = \d.*promised is 0\.\d+"):
+        fp.check_tracking(fp.Exponential(rate=3.0, integral=False), seed=2, duration=6.0, decay=promised)
+
+
+# Optimisers
+
+
+OPTIMISERS: tuple[Optimiser, ...] = (
+    fp.FixedPoint(iterations=20, tolerance=FINE),
+    fp.FixedPoint(iterations=1, tolerance=FINE),
+    fp.ReducedGradient(iterations=200, tolerance=FINE),
+    fp.GradientFixedPoint(iterations=100, tolerance=FINE),
+    fp.FullSpaceFixedPoint(iterations=300, tolerance=FINE, scaled=True, acceleration=fp.Anderson(8)),
+    fp.InteriorPoint(tolerance=FINE),
+    fp.Fatrop(tolerance=FINE),
+    fp.SequentialQuadratic(tolerance=FINE),
+    fp.SequentialQuadratic(tolerance=FINE, quadratic=fp.Osqp()),
+)
+
+
+@pytest.mark.parametrize("optimiser", OPTIMISERS, ids=named(OPTIMISERS))
+def test_optimiser_laws(optimiser):
+    """Riccati, finite differences and least squares agree with what each finds and says."""
+    fp.check_optimiser(optimiser, tolerance=FINE, seed=1)
+
+
+def test_every_optimiser_is_tested():
+    """A new file must join the tuple above."""
+    assert members(fpirhc.optimisers, Optimiser) == {type(o) for o in OPTIMISERS}
+
+
+@dataclass(frozen=True)
+class Dishonest(Optimiser):
+    """A fixed-point optimiser that changes what it is given or what it answers."""
+
+    change: str
+    settings: list | None = None
+    within: Optimiser = OPTIMISERS[0]
+
+    def memory(self, ocp):
+        """As the contract says, but for the change."""
+        layout = self.within.memory(ocp)
+        renamed = tuple(replace(s, name=s.name.replace("plan_inputs", "plan")) for s in layout.signals)
+        return Layout(renamed) if self.change == "forgets its plan" else layout
+
+    def shifted(self, ocp, memory):
+        """As the contract says, but for the change."""
+        return 0 * memory + 1 if self.change == "shifts badly" else self.within.shifted(ocp, memory)
+
+    def converging(self, ocp):
+        """Honest in an open-loop solve, where only the single step is not."""
+        return self.within.converging(ocp) if self.change == "one step OK" else self.step(ocp)
+
+    def step(self, ocp):
+        """As the contract says, but for the change."""
+        size = self.within.memory(ocp).size
+        sizes = {"s": ocp.state.size, "data": (ocp.data.size, ocp.stages + 1), "l": 1, "u": 1, "memory": size}
+        s, data, lower, upper, memory = given = [ca.MX.sym(n, *np.atleast_1d(k).tolist()) for n, k in sizes.items()]
+        if self.change == "own bounds":
+            lower, upper = ca.DM(ocp.input_lower), ca.DM(ocp.input_upper)
+        if self.change == "hides NaN":
+            s = ca.fmin(1e3, ca.fmax(-1e3, s))
+        inner = self.within.step(ocp)
+        inputs, said, following = inner(s, data, lower, upper, memory)
+        if self.change == "poisoned":
+            following = ca.if_else(ca.sum1(ca.fabs(memory)) <= 1e300, following, memory)
+        if self.change in ("always OK", "one step OK"):
+            said = ca.vertcat(said[:4], 0)
+        if self.change == "off":
+            inputs = inputs + 1e-2
+        if self.change == "never feasible":
+            said = ca.vertcat(said[:2], ca.if_else(said[2] > 1e-4, 0, said[2]), said[3:])
+        if self.change == "ignores bounds":
+            inputs, said, following = inner(s, data, -math.inf, math.inf, memory)
+        if self.change == "cost":
+            said = ca.vertcat(2 * said[0], said[1:])
+        return ca.Function("dishonest", given, [inputs, said, following])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "law"),
+    [
+        (Dishonest("", settings=[1]), optimiser_laws.frozen_value),
+        (Dishonest("forgets its plan"), optimiser_laws.remembers_a_plan),
+        (Dishonest("off"), optimiser_laws.linear_plan_is_riccati),
+        (Dishonest("cost"), optimiser_laws.plan_is_stationary),
+        (Dishonest("always OK", within=fp.FixedPoint(iterations=1, tolerance=1e-9)), optimiser_laws.plan_is_stationary),
+        (Dishonest("one step OK", within=OPTIMISERS[1]), optimiser_laws.status_is_honest),
+        (Dishonest("ignores bounds"), optimiser_laws.bounds_of_inputs_are_kept),
+        (Dishonest("own bounds"), optimiser_laws.bounds_of_a_call_count),
+        (Dishonest("never feasible"), optimiser_laws.infeasible_is_told),
+        (Dishonest("hides NaN"), optimiser_laws.nan_is_told),
+        (Dishonest("poisoned"), optimiser_laws.poisoned_memory_is_forgotten),
+        (Dishonest("shifts badly"), optimiser_laws.solution_stays),
+    ],
+    ids=lambda v: getattr(v, "change", None),
+)
+def test_wrong_optimisers_are_caught(wrong, law):
+    """Each lie is caught by the law that is about it."""
+    with pytest.raises(AssertionError, match=f"Dishonest {breaks(law)}"):
+        fp.check_optimiser(wrong, tolerance=FINE, seed=1)
+
+
+def test_the_tolerance_must_tell_a_solution():
+    with pytest.raises(InvalidValue, match="up to 1e-3"):
+        fp.check_optimiser(OPTIMISERS[0], tolerance=0.1, seed=1)
+
+
+# Controllers
+
+
+def slots() -> tuple[Controller, fp.Problem]:
+    task = fp.load_problem("mass_spring_slots")
+    return task.controllers["slots"], task.problem
+
+
+def late() -> fp.Problem:
+    """The default problem with a command that arrives two cycles late."""
+    return replace(controller_laws.two_masses(), dead_time=fp.DeadTime(inputs={"Fa": 0.01, "Fb": 0.01}))
+
+
+def shipped(problem: str, name: str, duration: float, **changes: Any) -> tuple[Controller, fp.Problem]:
+    """A shipped controller, for a shorter time."""
+    task = fp.load_problem(problem)
+    return task.controllers[name], replace(task.problem, duration=duration, measure_from=0.0, **changes)
+
+
+KALMAN = fp.DisturbanceKalman({"a": 1.0, "b": 1.0}, dict.fromkeys(("a", "b", "a'", "b'"), 1e-3))
+AWAY = {"q1": 0.3, "q2": 0.3}
+RIVALS = (
+    "PID",
+    "sliding mode",
+    "acceleration feedback",
+    "acceleration rate",
+    "force MRAC",
+    "backstepping MRAC",
+    "Lyapunov MRAC",
+)
+CONTROLLERS: dict[str, tuple[Controller, fp.Problem | None]] = {
+    "CTC": (fp.ComputedTorque(TRACKING), None),
+    "CTC+FPI": (fp.ComputedTorque(TRACKING, SIGMOID), None),
+    "RHC+FPI": (fp.RecedingHorizon(PLANNER, SIGMOID), None),
+    "informed": (fp.Informed(fp.ComputedTorque(TRACKING)), None),
+    "predicted": (fp.Predicted(fp.ComputedTorque(TRACKING), inputs=0.01), late()),
+    "slots": slots(),
+    "estimating": (fp.Estimating(fp.ComputedTorque(TRACKING), KALMAN), None),
+    **{name: shipped("mrac_pendulum", name, 3.0) for name in RIVALS},
+    "AID": shipped("planar_arm", "AID", 2.0, start=AWAY),
+    "Slotine-Li": shipped("planar_arm", "Slotine-Li", 2.0, start=AWAY),
+}
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_controller_laws(name):
+    """Limits, bad measurements, and one command however it is computed; C is compared where it compiles quickly."""
+    controller, problem = CONTROLLERS[name]
+    # Without a model nothing is known of a reference that moves.
+    left = 0.25 if name == "PID" else 0.05
+    fp.check_controller(controller, problem=problem, seed=1, left=left, compiled=name == "CTC+FPI")
+
+
+def test_every_controller_is_tested():
+    """A new file must join the table above."""
+    assert members(fpirhc.controllers, Controller) == {type(c) for c, _ in CONTROLLERS.values()}
+
+
+class Counter(ca.Callback):
+    """Hidden state: 0 or 1, in turns of three calls."""
+
+    def __init__(self):
+        ca.Callback.__init__(self)
+        self.calls = 0
+        self.construct("counter", {})
+
+    def eval(self, arguments):
+        """Count; the argument only keeps CasADi from calling it once for all."""
+        del arguments
+        self.calls += 1
+        return [ca.DM(self.calls % 3 == 0)]
+
+
+COUNTER = Counter()
+
+
+@dataclass(frozen=True)
+class Faulty(fp.ComputedTorque):
+    """Computed torque with one fault."""
+
+    change: str = ""
+    settings: tuple | list = field(default_factory=tuple)
+
+    def blocks(self, problem):
+        """As the contract says, but for the change."""
+        blocks, delays = super().blocks(problem)
+        at = next(k for k, b in enumerate(blocks) if b.name == "limit")
+        limit, judge = blocks[at : at + 2]
+
+        def limited(s):
+            if self.change == "clamps first":
+                s.requested = ca.fmin(30, ca.fmax(-30, s.requested))
+            given = dict(limit.step(s))
+            if self.change == "no limits":
+                given["command"] = s.requested
+            if self.change == "random":
+                given["command"] = given["command"] * (1 - 1e-6 * random.random())
+            if self.change == "counts":
+                given["command"] = given["command"] * (1 - 1e-6 * COUNTER(s.requested[0]))
+            if self.change == "trusts responses":
+                given["command"] = ca.if_else(s.realised[0] > 1e9, s.realised, given["command"])
+            return given
+
+        def judged(s):
+            return {"status": 0 * s._held} if self.change == "says OK" else judge.step(s)
+
+        reads = Layout((*limit.reads.signals, problem.plant.response_signal("realised")))
+        blocks[at] = Block("limit", reads, limit.writes, limited, opaque=self.change == "counts")
+        blocks[at + 1] = Block("judge", judge.reads, judge.writes, judged)
+        if self.change == "keeps NaN":
+            blocks, delays = self._summing(problem, blocks, delays)
+        if self.change == "no status":
+            blocks = [b for b in blocks if b.name != "judge"]
+        return blocks, delays
+
+    def _summing(self, problem, blocks, delays):
+        """A filter of the measured state whose memory keeps a NaN for ever, seen by the law of the next cycle."""
+        plant = problem.plant
+        kept, new = (Signal(n, plant.state.elements) for n in ("_filtered_before", "filtered"))
+        law = next(k for k, b in enumerate(blocks) if b.name == "tracking")
+        inner = blocks[law]
+
+        def step(s):
+            seen = s.state + 1e-9 * s._filtered_before
+            s.state = seen
+            return {**inner.step(s), "filtered": seen}
+
+        reads, writes = Layout((*inner.reads.signals, kept)), Layout((*inner.writes.signals, new))
+        blocks[law] = Block("tracking", reads, writes, step)
+        return blocks, [*delays, Delay(kept, "filtered")]
+
+
+@dataclass(frozen=True)
+class Backwards(Tracking):
+    """A law that pushes the plant away."""
+
+    def law(self, plant, period):
+        """As the contract says, but for the change."""
+        return Altered(change="pushes away", rate=1.0, integral=False).law(plant, period)
+
+    def update(self, plant, period):
+        """As the contract says, but for the change."""
+        return TRACKING.update(plant, period)
+
+    def delays(self, plant):
+        """As the contract says, but for the change."""
+        return TRACKING.delays(plant)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "law"),
+    [
+        (Faulty(TRACKING, settings=[1]), controller_laws.frozen_value),
+        (Faulty(TRACKING, change="no status"), controller_laws.writes_a_command_and_a_status),
+        (Faulty(TRACKING, change="counts"), controller_laws.same_arguments_same_command),
+        (Faulty(TRACKING, change="random"), controller_laws.same_command_everywhere),
+        (Faulty(TRACKING, change="no limits"), controller_laws.command_keeps_the_limits),
+        (Faulty(TRACKING, change="clamps first"), controller_laws.bad_measurement_never_acts),
+        (Faulty(TRACKING, change="says OK"), controller_laws.bad_measurement_never_acts),
+        (Faulty(TRACKING, change="keeps NaN"), controller_laws.bad_measurement_never_acts),
+        (Faulty(TRACKING, change="trusts responses"), controller_laws.bad_response_never_acts),
+        (Faulty(Backwards()), controller_laws.exact_model_tracks),
+    ],
+    ids=lambda v: getattr(v, "change", None),
+)
+def test_wrong_controllers_are_caught(wrong, law):
+    """Also the clamp that turns a NaN into a full command."""
+    with pytest.raises(AssertionError, match=f"Faulty {breaks(law)}"):
+        fp.check_controller(wrong, seed=1, compiled=False)
+
+
+# Plants
+
+
+@pytest.mark.parametrize("name", shipped_problems())
+def test_plant_laws(name):
+    """Every shipped plant near its start."""
+    problem = fp.load_problem(name).problem
+    box = {e: (v - 0.1, v + 0.1) for e, v in zip(problem.plant.state.elements, problem.start_state, strict=True)}
+    fp.check_plant(problem.plant, seed=1, box=box)
+
+
+def oscillator(response=None, inverse=None, cls=fp.Plant) -> fp.Plant:
+    return cls(
+        coordinates={"y": "m"},
+        inputs={"u": "N"},
+        parameters={"m": fp.Parameter(1.5, 1.0, "kg"), "k": fp.Parameter(2.0, 3.0, "N/m")},
+        response=response or (lambda q, v, u, p: {"y": (u.u - p.k * q.y) / p.m}),
+        inverse=inverse,
+    )
+
+
+class Hasty(fp.Plant):
+    """A plant that moves twice as fast as its velocity says."""
+
+    @property
+    def forced_derivative_function(self):
+        """Wrong."""
+        inner = super().forced_derivative_function
+        symbols = inner.sx_in()
+        return ca.Function("hasty", symbols, [inner(*symbols) * ca.DM([2, 1])])
+
+
+def kinked(q, v, u, p):
+    """A spring that is written so that its derivative is lost: rounding to a grid much finer than the motion."""
+    return {"y": (u.u - p.k * ca.floor(q.y * 1e9) / 1e9) / p.m}
+
+
+PLANTS = (
+    (
+        oscillator(lambda q, v, u, p: {"y": u.u / p.m - p.k * ca.sqrt(q.y)}),
+        plant_laws.response_is_finite,
+        "response of 'y'",
+    ),
+    (
+        oscillator(lambda q, v, u, p: {"y": (u.u - 3.0 * q.y) / p.m}),
+        plant_laws.both_parameter_sets_enter,
+        "parameter 'k'",
+    ),
+    (
+        oscillator(lambda q, v, u, p: {"y": (u.u - p.k * q.y) / p.m + random.random()}),
+        plant_laws.response_is_pure,
+        "built twice",
+    ),
+    (oscillator(cls=Hasty), plant_laws.derivative_is_the_chain, "dy/dt is"),
+    (oscillator(kinked), plant_laws.slopes_are_true, "derivative of the response by 'y'"),
+    (
+        oscillator(inverse=lambda q, v, r, p: {"u": p.m * r.y - p.k * q.y}),
+        plant_laws.inverse_inverts,
+        "whose response is",
+    ),
+)
+
+
+@pytest.mark.parametrize(("wrong", "law", "sentence"), PLANTS, ids=[law.__name__ for _, law, _ in PLANTS])
+def test_wrong_plants_are_caught(wrong, law, sentence):
+    """A sign in an inverse, a number where a parameter belongs, a lost derivative."""
+    with pytest.raises(AssertionError, match=f"{breaks(law)}.*{sentence}"):
+        fp.check_plant(wrong, seed=1)
+
+
+def test_the_box_is_checked():
+    """A misspelt state is offered the right one; the box decides where a root is asked for."""
+    with pytest.raises(InvalidProblem, match="Did you mean 'y'"):
+        fp.check_plant(oscillator(), seed=1, box={"yy": (0, 1)})
+    fp.check_plant(PLANTS[0][0], seed=1, box={"y": (1.0, 2.0)})
+
+
+# The laws themselves
+
+
+@pytest.mark.parametrize(
+    ("laws", "tested"),
+    [
+        (tracking_laws, test_wrong_tracking_laws_are_caught),
+        (optimiser_laws, test_wrong_optimisers_are_caught),
+        (controller_laws, test_wrong_controllers_are_caught),
+        (plant_laws, test_wrong_plants_are_caught),
+    ],
+    ids=lambda v: getattr(v, "__name__", ""),
+)
+def test_every_law_has_caught_something(laws, tested):
+    """A law that no wrong class breaks might be one that cannot fail."""
+    cases = [case[1] for mark in tested.pytestmark for case in mark.args[1]]
+    assert {law.__name__ for law in laws.LAWS} == {law.__name__ for law in cases}
+
+
+def test_nan_is_within_nothing():
+    """A comparison that NaN passes would let every law pass."""
+    assert not within(math.nan, 1.0)
+    assert not within([0.0, math.nan], 1.0)
+    assert within([0.0, -1.0], 1.0)
+
+
+def test_deformations_are_named_too():
+    """The deformations' laws speak in the same way."""
+
+    class Bare(fp.Affine):
+        def step(self, request, response, desired, memory):
+            """Weaker than it says."""
+            del memory
+            return request + 0.4 * self.gain * (response - desired), {}
+
+    with pytest.raises(AssertionError, match=f"Bare {breaks(deformation_laws.first_step_is_effective_gain)}"):
+        fp.check_deformation(Bare(-0.5), seed=1)
+
+
+def test_what_a_class_raises_is_noted():
+    """A mistake of the class itself keeps its traceback, with the law that was tried."""
+
+    @dataclass(frozen=True)
+    class Broken(fp.ComputedTorque):
+        def blocks(self, problem):
+            """Fail."""
+            return len(problem.plant.names) / 0
+
+    with pytest.raises(ZeroDivisionError) as raised:
+        fp.check_controller(Broken(TRACKING), seed=1)
+    assert any("Broken" in note and "law" in note for note in raised.value.__notes__)

@@ -1,0 +1,247 @@
+"""A newcomer's first commands: `fpirhc new` and `fpirhc doctor`."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+
+import pytest
+
+import fpirhc as fp
+from fpirhc.cli import main
+from fpirhc.doctor import machine, traps
+from fpirhc.doctor.examine import Diagnosis
+from fpirhc.doctor.finding import Finding, Outcome, ask
+from fpirhc.scaffold.create import create_problem
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+# new
+
+
+def test_new_files_work_at_once(folder, capsys):
+    """The problem loads, adaptation helps, every cycle is solved, and the plant keeps its laws."""
+    assert main(["new", "my_arm", "--dir", "arms/left"]) == 0
+    printed = capsys.readouterr().out
+    assert "fpirhc compare arms/left/my_arm.py" in printed
+    task = fp.load_problem(str(folder / "arms" / "left" / "my_arm.py"))
+    assert task.title.startswith("my_arm: ")
+    short = replace(task, problem=replace(task.problem, duration=1.6, measure_from=1.0))
+    found = fp.compare(short, seed=0, controllers=list(task.headline), compiled=False)
+    assert found["RHC+FPI"].metrics.rms_error["y"] < 0.2 * found["RHC"].metrics.rms_error["y"]
+    fp.check_plant(task.problem.plant, seed=1)
+    assert set(found["RHC+FPI"].metrics.statuses) == {"OK"}
+
+
+def test_written_test_passes(folder):
+    """As pytest runs it, without the loops that the rest of the suite runs anyway."""
+    main(["new", "arm"])
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-W",
+        "error",
+        "-k",
+        "plant or helps or exact",
+    ]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stdout
+    assert "3 passed" in done.stdout
+
+
+@pytest.mark.parametrize("taken", ["arm.py", "test_arm.py"])
+def test_new_never_overwrites(folder, capsys, taken):
+    """Nothing is written where one of the two files is there, and the file keeps its text; exit code 3."""
+    (folder / taken).write_text("mine")
+    assert main(["new", "arm"]) == 3
+    assert f"'{taken}' exists already and is kept" in capsys.readouterr().err
+    assert [f.name for f in folder.iterdir()] == [taken]
+    assert (folder / taken).read_text() == "mine"
+
+
+def test_new_does_not_follow_a_link(folder):
+    """A link that leads elsewhere counts as a file, also where nothing is at its end."""
+    (folder / "arm.py").symlink_to(folder / "elsewhere.py")
+    with pytest.raises(OSError, match="exists already"):
+        create_problem("arm", folder)
+    assert not (folder / "elsewhere.py").exists()
+
+
+def test_new_into_a_file(folder, capsys):
+    """A folder that cannot be made: exit code 3 and what to do."""
+    (folder / "taken").write_text("")
+    assert main(["new", "arm", "--dir", "taken"]) == 3
+    assert "choose another with --dir" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "fix"),
+    [
+        ("", "my_plant"),
+        ("my-arm", "my_arm"),
+        ("arm.py", "arm"),
+        ("../../etc/passwd", "etc_passwd"),
+        ("a; rm -rf ~", "a_rm_rf"),
+        ("$(id)", "id"),
+        ("<script>alert(1)</script>", "script_alert_1_script"),
+        ("[bold]arm", "bold_arm"),
+        ("\x1b[31mred", "plant_31mred"),
+        ("2dof", "plant_2dof"),
+        ("_hidden", "hidden"),
+        ("arm\n", "arm"),
+        ("größe", "gr_e"),
+        ("class", "my_class"),
+        ("numpy", "my_numpy"),
+        ("json", "my_json"),
+        ("two_mass", "my_two_mass"),
+        ("test_arm", "my_test_arm"),
+        ("x" * 300, "x" * 52),
+    ],
+)
+def test_hostile_names_are_refused_with_the_fix(folder, capsys, name, fix):
+    """Exit code 2, nothing written, nothing that a terminal would obey, and the offered name is accepted."""
+    assert main(["new", name]) == 2
+    said = capsys.readouterr().err
+    assert f"Try '{fix}'" in said
+    assert "\x1b" not in said
+    assert len(said) < 400
+    assert not list(folder.iterdir())
+    assert len(create_problem(fix, folder)) == 2
+
+
+# doctor
+
+
+def test_doctor_finds_this_installation_in_order(capsys, tmp_path, monkeypatch):
+    """Every check by name; no check fails where the tests pass; one JSON object."""
+    monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    assert main(["doctor", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert {"fpirhc", "casadi", "numpy", "python"} <= set(found["versions"])
+    assert found["outcome"] in ("ok", "warn")
+    checks = {c["name"]: c for c in found["checks"]}
+    assert len(checks) == len(machine.CHECKS) + len(traps.CHECKS)
+    for check in traps.CHECKS:
+        name = check.__name__.replace("_", "-")
+        assert checks[name]["outcome"] == "ok", checks[name]
+    assert str(tmp_path / "cache") in checks["cache"]["found"]
+
+
+def test_a_missing_compiler_is_a_warning(monkeypatch):
+    """Everything works without one, more slowly; what to do is said."""
+    monkeypatch.setenv("FPIRHC_CC", "none")
+    outcome, found, remedy = machine.c_compiler()
+    assert outcome == Outcome.WARN
+    assert "FPIRHC_CC=none" in found
+    assert "gcc" in remedy
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions of another kind")
+def test_a_cache_that_others_may_write_fails(tmp_path, monkeypatch):
+    """What is loaded from the cache is run, so nobody else may put a library there."""
+    monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path))
+    tmp_path.chmod(0o777)
+    outcome, found, remedy = machine.cache()
+    assert outcome == Outcome.FAIL
+    assert "can be written by everybody" in found
+    assert "chmod 700" in remedy
+    tmp_path.chmod(0o700)
+    assert machine.cache()[0] == Outcome.OK
+
+
+def test_a_cache_that_cannot_be_made_is_a_warning(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path / "file" / "cache"))
+    outcome, found, _ = machine.cache()
+    assert outcome == Outcome.WARN
+    assert "temporary folder" in found
+
+
+def test_missing_solvers_are_named(monkeypatch):
+    monkeypatch.setattr(machine.ca, "has_nlpsol", lambda name: name != "fatrop")
+    outcome, found, _ = machine.solver_plugins()
+    assert outcome == Outcome.WARN
+    assert "missing fatrop" in found
+
+
+BROKEN = {
+    "maximum_hides_nan": ("fpirhc.doctor.traps.is_finite", lambda value: 1),
+    "nan_equals_nan": ("fpirhc.doctor.traps.within", lambda value, bound: True),
+    "conic_fatrop": ("fpirhc.doctor.traps.quadratic_solver", lambda name: None),
+    "solver_pickle": ("fpirhc.doctor.traps.pickle.dumps", lambda value: bytes(8_700_000)),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_checks_fail_where_the_guard_is_gone(name, monkeypatch):
+    """A check that cannot fail checks nothing: with its guard taken out, each says so."""
+    monkeypatch.setattr(*BROKEN[name])
+    outcome, _, remedy = getattr(traps, name)()
+    assert outcome == Outcome.FAIL
+    assert remedy
+
+
+def test_banner_is_noticed(monkeypatch):
+    """IPOPT left to itself prints."""
+    loud = {"print_time": False, "ipopt.sb": "no", "ipopt.print_level": 5}
+    monkeypatch.setattr("fpirhc.optimisers.nlp.InteriorPoint.options", lambda self, ocp: loud)
+    assert traps.solver_banner()[0] == Outcome.WARN
+
+
+def test_a_check_that_raises_has_failed_and_the_rest_goes_on(capsys, monkeypatch):
+    """One line for the error, one for what to do; exit code 5."""
+
+    def broken_library():
+        raise OSError("libfoo.so: cannot open\nmore")
+
+    findings = ask([broken_library, machine.cores])
+    assert findings[0].outcome == Outcome.FAIL
+    assert findings[0].name == "broken-library"
+    assert findings[0].found == "OSError: libfoo.so: cannot open"
+    assert findings[1].outcome == Outcome.OK
+    monkeypatch.setattr("fpirhc.doctor.examine.examine", lambda: Diagnosis({"fpirhc": "0"}, findings))
+    assert main(["doctor"]) == 5
+    printed = capsys.readouterr().out
+    assert "fail  broken-library" in printed
+    assert "to do: install" in printed
+    assert "1 ok, 0 to look at, 1 failed" in printed
+
+
+def test_warnings_alone_exit_with_zero(monkeypatch, capsys):
+    findings = [Finding("slow", Outcome.WARN, "slow", "be patient")]
+    monkeypatch.setattr("fpirhc.doctor.examine.examine", lambda: Diagnosis({}, findings))
+    assert main(["doctor", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["outcome"] == "warn"
+
+
+def test_numpy_check_leaves_warnings_as_they_were():
+    """It looks at a warning without letting it out."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        traps.numpy_on_symbols()
+    assert not caught
+
+
+@pytest.mark.parametrize("command", ["new", "doctor"])
+def test_help_has_examples(command, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    assert stop.value.code == 0
+    printed = capsys.readouterr().out
+    assert "examples:" in printed
+    assert f"fpirhc {command}" in printed
+    assert "xit codes: 0" in printed

@@ -1,0 +1,222 @@
+"""Results show themselves, and names that a user chose are shown as they are, wherever they are shown."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.report.html import render
+from fpirhc.report.terminal import progress_bars, show, show_run
+from fpirhc.studies.problem_file import Task
+from fpirhc.summary import printable, table
+
+HOSTILE = "<img src=x onerror=alert(1)>[bold red]$\\frac$ \x1b[31m:bomb: `id` $(id) \"'&"
+MARKED = "[bold]plain[/bold]\\[/x]"
+UNIT = "</script><b>m[/]$"
+
+
+def hostile_problem(duration: float = 0.3) -> fp.Problem:
+    """A mass whose units, parameter and cost term have names that a page, a shell or a terminal would obey."""
+    plant = fp.Plant(
+        coordinates={"y": UNIT},
+        inputs={"u": "N<i>"},
+        parameters={
+            "<b>": fp.Parameter(approximate=1.0, exact=1.6, unit="<u>"),
+            "k": fp.Parameter(approximate=2.0, exact=5.0, unit="1/s^2"),
+        },
+        response=lambda q, v, u, p: {"y": p["<b>"] * u.u - p.k * q.y - 0.2 * v.y},
+    )
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"y": ca.sin(2 * t)}),
+        start={"y": 0.5},
+        period=5e-3,
+        duration=duration,
+        limits=fp.Limits(inputs={"u": (-30.0, 30.0)}),
+        horizon=fp.Horizon(stages=4, step=1e-2),
+        cost=fp.General(lambda s: {"<s>cost</s>[/]": 100 * (s.state.y - s.reference.y) ** 2 + 1e-2 * s.input.u**2}),
+    )
+
+
+@pytest.fixture(scope="module")
+def comparison() -> fp.Comparison:
+    """A pair with hostile names, a controller that ends early, and one that is skipped."""
+    tracking = fp.Exponential(rate=6.0)
+    planner = fp.FixedPoint(iterations=1, tolerance=1e-3)
+    controllers = {
+        MARKED: fp.ComputedTorque(tracking),
+        HOSTILE: fp.ComputedTorque(tracking, fp.Sigmoid(gain=-0.5, scale=50.0)),
+        "RHC [/]": fp.RecedingHorizon(planner),
+        "skipped <b>[/b]": fp.Predicted(fp.Predicted(fp.ComputedTorque(tracking), inputs=0.01), inputs=0.01),
+    }
+    task = Task("[bold]<i>", Path("x.py"), HOSTILE, HOSTILE, hostile_problem(), controllers, (MARKED, HOSTILE))
+    return fp.compare(task, seed=0, compiled=False, command="fpirhc compare '<b>'")
+
+
+@pytest.fixture(scope="module")
+def plan() -> fp.Plan:
+    problem = hostile_problem()
+    assert problem.horizon is not None
+    assert problem.cost is not None
+    given = problem.plant, problem.reference, problem.horizon, problem.cost
+    limits = fp.Limits(states={"y": (0.9, 1.0)}, inputs={"u": (-1.0, 1.0)})
+    data = np.asarray(stage_data(*given)(0.0, problem.plant.approximate).full())
+    return fp.solve(transcribe(*given, limits), fp.FixedPoint(iterations=5, tolerance=1e-3), np.array([0.5, 0.0]), data)
+
+
+class Tags(HTMLParser):
+    """Tags of a page, and the text between them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: set[str] = set()
+        self.attributes: set[str] = set()
+        self.text = ""
+
+    def handle_starttag(self, tag, attrs):
+        """Note the tag and its attributes."""
+        self.tags.add(tag)
+        self.attributes |= {name for name, _ in attrs}
+
+    def handle_data(self, data):
+        """Collect what is seen."""
+        self.text += data
+
+
+def read(page: str) -> Tags:
+    parser = Tags()
+    parser.feed(page)
+    return parser
+
+
+def shown(comparison: fp.Comparison, plan: fp.Plan) -> dict[str, object]:
+    entry = comparison[HOSTILE]
+    assert entry.contraction is not None
+    return {
+        "comparison": comparison,
+        "run": entry.run,
+        "metrics": entry.metrics,
+        "contraction": entry.contraction.report,
+        "plan": plan,
+        "certificate": fp.certify(plan),
+    }
+
+
+KINDS = ("comparison", "run", "metrics", "contraction", "plan", "certificate")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_results_show_themselves(kind, comparison, plan):
+    """A line that names the class, and a table of nothing but text."""
+    value = shown(comparison, plan)[kind]
+    said, page = repr(value), read(value._repr_html_())
+    assert said.startswith(f"{type(value).__name__}(")
+    assert "\n" not in said
+    assert len(said) < 1000
+    assert "array(" not in said
+    assert str(value) == said
+    assert "\x1b" not in said + page.text
+    assert page.tags <= {"div", "table", "caption", "tr", "th", "td", "p"}
+    assert not page.attributes
+
+
+def test_what_is_shown_is_what_was_found(comparison, plan):
+    """Numbers and names, each where it is looked for."""
+    found = {kind: read(value._repr_html_()).text for kind, value in shown(comparison, plan).items()}
+    rms = f"{comparison[HOSTILE].metrics.rms_error['y']:.4g}"
+    assert rms in found["comparison"]
+    assert rms in found["metrics"]
+    assert MARKED in found["comparison"]
+    assert printable(HOSTILE) in found["comparison"]
+    assert printable(comparison.verdict[0]) in found["comparison"]
+    assert UNIT in found["run"]
+    assert f"{comparison[HOSTILE].run['command.u'].max():.4g}" in found["run"]
+    assert comparison[HOSTILE].contraction.report.text in found["contraction"]
+    assert "below 0.9, at stage 0" in found["plan"]
+    assert plan.status.name in repr(plan)
+
+
+def test_an_empty_run_shows_itself(comparison):
+    """A run that ended in its first cycle has no extremes, but a reason."""
+    run = replace(comparison[MARKED].run, log=comparison[MARKED].run.log[:0], stop="signal <b> is not finite")
+    assert "0 cycles" in repr(run)
+    assert "ended early: signal <b> is not finite" in read(run._repr_html_()).text
+
+
+def test_plots_are_pictures_and_open_no_window(comparison):
+    """A figure gives its own picture; pyplot, which would keep it and choose a back end, is not even imported."""
+    figure = comparison[HOSTILE].run.plot()
+    assert figure._repr_png_().startswith(b"\x89PNG")
+    assert figure.canvas.manager is None
+    code = (
+        "import sys, casadi, fpirhc as fp\n"
+        "p = fp.load_problem('van_der_pol').problem\n"
+        "from dataclasses import replace\n"
+        "p = replace(p, duration=0.02, measure_from=0.0)\n"
+        "r = fp.simulate(p, fp.ComputedTorque(fp.Exponential(rate=6.0)), seed=0, compiled=False)\n"
+        "r.plot()._repr_png_(); r._repr_html_()\n"
+        "print('matplotlib.pyplot' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.strip() == "False"
+
+
+def test_report_holds_no_foreign_tags(comparison):
+    """No tag or handler comes from a name, no script ends early, and the names are in the text."""
+    page = render(comparison)
+    parsed = read(page)
+    assert not {"i", "u", "s", "img "} & parsed.tags
+    assert "onerror" not in parsed.attributes
+    assert "<b>m[/]" not in page
+    assert page.count("<img ") == page.count("<img alt=")
+    assert page.count("</script>") == page.count("<script>") == 2
+    assert MARKED in parsed.text
+    assert "skipped <b>[/b]" in parsed.text
+
+
+def test_figures_show_names_literally(comparison):
+    """Dollar signs are no formula: one that is wrong would end the report."""
+    figure = comparison[HOSTILE].run.plot()
+    figure.savefig("/dev/null", format="png", dpi=30)
+    title = figure.get_suptitle()
+    assert title.replace("\\$", "$") == printable(HOSTILE)
+    assert "\x1b" not in title
+
+
+def test_terminal_shows_names_literally(comparison, capsys, monkeypatch):
+    """No markup, no emoji, no escape codes: what was written is what is read."""
+    monkeypatch.setenv("COLUMNS", "4000")
+    show(comparison, Path("[bold]report.html"))
+    printed = capsys.readouterr().out
+    for name in (
+        MARKED,
+        printable(HOSTILE),
+        "RHC [/]",
+        "skipped skipped <b>[/b]",
+        "[bold]<i>, from",
+        f"rms y [{UNIT}]",
+    ):
+        assert name in printed
+    assert "report: [bold]report.html" in printed
+    assert "\x1b[31m" not in printed
+    show_run(hostile_problem(), comparison[HOSTILE].run, Path("[/]run.npz"))
+    assert UNIT in capsys.readouterr().out
+    with progress_bars() as report:
+        report(HOSTILE, 1, 2)
+    assert "\x1b[31m:bomb:" not in capsys.readouterr().err
+
+
+def test_tables_escape_every_part():
+    """Caption, heads, cells and notes."""
+    page = table("<a>", ("<b>",), [("<c>", "<d>")], ["<e>"])
+    assert read(page).tags == {"div", "table", "caption", "tr", "th", "td", "p"}
+    assert read(page).text == "<a><b><c><d><e>"
