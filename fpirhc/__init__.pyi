@@ -1,6 +1,7 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
 from .contraction import assess_gain, check_gain, response_jacobian, spectrum_over_box, spectrum_over_run
+from .controllers.chosen_schedules import ByError, ByLookAhead
 from .controllers.computed_torque import ComputedTorque
 from .controllers.floquet import Floquet, floquet_radius
 from .controllers.informed import Informed
@@ -8,7 +9,7 @@ from .controllers.nominal import OpenPlan, Restart, RestartAndTrack
 from .controllers.on_failure import Feedforward, HoldPlan, StopRun
 from .controllers.predicted import ByDesired, ByModel, Predicted
 from .controllers.receding_horizon import RecedingHorizon
-from .controllers.schedules import ByError, ByLookAhead, FixedSchedule, Periodic
+from .controllers.schedules import FixedSchedule, Periodic
 from .controllers.slot import Slot
 from .controllers.slotted import Slotted
 from .dead_time import DeadTime
