@@ -115,7 +115,7 @@ class Slotted(Controller):
         )
         verb = "shrink" if found.radius < 1 else "grow"
         return (
-            f"Floquet radius {found.radius:.3g} per period of {found.period:g} s: near the set-point errors {verb} "
+            f"Floquet radius {found.radius:.3g} per period of {found.period:g} s: near the set-point errors of ideal slots {verb} "
             f"(largest real part in each slot alone, 1/s: {alone})",
         )
 
@@ -127,8 +127,8 @@ class Slotted(Controller):
         """Raise if the slots or the schedule do not fit the problem.
 
         Raises:
-            InvalidProblem: all mistakes together. NotInvertible: y^(r) not affine in the input. NotContractive: a deformation's
-            gain of the wrong sign or too large at the start.
+            InvalidProblem: all mistakes together, of slots and schedule; slots that last too long. NotContractive: a
+            deformation's gain of the wrong sign or too large at the start.
         """
         mistakes = Mistakes("Slotted")
         names = [s.coordinate for s in self.slots]
@@ -140,7 +140,8 @@ class Slotted(Controller):
             )
         for slot in self.slots:
             _check_slot(problem, slot, mistakes)
-        self.schedule.check(names, problem, mistakes)
+        if names:
+            self.schedule.check(names, problem, mistakes)
         mistakes.raise_if_any()
         channels = self.channels(problem)
         for one in channels:
@@ -173,9 +174,9 @@ class Slotted(Controller):
             light, law = one.plant, one.slot.tracking
             blocks.append(for_channel(law.law(light, problem.period), one, {"time"}, {"desired": one.wire("law")}))
             blocks.append(join_block(problem, channels, one, self.blend, self.blank))
-            shown = {name: f"{name}_{one.slot.coordinate}" for name in one.slot.deformation.shown()}
-            shown["started"] = one.wire("valid")
-            blocks.append(for_channel(deform_block(light, one.slot.deformation), one, set(), shown))
+            names = {name: f"{name}_{one.slot.coordinate}" for name in one.slot.deformation.shown()}
+            names["started"] = one.wire("valid")
+            blocks.append(for_channel(deform_block(light, one.slot.deformation), one, set(), names))
             delays += delays_for_channel(law.delays(light), one)
         blocks += [command_block(problem, channels), judge_block()]
         blocks += [
@@ -193,6 +194,7 @@ def _check_slot(problem: Problem, slot: Slot, mistakes: Mistakes) -> None:
     name = slot.coordinate
     try:
         channel(problem, slot, 0)
+        slot.deformation.largest_step()  # says so where a scale is still to be chosen
     except FpirhcError as error:
         mistakes.add(f"slot '{name}': {error}")
         return
