@@ -6,6 +6,7 @@ from .contraction import assess_gain, check_gain, delayed_limit, response_jacobi
 from .controllers.acceleration_feedback import AccelerationFeedback
 from .controllers.adaptive_inverse_dynamics import AdaptiveInverseDynamics
 from .controllers.backstepping_mrac import BacksteppingMrac
+from .controllers.chosen_schedules import ByError, ByLookAhead
 from .controllers.computed_torque import ComputedTorque
 from .controllers.estimating import Estimating
 from .controllers.floquet import Floquet, floquet_radius
@@ -18,7 +19,7 @@ from .controllers.pid import Pid
 from .controllers.predicted import ByDesired, ByModel, Predicted
 from .controllers.receding_horizon import RecedingHorizon
 from .controllers.resolved_rate import ResolvedAccelerationRate
-from .controllers.schedules import ByError, ByLookAhead, FixedSchedule, Periodic
+from .controllers.schedules import FixedSchedule, Periodic
 from .controllers.sliding_mode import SlidingMode
 from .controllers.slot import Slot
 from .controllers.slotine_li import SlotineLi

@@ -16,7 +16,7 @@ from functools import cached_property
 import casadi as ca
 
 from fpirhc.errors import InvalidName, NotInvertible, nearest
-from fpirhc.plant import Plant, derivative_unit
+from fpirhc.plant import Plant, derivative_unit, structural_order
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +68,16 @@ def output_chain(plant: Plant, coordinate: str, input_name: str | None = None) -
         if ca.jacobian_sparsity(following, chosen).nnz():
             return _chain(plant, coordinate, name, ladder, following, (x, u, p, w))
         if ca.depends_on(following, u):
+            others = [e for k, e in enumerate(plant.inputs) if ca.jacobian_sparsity(following, u[k]).nnz()]
             raise NotInvertible(
-                f"derivative {order} of '{coordinate}' is reached by another input than '{name}'; choose that input"
+                f"derivative {order} of '{coordinate}' is reached by another input than '{name}'; choose input='{others[0]}'"
             )
         ladder.append(following)
-    raise NotInvertible(f"input '{name}' does not reach coordinate '{coordinate}', however often it is differentiated")
+    orders = ", ".join(f"{c} {structural_order(plant, c) or 'none'}" for c in plant.names)
+    raise NotInvertible(
+        f"input '{name}' does not reach coordinate '{coordinate}', however often it is differentiated "
+        f"(relative order by coordinate: {orders}); choose a coordinate that has one"
+    )
 
 
 def _input(plant: Plant, coordinate: str, name: str | None) -> str:

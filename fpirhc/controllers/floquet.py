@@ -36,6 +36,8 @@ class Floquet:
 def floquet_radius(problem: Problem, slots: Sequence[Slot], schedule: Schedule, *, blend: float = 0.0) -> Floquet:
     """Return the spectral radius of the schedule's period, with ideal deformations and the plant's exact parameters.
 
+    Limits, dead time and the hold of the command over a cycle are left out.
+
     Parameters: `blend` as in Slotted, s; 0 leaves the offset at switches out.
 
     Raises:
@@ -52,6 +54,8 @@ def radius_of(problem: Problem, channels: Sequence[Channel], schedule: Schedule,
     eigenvalues = {name: mode.eigenvalues for name, mode in zip(names, modes, strict=False)}
     sequence = schedule.sequence(problem)
     period = sum(duration for _, duration in sequence)
+    if not reason and len(problem.plant.inputs) > 1:
+        reason = "the plant has several inputs, and those that a slot does not use keep their last command"
     if reason or not sequence:
         return Floquet(None, period, eigenvalues, reason or "the schedule is not periodic")
     before, whole = modes[names.index(sequence[-1][0])], np.eye(modes[0].generator.shape[0])

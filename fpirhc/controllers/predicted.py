@@ -186,6 +186,11 @@ class Predicted(Controller):
         """
         self.controller.check(problem)
         self.by.check(problem.plant)
+        if self.controller.response(problem) is not None and self.by != ByModel():
+            raise NotSupported(
+                f"Predicted: {self.by} compares the responses of the plant's controlled coordinates, but "
+                f"{type(self.controller).__name__} answers others; use by=ByModel()"
+            )
         if self._cycles(problem) > MOST:
             raise InvalidValue(f"Predicted: {self._cycles(problem)} cycles of dead time, more than {MOST}")
 
@@ -213,9 +218,10 @@ def _predict_block(
     past = tuple(f"{e}@{k}" for k in range(1, cycles + 2) for e in before.elements)
     queue = Signal("sent", past, start=by.sent_at_start(problem) * (cycles + 1))
     residual = Signal("residual", plant.names, plant.response_units)
-    reads = (scalar("time", "s"), plant.state, plant.response_signal("realised"), plant.parameter, before)
     advance = by.advance(plant, problem.period)
     corrected = _residual(plant, by.residual_time, problem.period) if by.residual_time else None
+    seen = (plant.response_signal("realised"),) if corrected else ()
+    reads = (scalar("time", "s"), plant.state, *seen, plant.parameter, before)
     own = (queue, residual) if corrected else (queue,)
 
     def step(s: Any) -> dict[str, Expression]:

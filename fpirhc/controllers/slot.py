@@ -35,7 +35,7 @@ class Slot:
     Parameters:
         coordinate: the coordinate y that follows its reference.
         tracking: the law that gives the desired y^(r).
-        deformation: the fixed-point map between desired y^(r) and request; Identity() is no adaptation.
+        deformation: the fixed-point map between desired y^(r) and request, its scale given; Identity() is no adaptation.
         order: the relative order r from the input to y; None: found from the model. A wrong one is refused.
         input: the input that acts; may be left out where the plant has only one. Other inputs keep their last command.
     """
@@ -87,7 +87,8 @@ def channel(problem: Problem, slot: Slot, number: int) -> Channel:
     chain = output_chain(plant, slot.coordinate, slot.input)
     if slot.order is not None and slot.order != chain.order:
         raise InvalidProblem(
-            f"order={slot.order} is not the relative order from '{chain.input}' to '{slot.coordinate}': it is {chain.order}"
+            f"order={slot.order} is not the relative order from '{chain.input}' to '{slot.coordinate}', which is {chain.order}; "
+            f"write order={chain.order} or leave it out"
         )
     if not chain.affine:
         raise NotInvertible(

@@ -28,7 +28,7 @@ class Mode:
         generator: A, shape (n + 2, n + 2). command: row k with u - u* = k z, shape (n + 2,).
         own: row of y^(r) in (x - x*) and its gain b. law: row of y^(r),Des in z without the offset.
         first_integral: row of the integral at the start of the slot in x - x*, shape (n,).
-        blends: whether a switch leaves an offset.
+        blends: whether a switch leaves an offset. integrates: whether the law has an integral.
     """
 
     generator: np.ndarray

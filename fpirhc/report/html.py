@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fpirhc.errors import OutputError
-from fpirhc.report.figures import PALETTE, contraction_figure, lyapunov_figure, pair_figures
+from fpirhc.report.figures import BANDS, PALETTE, contraction_figure, lyapunov_figure, pair_figures
 from fpirhc.report.series import chart_data
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def render(comparison: Comparison) -> str:
     """Return the page's text."""
     head = "\n".join(f"<style>{_asset(name)}</style>" for name in ("uPlot.min.css", "report.css"))
     pair = headline_pair(comparison)
-    series = {**chart_data(comparison, PALETTE), "begin": [e.name for e in pair] if pair else []}
+    series = {**chart_data(comparison, PALETTE), "bands": BANDS, "begin": [e.name for e in pair] if pair else []}
     data = json.dumps(series, separators=(",", ":")).replace("<", "\\u003c")
     parts = [
         f"<header><h1>{_text(comparison.title)}</h1></header>",
@@ -160,13 +160,32 @@ def _iterations(solve: Mapping[str, float]) -> str:
 
 
 def _charts(comparison: Comparison) -> str:
-    slots = any(e.run.spans() for e in comparison.entries)
-    bands = " Pale bands are the time slots of the first controller shown that has some." if slots else ""
     return (
         "<section><h2>Signals over time</h2><p>Drag across a chart to zoom all of them, double-click to return. Lines show "
-        "the extremes of each short interval, so no peak is lost."
-        f"{bands}</p>"
+        f"the extremes of each short interval, so no peak is lost.</p>{_bands(comparison)}"
         "<div id='controllers' role='group' aria-label='controllers shown'></div><div id='charts'></div></section>"
+    )
+
+
+def _bands(comparison: Comparison) -> str:
+    """Legend of the time slots, one line for controllers whose slots are the same; empty where nobody has slots."""
+    slotted = [e for e in comparison.entries if e.run.spans()]
+    if not slotted:
+        return ""
+    by_slots: dict[tuple[str, ...], list[str]] = {}
+    for e in slotted:
+        by_slots.setdefault(e.run.layout["desired"].elements, []).append(e.name)
+    lines = []
+    for slots, names in by_slots.items():
+        swatches = " ".join(
+            f"<span class='band' style='background:{BANDS[k % len(BANDS)]}22;border-color:{BANDS[k % len(BANDS)]}'></span> "
+            f"slot {_text(slot)}"
+            for k, slot in enumerate(slots)
+        )
+        lines.append(f"<li>{swatches} ({_text(', '.join(names))})</li>")
+    return (
+        "<p>Pale bands are the time slots of the chart's own controller, else of the first one shown that has some.</p>"
+        f"<ul id='bands'>{''.join(lines)}</ul>"
     )
 
 

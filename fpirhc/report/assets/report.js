@@ -1,7 +1,6 @@
 "use strict";
 // Linked charts: one cursor, one zoom, one set of shown controllers. DATA is written by the page.
 const RESPONSES = { nominal: "#009e73", desired: "#0072b2", deformed: "#e69f00", realised: "#d55e00" };
-const BANDS = ["#7f7f7f", "#e69f00", "#56b4e9", "#cc79a7"];
 const colors = Object.fromEntries(DATA.controllers.map((c) => [c.name, c.color]));
 const ink = getComputedStyle(document.documentElement).getPropertyValue("--ink").trim();
 const faint = getComputedStyle(document.documentElement).getPropertyValue("--line").trim();
@@ -29,7 +28,7 @@ function bands(chart, spec) {
   ctx.clip();
   for (const [start, end, slot] of owner.slots) {
     const left = chart.valToPos(start, "x", true);
-    ctx.fillStyle = BANDS[slot % BANDS.length] + "22";
+    ctx.fillStyle = DATA.bands[slot % DATA.bands.length] + "22";
     ctx.fillRect(left, bbox.top, chart.valToPos(end, "x", true) - left, bbox.height);
   }
   ctx.restore();
