@@ -1,8 +1,8 @@
-"""The command line: list, solve, run and compare problems.
+"""The command line: list, solve, run, compare and check problems.
 
 Exit codes: 0 finished; 2 bad input (names, values, a problem file, an option); 3 a folder or file cannot be written;
 4 the run ended early because a signal was not finite (`run`; `compare` reports it) or a plan did not converge (`solve`);
-130 interrupted.
+5 and 6 a metric changed, or there is no usable baseline (`check`); 130 interrupted.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from fpirhc.regression.commands import add_commands
 
 if TYPE_CHECKING:
     from fpirhc.studies.compare import Comparison, Progress
@@ -26,9 +28,10 @@ _EXAMPLES = """examples:
   fpirhc compare two_mass --optimisers all      the headline pair with every optimiser
   fpirhc run two_mass "RHC+FPI" --out results   one run, saved as .npz and .png
   fpirhc solve cart_pole --optimisers fixed-point ipopt      the first horizon, open loop, with certificates
+  fpirhc check                                  fresh results against the committed baselines
 
 exit codes: 0 finished, 2 bad input, 3 cannot write, 4 the run ended early (run)
-or a plan did not converge (solve), 130 interrupted
+or a plan did not converge (solve), 5 a metric changed (check), 6 no usable baseline (check), 130 interrupted
 """
 
 
@@ -65,6 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_compare(commands)
     _add_run(commands)
     _add_solve(commands)
+    add_commands(commands)
     listing = commands.add_parser("list", help="list the shipped problems")
     listing.set_defaults(command=_list)
     return parser
