@@ -140,11 +140,13 @@ def bless(
     baselines: Path | None = None,
     compiled: bool = True,
     processes: int = 1,
+    working: Path | None = None,
     progress: Progress | None = None,
 ) -> tuple[Baseline, Path]:
     """Measure every controller under all variants, write the baseline, and return it and where it is.
 
-    Parameters: `reason` why the new numbers are right; `seed` of the nominal run and how many `seeds` the bands are made of.
+    Parameters: `reason` why the new numbers are right; `seed` of the nominal run and how many `seeds` the bands are made of;
+    `working` a folder of the project that may be written to, the current one when not given.
 
     Raises:
         InvalidValue: no reason. BaselineError: it would hold nothing. OutputError: it cannot be written there.
@@ -152,9 +154,10 @@ def bless(
     require_reason(reason)
     if seeds < 2 or seed < 0:
         raise InvalidValue(f"seed {seed} with {seeds} seeds: expected at least 0 and at least 2; 5 seeds are usual")
-    check_inside(baseline_path(task.path, baselines), Path.cwd())
+    project = working or Path.cwd()
+    check_inside(baseline_path(task.path, baselines), project)
     found = measure_expected(
         task, list(task.controllers), seed=seed, seeds=seeds, compiled=compiled, processes=processes, progress=progress
     )
     baseline = compose_baseline(task, found, reason, seed=seed, seeds=seeds, compiled=compiled)
-    return baseline, write_baseline(task, baseline, baselines, Path.cwd())
+    return baseline, write_baseline(task, baseline, baselines, project)

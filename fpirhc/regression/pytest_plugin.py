@@ -31,7 +31,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Refuse an empty reason at once."""
-    config.stash[_found], config.stash[_told] = [], []
+    config.stash[_found] = []
+    config.stash[_told] = []
     reason = config.getoption("--fpirhc-bless")
     if reason is not None and not reason.strip():
         raise pytest.UsageError("--fpirhc-bless needs a reason: say why the new numbers are right")
@@ -92,13 +93,14 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     if hasattr(config, "workeroutput"):
         config.workeroutput[_OUTPUT] = config.stash[_found]
         return
-    if not config.stash[_found]:
+    found = config.stash[_found]
+    if not found:
         return
     from fpirhc.errors import FpirhcError
     from fpirhc.regression.merging import write_merged
 
     texts: dict[str, list[str]] = {}
-    for path, text in sorted(config.stash[_found]):
+    for path, text in sorted(found):
         texts.setdefault(path, []).append(text)
     for path, parts in texts.items():
         try:
