@@ -37,8 +37,13 @@ class Metric:
 
     @property
     def loose(self) -> bool:
-        """Whether the band is so wide that it hardly holds anything."""
-        return isinstance(self.value, int | float) and self.kind == BANDED and self.band > _LOOSE * abs(self.value) > 0
+        """Whether the spread is so wide that the band hardly holds anything."""
+        return isinstance(self.value, int | float) and FACTOR * self.widest > _LOOSE * abs(self.value)
+
+    @property
+    def widest(self) -> float:
+        """The largest difference under any variant."""
+        return max(self.spread.values(), default=0.0)
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from fpirhc.regression.bands import Metric
+from fpirhc.regression.bands import FACTOR, Metric
 from fpirhc.regression.baseline import Baseline
 from fpirhc.regression.judging import Judgement
 from fpirhc.regression.words import HEADS, cells, clean, headline, number, remarks, shown
 
+_MOSTLY = 0.9  # share of a band; its digits are rounded
 _STYLES = {"holds": "", "better": "bold green", "worse": "bold red"}
 
 
@@ -38,7 +39,7 @@ def show_baseline(baseline: Baseline, path: str) -> None:
     """Print what was blessed and how wide its bands are."""
     console = Console()
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=Text(f"{clean(baseline.problem)}, baseline"))
-    for head in ("controller", "metric", "value", "band", "mostly from"):
+    for head in ("controller", "metric", "value", "band", "made of"):
         table.add_column(head)
     loose = []
     for name, one in baseline.controllers.items():
@@ -54,13 +55,15 @@ def show_baseline(baseline: Baseline, path: str) -> None:
             _say(console, f"not compared: {clean(name)}, {clean(metric)} ({clean(why)})")
     console.print(table)
     if loose:
-        _say(console, f"{len(loose)} bands are wider than half their value and will hardly notice a change")
+        _say(console, f"{len(loose)} bands are wider than half their value and hardly notice a change")
     _say(console, f"wrote {clean(path)}")
 
 
 def _source(metric: Metric) -> str:
-    largest = max(metric.spread, key=lambda s: metric.spread[s], default="")
-    return largest if metric.spread.get(largest, 0.0) else "-"
+    """What the band is made of, where that is more than the least width."""
+    if FACTOR * metric.widest < _MOSTLY * metric.band:
+        return "least width"
+    return max(metric.spread, key=lambda s: metric.spread[s])
 
 
 def _table(problem: str) -> Table:
