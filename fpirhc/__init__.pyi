@@ -44,6 +44,7 @@ from .optimisers.reduced_gradient import ReducedGradient
 from .plant import Parameter, Plant, structural_order
 from .problem import Problem
 from .reference import Table, Trajectory
+from .regression.check import bless, check_baseline
 from .relative_order import OutputChain, output_chain
 from .report.html import write_report
 from .run import Run, load_run
@@ -145,7 +146,9 @@ __all__ = [
     "Tuned",
     "VelocityDifference",
     "assess_gain",
+    "bless",
     "certify",
+    "check_baseline",
     "check_deformation",
     "check_gain",
     "compare",

@@ -25,6 +25,14 @@ from fpirhc.regression.settings import fingerprint
 CHANGED, NO_BASELINE, BAD_INPUT = 5, 6, 2
 CHECK = ("check", "line.py", "--no-compile")
 
+# Lines of the problem files
+CTC = '    "CTC": fp.ComputedTorque(tracking),\n'
+ADAPTIVE = '    "CTC+FPI": fp.ComputedTorque(tracking, sigmoid),\n'
+SWAPPED = ADAPTIVE.replace("CTC+FPI", "CTC") + CTC.replace("CTC", "CTC+FPI")
+GAIN = '        "b": fp.Parameter(approximate=1.0, exact=1.6, unit="1/kg"),\n'
+SPRING = '        "k": fp.Parameter(approximate=2.0, exact=5.0, unit="1/s^2"),\n'
+PUSH, SHAKE = '"u": fp.Noise(0.5)', '"y": fp.Noise(2.0)'
+
 
 @pytest.fixture(scope="module")
 def blessed(tmp_path_factory):
@@ -134,6 +142,11 @@ def result(change):
     return fault
 
 
+def becomes(name, change):
+    """One metric changes wherever it is."""
+    return lambda numbers: numbers.update({k: change(v) for k, v in numbers.items() if k == name})
+
+
 def plan(change):
     """A fault in what is measured of open-loop plans."""
 
@@ -200,8 +213,9 @@ def hidden(folder, patch):
     (folder / "baselines" / "unchecked.toml").write_text('line = "no time"')
 
 
-def metrics(facts, controller="CTC"):
-    return facts["controllers"][controller]["metrics"]
+def rms(key, value):
+    """Another entry of one metric."""
+    return lambda facts: facts["controllers"]["CTC"]["metrics"]["rms_error.y"].update({key: value})
 
 
 def emptied_metrics(facts):
@@ -221,8 +235,8 @@ FAULTS = {
     "approximate parameter": (NO_BASELINE, CHECK, edited("approximate=2.0", "approximate=2.0001")),
     "limit": (NO_BASELINE, CHECK, edited("(-25.0, 25.0)", "(-25.0, 26.0)")),
     "measured from another time": (NO_BASELINE, CHECK, edited("measure_from=0.1", "measure_from=0.101")),
-    "swapped controllers": (NO_BASELINE, CHECK, edited('"CTC": fp.ComputedTorque(tracking),\n    "CTC+FPI"', '"CTC+FPI": fp.ComputedTorque(tracking),\n    "CTC"')),
-    "controller taken out": (CHANGED, CHECK, edited('    "CTC": fp.ComputedTorque(tracking),\n', "")),
+    "swapped controllers": (NO_BASELINE, CHECK, edited(CTC + ADAPTIVE, SWAPPED)),
+    "controller taken out": (CHANGED, CHECK, edited(CTC, "")),
     "controller added": (CHANGED, CHECK, edited("controllers = {", 'controllers = {"X": fp.ComputedTorque(tracking),')),
     # in the problem file: formulas, which settings do not show
     "reference": (CHANGED, CHECK, edited("ca.sin(2 * t)", "1.0001 * ca.sin(2 * t)")),
@@ -238,13 +252,13 @@ FAULTS = {
     "diverged run": (CHANGED, CHECK, ends_early),
     "refused controller": (CHANGED, CHECK, refused),
     # in the results
-    "metric becomes NaN": (CHANGED, CHECK, result(lambda n: n.update({"rms_error.y": float("nan")}))),
-    "factor becomes NaN": (CHANGED, CHECK, result(lambda n: "contraction.measured" in n and n.update({"contraction.measured": float("nan")}))),
-    "metric becomes infinite": (CHANGED, CHECK, result(lambda n: "contraction.predicted" in n and n.update({"contraction.predicted": float("inf")}))),
+    "metric becomes NaN": (CHANGED, CHECK, result(becomes("rms_error.y", lambda v: float("nan")))),
+    "factor becomes NaN": (CHANGED, CHECK, result(becomes("contraction.measured", lambda v: float("nan")))),
+    "metric becomes infinite": (CHANGED, CHECK, result(becomes("contraction.predicted", lambda v: float("inf")))),
     "metric vanishes": (CHANGED, CHECK, result(lambda n: n.pop("iae.y"))),
-    "metric out of its band": (CHANGED, CHECK, result(lambda n: n.update({"max_error.y": n["max_error.y"] * 1.0001}))),
-    "metric much better": (CHANGED, CHECK, result(lambda n: n.update({"rms_error.y": 0.5 * n["rms_error.y"]}))),
-    "one cycle of another status": (CHANGED, CHECK, result(lambda n: n.update({"status.OK": n["status.OK"] - 1, "status.HELD": 1}))),
+    "metric out of its band": (CHANGED, CHECK, result(becomes("max_error.y", lambda v: 1.0001 * v))),
+    "metric much better": (CHANGED, CHECK, result(becomes("rms_error.y", lambda v: 0.5 * v))),
+    "one cycle of another status": (CHANGED, CHECK, result(becomes("status.OK", lambda v: v - 1))),
     "optimal cost": (CHANGED, CHECK, plan({"plan.cost": lambda v: v * (1 + 1e-5)})),
     "plan not converged": (CHANGED, CHECK, plan({"plan.status": lambda v: "NOT_CONVERGED"})),
     "swapped results": (CHANGED, CHECK, swapped_results),
@@ -255,10 +269,10 @@ FAULTS = {
     "empty baseline file": (NO_BASELINE, CHECK, emptied("baselines/line.json")),
     "baseline of nothing": (NO_BASELINE, CHECK, baseline(lambda f: f.update(controllers={}))),
     "baseline without metrics": (NO_BASELINE, CHECK, baseline(emptied_metrics)),
-    "band widened by hand": (NO_BASELINE, CHECK, baseline(lambda f: metrics(f)["rms_error.y"].update(band=1e3), signed=False)),
-    "value edited by hand": (NO_BASELINE, CHECK, baseline(lambda f: metrics(f)["rms_error.y"].update(value=0.1), signed=False)),
-    "band taken out": (NO_BASELINE, CHECK, baseline(lambda f: metrics(f)["rms_error.y"].pop("band") and None)),
-    "NaN for a value": (NO_BASELINE, CHECK, baseline(lambda f: metrics(f)["rms_error.y"].update(value=float("nan")))),
+    "band widened by hand": (NO_BASELINE, CHECK, baseline(rms("band", 1e3), signed=False)),
+    "value edited by hand": (NO_BASELINE, CHECK, baseline(rms("value", 0.1), signed=False)),
+    "band taken out": (NO_BASELINE, CHECK, baseline(rms("band", None))),
+    "NaN for a value": (NO_BASELINE, CHECK, baseline(rms("value", float("nan")))),
     "exchanged baselines": (NO_BASELINE, CHECK, exchanged_baselines),
 }  # fmt: skip
 
@@ -374,10 +388,10 @@ HARMLESS = {
     "sorted JSON": (CHECK, rewritten(sort_keys=True)),
     "reversed JSON": (CHECK, reversed_keys),
     "line endings": (CHECK, line_endings),
-    "order of controllers": (CHECK, edited('    "CTC": fp.ComputedTorque(tracking),\n    "CTC+FPI": fp.ComputedTorque(tracking, sigmoid),\n', '    "CTC+FPI": fp.ComputedTorque(tracking, sigmoid),\n    "CTC": fp.ComputedTorque(tracking),\n')),
-    "order of parameters": (CHECK, edited('        "b": fp.Parameter(approximate=1.0, exact=1.6, unit="1/kg"),\n        "k": fp.Parameter(approximate=2.0, exact=5.0, unit="1/s^2"),\n', '        "k": fp.Parameter(approximate=2.0, exact=5.0, unit="1/s^2"),\n        "b": fp.Parameter(approximate=1.0, exact=1.6, unit="1/kg"),\n')),
+    "order of controllers": (CHECK, edited(CTC + ADAPTIVE, ADAPTIVE + CTC)),
+    "order of parameters": (CHECK, edited(GAIN + SPRING, SPRING + GAIN)),
     "order of weights": (CHECK, edited('{"y": 100.0, "y\'": 1.0}', '{"y\'": 1.0, "y": 100.0}')),
-    "title and comments": (CHECK, edited('"""A mass on a line with a wrong gain."""', '"""Another title."""\n# with a comment')),
+    "title and comments": (CHECK, edited('with a wrong gain."""', 'otherwise."""\n# with a comment')),
     "formula written otherwise": (CHECK, edited("p.b * u.u - p.k * q.y", "-(q.y * p.k) + u.u * p.b")),
     "a headline": (CHECK, edited("controllers = {", 'headline = ("CTC", "CTC+FPI")\ncontrollers = {')),
     "two processes": ((*CHECK, "--processes", "2"), several()),
@@ -387,7 +401,7 @@ HARMLESS = {
     "log level": (CHECK, debug_log),
     "global generator, locale, terminal": (CHECK, spoilt_globals),
     "finer integrator": (CHECK, finer),
-    "order of the noises": (NOISY, edited('{"u": fp.Noise(0.5), "y": fp.Noise(2.0)}', '{"y": fp.Noise(2.0), "u": fp.Noise(0.5)}', "noisy")),
+    "order of the noises": (NOISY, edited(f"{PUSH}, {SHAKE}", f"{SHAKE}, {PUSH}", "noisy")),
     "seed 17": (NOISY, other_seed(17)),
     "seed 4711": (NOISY, other_seed(4711)),
     "versions": (CHECK, baseline(lambda f: f["versions"].update(casadi="3.7.2", machine="arm64"))),

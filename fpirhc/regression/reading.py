@@ -133,7 +133,7 @@ def _metric(where: str, name: str, facts: dict[str, Any]) -> Metric:
     if kind not in KINDS:
         raise BaselineError(f"{where} has class '{kind}'; expected one of {', '.join(KINDS)}")
     if not (value is None or isinstance(value, str) or _is_number(value)):
-        raise BaselineError(f"{where} has the value {value!r}; expected a finite number, a word or null")
+        raise BaselineError(f"{where} has the value {str(value)[:40]!r}; expected a finite number, a word or null")
     if kind == EXACT:
         return Metric(kind, value, 0.0, {})
     if not _is_number(value):
@@ -147,4 +147,7 @@ def _metric(where: str, name: str, facts: dict[str, Any]) -> Metric:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    try:
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # a whole number beyond all floats
+        return False
