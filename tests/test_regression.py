@@ -23,6 +23,7 @@ from fpirhc.regression.judging import Judgement, Row, judge
 from fpirhc.regression.junit import to_junit
 from fpirhc.regression.markdown import to_markdown
 from fpirhc.regression.measuring import DIVERGED, FINISHED, Measured
+from fpirhc.regression.places import problems_here
 from fpirhc.regression.reading import read_baseline
 from fpirhc.regression.settings import fingerprint, settings_of
 from fpirhc.regression.variants import INTEGRATOR, NOMINAL, ROUNDING, SEEDS, Variant, variants
@@ -269,6 +270,38 @@ def test_unchecked_problems_need_a_reason(text, message, folder, capsys):
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("text", "counts"),
+    [
+        ("problem, controllers = 1, {}", True),
+        ("from line import problem, controllers", True),
+        ("problem: int = 1\nif True:\n    controllers = {}", True),
+        ("problem = = 1", True),
+        ("def f():\n    problem, controllers = 1, {}", False),
+        ("problem = 1", False),
+    ],
+)
+def test_what_counts_as_a_problem_file(text, counts, folder):
+    """Whatever defines both names, however it does; one with a mistake in it must not be passed over."""
+    (folder / "other.py").write_text(text)
+    found, unchecked = problems_here(folder)
+    assert [path.name for path in found] == ["line.py", "noisy.py", "other.py"][: 2 + counts]
+    assert unchecked == {}
+
+
+def test_other_versions_are_told_where_something_changed(folder, capsys):
+    """They explain a change; alone they are none."""
+    path = folder / "baselines" / "noisy.json"
+    facts = json.loads(path.read_text())
+    facts["versions"]["casadi"] = "3.7.2"
+    path.write_text(signed(facts))
+    assert main(["check", "noisy.py", "--no-compile"]) == 0
+    assert "3.7.2" not in capsys.readouterr().out
+    path.write_text(spoilt(lambda f: _metrics(f)["cycles"].update(value=299))(path))
+    assert main(["check", "noisy.py", "--no-compile"]) == 5
+    assert "measured with casadi 3.7.2 (now" in capsys.readouterr().out
+
+
 def test_nothing_to_check_is_an_error(tmp_path, monkeypatch, capsys):
     """An empty folder must not look like success."""
     monkeypatch.chdir(tmp_path)
@@ -365,7 +398,7 @@ def test_pytest_plugin(pytester, blessed):
     run("--fpirhc-bless", "first", "-n", "2").assert_outcomes(passed=3)
     file = pytester.path / "baselines" / "line.json"
     first = read_baseline(file)
-    assert list(first.controllers) == ["CTC", "CTC+FPI", "RHC+FPI"]
+    assert list(first.controllers) == ["CTC", "CTC+FPI", "RHC+FPI"], "in this order, whichever worker was first"
     assert first.controllers == read_baseline(blessed / "baselines" / "line.json").controllers
     run("-n", "2").assert_outcomes(passed=3)
     path.write_text(

@@ -39,7 +39,9 @@ class Baseline:
 
 
 def to_text(baseline: Baseline) -> str:
-    """Return the file's text."""
+    """Return the file's text; controllers by name, so that the order in which they were measured does not show."""
+    settings = asdict(baseline.settings)
+    settings["controllers"] = dict(sorted(settings["controllers"].items()))
     facts = {
         "format": FORMAT,
         "problem": baseline.problem,
@@ -48,8 +50,8 @@ def to_text(baseline: Baseline) -> str:
         "seed": baseline.seed,
         "versions": dict(baseline.versions),
         "varied": {source: list(names) for source, names in baseline.varied.items()},
-        "settings": {"hash": settings_hash(baseline.settings), **asdict(baseline.settings)},
-        "controllers": {name: _entry(one) for name, one in baseline.controllers.items()},
+        "settings": {"hash": settings_hash(baseline.settings), **settings},
+        "controllers": {name: _entry(one) for name, one in sorted(baseline.controllers.items())},
     }
     facts["checksum"] = fingerprint(facts)
     return _written(facts, "", keep_open=True) + "\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -30,7 +31,8 @@ def check_baseline(
 ) -> Judgement:
     """Measure a problem's controllers and compare them with its baseline; nothing is written.
 
-    Parameters: `controllers` to compare, all when not given; `baselines` folder instead of the one beside the problem file.
+    Parameters: `controllers` to compare, all when not given; `baselines` folder instead of the one beside the problem file;
+    `processes` at once, each of which loads the problem file anew.
 
     Raises:
         InvalidProblem: unknown controllers.
@@ -42,7 +44,15 @@ def check_baseline(
         return Judgement(task.name, unusable=(str(error),))
     jobs = [Job(name, nominal(baseline.seed, compiled)) for name in chosen]
     results = measure_all(task, jobs, processes=processes, progress=progress)
-    return judge(baseline, settings_of(task), dict(zip(chosen, results, strict=True)))
+    judgement = judge(baseline, settings_of(task), dict(zip(chosen, results, strict=True)))
+    return judgement if judgement.holds else replace(judgement, notes=(*judgement.notes, *_other_versions(baseline)))
+
+
+def _other_versions(baseline: Baseline) -> list[str]:
+    """What the baseline was measured with, where that is something else now."""
+    now = versions()
+    other = [f"{name} {was} (now {now.get(name)})" for name, was in baseline.versions.items() if now.get(name) != was]
+    return [f"the baseline was measured with {', '.join(other)}"] if other else []
 
 
 def check_file(

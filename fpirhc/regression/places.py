@@ -54,9 +54,11 @@ def _is_problem(path: Path) -> bool:
         body = ast.parse(path.read_text(encoding="utf-8")).body
     except (OSError, SyntaxError, ValueError):
         return True
-    targets = [t for s in body if isinstance(s, ast.Assign) for t in s.targets]
-    targets += [s.target for s in body if isinstance(s, ast.AnnAssign)]
-    return {"problem", "controllers"} <= {t.id for t in targets if isinstance(t, ast.Name)}
+    inside = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+    nodes = [node for s in body if not isinstance(s, inside) for node in ast.walk(s)]
+    defined = {n.id for n in nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+    defined |= {n.asname or n.name for n in nodes if isinstance(n, ast.alias)}
+    return {"problem", "controllers"} <= defined
 
 
 def _unchecked(path: Path) -> dict[str, str]:
