@@ -16,7 +16,7 @@ from blessed import LINE, NOISY, write_problems
 import fpirhc as fp
 from fpirhc.cli import main
 from fpirhc.errors import BaselineError, InvalidName
-from fpirhc.regression.bands import Expected, expected
+from fpirhc.regression.bands import FACTOR, Expected, expected
 from fpirhc.regression.baseline import to_text
 from fpirhc.regression.catalogue import BANDED, EXACT, FAMILIES, TIGHT, family_of
 from fpirhc.regression.judging import Judgement, Row, judge
@@ -54,13 +54,24 @@ def folder(blessed, tmp_path, monkeypatch) -> Path:
     return tmp_path / "project"
 
 
-def test_a_band_is_three_times_the_largest_difference():
+def test_a_band_is_three_times_the_spread():
     """Of all sources the widest counts, and each is kept beside the band."""
     found = expected(VARIANTS, measured(1.0, 1.1, 0.99, 1.0), 1e-3).metrics["rms_error.y"]
     assert found.kind == BANDED
     assert found.band == pytest.approx(0.3, rel=0.01)
     assert found.band >= 3 * 0.1
     assert found.spread == pytest.approx({SEEDS: 0.1, ROUNDING: 0.01})
+
+
+def test_another_draw_of_the_noise_stays_in_the_band():
+    """Of a normal value and eight seeds, within a factor of two of the 1.2e-4 that a simulation gives."""
+    draws = np.random.default_rng(0).normal(size=(400_000, 9))
+    outside = np.abs(draws[:, 8] - draws[:, 0]) > FACTOR * np.ptp(draws[:, :8], axis=1)
+    assert outside.mean() == pytest.approx(1.2e-4, rel=1.0)
+    chosen = [VARIANTS[0], *[VARIANTS[1]] * 7]
+    for row in draws[:20]:
+        found = expected(chosen, measured(*row[:8]), 1e-3).metrics["rms_error.y"]
+        assert found.band == pytest.approx(FACTOR * np.ptp(row[:8]), rel=0.03)
 
 
 def test_a_band_is_never_narrower_than_rounding():

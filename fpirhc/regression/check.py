@@ -76,7 +76,7 @@ def measure_expected(
     controllers: Sequence[str],
     *,
     seed: int = 0,
-    seeds: int = 5,
+    seeds: int = 8,
     compiled: bool = True,
     processes: int = 1,
     progress: Progress | None = None,
@@ -92,7 +92,7 @@ def measure_expected(
 
 
 def compose_baseline(
-    task: Task, found: Mapping[str, Expected], reason: str, *, seed: int = 0, seeds: int = 5, compiled: bool = True
+    task: Task, found: Mapping[str, Expected], reason: str, *, seed: int = 0, seeds: int = 8, compiled: bool = True
 ) -> Baseline:
     """Return the baseline of what was measured; controllers that were not are left out.
 
@@ -146,7 +146,7 @@ def bless(
     reason: str,
     *,
     seed: int = 0,
-    seeds: int = 5,
+    seeds: int = 8,
     baselines: Path | None = None,
     compiled: bool = True,
     processes: int = 1,
@@ -163,7 +163,7 @@ def bless(
     """
     require_reason(reason)
     if seeds < 2 or seed < 0:
-        raise InvalidValue(f"seed {seed} with {seeds} seeds: expected at least 0 and at least 2; 5 seeds are usual")
+        raise InvalidValue(f"seed {seed} with {seeds} seeds: expected at least 0 and at least 2; 8 seeds are usual")
     project = working or Path.cwd()
     check_inside(baseline_path(task.path, baselines), project)
     found = measure_expected(

@@ -37,7 +37,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--reason", required=True, metavar="TEXT", help="why the new numbers are right; kept in the file"
     )
     bless.add_argument("--seed", type=int, default=0, help="seed of the run that is compared (default: 0)")
-    bless.add_argument("--seeds", type=int, default=5, help="seeds that the bands are made of (default: 5)")
+    bless.add_argument("--seeds", type=int, default=8, help="seeds that the bands are made of (default: 8)")
     _add_common(bless)
     bless.set_defaults(command=_bless)
 

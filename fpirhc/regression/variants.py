@@ -1,8 +1,8 @@
 """What a result may depend on without having changed: seed, rounding, and the steps of the simulated plant.
 
-`bless` measures every controller under all of these; the spread of the results is what bands are made of. Compiled C and the
-virtual machine often agree to the last digit on one machine and differ on the next, so rounding is also tried directly: the
-first state and the exact parameters move by 1e-14 of themselves.
+`bless` measures every controller under all of these; the spread of the results is what bands are made of. C compiled at
+two levels may agree to the last digit, which says nothing about another machine, so rounding is also tried directly: the first
+state and the exact parameters move by 1e-14 of themselves.
 """
 
 from __future__ import annotations
