@@ -71,7 +71,8 @@ def test_another_draw_of_the_noise_stays_in_the_band():
     chosen = [VARIANTS[0], *[VARIANTS[1]] * 7]
     for row in draws[:20]:
         found = expected(chosen, measured(*row[:8]), 1e-3).metrics["rms_error.y"]
-        assert found.band == pytest.approx(FACTOR * np.ptp(row[:8]), rel=0.03)
+        assert found.band == pytest.approx(FACTOR * np.ptp(row[:8]), rel=0.011)
+        assert found.band >= FACTOR * np.ptp(row[:8])
 
 
 def test_a_band_is_never_narrower_than_rounding():

@@ -95,10 +95,11 @@ def _metric(name: str, found: Sequence[tuple[str, Number]], quantum: float) -> M
     largest = FACTOR * max(spread.values(), default=0.0)
     if family.kind == EXACT and largest == 0:
         return Metric(EXACT, value, 0.0, {})
+    told = {source: float(f"{width:.2g}") for source, width in spread.items()}
     tight = RELATIVE * abs(float(value))
     if family.kind == TIGHT and largest <= tight:
-        return Metric(TIGHT, value, _readable(max(tight, family.floor)), spread)
-    return Metric(BANDED, value, _readable(max(largest, tight, family.floor, _QUANTA * quantum)), spread)
+        return Metric(TIGHT, value, _readable(max(tight, family.floor)), told)
+    return Metric(BANDED, value, _readable(max(largest, tight, family.floor, _QUANTA * quantum)), told)
 
 
 def _readable(band: float) -> float:
@@ -111,7 +112,7 @@ def _spread(found: Sequence[tuple[str, float]]) -> dict[str, float]:
     for source, value in found[1:]:
         by_source.setdefault(source, [found[0][1]]).append(value)
     widths = {source: max(values) - min(values) for source, values in by_source.items()}
-    return {source: float(f"{width:.2g}") for source, width in widths.items() if width}
+    return {source: width for source, width in widths.items() if width}
 
 
 def _quantum(name: str, nominal: Measured, period: float) -> float:
