@@ -63,6 +63,7 @@ from .optimisers.reduced_gradient import ReducedGradient
 from .plant import Parameter, Plant, structural_order
 from .problem import Problem
 from .reference import Table, Trajectory
+from .regression.check import bless, check_baseline
 from .regressor import Combination, Regressor, linear_parameters
 from .relative_order import OutputChain, output_chain
 from .report.html import write_report
@@ -198,7 +199,9 @@ __all__ = [
     "Uncertain",
     "VelocityDifference",
     "assess_gain",
+    "bless",
     "certify",
+    "check_baseline",
     "check_controller",
     "check_deformation",
     "check_gain",

@@ -1,9 +1,10 @@
-"""The command line: list, review, solve, run and compare problems; begin a new one; examine the installation.
+"""The command line: list, review, solve, run, compare and check problems; begin a new one; examine the installation.
 
 Exit codes: 0 finished; 1 some answer of `review` is no; 2 bad input (names, values, a problem file, an option); 3 a folder
 or file cannot be written;
 4 the run ended early because a signal was not finite (`run`; `compare` reports it) or a plan did not converge (`solve`);
-5 a check failed (`doctor`); 130 interrupted.
+5 and 6 a metric changed, or there is no usable baseline (`check`); 7 a check of the installation failed (`doctor`);
+130 interrupted.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fpirhc.doctor.command import add_doctor
+from fpirhc.regression.commands import add_commands
 from fpirhc.scaffold.command import add_new
 from fpirhc.summary import printable
 
@@ -32,11 +34,13 @@ _EXAMPLES = """examples:
   fpirhc compare two_mass --optimisers all      the headline pair with every optimiser
   fpirhc run two_mass "RHC+FPI" --out results   one run, saved as .npz and .png
   fpirhc solve cart_pole --optimisers fixed-point ipopt      the first horizon, open loop, with certificates
+  fpirhc check                                  fresh results against the committed baselines
   fpirhc new my_arm                             a problem file and its test to start from
   fpirhc doctor                                 what is installed, and known traps
 
 exit codes: 0 finished, 1 an answer of review is no, 2 bad input, 3 cannot write, 4 the run ended early (run)
-or a plan did not converge (solve), 5 a check failed (doctor), 130 interrupted
+or a plan did not converge (solve), 5 a metric changed (check), 6 no usable baseline (check), 7 a check of the
+installation failed (doctor), 130 interrupted
 """
 
 
@@ -76,6 +80,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_solve(commands)
     add_new(commands)
     add_doctor(commands)
+    add_commands(commands)
     listing = commands.add_parser("list", help="list the shipped problems")
     listing.set_defaults(command=_list)
     return parser

@@ -53,6 +53,10 @@ class OutputError(FpirhcError, OSError):
     """A file or folder that cannot be written or read."""
 
 
+class BaselineError(FpirhcError, ValueError):
+    """A baseline that is missing, damaged, edited by hand, or of another problem or format."""
+
+
 class CompileError(FpirhcError, RuntimeError):
     """The C compiler failed on generated code."""
 

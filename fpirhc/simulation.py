@@ -7,7 +7,7 @@ progress.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -32,19 +32,20 @@ def simulate(
     seed: int,
     name: str = "",
     compiled: bool = True,
+    flags: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Run:
     """Run the closed loop of problem and controller and return every signal.
 
     Parameters: `seed` of the noise of disturbances and sensors; `name` of the controller in the results; `compiled`: use C
-    when there is a compiler; `progress` is called with (cycles done, cycles in all).
+    when there is a compiler, with `flags` after its usual ones; `progress` is called with (cycles done, cycles in all).
 
     A signal that becomes NaN or infinite ends the run at that cycle; the finite part is kept and `Run.stop` says why.
     """
     chosen = controller.resolved(problem)
     loop = close_loop(problem, chosen)
     chunked = loop.function.mapaccum(f"{loop.function.name()}_run", CHUNK)
-    backend = native(chunked) if compiled else None
+    backend = native(chunked, flags) if compiled else None
     evaluator = Evaluator(backend.function if backend else chunked)
     log, stop = _run_chunks(problem, loop.memory, loop.trace, evaluator, seed, progress)
     found = judgements(problem, chosen, loop.trace, log)

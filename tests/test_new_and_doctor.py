@@ -203,7 +203,7 @@ def test_banner_is_noticed(monkeypatch):
 
 
 def test_a_check_that_raises_has_failed_and_the_rest_goes_on(capsys, monkeypatch):
-    """One line for the error, one for what to do; exit code 5."""
+    """One line for the error, one for what to do; exit code 7."""
 
     def broken_library():
         raise OSError("libfoo.so: cannot open\nmore")
@@ -214,7 +214,7 @@ def test_a_check_that_raises_has_failed_and_the_rest_goes_on(capsys, monkeypatch
     assert findings[0].found == "OSError: libfoo.so: cannot open"
     assert findings[1].outcome == Outcome.OK
     monkeypatch.setattr("fpirhc.doctor.examine.examine", lambda: Diagnosis({"fpirhc": "0"}, findings))
-    assert main(["doctor"]) == 5
+    assert main(["doctor"]) == 7
     printed = capsys.readouterr().out
     assert "fail  broken-library" in printed
     assert "to do: install" in printed

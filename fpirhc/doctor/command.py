@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-_FAULTY = 5
+_FAULTY = 7
 _EXAMPLES = """examples:
   fpirhc doctor                          versions, solvers, compiler, cache, and known traps
   fpirhc doctor --json > doctor.json     one JSON object, to keep or to send

@@ -209,7 +209,7 @@ def _entry(
         cycle=measure_cycle(problem, resolved, run, compiled=compiled),
         adaptive=adaptive,
         pair=_pair(chosen, name) if adaptive else None,
-        contraction=_contraction(problem, resolved, run) if adaptive else None,
+        contraction=measure_contraction(problem, resolved, run) if adaptive else None,
         optimality=measure_optimality(problem, resolved, run, compiled=compiled),
         notes=(*_notes(controller, resolved), *resolved.notes(problem), *([view.text] if view else [])),
         lyapunov=view,
@@ -234,7 +234,7 @@ def _without_adaptation(settings: Any) -> Any:
     return {k: identity if k == "deformation" else _without_adaptation(v) for k, v in settings.items()}
 
 
-def _contraction(problem: Problem, controller: Controller, run: Run) -> Contraction | None:
+def measure_contraction(problem: Problem, controller: Controller, run: Run) -> Contraction | None:
     """Predicted along the run and measured from it; None when the run is too short, or the response not the plant's own."""
     if run.cycles < 10 or controller.response(problem) is not None:
         return None

@@ -65,15 +65,15 @@ def find_compiler() -> str | None:
     return None
 
 
-def native(function: ca.Function) -> Native:
-    """Return `function` compiled, or itself with the reason why not."""
+def native(function: ca.Function, flags: Sequence[str] = ()) -> Native:
+    """Return `function` compiled, or itself with the reason why not; `flags` come after the usual ones of the compiler."""
     if function.is_a("External"):
         return Native(function, True, "")
     compiler = find_compiler()
     if compiler is None:
         return Native(function, False, _why_no_compiler())
     try:
-        return Native(_library(generate(function), compiler), True, "")
+        return Native(_library(generate(function), compiler, flags), True, "")
     except (NotSupported, CompileError) as error:
         return Native(function, False, str(error))
 
@@ -161,9 +161,9 @@ def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
         raise CompileError(f"the C compiler '{command[0]}' cannot be started: {error}") from None
 
 
-def _library(sources: Sequence[str], compiler: str) -> ca.Function:
+def _library(sources: Sequence[str], compiler: str, more: Sequence[str] = ()) -> ca.Function:
     """Return the external Function of the library for these files, compiling it when needed."""
-    flags = _FLAGS if max(map(len, sources)) < _LARGE else _LARGE_FLAGS
+    flags = (*(_FLAGS if max(map(len, sources)) < _LARGE else _LARGE_FLAGS), *more)
     facts = "\0".join((*sources, compiler, _version(compiler), *flags, platform.machine(), ca.CasadiMeta.version()))
     key = hashlib.sha256(facts.encode()).hexdigest()[:32]
     if key not in _loaded:

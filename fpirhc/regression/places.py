@@ -1,0 +1,112 @@
+"""Where baselines are: `baselines/NAME.json` beside the problem file NAME.py, and which problems need one.
+
+Beside the problem, so that a change of either shows in the same review and both move together. A folder's `unchecked.toml` in
+`baselines` names the problems that have none, each with the reason: `chain_of_masses = "takes a minute"`.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import tempfile
+import tomllib
+from pathlib import Path
+
+from fpirhc.errors import BaselineError, OutputError
+
+FOLDER, UNCHECKED = "baselines", "unchecked.toml"
+
+
+def baseline_path(problem: Path, folder: Path | None = None) -> Path:
+    """Return where the baseline of a problem file is; `folder` instead of `baselines` beside it."""
+    return (folder or problem.parent / FOLDER) / f"{problem.stem}.json"
+
+
+def problems_here(folder: Path, baselines: Path | None = None) -> tuple[list[Path], dict[str, str]]:
+    """Return the problem files to check, and the names of those deliberately not, with their reasons.
+
+    They are those of `folder/problems` if there is such a folder, else of `folder` itself: files that define `problem` and
+    `controllers`, and every name that a baseline has, so that a problem that vanished is noticed.
+
+    Raises:
+        BaselineError: nothing is there to check, or `unchecked.toml` is wrong.
+    """
+    place = folder / "problems" if (folder / "problems").is_dir() else folder
+    held = baselines or place / FOLDER
+    named = {path.stem: path for path in sorted(place.glob("*.py")) if _is_problem(path)}
+    for path in sorted(held.glob("*.json")):
+        named.setdefault(path.stem, place / f"{path.stem}.py")
+    unchecked = _unchecked(held / UNCHECKED)
+    for name in unchecked:
+        if name not in named:
+            raise BaselineError(f"{UNCHECKED} names '{name}', which is no problem in '{place}'; take it out")
+        if baseline_path(named[name], held).exists():
+            raise BaselineError(f"{UNCHECKED} names '{name}', which has a baseline; take it out")
+    chosen = [path for name, path in sorted(named.items()) if name not in unchecked]
+    if not chosen:
+        raise BaselineError(f"no problem to check in '{place}'; name one, or go to the folder that has 'problems'")
+    return chosen, unchecked
+
+
+def _is_problem(path: Path) -> bool:
+    """Whether the file defines problem and controllers, seen without running it; one with a mistake in it counts."""
+    try:
+        body = ast.parse(path.read_text(encoding="utf-8")).body
+    except (OSError, SyntaxError, ValueError):
+        return True
+    inside = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+    nodes = [node for s in body if not isinstance(s, inside) for node in ast.walk(s)]
+    defined = {n.id for n in nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+    defined |= {n.asname or n.name for n in nodes if isinstance(n, ast.alias)}
+    return {"problem", "controllers"} <= defined
+
+
+def _unchecked(path: Path) -> dict[str, str]:
+    try:
+        facts = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise BaselineError(f"'{path}' cannot be read: {error}") from None
+    for name, reason in facts.items():
+        if not isinstance(reason, str) or not reason.strip():
+            raise BaselineError(f"'{path}': '{name}' needs a reason in quotes")
+    return facts
+
+
+def check_inside(path: Path, working: Path) -> None:
+    """Raise unless `path` lies in the project: the nearest folder above `working` with .git or pyproject.toml, or `working`.
+
+    Raises:
+        OutputError: it does not, links resolved.
+    """
+    working = working.resolve()
+    marks = (".git", "pyproject.toml")
+    root = next((f for f in (working, *working.parents) if any((f / m).exists() for m in marks)), working)
+    if not path.resolve().is_relative_to(root):
+        raise OutputError(
+            f"'{path}' lies outside of the project '{root}' and is not written; "
+            "go to the problem's own project, or give --baselines FOLDER"
+        )
+
+
+def write_whole(text: str, path: Path, what: str) -> None:
+    """Write a text file that is complete or not there.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(
+            "w", encoding="utf-8", dir=path.parent, prefix=".", suffix=".part", delete=False, newline="\n"
+        ) as file:
+            file.write(text)
+        try:
+            os.chmod(file.name, 0o644)
+            Path(file.name).replace(path)
+        except OSError:
+            Path(file.name).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise OutputError(f"cannot write the {what} to '{path}': {error.strerror}") from None
