@@ -55,20 +55,21 @@ def test_written_test_passes(folder):
         "-W",
         "error",
         "-k",
-        "plant or helps or exact",
+        "plant or helps or exact or numbers",
     ]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stdout
-    assert "3 passed" in done.stdout
+    assert "4 passed" in done.stdout
 
 
-@pytest.mark.parametrize("taken", ["arm.py", "test_arm.py"])
+@pytest.mark.parametrize("taken", ["arm.py", "test_arm.py", "baselines/arm.json"])
 def test_new_never_overwrites(folder, capsys, taken):
-    """Nothing is written where one of the two files is there, and the file keeps its text; exit code 3."""
+    """Nothing is written where one of the three files is there, and the file keeps its text; exit code 3."""
+    (folder / taken).parent.mkdir(exist_ok=True)
     (folder / taken).write_text("mine")
     assert main(["new", "arm"]) == 3
     assert f"'{taken}' exists already and is kept" in capsys.readouterr().err
-    assert [f.name for f in folder.iterdir()] == [taken]
+    assert [str(f.relative_to(folder)) for f in folder.rglob("*") if f.is_file()] == [taken]
     assert (folder / taken).read_text() == "mine"
 
 

@@ -10,7 +10,9 @@ from importlib.resources import files
 from pathlib import Path
 
 from fpirhc.errors import InvalidName, OutputError
-from fpirhc.studies.problem_file import shipped_problems
+from fpirhc.regression.check import bless
+from fpirhc.regression.places import baseline_path
+from fpirhc.studies.problem_file import load_problem, shipped_problems
 
 _LONGEST = 60  # characters of a name
 _FALLBACK = "my_plant"
@@ -24,6 +26,9 @@ def create_problem(name: str, folder: Path) -> tuple[Path, ...]:
         OutputError: one of the files exists already (nothing is written then), or the folder cannot be written to.
     """
     check_name(name)
+    baseline = baseline_path(folder / f"{name}.py")
+    if baseline.exists() or baseline.is_symlink():
+        raise OutputError(f"'{baseline}' exists already and is kept; choose another name or --dir")
     texts = {
         folder / f"{name}.py": _template("problem.txt", name),
         folder / f"test_{name}.py": _template("test.txt", name),
@@ -44,13 +49,14 @@ def create_problem(name: str, folder: Path) -> tuple[Path, ...]:
         raise OutputError(
             f"cannot write to the folder '{folder}': {error.strerror}; choose another with --dir"
         ) from None
-    return (*written, *_baselines(written[0]))
+    return tuple(written)
 
 
-def _baselines(problem_file: Path) -> tuple[Path, ...]:
-    """Write what later runs of a new problem are compared with, and return the paths: nothing yet."""
-    del problem_file
-    return ()
+def first_baseline(problem_file: Path) -> Path:
+    """Measure what later runs of a new problem are compared with, and return where it is."""
+    task = load_problem(str(problem_file))
+    _, path = bless(task, "first numbers of a new problem", working=problem_file.parent)
+    return path
 
 
 def check_name(name: str) -> None:
