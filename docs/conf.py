@@ -1,0 +1,42 @@
+"""Settings of the documentation site: python -m sphinx -W -b html docs docs/_build/html"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+project = "fpirhc"
+author = "The fpirhc authors"
+release = importlib.metadata.version("fpirhc")
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.mathjax",
+    "sphinx_gallery.gen_gallery",
+    "plain_docstrings",
+]
+exclude_patterns = ["_build", "gallery_src/README.rst"]
+html_theme = "furo"
+html_title = f"fpirhc {release}"
+# Offline like the reports: formulas are typeset by a script only where there is a network.
+myst_enable_extensions = ["dollarmath", "colon_fence"]
+myst_heading_anchors = 3
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+napoleon_use_param = False
+napoleon_use_rtype = False
+sphinx_gallery_conf = {
+    "examples_dirs": "gallery_src",
+    "gallery_dirs": "gallery",
+    "filename_pattern": "/plot_",
+    "download_all_examples": False,
+    "show_memory": False,
+    "abort_on_example_error": True,
+    "only_warn_on_example_error": False,
+    "plot_gallery": True,
+    "remove_config_comments": True,
+}

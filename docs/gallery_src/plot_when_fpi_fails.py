@@ -1,0 +1,147 @@
+"""
+When FPI fails, and how to see it before
+========================================
+
+Six ways to lose, each with what the tools say about it. All start from the same mass on
+a spring, whose model is too heavy.
+"""
+
+from dataclasses import replace
+
+import casadi as ca
+import matplotlib.pyplot as plt
+import numpy as np
+
+import fpirhc as fp
+
+plant = fp.Plant(
+    coordinates={"q": "m"},
+    inputs={"u": "N"},
+    order=2,
+    response=lambda q, v, u, p: {"q": (u.u - p.stiffness * q.q) / p.mass},
+    parameters={
+        "mass": fp.Parameter(approximate=1.5, exact=1.0, unit="kg"),
+        "stiffness": fp.Parameter(approximate=5.0, exact=20.0, unit="N/m"),
+    },
+)
+problem = fp.Problem(
+    plant=plant,
+    reference=fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(3 * t)}),
+    start={"q": 0.0, "q'": 1.5},
+    period=2e-3,
+    duration=4.0,
+    limits=fp.Limits(inputs={"u": (-60.0, 60.0)}),
+    measure_from=1.0,
+)
+tracking = fp.Exponential(rate=6.0)
+good = fp.ComputedTorque(tracking, fp.Sigmoid(gain=-1.0, scale=5.0))
+
+
+def error(problem, controller):
+    """Rms error from 1 s on, mm."""
+    run = fp.simulate(problem, controller, seed=0)
+    return 1e3 * fp.measure(problem, run).rms_error["q"]
+
+
+print(
+    f"without {error(problem, fp.ComputedTorque(tracking)):.1f} mm, with FPI {error(problem, good):.3f} mm"
+)
+
+# %%
+# 1. The sign is wrong
+# --------------------
+# If the model has the sign of the input's effect wrong, every cycle enlarges the error.
+# It is refused before the run.
+
+try:
+    fp.simulate(
+        problem, fp.ComputedTorque(tracking, fp.Sigmoid(gain=1.0, scale=5.0)), seed=0
+    )
+except fp.FpirhcError as reason:
+    print(reason)
+
+# %%
+# 2. The gain is too large
+# ------------------------
+# Beyond the limit the loop chatters, bounded by the saturation of the map. `fpirhc
+# review` says so beforehand.
+
+large = fp.ComputedTorque(tracking, fp.Sigmoid(gain=-4.0, scale=5.0))
+[answer] = [
+    a
+    for a in fp.review(problem, {"large": large}, mismatch=0.0, seed=0).answers
+    if "gain admissible" in a.question
+]
+print(answer.verdict, "-", answer.found)
+
+# %%
+# 3. The map cannot keep up
+# -------------------------
+# The step of eq (6) is at most a multiple of its scale S per cycle. With a small S it
+# is slower than the task.
+
+for scale in (5.0, 0.05, 0.005):
+    print(
+        f"S = {scale:g}: {error(problem, fp.ComputedTorque(tracking, fp.Sigmoid(gain=-1.0, scale=scale))):.3f} mm"
+    )
+
+# %%
+# 4. The response comes late
+# --------------------------
+# Ten cycles of dead time that nobody told the deformation about. Told, it is stable;
+# the tracking still pays for the delay.
+
+late = replace(problem, dead_time=fp.DeadTime(inputs={"u": 20e-3}))
+runs = {
+    "not told": fp.simulate(late, good, seed=0),
+    "Paired": fp.simulate(
+        late,
+        fp.ComputedTorque(tracking, fp.Paired(good.deformation, cycles=10)),
+        seed=0,
+    ),
+    "Increment, predicted": fp.simulate(
+        late,
+        fp.Predicted(
+            fp.ComputedTorque(tracking, fp.Increment(good.deformation, cycles=10)),
+            inputs=20e-3,
+        ),
+        seed=0,
+    ),
+}
+figure, axis = plt.subplots(figsize=(8, 3), layout="constrained")
+for name, run in runs.items():
+    axis.plot(run.time, 1e3 * run["true_error.q"], lw=1, label=name)
+axis.set(xlabel="time [s]", ylabel="true error [mm]")
+axis.legend()
+
+# %%
+# 5. The disturbance is out of reach
+# ----------------------------------
+# A deformation corrects the response that the input acts on, and nothing else. A leak
+# in the second of two tanks, while the pump fills the first, needs an estimator of
+# disturbances: the better choice there is offset-free control.
+
+tanks = fp.load_problem("leaking_tanks")
+for name, controller in tanks.controllers.items():
+    run = fp.simulate(tanks.problem, controller, seed=0)
+    print(
+        f"{name:30s}",
+        {
+            q: f"{1e3 * e:.2f} mm"
+            for q, e in fp.measure(tanks.problem, run).rms_error.items()
+        },
+    )
+
+# %%
+# 6. The measurement is noise
+# ---------------------------
+# Noise of the response goes through: with deviation one it becomes the square root of a
+# / (2 - a) in the request. Tracking hardly notices, the actuator does.
+
+rough = fp.Sensing({"q''": fp.Sensor(noise=fp.Noise(5.0))})
+for gain in (-0.25, -1.0, -2.0):
+    controller = fp.ComputedTorque(tracking, fp.Sigmoid(gain=gain, scale=50.0))
+    run = fp.simulate(replace(problem, sensing=rough), controller, seed=0)
+    print(
+        f"gain {gain}: jumps of the force {np.diff(run['command.u'][500:]).std():.2f} N per cycle"
+    )

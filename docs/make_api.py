@@ -1,0 +1,70 @@
+"""Writes the API page from the public names: python docs/make_api.py"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import fpirhc as fp
+
+PAGE = Path(__file__).resolve().parent / "api.rst"
+STUB = Path(fp.__file__).with_suffix(".pyi")
+SECTIONS = {
+    "Plants and problems": (
+        "plant",
+        "problem",
+        "reference",
+        "limits",
+        "disturbance",
+        "integrate",
+        "relative_order",
+        "symbolic",
+    ),
+    "Dead time and sensing": ("dead_time", "sensing"),
+    "Controllers": ("controllers",),
+    "Tracking laws": ("tracking",),
+    "Deformations": ("deformation", "contraction"),
+    "Horizons and optimisers": ("horizon", "optimisers"),
+    "Learning": ("estimation", "adaptation", "regressor"),
+    "Running and measuring": ("simulation", "run", "stepper", "metrics", "lyapunov", "status"),
+    "Studies and reports": ("studies", "report", "regression"),
+    "Testing and errors": ("testing", "errors"),
+}
+WITH_MEMBERS = {
+    "Run",
+    "Stepper",
+    "Comparison",
+    "Plan",
+    "Certificate",
+    "Metrics",
+    "Plant",
+    "Problem",
+    "LyapunovView",
+    "Review",
+}
+
+
+def by_section() -> dict[str, list[str]]:
+    """Public names by section; a module that no section names is an error, so that no name is left out silently."""
+    found: dict[str, list[str]] = {title: [] for title in SECTIONS}
+    homes = {module: title for title, modules in SECTIONS.items() for module in modules}
+    text = re.sub(r"\(\s*([^)]*?),?\s*\)", lambda m: " ".join(m.group(1).split()), STUB.read_text(encoding="utf-8"))
+    for module, names in re.findall(r"^from \.(\w+)[\w.]* import (.+)$", text, re.MULTILINE):
+        found[homes[module]] += [name.strip() for name in names.split(",") if name.strip()]
+    return found
+
+
+def page() -> str:
+    """The page's text."""
+    about = "Every name below is imported from ``fpirhc``; the docstrings give equations, shapes, units and sources."
+    lines = ["API", "===", "", about, ""]
+    for title, names in by_section().items():
+        lines += [title, "-" * len(title), ""]
+        for name in names:
+            kind = "autoclass" if isinstance(getattr(fp, name), type) else "autofunction"
+            lines += [f".. {kind}:: fpirhc.{name}"] + (["   :members:"] if name in WITH_MEMBERS else []) + [""]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

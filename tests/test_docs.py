@@ -1,0 +1,59 @@
+"""The documentation's code runs as printed, its links lead somewhere, and its list of names is complete."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+from fpirhc.cli import main
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+PAGES = sorted(p for p in DOCS.rglob("*.md") if "_build" not in p.parts)
+
+
+def blocks(page: Path) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p)], ids=lambda p: p.stem)
+def test_code_runs(page, tmp_path, monkeypatch):
+    """The blocks of a page, one after the other, as a reader would paste them."""
+    monkeypatch.chdir(tmp_path)
+    exec(compile("\n".join(blocks(page)), str(page), "exec"), {"__name__": "__main__"})
+
+
+def test_tutorial_does_what_it_says(tmp_path, monkeypatch, capsys):
+    """Its file compares, a turned sign is refused with the reason, and the review finds nothing wrong."""
+    monkeypatch.chdir(tmp_path)
+    text = "\n".join(blocks(DOCS / "tutorial.md")).partition("run = fp.simulate")[0]
+    Path("drone.py").write_text(text)
+    assert main(["compare", "drone.py"]) == 0
+    said = capsys.readouterr().out.replace("\n", " ")
+    assert "from 0.0235 to 0.00011 m" in said
+    Path("turned.py").write_text(text.replace("gain=-0.5", "gain=0.5"))
+    assert main(["compare", "turned.py"]) == 2
+    assert "has the wrong sign" in capsys.readouterr().err
+    Path("light.py").write_text(text.replace("exact=1.6", "exact=0.2"))
+    assert main(["compare", "light.py"]) == 0
+    assert main(["review", "drone.py"]) == 0
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)
+def test_links_lead_somewhere(page):
+    """Relative links point to files; those into the gallery to the scripts that it is made of."""
+    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
+        if "://" in target:
+            continue
+        made = DOCS / "gallery_src" / f"{Path(target).name}.py"
+        assert (page.parent / target).exists() or ("gallery/" in target and made.exists()), target
+
+
+def test_every_public_name_is_on_the_api_page():
+    """The page is what `python docs/make_api.py` writes."""
+    spec = importlib.util.spec_from_file_location("make_api", DOCS / "make_api.py")
+    maker = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(maker)
+    assert maker.PAGE.read_text(encoding="utf-8") == maker.page()
