@@ -36,6 +36,16 @@ def close_loop(problem: Problem, controller: Controller) -> Composite:
     return compose("loop", Layout(disturbed), around, [*_plant_delays(problem, chosen), *delays])
 
 
+def start_memory(loop: Composite, problem: Problem, controller: Controller) -> np.ndarray:
+    """Return the first memory of `loop` for a problem that differs from the loop's own in its exact parameters only."""
+    chosen = prepared(problem, controller)
+    remembered = [
+        signal for b in _sense_blocks(problem, chosen.response(problem), predicts=False) for signal in b.memory.signals
+    ]
+    remembered += [d.now for d in _plant_delays(problem, chosen)]
+    return loop.memory.pack({s.name: s.start_vector() for s in remembered})
+
+
 def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:
     """Return the signal of all disturbances in the order of the problem, or nothing when there are none."""
     if not problem.disturbances:
