@@ -40,6 +40,11 @@ class Simulator:
     compiled: bool
     why_not_compiled: str
 
+    @property
+    def remembers(self) -> bool:
+        """Whether some solver inside keeps what it found for the next run (OSQP does): a run would depend on those before."""
+        return any(f.class_name() == "OsqpInterface" for f in self.loop.function.find_functions())
+
     def run(
         self, *, seed: int, name: str = "", variant: Problem | None = None, progress: Progress | None = None
     ) -> Run:
