@@ -1,6 +1,7 @@
 """The command line: list, solve, run and compare problems.
 
-Exit codes: 0 finished; 2 bad input (names, values, a problem file, an option); 3 a folder or file cannot be written;
+Exit codes: 0 finished; 2 bad input (names, values, a problem file, an option); 3 a folder or file cannot be written, or
+holds results of something else;
 4 the run ended early because a signal was not finite (`run`; `compare` reports it) or a plan did not converge (`solve`);
 130 interrupted.
 """
@@ -13,6 +14,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fpirhc.commands import scenarios
+from fpirhc.commands.common import output_folder
+
 if TYPE_CHECKING:
     from fpirhc.studies.compare import Comparison, Progress
 
@@ -24,10 +28,11 @@ _EXAMPLES = """examples:
   fpirhc compare my_arm.py --controllers RHC RHC+FPI --out results/arm
   fpirhc compare two_mass --json                one JSON object on standard output
   fpirhc compare two_mass --optimisers all      the headline pair with every optimiser
+  fpirhc compare two_mass --seeds 100 --mismatch 20          paired scenarios with other exact parameters
   fpirhc run two_mass "RHC+FPI" --out results   one run, saved as .npz and .png
   fpirhc solve cart_pole --optimisers fixed-point ipopt      the first horizon, open loop, with certificates
 
-exit codes: 0 finished, 2 bad input, 3 cannot write, 4 the run ended early (run)
+exit codes: 0 finished, 2 bad input, 3 cannot write or results of something else are there, 4 the run ended early (run)
 or a plan did not converge (solve), 130 interrupted
 """
 
@@ -73,14 +78,18 @@ def _parser() -> argparse.ArgumentParser:
 def _add_compare(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     command = commands.add_parser(
         "compare",
-        help="run several controllers on one problem and write a report",
-        epilog=_EXAMPLES,
+        help="run several controllers on one problem, once or in many scenarios, and write a report",
+        epilog=f"{_EXAMPLES}\n{scenarios.EXAMPLES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     _add_common(command)
     command.add_argument("--controllers", nargs="+", metavar="NAME", help="only these controllers (default: all)")
     _add_optimisers(command)
     command.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
+    command.add_argument(
+        "--tuned", metavar="FILE", help="use the settings in a file that 'fpirhc tune' wrote, and say so"
+    )
+    scenarios.add_options(command)
     command.set_defaults(command=_compare)
 
 
@@ -152,6 +161,11 @@ def _list(options: argparse.Namespace) -> int:  # noqa: ARG001
 
 
 def _compare(options: argparse.Namespace) -> int:
+    scenarios.check_options(options)
+    return _compare_once(options) if options.seeds is None else scenarios.run(options)
+
+
+def _compare_once(options: argparse.Namespace) -> int:
     from fpirhc.report.html import write_report
     from fpirhc.report.terminal import announce_backend, progress_bars, show
     from fpirhc.studies.compare import compare
@@ -244,20 +258,7 @@ def _named(progress: Progress, name: str):  # type: ignore[no-untyped-def]
 
 
 def _folder(options: argparse.Namespace, name: str) -> Path:
-    """Create the output folder before anything runs, so that a wrong path fails at once."""
-    from fpirhc.errors import OutputError
-
-    folder = Path(options.out) if options.out else Path("results") / name
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".fpirhc-probe"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise OutputError(
-            f"cannot write to the folder '{folder}': {error.strerror}; choose another with --out"
-        ) from None
-    return folder
+    return output_folder(Path(options.out) if options.out else Path("results") / name)
 
 
 def _command(options: argparse.Namespace) -> str:

@@ -79,13 +79,13 @@ class Bench:
         scenario, variant = self._scenario(number)
         run = ready.run(seed=scenario.seed, name=name, variant=variant)
         metrics = measure(variant, run)
-        error = relative_error(metrics, self._ranges)
+        size = relative_error(metrics, self._ranges)
         return {
             "scenario": number,
             "controller": name,
             "mismatch": scenario.mismatch,
-            "outcome": outcome(run, error),
-            "error": _finite(error),
+            "outcome": outcome(run, size),
+            "error": _finite(size),
             "rms_error": _finite(metrics.rms_error),
             "max_error": _finite(metrics.max_error),
             "effort": _finite(metrics.effort),

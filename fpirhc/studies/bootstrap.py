@@ -36,7 +36,7 @@ def median_interval(values: np.ndarray, seed: int) -> Interval:
         size = (min(rows, RESAMPLES - at), values.size)
         found.append(middle(values[random.integers(values.size, size=size)]))
     medians = np.sort(np.concatenate(found))
-    tail = int(round((1 - LEVEL) / 2 * RESAMPLES))
+    tail = round((1 - LEVEL) / 2 * RESAMPLES)
     return Interval(float(middle(values)), float(medians[tail]), float(medians[-1 - tail]))
 
 

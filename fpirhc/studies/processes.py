@@ -7,6 +7,7 @@ started anew and given the jobs that it had not answered.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import queue
@@ -167,9 +168,7 @@ def _end(process: subprocess.Popen[str]) -> None:
     process.kill()
     assert process.stdin is not None
     assert process.stdout is not None
-    try:
+    with contextlib.suppress(OSError):
         process.stdin.close()
-    except OSError:
-        pass
     process.stdout.close()
     process.wait()
