@@ -51,6 +51,10 @@ from .status import Status
 from .stepper import Stepper
 from .studies.compare import Comparison, compare
 from .studies.problem_file import load_problem
+from .studies.scenario_study import ScenarioComparison, compare_scenarios
+from .studies.settings import with_settings
+from .studies.spans import LogSpan, Span
+from .studies.tune import Tuning, tune
 from .symbolic.functions import signed_power
 from .testing import check_deformation
 from .tracking.exponential import Exponential
@@ -94,6 +98,7 @@ __all__ = [
     "Informed",
     "InteriorPoint",
     "Limits",
+    "LogSpan",
     "LqrTerminal",
     "Metrics",
     "Noise",
@@ -120,12 +125,14 @@ __all__ = [
     "Rotation",
     "Run",
     "RungeKutta4",
+    "ScenarioComparison",
     "SelfPaired",
     "SequentialQuadratic",
     "Sigmoid",
     "Sine",
     "Slot",
     "Slotted",
+    "Span",
     "Status",
     "Step",
     "Stepper",
@@ -133,11 +140,13 @@ __all__ = [
     "Table",
     "Trajectory",
     "Tuned",
+    "Tuning",
     "assess_gain",
     "certify",
     "check_deformation",
     "check_gain",
     "compare",
+    "compare_scenarios",
     "floquet_radius",
     "load_problem",
     "load_run",
@@ -150,6 +159,8 @@ __all__ = [
     "spectrum_over_box",
     "spectrum_over_run",
     "structural_order",
+    "tune",
+    "with_settings",
     "write_report",
 ]
 

@@ -1,4 +1,4 @@
-"""The command line: list, solve, run and compare problems.
+"""The command line: list, solve, run, compare and tune problems.
 
 Exit codes: 0 finished; 2 bad input (names, values, a problem file, an option); 3 a folder or file cannot be written, or
 holds results of something else;
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fpirhc.commands import scenarios
+from fpirhc.commands import scenarios, tune
 from fpirhc.commands.common import output_folder
 
 if TYPE_CHECKING:
@@ -70,6 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_compare(commands)
     _add_run(commands)
     _add_solve(commands)
+    tune.add(commands)
     listing = commands.add_parser("list", help="list the shipped problems")
     listing.set_defaults(command=_list)
     return parser
@@ -170,8 +171,11 @@ def _compare_once(options: argparse.Namespace) -> int:
     from fpirhc.report.terminal import announce_backend, progress_bars, show
     from fpirhc.studies.compare import compare
     from fpirhc.studies.problem_file import load_problem
+    from fpirhc.studies.tuned_file import noted, read_tuned, with_tuned
 
     task = load_problem(options.problem)
+    tuned = read_tuned(options.tuned, task) if options.tuned else None
+    task = with_tuned(task, tuned.values) if tuned else task
     chosen = options.controllers
     if options.optimisers:
         from fpirhc.studies.compare import select
@@ -188,6 +192,7 @@ def _compare_once(options: argparse.Namespace) -> int:
             command=_command(options),
             progress=progress,
         )
+    comparison = noted(comparison, tuned.notes) if tuned else comparison
     report = folder / "report.html"
     write_report(comparison, report)
     announce_backend(comparison)
@@ -270,6 +275,8 @@ def _command(options: argparse.Namespace) -> str:
         words += ["--controllers", *options.controllers]
     if options.optimisers:
         words += ["--optimisers", *options.optimisers]
+    if options.tuned:
+        words += ["--tuned", options.tuned]
     if options.no_compile:
         words.append("--no-compile")
     return shlex.join(words)

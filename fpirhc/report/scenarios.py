@@ -139,7 +139,9 @@ def _cells(one: Summary) -> list[str]:
 
 def _tuning(found: ScenarioComparison) -> str:
     if not found.tuning:
-        return "<section><h2>Tuning</h2><p>Settings are those of the problem file; no file of tuned settings was given.</p></section>"
+        return (
+            "<section><h2>Tuning</h2><p>No file of tuned settings was given: all are the problem file's.</p></section>"
+        )
     names = [*(s.name for s in found.summaries), *found.skipped]
     items = "".join(f"<li><b>{text(n)}</b>: {text(found.tuning[n])}</li>" for n in names if n in found.tuning)
     return f"<section><h2>Tuning</h2><ul>{items}</ul></section>"

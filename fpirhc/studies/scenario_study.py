@@ -17,7 +17,8 @@ from fpirhc.studies.paired import Summary, summarise, verdict
 from fpirhc.studies.problem_file import Task
 from fpirhc.studies.processes import Workers
 from fpirhc.studies.scenarios import COMPARING
-from fpirhc.studies.settings import Values, with_tuned
+from fpirhc.studies.settings import Values
+from fpirhc.studies.tuned_file import with_tuned
 
 LEDGER = "scenarios.jsonl"
 Progress = Callable[[str, int, int], None]

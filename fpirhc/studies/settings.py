@@ -1,4 +1,4 @@
-"""Settings of a controller by dotted path: what tuning changes, and how what it found is written down."""
+"""Settings of a controller by dotted path: what tuning changes."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 from fpirhc.controllers.base import Controller
-from fpirhc.errors import InvalidName, InvalidValue, Mistakes, nearest
-from fpirhc.studies.problem_file import Task
+from fpirhc.errors import InvalidName, InvalidValue, nearest
 
 Values = Mapping[str, float]
 
@@ -55,33 +54,13 @@ def current_setting(controller: Controller, path: str) -> float:
     return value
 
 
-def with_tuned(task: Task, tuned: Mapping[str, Values]) -> Task:
-    """Return the task with these settings of these controllers changed.
-
-    Raises:
-        InvalidProblem: unknown controllers or settings.
-    """
-    mistakes = Mistakes(f"tuned settings of problem '{task.name}'")
-    mistakes.unknown("controller", tuned, task.controllers)
-    changed = dict(task.controllers)
-    for name, values in tuned.items():
-        if name in changed:
-            try:
-                changed[name] = with_settings(changed[name], values)
-            except (InvalidName, InvalidValue) as error:
-                mistakes.add(f"controller '{name}': {error}")
-    mistakes.raise_if_any()
-    return replace(task, controllers=changed)
-
-
-def as_python(tuned: Mapping[str, Values], notes: Mapping[str, str]) -> str:
-    """Return the lines that give a problem file's controllers these settings; `notes` stand behind them."""
-    lines = []
-    for name, values in tuned.items():
-        inside = ", ".join(f"{path!r}: {value!r}" for path, value in values.items())
-        note = f"  # {notes[name]}" if name in notes else ""
-        lines.append(f"controllers[{name!r}] = fp.with_settings(controllers[{name!r}], {{{inside}}}){note}")
-    return "\n".join(lines)
+def is_whole(controller: Controller, path: str) -> bool:
+    """Whether the setting at a path is declared as a whole number."""
+    *parents, name = path.split(".")
+    owner: Any = controller
+    for parent in parents:
+        owner = _entry(owner, parent)
+    return is_dataclass(owner) and any(f.name == name and f.type in (int, "int") for f in fields(owner))
 
 
 def _names(value: Any) -> list[str]:

@@ -15,7 +15,7 @@ from typing import Any, TextIO
 from fpirhc.errors import FpirhcError
 from fpirhc.studies.bench import Bench, Conditions, fingerprint
 from fpirhc.studies.problem_file import load_problem
-from fpirhc.studies.settings import with_tuned
+from fpirhc.studies.tuned_file import with_tuned
 
 
 def main() -> None:
