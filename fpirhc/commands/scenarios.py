@@ -62,7 +62,8 @@ def run(options: argparse.Namespace) -> int:
     task = load_problem(options.problem)
     tuned = read_tuned(options.tuned, task) if options.tuned else None
     percent = options.mismatch or 0.0
-    default = Path("results") / task.name / f"scenarios_{percent:g}percent_seed{options.seed}"
+    kind = "tuned_scenarios" if tuned else "scenarios"
+    default = Path("results") / task.name / f"{kind}_{percent:g}percent_seed{options.seed}"
     folder = output_folder(Path(options.out) if options.out else default)
     try:
         with progress_bars() as progress:

@@ -93,15 +93,14 @@ def _show(found: Tuning, saved: Path) -> None:
     console = Console()
     title = f"{found.problem}: {found.trials} trials each, seed {found.seed}, {found.conditions}"
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title)
-    for head in ("controller", "setting"):
-        table.add_column(head)
-    for head in ("before", "after", "cost before", "cost after", "failed trials"):
+    table.add_column("controller, setting", no_wrap=True)
+    for head in ("before", "after", "failed"):
         table.add_column(head, justify="right")
     for entry in found.entries:
-        numbers = [f"{entry.cost_before:.4g}", f"{entry.cost:.4g}", str(entry.failed)]
-        for k, (path, value) in enumerate(entry.settings.items()):
-            shown = [entry.name.replace("[", "\\["), *numbers] if k == 0 else [""] * 4
-            table.add_row(shown[0], path, f"{entry.before[path]:.4g}", f"{value:.4g}", *shown[1:])
+        name = entry.name.replace("[", "\\[")
+        table.add_row(f"{name}: cost", f"{entry.cost_before:.4g}", f"{entry.cost:.4g}", str(entry.failed))
+        for path, value in entry.settings.items():
+            table.add_row(f"  {path}", f"{entry.before[path]:.4g}", f"{value:.4g}", "")
     console.print(table)
     if found.untouched:
         console.print(f"not tuned: {', '.join(found.untouched)}", markup=False, highlight=False)

@@ -37,7 +37,7 @@ def mismatch_figure(found: ScenarioComparison) -> Figure:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 4.8), layout="constrained")
-    figure.suptitle(f"{found.title} Error against mismatch.", fontsize=11)
+    figure.suptitle(f"{found.problem}: error against mismatch, {found.count} scenarios", fontsize=11)
     axis = figure.subplots()
     finite = np.concatenate([s.errors[np.isfinite(s.errors)] for s in found.summaries])
     edge = 200 * float(finite.max(initial=1e-3))
@@ -142,8 +142,7 @@ def _tuning(found: ScenarioComparison) -> str:
         return (
             "<section><h2>Tuning</h2><p>No file of tuned settings was given: all are the problem file's.</p></section>"
         )
-    names = [*(s.name for s in found.summaries), *found.skipped]
-    items = "".join(f"<li><b>{text(n)}</b>: {text(found.tuning[n])}</li>" for n in names if n in found.tuning)
+    items = "".join(f"<li><b>{text(name)}</b>: {text(note)}</li>" for name, note in found.tuning.items())
     return f"<section><h2>Tuning</h2><ul>{items}</ul></section>"
 
 

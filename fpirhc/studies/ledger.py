@@ -30,12 +30,14 @@ class Ledger:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("a+b")
+        except OSError as error:
+            raise OutputError(f"cannot write to '{path}': {error.strerror}; choose another folder with --out") from None
+        try:
             _lock(self._file, path)
             self.records = self._read(json.loads(json.dumps(header)))
-        except OSError as error:
-            if isinstance(error, OutputError):
-                raise
-            raise OutputError(f"cannot write to '{path}': {error.strerror}; choose another folder with --out") from None
+        except BaseException:
+            self._file.close()
+            raise
 
     def append(self, record: Mapping[str, Any]) -> None:
         """Write one record and wait until it is on the disk.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,10 @@ def compare_scenarios(
     for name, value in (("seeds", count), ("processes", processes)):
         if value < 1:
             raise InvalidValue(f"{name} {value}: expected at least 1")
+    if percent == 0 and not task.problem.disturbances:
+        raise InvalidValue(
+            "every scenario would be the same: the problem has no disturbances and no parameter is drawn; give --mismatch P"
+        )
     task = with_tuned(task, tuned or {})
     names = list(select(task, [*([baseline] if baseline else []), *(controllers or task.controllers)]))
     check_gains(task, select(task, names))
@@ -98,16 +103,19 @@ def compare_scenarios(
         found = {(r["scenario"], r["controller"]): r for r in ledger.records}
         jobs = [(k, name) for k in range(count) for name in names if (k, name) not in found]
         done = {name: sum((k, name) in found for k in range(count)) for name in names}
-        for record in _answers(bench, Workers(__package__ + ".worker", opening, header, processes), processes, jobs):
-            name = record["controller"]
-            if "skipped" in record:
-                skipped[name] = record["skipped"]
-            else:
-                ledger.append(record)
-                found[record["scenario"], name] = record
-            done[name] += 1
-            if progress:
-                progress(name, done[name], count)
+        workers = Workers(__package__ + ".worker", opening, header, processes)
+        # Closed whatever happens: the workers end with it.
+        with closing(_answers(bench, workers, processes, jobs)) as answers:
+            for record in answers:
+                name = record["controller"]
+                if "skipped" in record:
+                    skipped[name] = record["skipped"]
+                else:
+                    ledger.append(record)
+                    found[record["scenario"], name] = record
+                done[name] += 1
+                if progress:
+                    progress(name, done[name], count)
     records = {n: [found[k, n] for k in range(count)] for n in names if n not in skipped}
     summaries = _summaries(records, seed)
     return ScenarioComparison(
@@ -123,7 +131,7 @@ def compare_scenarios(
         records=records,
         skipped=skipped,
         verdict=verdict(summaries, skipped),
-        tuning=dict(tuning or {}),
+        tuning={n: note for n, note in (tuning or {}).items() if n in names},
         settings={"problem": describe(task.problem), **{n: describe(task.controllers[n]) for n in names}},
         versions=versions(),
         command=command,
@@ -133,7 +141,7 @@ def compare_scenarios(
 
 def _answers(
     bench: Bench, workers: Workers, processes: int, jobs: Sequence[tuple[int, str]]
-) -> Iterator[dict[str, Any]]:
+) -> Generator[dict[str, Any]]:
     """Records of the jobs as they come."""
     if processes == 1 or not jobs:
         for number, name in jobs:

@@ -131,7 +131,7 @@ def _optuna() -> ModuleType:
     except ImportError:
         raise NotSupported("tuning needs Optuna, which is not installed: pip install 'fpirhc[tune]'") from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    return optuna  # type: ignore[no-any-return]
+    return optuna
 
 
 def _chosen(task: Task, names: Sequence[str] | None) -> list[str]:
