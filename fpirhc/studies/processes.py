@@ -64,7 +64,7 @@ class Workers:
             self._threads[-1].start()
         for _ in jobs:
             answer = given.get()
-            if isinstance(answer, FpirhcError):
+            if isinstance(answer, Exception):
                 raise answer
             yield answer
 
@@ -96,11 +96,13 @@ class Workers:
                 deaths = 0
                 pending.popleft()
                 given.put(json.loads(line))
-        except FpirhcError as error:
+        except Exception as error:  # noqa: BLE001 -- whatever it is must reach the one who waits for an answer
             given.put(error)
         finally:
-            if process is not None:
-                _end(process)
+            with self._starting:
+                last = self._running.pop(k, None)
+            if last is not None:
+                _end(last)
 
     def _start(self, k: int) -> subprocess.Popen[str] | None:
         """Start worker `k` and check its greeting; None when all are to stop. One that dies before it greets is replaced."""
