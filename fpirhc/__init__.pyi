@@ -85,6 +85,10 @@ from .studies.compare import Comparison, compare
 from .studies.problem_file import load_problem
 from .studies.review.answer import Answer, Review
 from .studies.review.review import review
+from .studies.scenario_study import ScenarioComparison, compare_scenarios
+from .studies.settings import with_settings
+from .studies.spans import LogSpan, Span
+from .studies.tune import Tuning, tune
 from .symbolic.functions import signed_power
 from .testing import check_controller, check_deformation, check_optimiser, check_plant, check_tracking
 from .tracking.exponential import Exponential
@@ -138,6 +142,7 @@ __all__ = [
     "Informed",
     "InteriorPoint",
     "Limits",
+    "LogSpan",
     "LowPassDifference",
     "LqrTerminal",
     "LyapunovMrac",
@@ -178,6 +183,7 @@ __all__ = [
     "Run",
     "RungeKutta4",
     "SavitzkyGolay",
+    "ScenarioComparison",
     "SelfPaired",
     "Sensing",
     "Sensor",
@@ -188,6 +194,7 @@ __all__ = [
     "Slot",
     "SlotineLi",
     "Slotted",
+    "Span",
     "StateVariableFilter",
     "Status",
     "Step",
@@ -196,6 +203,7 @@ __all__ = [
     "Table",
     "Trajectory",
     "Tuned",
+    "Tuning",
     "Uncertain",
     "VelocityDifference",
     "assess_gain",
@@ -209,6 +217,7 @@ __all__ = [
     "check_plant",
     "check_tracking",
     "compare",
+    "compare_scenarios",
     "delayed_limit",
     "disturbed",
     "floquet_radius",
@@ -226,6 +235,8 @@ __all__ = [
     "spectrum_over_box",
     "spectrum_over_run",
     "structural_order",
+    "tune",
+    "with_settings",
     "write_report",
 ]
 

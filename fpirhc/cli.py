@@ -1,7 +1,7 @@
-"""The command line: list, review, solve, run, compare and check problems; begin a new one; examine the installation.
+"""The command line: list, review, solve, run, compare, tune and check problems; begin a new one; examine the installation.
 
 Exit codes: 0 finished; 1 some answer of `review` is no; 2 bad input (names, values, a problem file, an option); 3 a folder
-or file cannot be written;
+or file cannot be written, or holds results of something else;
 4 the run ended early because a signal was not finite (`run`; `compare` reports it) or a plan did not converge (`solve`);
 5 and 6 a metric changed, or there is no usable baseline (`check`); 7 a check of the installation failed (`doctor`);
 130 interrupted.
@@ -15,6 +15,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fpirhc.commands import scenarios, tune
+from fpirhc.commands.common import output_folder
 from fpirhc.doctor.command import add_doctor
 from fpirhc.regression.commands import add_commands
 from fpirhc.scaffold.command import add_new
@@ -32,15 +34,16 @@ _EXAMPLES = """examples:
   fpirhc compare my_arm.py --controllers RHC RHC+FPI --out results/arm
   fpirhc compare two_mass --json                one JSON object on standard output
   fpirhc compare two_mass --optimisers all      the headline pair with every optimiser
+  fpirhc compare two_mass --seeds 100 --mismatch 20          paired scenarios with other exact parameters
   fpirhc run two_mass "RHC+FPI" --out results   one run, saved as .npz and .png
   fpirhc solve cart_pole --optimisers fixed-point ipopt      the first horizon, open loop, with certificates
   fpirhc check                                  fresh results against the committed baselines
   fpirhc new my_arm                             a problem file and its test to start from
   fpirhc doctor                                 what is installed, and known traps
 
-exit codes: 0 finished, 1 an answer of review is no, 2 bad input, 3 cannot write, 4 the run ended early (run)
-or a plan did not converge (solve), 5 a metric changed (check), 6 no usable baseline (check), 7 a check of the
-installation failed (doctor), 130 interrupted
+exit codes: 0 finished, 1 an answer of review is no, 2 bad input, 3 cannot write or results of something else are there,
+4 the run ended early (run) or a plan did not converge (solve), 5 a metric changed (check), 6 no usable baseline (check),
+7 a check of the installation failed (doctor), 130 interrupted
 """
 
 
@@ -78,6 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_compare(commands)
     _add_run(commands)
     _add_solve(commands)
+    tune.add(commands)
     add_new(commands)
     add_doctor(commands)
     add_commands(commands)
@@ -109,14 +113,18 @@ def _add_review(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
 def _add_compare(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     command = commands.add_parser(
         "compare",
-        help="run several controllers on one problem and write a report",
-        epilog=_EXAMPLES,
+        help="run several controllers on one problem, once or in many scenarios, and write a report",
+        epilog=f"{_EXAMPLES}\n{scenarios.EXAMPLES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     _add_common(command)
     command.add_argument("--controllers", nargs="+", metavar="NAME", help="only these controllers (default: all)")
     _add_optimisers(command)
     command.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
+    command.add_argument(
+        "--tuned", metavar="FILE", help="use the settings in a file that 'fpirhc tune' wrote, and say so"
+    )
+    scenarios.add_options(command)
     command.set_defaults(command=_compare)
 
 
@@ -204,12 +212,20 @@ def _review(options: argparse.Namespace) -> int:
 
 
 def _compare(options: argparse.Namespace) -> int:
+    scenarios.check_options(options)
+    return _compare_once(options) if options.seeds is None else scenarios.run(options)
+
+
+def _compare_once(options: argparse.Namespace) -> int:
     from fpirhc.report.html import write_report
     from fpirhc.report.terminal import announce_backend, progress_bars, show
     from fpirhc.studies.compare import compare
     from fpirhc.studies.problem_file import load_problem
+    from fpirhc.studies.tuned_file import noted, read_tuned, with_tuned
 
     task = load_problem(options.problem)
+    tuned = read_tuned(options.tuned, task) if options.tuned else None
+    task = with_tuned(task, tuned.values) if tuned else task
     chosen = options.controllers
     if options.optimisers:
         from fpirhc.studies.compare import select
@@ -226,6 +242,7 @@ def _compare(options: argparse.Namespace) -> int:
             command=_command(options),
             progress=progress,
         )
+    comparison = noted(comparison, tuned.notes) if tuned else comparison
     report = folder / "report.html"
     write_report(comparison, report)
     announce_backend(comparison)
@@ -296,20 +313,7 @@ def _named(progress: Progress, name: str):  # type: ignore[no-untyped-def]
 
 
 def _folder(options: argparse.Namespace, name: str) -> Path:
-    """Create the output folder before anything runs, so that a wrong path fails at once."""
-    from fpirhc.errors import OutputError
-
-    folder = Path(options.out) if options.out else Path("results") / name
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".fpirhc-probe"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise OutputError(
-            f"cannot write to the folder '{folder}': {error.strerror}; choose another with --out"
-        ) from None
-    return folder
+    return output_folder(Path(options.out) if options.out else Path("results") / name)
 
 
 def _command(options: argparse.Namespace) -> str:
@@ -321,6 +325,8 @@ def _command(options: argparse.Namespace) -> str:
         words += ["--controllers", *options.controllers]
     if options.optimisers:
         words += ["--optimisers", *options.optimisers]
+    if options.tuned:
+        words += ["--tuned", options.tuned]
     if options.no_compile:
         words.append("--no-compile")
     return shlex.join(words)

@@ -61,6 +61,10 @@ class CompileError(FpirhcError, RuntimeError):
     """The C compiler failed on generated code."""
 
 
+class WorkerDied(FpirhcError, RuntimeError):
+    """Processes that compute for this one die again and again."""
+
+
 def nearest(name: str, valid: Iterable[str]) -> str:
     """Return ' Did you mean ...? Valid: ...' for a message about an unknown `name`."""
     names = list(valid)

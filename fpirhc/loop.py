@@ -38,6 +38,17 @@ def close_loop(problem: Problem, controller: Controller) -> Composite:
     )
 
 
+def start_memory(loop: Composite, problem: Problem, controller: Controller) -> np.ndarray:
+    """Return the first memory of a loop for a problem that differs from the loop's in its exact parameters only.
+
+    `controller` is the loop's, resolved.
+    """
+    sensing = _sense_blocks(problem, controller.response(problem), predicts=False)
+    remembered = [s for block in sensing for s in block.memory.signals]
+    remembered += [delay.now for delay in _plant_delays(problem, controller)]
+    return loop.memory.pack({s.name: s.start_vector() for s in remembered})
+
+
 def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:
     """Return the signal of all disturbances in the order of the problem, or nothing when there are none."""
     if not problem.disturbances:

@@ -28,11 +28,12 @@ INVERSE_TOLERANCE = 1e-8  # relative response error beyond which a numerically f
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter: the value the model believes, the value the plant has, and their unit."""
+    """One parameter: the value the model believes, the value the plant has, their unit, and what is physically possible."""
 
     approximate: float
     exact: float
     unit: str
+    bounds: tuple[float, float] = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,12 +320,28 @@ def _check_parameters(parameters: Mapping[str, Parameter], mistakes: Mistakes) -
         if not isinstance(parameter, Parameter):
             mistakes.add(f"parameter '{name}' must be Parameter(approximate=..., exact=..., unit=...)")
             continue
+        numbers = True
         for which in ("approximate", "exact"):
             value = getattr(parameter, which)
             if not isinstance(value, int | float) or not math.isfinite(value):
                 mistakes.add(f"parameter '{name}': {which} must be a finite number, got {value!r}")
+                numbers = False
+        mistake = _bounds_mistake(parameter) if numbers else ""
+        if mistake:
+            mistakes.add(f"parameter '{name}': {mistake}")
         if not isinstance(parameter.unit, str) or not parameter.unit:
             mistakes.add(f"parameter '{name}' has no unit; write unit='kg' (or '1' for none)")
+
+
+def _bounds_mistake(parameter: Parameter) -> str:
+    try:
+        low, high = map(float, parameter.bounds)
+    except (TypeError, ValueError):
+        return f"bounds must be a pair of numbers (lowest, highest), got {parameter.bounds!r}"
+    if not low < high:
+        return f"bounds must be (lowest, highest), got {parameter.bounds!r}"
+    outside = [w for w in ("approximate", "exact") if not low <= getattr(parameter, w) <= high]
+    return f"{outside[0]} is outside its bounds {parameter.bounds!r}" if outside else ""
 
 
 def _check_response(plant: Plant, mistakes: Mistakes) -> None:

@@ -79,3 +79,8 @@ controllers = {
     "RHC+FPI, stiff, small S": fp.RecedingHorizon(optimiser, fp.Sigmoid(gain=-0.5, shift=0.3, scale=1.0), cost=stiff),
 }
 headline = ("RHC", "RHC+FPI")
+tuning = {
+    "CTC": {"tracking.rate": fp.LogSpan(2.0, 20.0)},  # 1/s
+    "CTC+FPI (eq 6)": {"tracking.rate": fp.LogSpan(2.0, 20.0), "deformation.gain": fp.LogSpan(-1.5, -0.05)},
+    "RHC+FPI": {"deformation.gain": fp.LogSpan(-1.5, -0.05), "deformation.scale": fp.LogSpan(5.0, 500.0)},
+}

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import base64
-import html
-import io
 import json
 import math
-import tempfile
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fpirhc.errors import OutputError
 from fpirhc.report.figures import BANDS, PALETTE, contraction_figure, lyapunov_figure, pair_figures
+from fpirhc.report.page import asset as _asset
+from fpirhc.report.page import page, write_page
+from fpirhc.report.page import picture as _picture
+from fpirhc.report.page import text as _text
 from fpirhc.report.series import chart_data
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from fpirhc.studies.compare import Comparison, Entry
 
 _CAPTIONS = {
@@ -38,19 +34,11 @@ def write_report(comparison: Comparison, path: Path) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    page = render(comparison)
-    try:
-        with tempfile.NamedTemporaryFile("w", encoding="utf-8", dir=path.parent, suffix=".part", delete=False) as file:
-            file.write(page)
-        Path(file.name).replace(path)
-        path.chmod(0o644)
-    except OSError as error:
-        raise OutputError(f"cannot write the report to '{path}': {error.strerror}") from None
+    write_page(render(comparison), path)
 
 
 def render(comparison: Comparison) -> str:
     """Return the page's text."""
-    head = "\n".join(f"<style>{_asset(name)}</style>" for name in ("uPlot.min.css", "report.css"))
     pair = headline_pair(comparison)
     series = {**chart_data(comparison, PALETTE), "bands": BANDS, "begin": [e.name for e in pair] if pair else []}
     data = json.dumps(series, separators=(",", ":")).replace("<", "\\u003c")
@@ -67,20 +55,7 @@ def render(comparison: Comparison) -> str:
     scripts = (
         f"<script>{_asset('uPlot.iife.min.js')}</script>\n<script>const DATA={data};\n{_asset('report.js')}</script>"
     )
-    body = "\n".join(parts)
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{_text(comparison.title)}</title>\n{head}</head>\n<body><main>{body}</main>\n{scripts}</body></html>\n"
-    )
-
-
-def _asset(name: str) -> str:
-    return files("fpirhc.report").joinpath("assets", name).read_text(encoding="utf-8")
-
-
-def _text(value: object) -> str:
-    return html.escape(str(value), quote=True)
+    return page(comparison.title, ("uPlot.min.css", "report.css"), "\n".join(parts), scripts)
 
 
 def _verdict(comparison: Comparison) -> str:
@@ -233,14 +208,6 @@ def _lyapunov(comparison: Comparison) -> str:
     )
     picture = _picture(figure, "Lyapunov function over time with its ultimate bound", caption)
     return f"<section><h2>Lyapunov's view</h2>{picture}</section>"
-
-
-def _picture(figure: Figure, alt: str, caption: str) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=88)
-    code = base64.b64encode(buffer.getvalue()).decode("ascii")
-    note = f"<figcaption>{_text(caption)}</figcaption>" if caption else ""
-    return f"<figure><img alt='{_text(alt)}' src='data:image/png;base64,{code}'>{note}</figure>"
 
 
 def _settings(comparison: Comparison) -> str:

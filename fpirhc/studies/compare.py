@@ -132,7 +132,7 @@ def compare(
         InvalidProblem: unknown controllers, or deformations with a gain of the wrong sign.
     """
     begin = time.perf_counter()
-    _check_gains(task, select(task, controllers))
+    check_gains(task, select(task, controllers))
     chosen, skipped = select(task, controllers), {}
     entries: list[Entry] = []
     for name, controller in chosen.items():
@@ -160,7 +160,7 @@ def compare(
     )
 
 
-def _check_gains(task: Task, chosen: Mapping[str, Controller]) -> None:
+def check_gains(task: Task, chosen: Mapping[str, Controller]) -> None:
     """A gain of the wrong sign is a mistake in the file, not a result: it is refused before anything runs."""
     mistakes = Mistakes(f"problem '{task.name}'")
     for name, controller in chosen.items():

@@ -1,7 +1,8 @@
 """Finds and loads a problem: a shipped one by name, or a user's Python file by path.
 
 A problem file defines `problem` (a Problem) and `controllers` ({name: Controller}); its docstring's first line is its
-title. Optional: `headline`, a pair (controller without adaptation, controller with) that the verdict is about.
+title. Optional: `headline`, a pair (controller without adaptation, controller with) that the verdict is about; `tuning`,
+{controller: {path of a setting: Span or LogSpan}}, where `fpirhc tune` looks for better settings.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ import importlib.util
 import sys
 import traceback
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, Mistakes, ProblemFileError, nearest
 from fpirhc.problem import Problem
+from fpirhc.studies.spans import Spans, check_tuning
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +33,7 @@ class Task:
     problem: Problem
     controllers: Mapping[str, Controller]
     headline: tuple[str, str] | None = None
+    tuning: Mapping[str, Spans] = field(default_factory=dict)
 
 
 def shipped_folders() -> list[Path]:
@@ -97,13 +100,15 @@ def load_problem(name_or_path: str) -> Task:
             mistakes.add(f"controllers['{name}'] must be a controller, got {type(controller).__name__}")
     headline = getattr(module, "headline", None)
     mistakes.unknown("headline: controller", headline or (), controllers)
+    tuning = getattr(module, "tuning", {})
     try:
         mistakes.raise_if_any()
+        check_tuning(tuning, controllers)
     except FpirhcError as error:
         raise ProblemFileError(str(error)) from None
     assert isinstance(problem, Problem)
     title, _, description = (module.__doc__ or path.stem).strip().partition("\n")
-    return Task(path.stem, path, title, description.strip(), problem, controllers, headline)
+    return Task(path.stem, path, title, description.strip(), problem, controllers, headline, tuning)
 
 
 def _import(path: Path) -> ModuleType:

@@ -1,0 +1,222 @@
+"""Paired scenarios on a terminal, as JSON, as a figure, and as one HTML file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fpirhc.report.figures import PALETTE
+from fpirhc.report.page import page, picture, text, write_page
+from fpirhc.studies.paired import Summary, percent, signed
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from fpirhc.studies.scenario_study import ScenarioComparison
+
+_GROUPS = 6  # of scenarios with similar mismatch, whose medians are joined by a line
+_CAPTION = (
+    "One point per scenario and controller; lines join medians of scenarios with similar mismatch, crosses at the upper edge "
+    "are runs that ended early. Mismatch: rms over the parameters of the relative distance between the model and the drawn "
+    "plant. Error: rms error over the reference's range, root mean square over the coordinates."
+)
+_MEANING = (
+    "Errors are rms errors over the range of the reference, root mean square over the judged coordinates. Every scenario has the "
+    "same noise, disturbances and drawn parameters for all controllers; differences are taken within scenarios, and their "
+    "intervals are 95 % percentile bootstrap intervals of the median. A run whose error exceeds the reference's range has "
+    "diverged; one that ended early counts as worse than any that did not."
+)
+
+
+def mismatch_figure(found: ScenarioComparison) -> Figure:
+    """Error of every scenario against its mismatch, one colour per controller."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 4.8), layout="constrained")
+    figure.suptitle(f"{found.problem}: error against mismatch, {found.count} scenarios", fontsize=11)
+    axis = figure.subplots()
+    finite = np.concatenate([s.errors[np.isfinite(s.errors)] for s in found.summaries])
+    edge = 200 * float(finite.max(initial=1e-3))
+    for k, one in enumerate(found.summaries):
+        colour, ended = PALETTE[k % len(PALETTE)], ~np.isfinite(one.errors)
+        x, y = 100 * one.mismatch, 100 * one.errors
+        axis.semilogy(x[~ended], y[~ended], "o", color=colour, ms=3, alpha=0.5)
+        axis.semilogy(x[ended], np.full(ended.sum(), edge), "x", color=colour, ms=6)
+        axis.semilogy(*_medians(x[~ended], y[~ended]), "-", color=colour, lw=1.5, label=one.name)
+    axis.set_xlabel("mismatch between model and plant [%]")
+    axis.set_ylabel("rms error [% of the reference's range]")
+    axis.grid(visible=True, alpha=0.25)
+    axis.legend(fontsize=8, framealpha=0.8)
+    return figure
+
+
+def _medians(x: np.ndarray, y: np.ndarray) -> tuple[list[float], list[float]]:
+    order = np.argsort(x)
+    groups = [g for g in np.array_split(order, min(_GROUPS, max(1, x.size // 3))) if g.size]
+    return [float(np.median(x[g])) for g in groups], [float(np.median(y[g])) for g in groups]
+
+
+def write_scenarios(found: ScenarioComparison, path: Path) -> None:
+    """Write the report, atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_page(render_scenarios(found), path)
+
+
+def render_scenarios(found: ScenarioComparison) -> str:
+    """Return the page's text."""
+    first, *others = found.verdict
+    rest = "".join(f"<li>{text(s)}</li>" for s in others)
+    about = f"<p class='about'>{text(found.description)}</p>" if found.description else ""
+    chart = picture(mismatch_figure(found), "Error against mismatch", _CAPTION) if found.summaries else ""
+    parts = [
+        f"<header><h1>{text(found.title)}</h1></header>",
+        f"<section id='verdict'><p class='headline'>{text(first)}</p><ul>{rest}</ul>{about}</section>",
+        _table(found),
+        f"<section><h2>Error against mismatch</h2>{chart}</section>",
+        _tuning(found),
+        _settings(found),
+    ]
+    return page(found.title, ("report.css",), "\n".join(parts))
+
+
+def _table(found: ScenarioComparison) -> str:
+    heads = ["controller", *_heads(found), "statuses (cycles)"]
+    columns = "".join(f"<th scope='col'>{text(h)}</th>" for h in heads)
+    rows = ""
+    for one in found.summaries:
+        cells = "".join(f"<td>{text(c)}</td>" for c in _cells(one))
+        statuses = ", ".join(f"{n} {name}" for name, n in sorted(one.statuses.items()))
+        rows += f"<tr><th scope='row'>{text(one.name)}</th>{cells}<td class='words'>{text(statuses)}</td></tr>"
+    for name, why in found.skipped.items():
+        rows += (
+            f"<tr><th scope='row'>{text(name)}</th>"
+            f"<td class='words' colspan='{len(heads) - 1}'>not run: {text(why)}</td></tr>"
+        )
+    return (
+        f"<section><h2>Controllers</h2><p>{text(_conditions(found))} {text(_MEANING)}</p><div class='scroll'><table><thead><tr>"
+        f"{columns}</tr></thead><tbody>{rows}</tbody></table></div></section>"
+    )
+
+
+def _conditions(found: ScenarioComparison) -> str:
+    return (
+        f"{found.count} scenarios of seed {found.seed}, exact parameters within {found.percent:g} % of the problem's, errors from "
+        f"t = {found.measure_from:g} s on."
+    )
+
+
+def _heads(found: ScenarioComparison) -> list[str]:
+    units = [f"median rms {c} [{unit}]" for c, unit in found.units.items()]
+    return ["median error", "difference (95 %)", "ratio", "smaller in", *units, "worst", "in scenario", "failures"]
+
+
+def _cells(one: Summary) -> list[str]:
+    difference, ratio, better = "baseline", "", ""
+    if one.difference is not None:
+        d = one.difference
+        difference = f"{signed(d.median)} ({signed(d.low)} to {signed(d.high)})"
+        ratio, better = f"{one.ratio:.3g}", str(one.better)
+    failures = ", ".join(f"{n} {outcome}" for outcome, n in one.outcomes.items() if outcome != "finished")
+    rms = [f"{v:.3g}" if np.isfinite(v) else "none" for v in one.rms_error.values()]
+    return [
+        percent(one.median),
+        difference,
+        ratio,
+        better,
+        *rms,
+        percent(one.worst),
+        str(one.worst_scenario),
+        failures or "0",
+    ]
+
+
+def _tuning(found: ScenarioComparison) -> str:
+    if not found.tuning:
+        return (
+            "<section><h2>Tuning</h2><p>No file of tuned settings was given: all are the problem file's.</p></section>"
+        )
+    items = "".join(f"<li><b>{text(name)}</b>: {text(note)}</li>" for name, note in found.tuning.items())
+    return f"<section><h2>Tuning</h2><ul>{items}</ul></section>"
+
+
+def _settings(found: ScenarioComparison) -> str:
+    dumps = "".join(
+        f"<details><summary>{text(name)}</summary><pre>{text(json.dumps(settings, indent=1))}</pre></details>"
+        for name, settings in found.settings.items()
+    )
+    versions = ", ".join(f"{k} {v}" for k, v in found.versions.items())
+    command = (
+        f"<p>This report is reproduced by</p><pre class='command'>{text(found.command)}</pre>" if found.command else ""
+    )
+    return f"<section><h2>Settings</h2>{dumps}<p>{text(versions)}; took {found.elapsed:.1f} s.</p>{command}</section>"
+
+
+def show_scenarios(found: ScenarioComparison, report: Path) -> None:
+    """Print the verdict, the table, and where the report is."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    _lines(console.print, [found.title, *(f"- {sentence}" for sentence in found.verdict)])
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=f"{found.problem}: {_conditions(found)}")
+    table.add_column("controller", min_width=16)
+    for head in ("median", "difference (95 %)", "ratio", "worst", "failed"):
+        table.add_column(head, justify="right")
+    for one in found.summaries:
+        cells = _cells(one)
+        shown = [*cells[:3], percent(one.worst), str(one.failures)]
+        table.add_row(one.name.replace("[", "\\["), *shown)
+    console.print(table)
+    _lines(console.print, [f"{name}: {note}" for name, note in found.tuning.items()])
+    _lines(console.print, [f"skipped {name}: {why}" for name, why in found.skipped.items()])
+    console.print(f"report: {report}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _lines(show, lines: Sequence[str]) -> None:  # type: ignore[no-untyped-def]
+    for line in lines:
+        show(line, markup=False, highlight=False)
+
+
+def scenarios_json(found: ScenarioComparison) -> str:
+    """Return the comparison as JSON text; numbers that are not finite become null."""
+    facts = {
+        "problem": found.problem,
+        "seeds": found.count,
+        "seed": found.seed,
+        "mismatch": found.percent,
+        "versions": dict(found.versions),
+        "verdict": list(found.verdict),
+        "controllers": {one.name: _facts(one) for one in found.summaries},
+        "skipped": dict(found.skipped),
+        "tuning": dict(found.tuning),
+    }
+    return json.dumps(facts, indent=2, allow_nan=False)
+
+
+def _facts(one: Summary) -> dict[str, object]:
+    d = one.difference
+    return {
+        "median_error": _number(one.median),
+        "difference": None if d is None else {n: _number(getattr(d, n)) for n in ("median", "low", "high")},
+        "ratio": _number(one.ratio),
+        "better": one.better,
+        "worst_error": _number(one.worst),
+        "worst_scenario": one.worst_scenario,
+        "rms_error": {c: _number(v) for c, v in one.rms_error.items()},
+        "outcomes": dict(one.outcomes),
+        "statuses": dict(one.statuses),
+        "errors": [_number(v) for v in one.errors],
+        "mismatch": [float(v) for v in one.mismatch],
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,133 @@
+"""An append-only file of results that survives being killed at any moment.
+
+One JSON object per line. The first line is a header that says what the results are of; a file with another header is refused.
+Every line is on the disk before `append` returns. A last line that is torn was never acknowledged: it is cut off and its
+result computed again. Only one process may have the file open.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import IO, Any, Self
+
+from fpirhc.errors import OutputError
+
+
+class Ledger:
+    """The open file; `records` are those found in it and those appended, in this order.
+
+    Raises:
+        OutputError: the file cannot be written, is damaged, is in use, or holds results of something else.
+    """
+
+    def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
+        self._path = path
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("a+b")
+        except OSError as error:
+            raise OutputError(f"cannot write to '{path}': {error.strerror}; choose another folder with --out") from None
+        try:
+            _lock(self._file, path)
+            self.records = self._read(json.loads(json.dumps(header)))
+        except BaseException:
+            self._file.close()
+            raise
+
+    def append(self, record: Mapping[str, Any]) -> None:
+        """Write one record and wait until it is on the disk.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        self._write(record)
+        self.records.append(dict(record))
+
+    def close(self) -> None:
+        """Close the file; another process may open it then."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _write(self, value: Mapping[str, Any]) -> None:
+        line = json.dumps(value, allow_nan=False, separators=(",", ":")).encode() + b"\n"
+        try:
+            self._file.write(line)
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise OutputError(f"cannot write to '{self._path}': {error.strerror}") from None
+
+    def _read(self, header: dict[str, Any]) -> list[dict[str, Any]]:
+        self._file.seek(0)
+        content = self._file.read()
+        whole = content[: content.rfind(b"\n") + 1]
+        lines = list(self._parsed(whole))
+        if len(whole) != len(content):
+            self._file.truncate(len(whole))
+        if not lines:
+            self._write(header)
+            _sync_folder(self._path.parent)
+            return []
+        if lines[0] != header:
+            raise OutputError(_refusal(self._path, lines[0], header))
+        return lines[1:]
+
+    def _parsed(self, content: bytes) -> Iterator[dict[str, Any]]:
+        for number, line in enumerate(content.splitlines(), 1):
+            try:
+                value = json.loads(line)
+            except ValueError:
+                value = None
+            if not isinstance(value, dict):
+                raise OutputError(f"'{self._path}', line {number} is damaged; remove the file to begin again")
+            yield value
+
+
+def _refusal(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> str:
+    names = [n for n in dict.fromkeys([*wanted, *found]) if found.get(n) != wanted.get(n)]
+    facts = "; ".join(f"{n} was {_short(found.get(n))}, is {_short(wanted.get(n))}" for n in names)
+    return (
+        f"'{path}' holds results of something else, and results are never mixed: {facts}. "
+        "Give another folder with --out, or remove the file"
+    )
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 40 else f"{text[:12]}...{text[-4:]}"
+
+
+def _lock(file: IO[bytes], path: Path) -> None:
+    """Hold the file until it is closed or this process ends, however it ends."""
+    if sys.platform == "win32":
+        return
+    import fcntl
+
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise OutputError(
+            f"'{path}' is in use by another run; wait for it, or choose another folder with --out"
+        ) from None
+    except OSError:
+        return  # some network file systems cannot lock
+
+
+def _sync_folder(folder: Path) -> None:
+    """A new file's name must be on the disk too; not every system allows it."""
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -1,0 +1,477 @@
+"""Paired scenarios: the same for everyone, told as they are, and never lost, repeated or mixed."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import random
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy import stats
+
+import fpirhc as fp
+from fpirhc.cli import main
+from fpirhc.errors import InvalidProblem, InvalidValue, OutputError, WorkerDied
+from fpirhc.studies.bench import Bench, Conditions
+from fpirhc.studies.bootstrap import median_interval, middle
+from fpirhc.studies.ledger import Ledger
+from fpirhc.studies.paired import summarise, verdict
+from fpirhc.studies.problem_file import Task
+from fpirhc.studies.processes import DEATHS, Workers
+from fpirhc.studies.scenarios import COMPARING, TUNING, check_percent, draw, mismatch_of, with_exact
+
+LINE = '''"""A mass on a line with a wrong gain, pushed by noise."""
+import casadi as ca
+import fpirhc as fp
+
+plant = fp.Plant(
+    coordinates={"y": "m"},
+    inputs={"u": "N"},
+    parameters={
+        "b": fp.Parameter(approximate=1.0, exact=1.6, unit="1/kg", bounds=(0.5, 2.4)),
+        "k": fp.Parameter(2.0, 5.0, "1/s^2"),
+    },
+    response=lambda q, v, u, p: {"y": p.b * u.u - p.k * q.y},
+)
+problem = fp.Problem(
+    plant=plant,
+    reference=fp.Trajectory(lambda t: {"y": ca.sin(2 * t)}),
+    start={"y": 0.5},
+    period=5e-3,
+    duration=1.5,
+    measure_from=0.5,
+    disturbances={"u": fp.Noise(0.1)},
+)
+tracking = fp.Exponential(rate=6.0)
+controllers = {
+    "CTC": fp.ComputedTorque(tracking),
+    "CTC+FPI": fp.ComputedTorque(tracking, fp.Sigmoid(gain=-0.5)),
+    "CTC exact": fp.Informed(fp.ComputedTorque(tracking)),
+}
+'''
+SETTINGS = {"percent": 20.0, "seed": 5, "compiled": False}
+
+
+@pytest.fixture
+def task(tmp_path, monkeypatch) -> Task:
+    """The task in a file of its own, in an empty working folder."""
+    monkeypatch.chdir(tmp_path)
+    Path("line.py").write_text(LINE)
+    return fp.load_problem("line.py")
+
+
+def lines_of(folder: Path) -> list[str]:
+    return (folder / "scenarios.jsonl").read_text().splitlines()
+
+
+# --- Draws ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_scenario_is_its_number(task):
+    """Drawn alone or among others it is the same; other numbers, seeds and uses are others."""
+    plant = task.problem.plant
+
+    def seventh(**changes):
+        return draw(plant, **{"seed": 3, "use": COMPARING, "number": 7, "percent": 20.0, **changes})
+
+    for number in range(20):
+        draw(plant, seed=3, use=COMPARING, number=number, percent=20.0)
+    first, again = seventh(), seventh()
+    assert first.seed == again.seed
+    np.testing.assert_array_equal(first.exact, again.exact)
+    others = [seventh(number=8), seventh(seed=4), seventh(use=TUNING)]
+    assert len({first.seed, *(o.seed for o in others)}) == 4
+    assert all(np.all(o.exact != first.exact) for o in others)
+
+
+def test_factors_are_log_uniform():
+    """Logarithms of the factors are uniform between those of 0.6 and 1.4; signs and zeros stay."""
+    values = {"a": 3.0, "b": -2.0, "zero": 0.0}
+    plant = fp.Plant(
+        {"y": "m"},
+        {"u": "N"},
+        {n: fp.Parameter(v, v, "1") for n, v in values.items()},
+        lambda q, v, u, p: {"y": u.u + p.a * q.y + p.b * v.y + p.zero},
+    )
+    drawn = np.array([draw(plant, seed=0, use=0, number=k, percent=40.0).exact for k in range(1500)])
+    assert np.all(drawn[:, 2] == 0)
+    low, high = math.log(0.6), math.log(1.4)
+    for column, value in ((0, 3.0), (1, -2.0)):
+        logarithms = np.log(drawn[:, column] / value)
+        assert low <= logarithms.min() < low + 0.01
+        assert high - 0.01 < logarithms.max() <= high
+        assert stats.kstest(logarithms, stats.uniform(low, high - low).cdf).pvalue > 0.01
+    assert abs(np.corrcoef(drawn[:, 0], drawn[:, 1])[0, 1]) < 4 / math.sqrt(1500)
+
+
+def test_draws_that_could_leave_physical_bounds_are_refused(task):
+    """The parameter is named, with how far it may be drawn: b = 1.6 may grow by one half to its bound of 2.4."""
+    check_percent(task.problem.plant, 49.9)
+    with pytest.raises(InvalidProblem, match=r"parameter 'b'.*at most 50 %"):
+        check_percent(task.problem.plant, 51.0)
+    for percent in (100.0, -1.0, math.nan):
+        with pytest.raises(InvalidValue, match="at least 0 and below 100"):
+            check_percent(task.problem.plant, percent)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "message"),
+    [((2.0, 3.0), "approximate is outside"), ((3.0, 0.0), r"\(lowest, highest\)"), (0.0, "a pair of numbers")],
+)
+def test_bounds_of_parameters_are_checked(bounds, message, task):
+    parameters = {**task.problem.plant.parameters, "b": fp.Parameter(1.0, 2.5, "1/kg", bounds)}
+    with pytest.raises(InvalidProblem, match=f"parameter 'b': .*{message}"):
+        replace(task.problem.plant, parameters=parameters)
+
+
+def test_mismatch_is_a_distance():
+    """Symmetric, zero for a right model, at most 1 for parameters of one sign; by hand: sqrt((0.5^2 + 0.25^2) / 2)."""
+    model, plant = np.array([1.0, 4.0]), np.array([2.0, 3.0])
+    assert mismatch_of(model, plant) == mismatch_of(plant, model) == pytest.approx(math.sqrt((0.25 + 0.0625) / 2))
+    assert mismatch_of(model, model) == 0 == mismatch_of(np.zeros(2), np.zeros(2))
+    assert mismatch_of(np.array([0.0]), plant[:1]) == 1
+
+
+@pytest.mark.parametrize("dead_time", [fp.DeadTime(), fp.DeadTime(measurement=0.01)])
+def test_a_prepared_loop_runs_what_a_fresh_one_runs(dead_time, task):
+    """Bit by bit: exact parameters are data of the loop, also where a controller is told them or the measurement is late."""
+    problem = replace(task.problem, dead_time=dead_time)
+    bench = Bench(replace(task, problem=problem), Conditions(5, COMPARING, 20.0, compiled=False))
+    for name, number in (("CTC+FPI", 0), ("CTC exact", 2), ("CTC+FPI", 1), ("CTC exact", 1)):
+        found = bench.record(number, name)
+        scenario = draw(problem.plant, seed=5, use=COMPARING, number=number, percent=20.0)
+        variant = with_exact(problem, scenario.exact)
+        run = fp.simulate(variant, task.controllers[name], seed=scenario.seed, compiled=False)
+        assert found["rms_error"] == dict(fp.measure(variant, run).rms_error)
+        assert found["effort"] == dict(fp.measure(variant, run).effort)
+
+
+# --- Statistics -------------------------------------------------------------------------------------------------------
+
+
+def test_interval_covers_the_median_as_often_as_it_says():
+    """95 % intervals of the median of 25 log-normal numbers hold the true one in about 95 of 100 samples."""
+    random = np.random.default_rng(0)
+    intervals = [median_interval(random.lognormal(size=25), seed=k) for k in range(200)]
+    covered = np.mean([i.low <= 1.0 <= i.high for i in intervals])
+    assert 0.90 <= covered <= 0.99
+    assert all(i.low <= i.median <= i.high for i in intervals)
+
+
+def test_medians_know_infinity():
+    """An infinite number lies beyond all others, and half-way between the two infinities is zero."""
+    assert middle(np.array([1.0, 2.0, math.inf])) == 2.0
+    assert middle(np.array([1.0, math.inf, math.inf])) == math.inf
+    assert middle(np.array([-math.inf, math.inf])) == 0.0
+    assert middle(np.array([3.0, 1.0])) == 2.0
+
+
+def _records(name, errors, outcome="finished"):
+    return [
+        {
+            "scenario": k,
+            "controller": name,
+            "mismatch": 0.1,
+            "outcome": "ended early" if e is None else outcome,
+            "error": e,
+            "rms_error": {"y": e},
+            "statuses": {"OK": 10},
+        }
+        for k, e in enumerate(errors)
+    ]
+
+
+def test_differences_are_taken_within_scenarios():
+    """Errors that vary by a factor of 100 between scenarios, and by one per cent of themselves between controllers."""
+    errors = list(np.geomspace(0.001, 0.1, 41))
+    plain, better = _records("A", errors), _records("B", [0.99 * e for e in errors])
+    one = summarise("B", better, plain, seed=0)
+    assert one.better == 41
+    assert one.ratio == pytest.approx(0.99)
+    assert one.difference.median == pytest.approx(-0.01 * errors[20])
+    assert one.difference.high < 0
+    assert (one.worst, one.worst_scenario) == (pytest.approx(0.099), 40)
+    told = verdict([summarise("A", plain, None, seed=0), one], {})
+    assert told[0].startswith("B has a smaller error than A")
+
+
+def test_failures_are_counted_and_are_worse_than_any_error():
+    """A controller that fails in most scenarios has no median; where both fail there is no difference."""
+    plain, failing = _records("A", [0.1, 0.1, None, 0.1, 0.1]), _records("B", [0.01, None, None, None, 0.01])
+    one = summarise("B", failing, plain, seed=0)
+    assert one.median == math.inf == one.worst
+    assert one.worst_scenario == 1
+    assert one.failures == 3
+    assert one.better == 2
+    assert one.difference.median == 0  # two gains, one tie, two losses
+    told = " ".join(verdict([summarise("A", plain, None, seed=0), one], {"C": "no horizon"}))
+    assert "B and A show no clear difference" in told
+    assert "B fails in 3 of 5 scenarios (3 ended early)" in told
+    assert "Not run: C (no horizon)" in told
+
+
+def test_runs_that_end_early_or_stray_are_told_apart(task):
+    """A model with nine tenths of the gain too little makes FPI stray; a response that leaves its range ends the run."""
+    wild = fp.ComputedTorque(fp.Exponential(6.0), fp.Rfpt(offset=1e4, sign=-1.0, gain=1.0))
+    strays = replace(task, controllers={"wild": wild})
+    record = Bench(strays, Conditions(0, COMPARING, 0.0, compiled=False)).record(0, "wild")
+    assert record["outcome"] in ("diverged", "ended early")
+    limited = replace(
+        task.problem.plant, response=lambda q, v, u, p: {"y": p.b * u.u - p.k * q.y + 1e-9 * ca.sqrt(0.9 - q.y)}
+    )
+    ending = replace(task, problem=replace(task.problem, plant=limited))
+    record = Bench(ending, Conditions(0, COMPARING, 0.0, compiled=False)).record(0, "CTC")
+    assert record["outcome"] == "ended early"
+    assert record["error"] is None
+    assert 0 < record["lasted"] < 1
+    json.dumps(record, allow_nan=False)
+
+
+# --- Ledger -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_torn_line_is_cut_off_wherever_it_is_torn(tmp_path):
+    """Cut after any byte, the file opens with every record whose line was whole, and takes new ones."""
+    path, header = tmp_path / "l.jsonl", {"of": "this"}
+    with Ledger(path, header) as ledger:
+        for k in range(3):
+            ledger.append({"k": k})
+    whole = path.read_bytes()
+    for size in range(len(whole)):
+        path.write_bytes(whole[:size])
+        with Ledger(path, header) as ledger:
+            complete = max(0, whole[:size].count(b"\n") - 1)
+            assert ledger.records == [{"k": k} for k in range(complete)]
+            for k in range(complete, 3):
+                ledger.append({"k": k})
+        assert path.read_bytes() == whole
+
+
+def test_other_results_damage_and_other_users_are_refused(tmp_path):
+    """Each with what differs, where, and what to do; the file stays as it was."""
+    path = tmp_path / "l.jsonl"
+    with Ledger(path, {"seed": 1, "version": "a"}) as ledger:
+        ledger.append({"k": 0})
+        ledger.append({"k": 1})
+        if sys.platform != "win32":
+            with pytest.raises(OutputError, match="in use by another run"):
+                Ledger(path, {"seed": 1, "version": "a"})
+    whole = path.read_bytes()
+    with pytest.raises(OutputError, match=r"seed was 1, is 2\. Give another folder"):
+        Ledger(path, {"seed": 2, "version": "a"})
+    assert path.read_bytes() == whole
+    path.write_bytes(whole.replace(b'{"k":0}', b'{"k":0'))
+    with pytest.raises(OutputError, match="line 2 is damaged"):
+        Ledger(path, {"seed": 1, "version": "a"})
+
+
+# --- Processes --------------------------------------------------------------------------------------------------------
+
+needs_kill = pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGKILL on Windows")
+
+
+@needs_kill
+def test_killed_workers_are_replaced(tmp_path):
+    """Every job is answered once, although workers die at four of them."""
+    opening = {"folder": str(tmp_path), "deadly": [0, 3, 4, 11]}
+    with Workers("mortal_worker", opening, opening, 2) as workers:
+        assert sorted(workers.answers(list(range(12)))) == [2 * k for k in range(12)]
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+@needs_kill
+def test_a_job_that_kills_every_worker_is_given_up(tmp_path):
+    """The job is named; nothing waits for ever."""
+    opening = {"folder": str(tmp_path), "deadly": []}
+    told = rf"{DEATHS} processes died one after the other at the job -1"
+    with pytest.raises(WorkerDied, match=told), Workers("mortal_worker", opening, opening, 2) as workers:
+        list(workers.answers([1, -1, 2]))
+
+
+def test_a_worker_with_another_task_is_refused(task, tmp_path):
+    """A task that is not as its file says cannot be shared with processes that read the file."""
+    changed = replace(task, problem=replace(task.problem, duration=1.0))
+    with pytest.raises(fp.FpirhcError, match="loaded another problem"):
+        fp.compare_scenarios(changed, count=2, folder=tmp_path / "out", processes=2, **SETTINGS)
+
+
+# --- The whole study --------------------------------------------------------------------------------------------------
+
+
+def test_results_do_not_depend_on_processes_order_or_company(task, tmp_path):
+    """Bit by bit: one process or two, all controllers or one, in one go or in two."""
+    one = fp.compare_scenarios(task, count=4, folder=tmp_path / "one", **SETTINGS)
+    two = fp.compare_scenarios(task, count=4, folder=tmp_path / "two", processes=2, **SETTINGS)
+    assert two.records == one.records
+    assert two.verdict == one.verdict
+    assert sorted(lines_of(tmp_path / "one")) == sorted(lines_of(tmp_path / "two"))
+    alone = fp.compare_scenarios(task, count=2, folder=tmp_path / "more", controllers=["CTC exact"], **SETTINGS)
+    begun = lines_of(tmp_path / "more")
+    more = fp.compare_scenarios(task, count=4, folder=tmp_path / "more", **SETTINGS)
+    assert alone.records["CTC exact"] == one.records["CTC exact"][:2]
+    assert more.records == one.records
+    assert lines_of(tmp_path / "more")[: len(begun)] == begun
+    assert len(lines_of(tmp_path / "more")) == 1 + 3 * 4
+
+
+def test_adaptation_is_judged_against_the_baseline(task, tmp_path):
+    """FPI is better than the wrong model in every scenario, and the informed controller is a bound."""
+    found = fp.compare_scenarios(task, count=8, folder=tmp_path, baseline="CTC", **SETTINGS)
+    plain, adaptive, informed = (found[n] for n in ("CTC", "CTC+FPI", "CTC exact"))
+    assert plain.difference is None
+    assert adaptive.better == informed.better == 8
+    assert adaptive.difference.high < 0
+    assert adaptive.statuses == {"OK": 8 * 300}
+    assert len(set(plain.mismatch)) == 8
+    reordered = fp.compare_scenarios(task, count=8, folder=tmp_path, baseline="CTC exact", **SETTINGS)
+    assert reordered.summaries[0].name == "CTC exact"
+    assert reordered["CTC+FPI"].difference.low > 0
+
+
+def test_scenarios_that_cannot_differ_are_refused(task, tmp_path):
+    """Without noise and without draws there is one scenario only."""
+    calm = replace(task, problem=replace(task.problem, disturbances={}))
+    with pytest.raises(InvalidValue, match="every scenario would be the same"):
+        fp.compare_scenarios(calm, count=3, folder=tmp_path, percent=0.0, seed=0)
+
+
+def test_a_controller_that_does_not_fit_is_skipped_with_its_reason(task, tmp_path):
+    """The others are compared as ever; only its reason stands in the table."""
+    planner = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3))
+    wider = replace(task, controllers={**task.controllers, "RHC": planner})
+    found = fp.compare_scenarios(wider, count=2, folder=tmp_path, **SETTINGS)
+    assert "needs Problem(horizon=...)" in found.skipped["RHC"]
+    assert [s.name for s in found.summaries] == ["CTC", "CTC+FPI", "CTC exact"]
+
+
+ARGUMENTS = ["compare", "line.py", "--seeds", "4", "--mismatch", "20", "--no-compile"]
+
+
+def test_command_line_journey(task, capsys):
+    """A report with the chart, a picture, a ledger and JSON; then more seeds, and a changed file that is refused."""
+    assert main([*ARGUMENTS, "--json", "--out", "out"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["controllers"]["CTC+FPI"]["difference"]["high"] < 0
+    assert len(found["controllers"]["CTC"]["errors"]) == 4
+    page = Path("out/report.html").read_text()
+    assert "Error against mismatch" in page
+    assert "CTC+FPI has a smaller error than CTC" in page
+    assert Path("out/mismatch.png").stat().st_size > 10_000
+    before = lines_of(Path("out"))
+    assert main([*ARGUMENTS, "--seeds", "5", "--out", "out"]) == 0
+    assert "CTC+FPI" in capsys.readouterr().out
+    assert lines_of(Path("out"))[: len(before)] == before
+    Path("line.py").write_text(LINE.replace("rate=6.0", "rate=7.0"))
+    assert main([*ARGUMENTS, "--out", "out"]) == 3
+    message = capsys.readouterr().err
+    assert "never mixed: problem file was" in message
+    assert "settings was" in message
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--mismatch", "20"], "--mismatch needs --seeds N"),
+        (["--processes", "2"], "--processes needs --seeds N"),
+        (["--seeds", "3", "--mismatch", "60"], "parameter 'b'"),
+        (["--seeds", "0", "--mismatch", "10"], "seeds 0: expected at least 1"),
+        (["--seeds", "3", "--processes", "0"], "processes 0: expected at least 1"),
+        (["--seeds", "3", "--baseline", "CTC+FPY"], "Did you mean 'CTC+FPI'"),
+        (["--seeds", "3", "--optimisers", "all"], "cannot be combined"),
+    ],
+)
+def test_bad_arguments(options, message, task, capsys):
+    """One clear sentence and exit code 2."""
+    assert main(["compare", "line.py", *options]) == 2
+    assert message in capsys.readouterr().err
+
+
+SCRIPT = """
+import os, signal, sys
+from pathlib import Path
+import fpirhc as fp
+
+def children():
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[1]) == os.getpid():
+            yield int(stat.parent.name)
+
+left = int(sys.argv[2])
+
+def progress(name, done, total):
+    global left
+    left -= 1
+    if left == 0:
+        victims = [os.getpid()] if sys.argv[1] == "parent" else list(children())
+        os.kill(victims[0], signal.SIGKILL)
+
+task = fp.load_problem("line.py")
+fp.compare_scenarios(
+    task, count=6, percent=20.0, seed=5, compiled=False, folder=Path("killed"), processes=2, progress=progress
+)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_kill_9_loses_and_doubles_nothing(task, tmp_path):
+    """The parent dies after four results, and a worker of its successor after three: the end is that of a calm run."""
+    calm = fp.compare_scenarios(task, count=6, folder=tmp_path / "calm", **SETTINGS)
+    for victim, after, code in (("parent", 4, -signal.SIGKILL), ("worker", 3, 0)):
+        done = subprocess.run([sys.executable, "-c", SCRIPT, victim, str(after)], check=False, capture_output=True)
+        assert done.returncode == code, done.stderr.decode()
+    assert sorted(lines_of(tmp_path / "killed")) == sorted(lines_of(tmp_path / "calm"))
+    resumed = fp.compare_scenarios(task, count=6, folder=tmp_path / "killed", **SETTINGS)
+    assert resumed.records == calm.records
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_thirty_random_kills(task, tmp_path):
+    """Parents and workers, at any moment; no scenario is lost, none is doubled, and all numbers are those of a calm run."""
+    moments, kills, count = random.Random(0), 0, 60
+    while True:
+        command = [sys.executable, "-m", "fpirhc", "compare", "line.py", "--seeds", str(count), "--mismatch", "20"]
+        command += ["--seed", "5", "--no-compile", "--processes", "2", "--out", "killed"]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while kills < 30:
+            try:
+                process.wait(moments.uniform(0.3, 2.5))
+            except subprocess.TimeoutExpired:
+                victim = moments.choice([process.pid, *_children(process.pid)])
+                try:
+                    os.kill(victim, signal.SIGKILL)
+                except ProcessLookupError:  # it ended by itself in between
+                    continue
+                kills += 1
+            if process.poll() is not None:
+                break
+        if process.wait() == 0:
+            if kills == 30:
+                break
+            count += 60  # too quick for thirty: go on with more
+    fp.compare_scenarios(task, count=count, folder=tmp_path / "calm", **SETTINGS)
+    assert sorted(lines_of(tmp_path / "killed")) == sorted(lines_of(tmp_path / "calm"))
+
+
+def _children(parent: int) -> list[int]:
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[1]) == parent:
+            found.append(int(stat.parent.name))
+    return found

@@ -1,0 +1,232 @@
+"""Tuning: the same budget and cost for all, never worse than before, and the same whether it is disturbed or not."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import fpirhc as fp
+from fpirhc.cli import main
+from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, NotSupported, OutputError, ProblemFileError
+from fpirhc.studies.settings import current_setting, is_whole
+from fpirhc.studies.tune import PENALTY
+from fpirhc.studies.tuned_file import read_tuned, with_tuned
+
+LINE = '''"""A mass on a line with a wrong gain."""
+import casadi as ca
+import fpirhc as fp
+
+plant = fp.Plant(
+    coordinates={"y": "m"},
+    inputs={"u": "N"},
+    parameters={"b": fp.Parameter(approximate=1.0, exact=1.6, unit="1/kg"), "k": fp.Parameter(2.0, 5.0, "1/s^2")},
+    response=lambda q, v, u, p: {"y": p.b * u.u - p.k * q.y},
+)
+problem = fp.Problem(
+    plant=plant,
+    reference=fp.Trajectory(lambda t: {"y": ca.sin(2 * t)}),
+    start={"y": 0.5},
+    period=5e-3,
+    duration=1.5,
+    measure_from=0.5,
+)
+tracking = fp.Exponential(rate=6.0)
+controllers = {
+    "CTC": fp.ComputedTorque(tracking),
+    "CTC+FPI": fp.ComputedTorque(tracking, fp.Sigmoid(gain=-0.1, scale=20.0)),
+    "CTC exact": fp.Informed(fp.ComputedTorque(tracking)),
+}
+tuning = {
+    "CTC": {"tracking.rate": fp.Span(2.0, 12.0)},
+    "CTC+FPI": {"deformation.gain": fp.LogSpan(-6.0, -0.05)},
+}
+'''
+
+
+@pytest.fixture
+def task(tmp_path, monkeypatch):
+    """The task in a file of its own, in an empty working folder."""
+    monkeypatch.chdir(tmp_path)
+    Path("line.py").write_text(LINE)
+    return fp.load_problem("line.py")
+
+
+# --- Settings by path -------------------------------------------------------------------------------------------------
+
+
+def test_settings_are_changed_by_path_and_nothing_else_is():
+    """Fields, keys of mappings and wrapped controllers; the controller that was given stays as it was."""
+    cost = fp.Quadratic(states={"q": 1.0, "q'": 2.0}, correction={"u": 3.0})
+    inner = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-2), fp.Sigmoid(gain=-0.5), cost=cost)
+    values = {
+        "controller.deformation.gain": -0.7,
+        "controller.cost.states.q'": 5.0,
+        "controller.optimiser.iterations": 3,
+    }
+    changed = fp.with_settings(fp.Informed(inner), values)
+    assert changed.controller.deformation == fp.Sigmoid(gain=-0.7)
+    assert dict(changed.controller.cost.states) == {"q": 1.0, "q'": 5.0}
+    assert changed.controller.optimiser == fp.FixedPoint(iterations=3, tolerance=1e-2)
+    assert inner.deformation == fp.Sigmoid(gain=-0.5)
+    for path, value in values.items():
+        assert current_setting(changed, path) == value
+    assert is_whole(fp.Informed(inner), "controller.optimiser.iterations")
+    assert not is_whole(fp.Informed(inner), "controller.deformation.gain")
+
+
+@pytest.mark.parametrize(
+    ("path", "error", "message"),
+    [
+        ("deformation.gian", InvalidName, r"\(Sigmoid\) has no 'gian'.*Did you mean 'gain'"),
+        ("deformatoin.gain", InvalidName, "Did you mean 'deformation'"),
+        ("deformation", InvalidValue, "not a number; go on with one of: gain, shift, scale"),
+        ("deformation.scale", InvalidValue, "is None, not a number; give it a number first"),
+        ("deformation.gain.x", InvalidName, "has no 'x'"),
+    ],
+)
+def test_wrong_paths_get_the_nearest_name(path, error, message):
+    controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5))
+    with pytest.raises(error, match=message):
+        fp.with_settings(controller, {path: 1.0})
+
+
+# --- Search spaces ----------------------------------------------------------------------------------------------------
+
+
+def test_spans_go_from_end_to_end():
+    """Half-way is the arithmetic or the geometric mean; four digits, because those are written down."""
+    assert [fp.Span(1.0, 3.0).number(s) for s in (0.0, 0.5, 1.0)] == [1.0, 2.0, 3.0]
+    assert [fp.LogSpan(0.01, 1.0).number(s) for s in (0.0, 0.5, 1.0)] == [0.01, 0.1, 1.0]
+    assert [fp.LogSpan(-1.0, -0.01).number(s) for s in (0.0, 0.5, 1.0)] == [-1.0, -0.1, -0.01]
+    assert fp.Span(0.0, 1.0).number(1 / 3) == 0.3333
+    assert fp.Span(0.0, 0.33333).number(1.0) <= 0.33333
+
+
+@pytest.mark.parametrize("wrong", [(2.0, 1.0), (1.0, 1.0), (0.0, float("inf")), ("a", 1.0)])
+def test_spans_are_checked(wrong):
+    for kind in (fp.Span, fp.LogSpan):
+        with pytest.raises(InvalidValue, match="expected two finite numbers, the smaller one first"):
+            kind(*wrong)
+    with pytest.raises(InvalidValue, match="the same sign; use Span"):
+        fp.LogSpan(-1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"deformation.gain"', '"deformation.gian"', "Did you mean 'gain'"),
+        ('    "CTC": {"tracking', '    "CCT": {"tracking', "Did you mean 'CTC'"),
+        ("fp.Span(2.0, 12.0)", "(2.0, 12.0)", "expected Span(low, high) or LogSpan(low, high)"),
+        ("tuning = {", "tuning = 1 or {", "expected {'controller'"),
+    ],
+)
+def test_mistakes_in_a_file_are_found_when_it_is_loaded(old, new, message, task, capsys):
+    assert old in LINE
+    Path("line.py").write_text(LINE.replace(old, new))
+    assert main(["compare", "line.py"]) == 2
+    assert message in capsys.readouterr().err
+
+
+# --- Tuning -----------------------------------------------------------------------------------------------------------
+
+
+def records(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "trials.jsonl").read_text().splitlines()[1:]]
+
+
+def test_every_controller_gets_the_same_budget_and_none_gets_worse(task, tmp_path):
+    """As many trials each, besides the settings of the file; a gain of -0.1 is too timid and is found to be."""
+    found = fp.tune(task, trials=8, seed=1, folder=tmp_path / "t")
+    tried = records(tmp_path / "t")
+    assert {n: [r["trial"] for r in tried if r["controller"] == n] for n in ("CTC", "CTC+FPI")} == {
+        n: list(range(-1, 8)) for n in ("CTC", "CTC+FPI")
+    }
+    assert all(e.cost <= e.cost_before for e in found.entries)
+    adaptive = found.entries[1]
+    assert adaptive.cost < 0.5 * adaptive.cost_before
+    assert found.untouched == ("CTC exact",)
+    # The cost is what a comparison would report, of the settings as they were written down.
+    changed = with_tuned(task, {e.name: e.settings for e in found.entries})
+    run = fp.simulate(task.problem, changed.controllers["CTC+FPI"], seed=0, compiled=False)
+    error = fp.measure(task.problem, run).rms_error["y"]
+    # Over 1.5 s the reference sin(2 t) moves between 0 and 1, so the relative error is the error itself.
+    assert adaptive.cost == pytest.approx(error, rel=1e-5)
+
+
+def test_failing_trials_cost_a_finite_penalty(task, tmp_path):
+    """Gains far beyond the limit of contraction diverge: finite, and above everything that works."""
+    wild = replace(
+        task, tuning={"CTC+FPI": {"deformation.gain": fp.Span(-1e4, -1e3), "deformation.scale": fp.Span(1e5, 1e6)}}
+    )
+    found = fp.tune(wild, trials=4, seed=0, folder=tmp_path / "t")
+    costs = [r["cost"] for r in records(tmp_path / "t")]
+    assert all(0 < c <= 2 * PENALTY for c in costs)
+    assert found.entries[0].failed == 4
+    assert found.entries[0].settings == {"deformation.gain": -0.1, "deformation.scale": 20.0}
+    refused = replace(task, tuning={"CTC+FPI": {"deformation.scale": fp.Span(-2.0, -1.0)}})
+    found = fp.tune(refused, trials=1, seed=0, folder=tmp_path / "refused")
+    assert records(tmp_path / "refused")[1]["cost"] == 2 * PENALTY
+    assert found.entries[0].settings == {"deformation.scale": 20.0}
+
+
+def test_a_disturbed_study_finds_what_a_calm_one_finds(task, tmp_path):
+    """Cut anywhere and gone on with, or begun with fewer trials: the same trials, bit by bit. Trials beyond the tenth learn."""
+    settings = {"seed": 3, "count": 2, "percent": 10.0, "controllers": ["CTC+FPI"]}
+    calm = fp.tune(task, trials=14, folder=tmp_path / "calm", **settings)
+    fp.tune(task, trials=5, folder=tmp_path / "cut", **settings)
+    content = (tmp_path / "cut" / "trials.jsonl").read_bytes()
+    (tmp_path / "cut" / "trials.jsonl").write_bytes(content[:-7])
+    again = fp.tune(task, trials=14, folder=tmp_path / "cut", **settings)
+    assert (tmp_path / "cut" / "trials.jsonl").read_bytes() == (tmp_path / "calm" / "trials.jsonl").read_bytes()
+    assert again.facts() == calm.facts()
+    with pytest.raises(OutputError, match="seed was 3, is 4"):
+        fp.tune(task, trials=14, folder=tmp_path / "cut", **{**settings, "seed": 4})
+
+
+def test_command_line_journey(task, capsys):
+    """Tune, paste the lines into the file, and compare with the file of tuned settings: all three agree."""
+    assert main(["tune", "line.py", "--trials", "6", "--out", "t"]) == 0
+    printed = capsys.readouterr().out
+    assert "not tuned: CTC exact" in printed
+    lines = [line for line in printed.splitlines() if line.startswith("controllers[")]
+    assert len(lines) == 2
+    Path("pasted.py").write_text(LINE + "\n".join(lines) + "\n")
+    tuned = read_tuned("t/tuning.json", task)
+    assert dict(fp.load_problem("pasted.py").controllers) == dict(with_tuned(task, tuned.values).controllers)
+    command = ["compare", "line.py", "--no-compile", "--tuned", "t/tuning.json", "--out", "c"]
+    assert main([*command, "--controllers", "CTC", "CTC exact"]) == 0
+    page = Path("c/report.html").read_text()
+    assert "tuned (6 trials, seed 0" in page
+    assert "not tuned: settings of the problem file" in page
+    assert main([*command, "--seeds", "3", "--mismatch", "10", "--controllers", "CTC", "CTC+FPI"]) == 0
+    assert "tuned (6 trials, seed 0" in Path("c/report.html").read_text()
+
+
+def test_a_file_of_another_problem_is_refused(task):
+    """And so is one that is not of tuning at all, or is not there."""
+    facts = {"format": 1, "problem": "arm", "controllers": {}, "trials": 1, "seed": 0, "conditions": ""}
+    Path("t.json").write_text(json.dumps(facts))
+    with pytest.raises(ProblemFileError, match="of problem 'arm', not of 'line'"):
+        read_tuned("t.json", task)
+    Path("t.json").write_text("[1, 2]")
+    with pytest.raises(ProblemFileError, match="not a file that 'fpirhc tune' wrote"):
+        read_tuned("t.json", task)
+    with pytest.raises(OutputError, match="cannot read"):
+        read_tuned("nowhere.json", task)
+
+
+def test_what_cannot_be_tuned_is_said(task, tmp_path, monkeypatch):
+    """Nothing to tune, no search space for a controller, no Optuna: each with what to do."""
+    with pytest.raises(InvalidProblem, match="no search space for controller 'CTC exact'"):
+        fp.tune(task, trials=1, seed=0, folder=tmp_path, controllers=["CTC exact"])
+    with pytest.raises(InvalidProblem, match=r"add to its file, for example, tuning ="):
+        fp.tune(replace(task, tuning={}), trials=1, seed=0, folder=tmp_path)
+    with pytest.raises(InvalidValue, match="trials 0: expected at least 1"):
+        fp.tune(task, trials=0, seed=0, folder=tmp_path)
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(NotSupported, match=r"pip install 'fpirhc\[tune\]'"):
+        fp.tune(task, trials=1, seed=0, folder=tmp_path)
