@@ -61,7 +61,7 @@ def radius_of(problem: Problem, channels: Sequence[Channel], schedule: Schedule,
     before, whole = modes[names.index(sequence[-1][0])], np.eye(modes[0].generator.shape[0])
     for name, duration in sequence:
         mode = modes[names.index(name)]
-        begin = mode.start(before) if len(sequence) > 1 else np.eye(len(whole))
+        begin = mode.start(before) if len(sequence) > 1 else mode.goes_on()
         whole = scipy.linalg.expm(mode.generator * duration) @ begin @ whole
         before = mode
     used = np.flatnonzero(np.abs(whole).sum(axis=0) > 0)

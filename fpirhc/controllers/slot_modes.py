@@ -62,6 +62,10 @@ class Mode:
             matrix[n + 1] = realised - self.law @ matrix
         return matrix
 
+    def goes_on(self) -> np.ndarray:
+        """Matrix that turns z into z where no switch happens: integral kept where the law has one, and never an offset."""
+        return np.diag([*np.ones(self.own.size), float(self.integrates), 0.0])
+
 
 def linear_modes(
     problem: Problem, channels: Sequence[Channel], parameters: np.ndarray, blend: float

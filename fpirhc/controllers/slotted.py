@@ -83,13 +83,13 @@ class Slotted(Controller):
     largest_growth: float = 100.0
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.blend) and self.blend >= 0):
+        if not (isinstance(self.blend, int | float) and math.isfinite(self.blend) and self.blend >= 0):
             raise InvalidValue(f"Slotted(blend={self.blend!r}): expected a number of seconds of at least 0")
         if not (isinstance(self.blank, int) and self.blank >= 0):
             raise InvalidValue(f"Slotted(blank={self.blank!r}): expected a whole number of cycles of at least 0")
-        if not 0 < self.smallest_gain < 1:
+        if not (isinstance(self.smallest_gain, int | float) and 0 < self.smallest_gain < 1):
             raise InvalidValue(f"Slotted(smallest_gain={self.smallest_gain!r}): expected a share between 0 and 1")
-        if not self.largest_growth > 1:
+        if not (isinstance(self.largest_growth, int | float) and self.largest_growth > 1):
             raise InvalidValue(f"Slotted(largest_growth={self.largest_growth!r}): expected a factor above 1")
 
     @property
@@ -141,7 +141,7 @@ class Slotted(Controller):
         for slot in self.slots:
             _check_slot(problem, slot, mistakes)
         if names:
-            self.schedule.check(names, problem, mistakes)
+            self.schedule.check(list(dict.fromkeys(names)), problem, mistakes)
         mistakes.raise_if_any()
         channels = self.channels(problem)
         for one in channels:

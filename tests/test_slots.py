@@ -1,0 +1,697 @@
+"""Time slots: stability of schedules, relative orders, continuity at switches, and what is refused."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plants import pendulum
+
+import fpirhc as fp
+from fpirhc.cli import main
+from fpirhc.errors import FpirhcError, InvalidValue
+from fpirhc.relative_order import output_chain
+from fpirhc.status import Status
+
+CRANE = fp.load_problem("crane_slots")
+TANKS = fp.load_problem("two_tanks_slots")
+MASSES = fp.load_problem("mass_spring_slots")
+POLE = fp.load_problem("cart_pole_slots")
+
+
+def crane(start: dict[str, float], **changes: object) -> fp.Problem:
+    """The crane from another start, measured from the first cycle."""
+    given = {e: start.get(e, 0.0) for e in CRANE.problem.plant.state.elements}
+    return replace(CRANE.problem, start=given, measure_from=0.0, **changes)
+
+
+def run(problem: fp.Problem, controller: fp.Controller) -> fp.Run:
+    """A run that is too short to be worth compiling."""
+    return fp.simulate(problem, controller, seed=0, compiled=False)
+
+
+def switches(found: fp.Run) -> np.ndarray:
+    """First cycles of all slots but the first."""
+    return np.flatnonzero(np.diff(found["slot"][:, 0])) + 1
+
+
+# Stability of a schedule
+
+
+def test_crane_schedule_is_stable_although_no_slot_is():
+    """The pendulum swings undamped in a cart slot, the cart rolls on in an angle slot; one period shrinks both."""
+    slots = CRANE.controllers["slots"]
+    found = fp.floquet_radius(CRANE.problem, slots.slots, slots.schedule, blend=slots.blend)
+    assert found.radius == pytest.approx(0.0485, abs=5e-4)
+    assert found.period == pytest.approx(5.3)
+    for values in found.eigenvalues.values():
+        assert values.real.max() == pytest.approx(0.0, abs=1e-6)
+
+
+def period_map(problem: fp.Problem, controller: fp.Controller, period: float) -> np.ndarray:
+    """The linear map of the state over one period of the schedule, from runs with one entry of the state disturbed.
+
+    It is taken from the second period to the third, since a run's first slot begins without an offset.
+    """
+    size, cycles, names = 1e-4, round(period / problem.period), problem.plant.state.elements
+    after = []
+    for name in names:
+        states = run(replace(problem, start={e: size * (e == name) for e in names}), controller)["state"]
+        after.append(states[[cycles, 2 * cycles]] / size)
+    first, second = np.array(after).transpose(1, 2, 0)
+    return second @ np.linalg.pinv(first, rcond=1e-9)
+
+
+def test_nonlinear_run_shrinks_by_the_floquet_radius():
+    """Near the set-point, by the wrong model with the deformation: 0.0493 at 5 ms and 0.0487 at 1 ms for 0.0485."""
+    slots = CRANE.controllers["slots+FPI"]
+    radius = fp.floquet_radius(CRANE.problem, slots.slots, slots.schedule, blend=slots.blend).radius
+    away = []
+    for period in (5e-3, 1e-3):
+        problem = crane({}, period=period, duration=10.6 + 2 * period, limits=fp.Limits())
+        found = np.abs(np.linalg.eigvals(period_map(problem, slots, 5.3))).max()
+        away.append(abs(found / radius - 1))
+    assert away[0] < 0.03
+    assert away[1] < 0.01
+
+
+def test_an_unstable_schedule_is_seen_and_grows_so():
+    """The cart-pole's schedule grows by 1.09 per period by Floquet, and the run grows as it says."""
+    slots, problem = POLE.controllers["slots+FPI"], POLE.problem
+    radius = fp.floquet_radius(problem, slots.slots, slots.schedule, blend=slots.blend).radius
+    assert radius == pytest.approx(1.094, abs=1e-3)
+    still = replace(problem, duration=1.21, measure_from=0.0, limits=fp.Limits())
+    assert np.abs(np.linalg.eigvals(period_map(still, slots, 0.6))).max() == pytest.approx(radius, rel=0.02)
+
+
+def test_one_slot_alone_has_the_radius_of_its_eigenvalues():
+    """Without a switch one period is e^(A T), whose radius is e^(largest real part T)."""
+    for integral in (False, True):
+        slot = fp.Slot("q2", fp.Exponential(rate=4.0, integral=integral))
+        found = fp.floquet_radius(MASSES.problem, [slot], fp.Periodic({"q2": 1.5}), blend=0.1)
+        assert found.eigenvalues["q2"].size == 4 + integral
+        assert found.eigenvalues["q2"].real.max() == pytest.approx(-0.1, abs=1e-3)
+        assert found.radius == pytest.approx(np.exp(1.5 * found.eigenvalues["q2"].real.max()), rel=1e-9)
+
+
+def test_no_radius_without_a_set_point_or_a_period():
+    """The reason is said."""
+    slots = CRANE.controllers["slots"]
+    chosen = fp.ByError({"cart": 1.0, "angle": 1.0}, dwell=0.5)
+    found = fp.floquet_radius(CRANE.problem, slots.slots, chosen)
+    assert found.radius is None
+    assert found.reason == "the schedule is not periodic"
+    moving = replace(CRANE.problem, reference=fp.Trajectory(lambda t: {"cart": 0.1 * t, "angle": 0 * t}))
+    found = fp.floquet_radius(moving, slots.slots, slots.schedule)
+    assert found.radius is None
+    assert "still moves" in found.reason
+
+
+# Relative orders
+
+
+@pytest.mark.parametrize(
+    ("task", "coordinate", "order"), [(MASSES, "q2", 2), (MASSES, "q1", 4), (TANKS, "h1", 1), (TANKS, "h2", 2)]
+)
+def test_relative_order(task, coordinate, order):
+    """The number of derivatives until the input appears."""
+    assert output_chain(task.problem.plant, coordinate).order == order
+
+
+def test_gains_of_the_masses():
+    """F / m2 in q2''; through the spring k2 / (m1 m2) in q1''''."""
+    plant, random = MASSES.problem.plant, np.random.default_rng(1)
+    p = dict(zip(plant.parameter.elements, plant.exact, strict=True))
+    for state in random.normal(size=(5, 4)):
+        for name, gain in {"q2": 1 / p["m2"], "q1": p["k2"] / (p["m1"] * p["m2"])}.items():
+            assert float(output_chain(plant, name).gain(state, [0.3], plant.exact)) == pytest.approx(gain, rel=1e-12)
+
+
+def test_gains_and_chain_of_the_tanks():
+    """1 / A1 in h1'; c1 / (2 A1 A2 sqrt(h1)) in h2''; and h2' = (c1 sqrt(h1) - c2 sqrt(h2)) / A2."""
+    plant, random = TANKS.problem.plant, np.random.default_rng(2)
+    p = dict(zip(plant.parameter.elements, plant.exact, strict=True))
+    for h1, h2 in random.uniform(0.5, 6.0, size=(5, 2)):
+        upper, lower = output_chain(plant, "h1"), output_chain(plant, "h2")
+        assert float(upper.gain([h1, h2], [0.3], plant.exact)) == pytest.approx(1 / p["A1"], rel=1e-12)
+        gain = p["c1"] / (2 * p["A1"] * p["A2"] * np.sqrt(h1))
+        assert float(lower.gain([h1, h2], [0.3], plant.exact)) == pytest.approx(gain, rel=1e-9)
+        rate = (p["c1"] * np.sqrt(h1) - p["c2"] * np.sqrt(h2)) / p["A2"]
+        assert lower.states([h1, h2], plant.exact).full().ravel() == pytest.approx([h2, rate], rel=1e-9)
+
+
+def test_response_of_the_crane():
+    """Response alpha + beta u, with beta = 1 / (M + m sin^2) for the cart and -cos / l times that for the angle."""
+    plant, random = CRANE.problem.plant, np.random.default_rng(3)
+    p = dict(zip(plant.parameter.elements, plant.exact, strict=True))
+    for state in random.normal(size=(5, 4)):
+        angle = state[plant.state.elements.index("angle")]
+        beta = 1 / (p["M"] + p["m"] * np.sin(angle) ** 2)
+        for name, gain in {"cart": beta, "angle": -np.cos(angle) / p["l"] * beta}.items():
+            chain = output_chain(plant, name)
+            assert float(chain.gain(state, [0.3], plant.exact)) == pytest.approx(gain, rel=1e-12)
+            ends = [float(chain.response(state, [u], plant.exact, [0, 0])) for u in (0.0, 2.0)]
+            assert ends[1] - ends[0] == pytest.approx(2 * gain, rel=1e-9)
+
+
+# Schedules
+
+
+def test_fixed_and_periodic_are_the_same_run():
+    """The same slots in the same cycles: bit by bit."""
+    problem, slots = crane({"cart": -1.0}, duration=8.0), CRANE.controllers["slots+FPI"]
+    spans = [("cart", 0.0, 1.4), ("angle", 1.4, 5.3), ("cart", 5.3, 6.7), ("angle", 6.7, 8.0)]
+    fixed = run(problem, replace(slots, schedule=fp.FixedSchedule(spans)))
+    periodic = run(problem, slots)
+    assert np.array_equal(fixed.log, periodic.log)
+    assert [(round(a, 9), round(b, 9), k) for a, b, k in fixed.spans()] == [
+        (a, b, ("cart", "angle").index(n)) for n, a, b in spans
+    ]
+
+
+def chosen(schedule: fp.Schedule, **changes: object) -> fp.Run:
+    """The crane with slots that are chosen as it goes."""
+    return run(CRANE.problem, replace(CRANE.controllers["slots+FPI"], schedule=schedule, **changes))
+
+
+def test_by_error_keeps_dwell_and_hysteresis():
+    """A slot ends when it has lasted the dwell and another weighted error is clearly larger; then and not otherwise."""
+    weights, dwell, hysteresis = np.array([1.0, 5.0]), 0.7, 0.2
+    found = chosen(fp.ByError({"cart": 1.0, "angle": 5.0}, dwell=dwell, hysteresis=hysteresis))
+    slot, scores = found["slot"][:, 0].astype(int), weights * np.abs(found["error"])
+    assert len(switches(found)) > 10
+    assert min(b - a for a, b, _ in found.spans()[:-1]) == pytest.approx(dwell)
+    assert slot[0] == np.argmax(scores[0])
+    for start, end, active in found.spans():
+        first, last = round(start / found.period), round(end / found.period)
+        free = np.arange(first + round(dwell / found.period), min(last + 1, found.cycles))
+        clear = scores[free, 1 - active] > (1 + hysteresis) * scores[free, active]
+        assert not clear[:-1].any()
+        assert not clear.size or clear[-1] == (last < found.cycles)
+
+
+def test_by_look_ahead_keeps_the_dwell():
+    """No slot is shorter; and with a hysteresis that no prediction exceeds the first slot stays for ever."""
+    weights = {"cart": 1.0, "angle": 1.0}
+    found = chosen(fp.ByLookAhead(weights, dwell=1.0, hysteresis=0.2))
+    assert len(switches(found)) > 10
+    assert min(b - a for a, b, _ in found.spans()[:-1]) >= 1.0 - 1e-9
+    assert len(chosen(fp.ByLookAhead(weights, dwell=1.0, hysteresis=1e9)).spans()) == 1
+
+
+def test_look_ahead_chooses_what_the_runs_show():
+    """The first slot is the one after which the weighted state is smaller, as runs with each slot alone find."""
+    weights, dwell, random = {"cart": 3.0, "cart'": 1.0, "angle": 1.0, "angle'": 1.0}, 1.0, np.random.default_rng(4)
+    names = CRANE.problem.plant.state.elements
+    slots = CRANE.controllers["slots exact model"].controller
+    sizes, firsts = np.array([weights[e] for e in names]), []
+    for state in 1e-3 * random.normal(size=(6, 4)):
+        problem = crane(dict(zip(names, state, strict=True)), duration=dwell + 2 * CRANE.problem.period)
+        values = []
+        for slot in slots.slots:
+            alone = replace(slots, slots=[slot], schedule=fp.Periodic({slot.coordinate: dwell}))
+            ended = run(problem, fp.Informed(alone))["state"][round(dwell / problem.period)]
+            values.append(float(sizes @ ended**2))
+        first = int(run(problem, fp.Informed(replace(slots, schedule=fp.ByLookAhead(weights, dwell))))["slot"][0, 0])
+        assert first == np.argmin(values)
+        firsts.append(first)
+    assert set(firsts) == {0, 1}
+
+
+def test_a_slot_without_gain_is_not_chosen():
+    """The angle has the larger error; but tilted by 0.2 rad the force's effect on it is below 99 % of that at the start."""
+    schedule = fp.ByError({"cart": 1e-6, "angle": 1.0}, dwell=0.01)
+    slots = replace(CRANE.controllers["slots exact model"].controller, schedule=schedule, smallest_gain=0.99)
+    found = run(crane({"cart": 0.1}, duration=2.0), fp.Informed(slots))
+    gain = angle_gain(found["state.angle"])
+    assert gain.min() > 0.99 * gain[0]
+    found = run(crane({"cart": 0.1, "angle'": 0.9}, duration=2.0), fp.Informed(slots))
+    gain = angle_gain(found["state.angle"])
+    low = gain < 0.99 * gain[0]
+    # In the dwell of two cycles an active slot may still lose its gain.
+    assert (found["slot"][2:, 0][low[2:] & low[1:-1] & low[:-2]] == 0).all()
+    assert low.sum() > 20
+    assert (found["slot"][:, 0] == 1).any()
+
+
+def angle_gain(angle: np.ndarray) -> np.ndarray:
+    """Size of d angle'' / dF of the crane."""
+    p = dict(zip(CRANE.problem.plant.parameter.elements, CRANE.problem.plant.exact, strict=True))
+    return np.cos(angle) / p["l"] / (p["M"] + p["m"] * np.sin(angle) ** 2)
+
+
+def pendulum_problem() -> fp.Problem:
+    """A pendulum that follows a ramp with hardly enough torque."""
+    return fp.Problem(
+        plant=pendulum(),
+        reference=fp.Trajectory(lambda t: {"angle": 0.5 * t}),
+        start={"angle": 0.4},
+        period=2e-3,
+        duration=2.0,
+        limits=fp.Limits(inputs={"torque": (-1.5, 1.5)}),
+    )
+
+
+@pytest.mark.parametrize("integral", [False, True])
+@pytest.mark.parametrize("deformation", [fp.Identity(), fp.Sigmoid(gain=-0.5, shift=0.3, scale=20.0)])
+def test_one_slot_is_computed_torque(integral, deformation):
+    """A slot that lasts the whole run, of a plant with one coordinate: law, deformation, integral, limits."""
+    problem = pendulum_problem()
+    law = fp.Exponential(rate=8.0, integral=integral)
+    torque = run(problem, fp.ComputedTorque(law, deformation))
+    slots = run(problem, fp.Slotted([fp.Slot("angle", law, deformation)], fp.Periodic({"angle": 0.5}), blend=0.1))
+    assert torque["clipped"].any()  # so that the anti-windup is compared as well
+    for name in ("command", "error", "desired", "deformed", "realised", "state", "clipped"):
+        np.testing.assert_allclose(slots[name], torque[name], rtol=1e-7, atol=1e-9, err_msg=name)
+
+
+# Switches
+
+
+@pytest.mark.parametrize("name", ["slots", "slots+FPI", "slots exact model"])
+def test_command_is_continuous_at_switches(name):
+    """A slot begins with the last command, and what it moves by in the next 0.1 s vanishes with the period; a jump would not."""
+    largest = []
+    for period in (5e-3, 2.5e-3):
+        found = run(crane({"cart": -1.0}, period=period, duration=10.6), CRANE.controllers[name])
+        steps, at = np.abs(np.diff(found["command"][:, 0])), switches(found)
+        assert len(at) == 3
+        assert steps[at - 1].max() < 1e-12
+        largest.append(max(steps[k - 1 : k + round(0.1 / period)].max() for k in at))
+    assert largest[1] < 0.6 * largest[0]
+    assert largest[0] < 0.08  # N, of commands of 1.3 N
+
+
+def test_without_blend_the_command_jumps():
+    """What `blend` is for: joined at once, the law moves the command by as much at any period."""
+    largest = []
+    for period in (5e-3, 2.5e-3):
+        slots = replace(CRANE.controllers["slots"], blend=0.0)
+        found = run(crane({"cart": -1.0}, period=period, duration=10.6), slots)
+        steps = np.abs(np.diff(found["command"][:, 0]))
+        largest.append(steps[switches(found)].max())
+    assert largest[1] > 0.9 * largest[0] > 0.5
+
+
+def own_law(found: fp.Run, name: str, rate: float) -> np.ndarray:
+    """y''^Des = 2 rate e' + rate^2 e towards rest."""
+    return -(2 * rate * found[f"state.{name}'"] + rate**2 * found[f"state.{name}"])
+
+
+@pytest.mark.parametrize("name", ["slots", "slots+FPI"])
+@pytest.mark.parametrize("blend", [0.1, 0.3])
+def test_offset_decays_with_the_blend(name, blend):
+    """What the desired response is away from the law falls as e^(-t / blend) and begins at what the plant does."""
+    found = run(crane({"cart": -1.0}, duration=5.3), replace(CRANE.controllers[name], blend=blend))
+    (at,) = switches(found)
+    offset = found["desired.angle"] - own_law(found, "angle", 3.0)
+    expected = offset[at] * np.exp(-(found.time[at:] - found.time[at]) / blend)
+    assert abs(offset[at]) > 0.1
+    np.testing.assert_allclose(offset[at:], expected, atol=1e-9)
+    np.testing.assert_allclose((found["desired.cart"] - own_law(found, "cart", 1.0))[:at], 0, atol=1e-12)
+    begins = found["realised.angle"] if name == "slots+FPI" else found["deformed.angle"]
+    assert found["desired.angle"][at] == pytest.approx(begins[at], rel=1e-9)
+
+
+def test_a_deformation_starts_afresh_with_every_slot():
+    """The tuned gain of one slot says nothing of the next: its factor is 1 at every start, and grows to 3 within."""
+    sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=10.0)
+    tuned = fp.Tuned(sigmoid, largest_gain=3 * sigmoid.effective_gain())
+    slots = CRANE.controllers["slots+FPI"]
+    slots = replace(slots, slots=[replace(s, deformation=tuned) for s in slots.slots])
+    found = run(crane({"cart": -1.0}, duration=10.6), slots)
+    assert len(found.spans()) == 4
+    for start, end, slot in found.spans():
+        first, last = round(start / found.period), round(end / found.period) - 1
+        active, other = (found[f"gain_factor_{('cart', 'angle')[k]}"][:, 0] for k in (slot, 1 - slot))
+        assert active[first] == 1
+        assert active[last] > 1.5
+        assert (other[first : last + 1] == 1).all()
+
+
+def test_an_integral_starts_afresh_with_every_slot():
+    """Bumpless: it begins where it cancels the feedback of error and rate, whatever it was at the end of the slot before."""
+    slots, problem = TANKS.controllers["slots"], replace(TANKS.problem, duration=480.0, measure_from=0.0)
+    found = run(problem, replace(slots, blend=0.0))
+    chain = output_chain(problem.plant, "h2")
+    of_integral, of_error, of_rate = fp.Exponential(rate=0.1).gains(2)
+
+    def feedback(cycle: int) -> float:
+        rate = float(chain.states(found["state"][cycle], problem.plant.approximate)[1])
+        return of_error * found["error.h2"][cycle] - of_rate * rate
+
+    lower = [(round(a / found.period), round(b / found.period)) for a, b, slot in found.spans() if slot == 0]
+    assert len(lower) == 4
+    for (_, ended), (first, _) in pairwise(lower):
+        begun = -feedback(first) / of_integral
+        # With blend = 0 the law is joined in the second cycle; by then one cycle's error was added.
+        used = (found["desired.h2"][first + 1] - feedback(first + 1)) / of_integral
+        assert used == pytest.approx(begun + found.period * found["error.h2"][first], rel=1e-9)
+        before = (found["desired.h2"][ended - 1] - feedback(ended - 1)) / of_integral
+        assert abs(before - begun) > 0.1 * abs(begun)
+
+
+def test_blanked_cycles_keep_the_distance():
+    """In the first cycles of a slot the request keeps its distance from the desired response; without blank it does not."""
+    for blank in (0, 4):
+        slots = replace(CRANE.controllers["slots+FPI"], blank=blank)
+        found = run(crane({"cart": -1.0}, duration=10.6), slots)
+        away = found["deformed"] - found["desired"]
+        for k in switches(found):
+            distance = away[k : k + 6, int(found["slot"][k, 0])]
+            assert np.ptp(distance[:4]) < 1e-9 if blank else np.ptp(distance[:4]) > 1e-3
+            assert abs(distance[4] - distance[3]) > 1e-5
+
+
+def test_too_little_gain_holds_the_command():
+    """Held in exactly the cycles in which the active slot's gain is below its share, and the status says so."""
+    slots = replace(CRANE.controllers["slots exact model"].controller, smallest_gain=0.995)
+    found = run(crane({"cart": -1.0}, duration=10.6), fp.Informed(slots))
+    gain = angle_gain(found["state.angle"])
+    cart_gain = gain / np.cos(found["state.angle"])
+    share = np.where(found["slot"][:, 0] == 1, gain / gain[0], cart_gain / cart_gain[0])
+    held = found["slot_held"][:, 0] > 0.5
+    assert 20 < held.sum() < found.cycles / 2
+    np.testing.assert_array_equal(held, share < 0.995)
+    np.testing.assert_array_equal(found["status"][:, 0], np.where(held, Status.HELD, Status.OK))
+    steps = np.diff(found["command"][:, 0])
+    assert np.abs(steps[held[1:]]).max() == 0
+    assert np.abs(steps[~held[1:]]).max() > 1e-3
+
+
+def test_inputs_of_other_slots_keep_their_command():
+    """Two masses, two forces, a slot for each: the force that does not act stands still."""
+    plant = fp.Plant(
+        coordinates={"a": "m", "b": "m"},
+        inputs={"Fa": "N", "Fb": "N"},
+        parameters={"m": fp.Parameter(1.0, 1.3, "kg")},
+        response=lambda q, v, u, p: {"a": (u.Fa - q.a) / p.m, "b": (u.Fb - q.b) / p.m},
+    )
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"a": 0 * t + 1, "b": 0 * t + 1}),
+        start={"a": 0.0, "b": 0.0},
+        period=1e-2,
+        duration=2.0,
+        judged=("a", "b"),
+    )
+    law = fp.Exponential(rate=2.0)
+    pair = (fp.Slot("a", law, input="Fa"), fp.Slot("b", law, input="Fb"))
+    found = run(problem, fp.Slotted(pair, fp.Periodic({"a": 0.5, "b": 0.5}), blend=0.05))
+    moved, slot = np.abs(np.diff(found["command"], axis=0)) > 0, found["slot"][1:, 0].astype(int)
+    assert not moved[slot == 0, 1].any()
+    assert not moved[slot == 1, 0].any()
+    assert moved[slot == 0, 0].sum() > 90
+    assert moved[slot == 1, 1].sum() > 90
+    assert "needs the name of its input. Valid: Fa, Fb." in refused(
+        problem, fp.Slotted((fp.Slot("a", law),), fp.Periodic({"a": 0.5}), blend=0.05)
+    )
+    message = refused(problem, fp.Slotted((fp.Slot("a", law, input="Fb"),), fp.Periodic({"a": 0.5}), blend=0.05))
+    assert "derivative 2 of 'a' is reached by another input than 'Fb'; choose input='Fa'" in message
+
+
+# Bad input
+
+
+def refused(problem: fp.Problem, controller: fp.Controller) -> str:
+    """The message with which a controller is refused."""
+    with pytest.raises(FpirhcError) as caught:
+        run(problem, controller)
+    return str(caught.value)
+
+
+def test_all_mistakes_of_a_schedule_at_once():
+    """Unknown, never active, overlapping, gap, and beyond the run, in one message."""
+    spans = [("cart", 0.0, 1.4), ("angel", 1.0, 3.0), ("cart", 4.0, 30.0)]
+    message = refused(CRANE.problem, replace(CRANE.controllers["slots"], schedule=fp.FixedSchedule(spans)))
+    assert "coordinate 'angel' is unknown. Did you mean 'angle'? Valid: cart, angle." in message
+    assert "slot 'angle' is never active" in message
+    assert "'angel' from 1 to 3 s overlaps what came before, which ends at 1.4 s; let it start there" in message
+    assert "no slot from 3 to 4 s; let 'cart' start at 3 s" in message
+    assert "the last slot ends at 30 s, after the run's 26.5 s; let it end there" in message
+    assert "5 mistakes" in message
+
+
+SCHEDULES = {
+    "late": (
+        fp.FixedSchedule([("cart", 0.5, 2.0), ("angle", 2.0, 26.5)]),
+        ["no slot from 0 to 0.5 s; let 'cart' start at 0 s"],
+    ),
+    "short": (
+        fp.FixedSchedule([("cart", 0.0, 2.0), ("angle", 2.0, 20.0)]),
+        ["no slot from 20 s to the end of the run at 26.5 s; add one"],
+    ),
+    "instant": (
+        fp.FixedSchedule([("cart", 0.0, 2.0), ("angle", 2.0, 2.001), ("cart", 2.001, 26.5)]),
+        ["'angle' from 2 to 2.001 s is shorter than one control cycle of 0.005 s; let it end later"],
+    ),
+    "no span": (fp.FixedSchedule([("cart", 0.0)]), ["('cart', 0.0) is no span; expected (coordinate, start, end)"]),  # type: ignore[list-item]
+    "periodic": (
+        fp.Periodic({"cart": -1.0, "angle": 1e-3, "angel": 1.0}),
+        [
+            "coordinate 'angel' is unknown. Did you mean 'angle'?",
+            "duration of 'cart' must be a positive number of seconds, got -1.0",
+            "duration of 'angle' is 0.001 s, shorter than one control cycle of 0.005 s",
+        ],
+    ),
+    "by error": (
+        fp.ByError({"cart": 0.0, "angel": 1.0}, dwell=0.0, hysteresis=-1.0),
+        [
+            "weight of coordinate 'angel' is unknown. Did you mean 'angle'?",
+            "the weight of 'cart' must be a positive number, got 0.0",
+            "the weight of 'angle' must be a positive number, got None",
+            "dwell must be a positive number of seconds, got 0.0",
+            "hysteresis must be a number of at least 0, got -1.0",
+        ],
+    ),
+    "by look-ahead": (
+        fp.ByLookAhead({"carts": 1.0, "angle": -1.0}, dwell=1e-3),
+        [
+            "weight of state 'carts' is unknown. Did you mean 'cart'?",
+            "weights must be numbers of at least 0, one of them positive, got [1.0, -1.0]",
+            "dwell is 0.001 s, shorter than one control cycle of 0.005 s",
+        ],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SCHEDULES)
+def test_mistakes_of_schedules(name):
+    """Each is told what, where, and what to do; all of one schedule at once."""
+    schedule, expected = SCHEDULES[name]
+    message = refused(CRANE.problem, replace(CRANE.controllers["slots"], schedule=schedule))
+    for text in expected:
+        assert text in message
+    assert len(expected) == 1 or f"{len(expected)} mistakes" in message
+
+
+def test_mistakes_of_slots_and_schedule_together():
+    """Everything about all slots and the schedule is in one message."""
+    slots, law = CRANE.controllers["slots"], fp.Exponential(rate=1.0)
+    wrong = (fp.Slot("carts", law), fp.Slot("angle", law, order=3), fp.Slot("angle", law, order=2))
+    message = refused(CRANE.problem, replace(slots, slots=wrong, schedule=fp.Periodic({"carts": 1.0})))
+    assert "coordinate 'angle' has more than one slot" in message
+    assert "slot 'carts': coordinate 'carts' is unknown. Did you mean 'cart'? Valid: cart, angle." in message
+    assert "order=3 is not the relative order from 'F' to 'angle', which is 2; write order=2 or leave it out" in message
+    assert "Periodic: slot 'angle' is never active" in message
+    assert "4 mistakes" in message
+    assert "there are no slots" in refused(CRANE.problem, replace(slots, slots=()))
+    unjudged = replace(CRANE.problem, judged=("cart",))
+    assert (
+        "slot 'angle' is not among the coordinates that are judged; write Problem(..., judged=('cart', 'angle'))"
+        in (refused(unjudged, slots))
+    )
+
+
+def test_a_coordinate_that_the_input_does_not_reach():
+    """The structural relative orders of all coordinates are shown."""
+    plant = fp.Plant(
+        coordinates={"a": "m", "b": "m", "c": "m"},
+        inputs={"F": "N"},
+        controlled=("a",),
+        parameters={"m": fp.Parameter(1.0, 1.3, "kg")},
+        response=lambda q, v, u, p: {"a": u.F / p.m, "b": -q.b, "c": q.a - q.c},
+    )
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"a": 0 * t, "b": 0 * t, "c": 0 * t}),
+        start={"a": 0.1, "b": 0.1, "c": 0.1},
+        period=1e-2,
+        duration=1.0,
+        judged=("a", "b", "c"),
+    )
+    pair = (fp.Slot("a", fp.Exponential(rate=2.0)), fp.Slot("b", fp.Exponential(rate=2.0)))
+    message = refused(problem, fp.Slotted(pair, fp.Periodic({"a": 0.5, "b": 0.5}), blend=0.1))
+    assert "input 'F' does not reach coordinate 'b'" in message
+    assert "(relative order by coordinate: a 2, b none, c 4); choose a coordinate that has one" in message
+
+
+def test_a_slot_in_which_the_zero_dynamics_diverge():
+    """The pole falls at 3.49 1/s: ln(100) / 3.49 = 1.32 s is the longest cart slot, by any schedule that promises more."""
+    slots = POLE.controllers["slots"]
+    for schedule in (
+        fp.Periodic({"angle": 0.5, "cart": 1.4}),
+        fp.FixedSchedule([("angle", 0.0, 0.5), ("cart", 0.5, 1.0), ("cart", 1.0, 1.9), ("angle", 1.9, 6.0)]),
+        fp.ByError({"angle": 1.0, "cart": 1.0}, dwell=1.4),
+    ):
+        message = refused(POLE.problem, replace(slots, schedule=schedule))
+        assert "slot 'cart' lasts 1.4 s, in which its zero dynamics, diverging at 3.5 1/s, grow e^4.9 times" in message
+        assert "make it shorter than 1.32 s" in message
+    brief = replace(POLE.problem, duration=0.02, measure_from=0.0)
+    run(brief, replace(slots, schedule=fp.Periodic({"angle": 0.5, "cart": 1.31})))
+    run(brief, replace(slots, schedule=fp.Periodic({"angle": 0.5, "cart": 1.4}), largest_growth=150.0))
+
+
+MAP = fp.Sigmoid(gain=-0.5, shift=0.3, scale=10.0)
+
+
+@pytest.mark.parametrize(
+    ("deformation", "culprit"),
+    [
+        (fp.Paired(MAP, cycles=2), "Paired"),
+        (fp.Increment(MAP, cycles=2), "Increment"),
+        (fp.SelfPaired(MAP, most=5), "SelfPaired"),
+        (fp.Tuned(fp.Paired(MAP, cycles=2), largest_gain=5.0), "Paired"),
+        (fp.Damped(fp.Tuned(fp.Increment(MAP, cycles=2), largest_gain=5.0)), "Increment"),
+        (fp.Guarded(fp.SelfPaired(MAP, most=5), largest_deformation=5.0), "SelfPaired"),
+    ],
+)
+def test_pairs_in_a_queue_are_refused(deformation, culprit):
+    """Pairs of cycles before a switch belong to another coordinate; also where another wrapper hides them."""
+    slots = CRANE.controllers["slots"]
+    wrong = (replace(slots.slots[0], deformation=deformation), slots.slots[1])
+    message = refused(CRANE.problem, replace(slots, slots=wrong))
+    assert f"slot 'cart': {culprit} keeps pairs of earlier cycles, which belong to another slot" in message
+
+
+def test_sensors_are_refused():
+    """They measure states and the plant's own response, not y^(r) of a slot."""
+    sensed = replace(CRANE.problem, sensing=fp.Sensing(sensors={"cart": fp.Sensor(quantum=1e-3)}))
+    message = refused(sensed, CRANE.controllers["slots+FPI"])
+    assert "Slotted reads responses of its own, which the problem's sensors do not measure" in message
+
+
+def test_deformations_that_cannot_converge_are_refused():
+    """A wrong sign by the slot's own gain, and a scale that nobody chose."""
+    slots = CRANE.controllers["slots"]
+    wrong = (slots.slots[0], replace(slots.slots[1], deformation=fp.Sigmoid(gain=2.0, shift=-0.3, scale=10.0)))
+    assert "slot 'angle': Sigmoid(gain=2) has the wrong sign" in refused(CRANE.problem, replace(slots, slots=wrong))
+    wrong = (slots.slots[0], replace(slots.slots[1], deformation=fp.Sigmoid(gain=-2.0)))
+    assert "slot 'angle': Sigmoid(scale=None): the scale is still to be chosen" in refused(
+        CRANE.problem, replace(slots, slots=wrong)
+    )
+
+
+def test_a_response_that_is_not_affine_is_refused():
+    """A slot inverts y^(r) = alpha + beta u."""
+    plant = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "N"},
+        parameters={"m": fp.Parameter(1.0, 1.3, "kg")},
+        response=lambda q, v, u, p: {"y": (u.u + 0.1 * u.u**3) / p.m},
+    )
+    problem = fp.Problem(plant, fp.Trajectory(lambda t: {"y": 0 * t}), {"y": 0.1}, period=1e-2, duration=1.0)
+    slots = fp.Slotted((fp.Slot("y", fp.Exponential(rate=2.0)),), fp.Periodic({"y": 1.0}), blend=0.1)
+    assert "derivative 2 of 'y' is not affine in 'u', which a slot needs" in refused(problem, slots)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"blend": -1.0},
+        {"blend": "a"},
+        {"blank": 1.5},
+        {"smallest_gain": 1.0},
+        {"smallest_gain": "a"},
+        {"largest_growth": 1},
+    ],
+)
+def test_numbers_out_of_range(changed):
+    """Told by name where they are given."""
+    ((name, value),) = changed.items()
+    with pytest.raises(InvalidValue, match=rf"Slotted\({name}={value!r}\): expected a"):
+        replace(CRANE.controllers["slots"], **changed)
+
+
+# The shipped problems
+
+# Rms errors from `measure_from` on as the docstrings state them, in the order of `judged`.
+MEASURED = {
+    "crane_slots": {"slots": (0.49, 0.023), "slots+FPI": (4.8e-3, 1.5e-3), "RHC": (6.1e-7, 7.8e-7)},
+    "cart_pole_slots": {"slots": (2.7, 0.055), "slots+FPI": (1.2, 3.6e-3), "slots exact model": (1.2, 3.8e-3)},
+    "mass_spring_slots": {"slots": (5.3e-3, 8.0e-3), "slots+FPI": (1.2e-7, 1.9e-7), "RHC": (1.6e-3, 2.4e-3)},
+    "two_tanks_slots": {"slots": (0.039, 0.020), "slots+FPI": (9.2e-5, 7.6e-5), "RHC": (0.087, 0.13)},
+}
+
+
+def rms(problem: fp.Problem, found: fp.Run) -> np.ndarray:
+    """Of every judged error, from `measure_from` on."""
+    assert found.stop is None
+    return np.sqrt(np.mean(found["error"][round(problem.measure_from / found.period) :] ** 2, axis=0))
+
+
+@pytest.mark.parametrize("name", MEASURED)
+def test_shipped_problems_measure_what_they_say(name):
+    """Adaptation improves slots by a wrong model everywhere, on masses and tanks beyond RHC without it."""
+    task = fp.load_problem(name)
+    found = {}
+    for controller, expected in MEASURED[name].items():
+        found[controller] = rms(task.problem, run(task.problem, task.controllers[controller]))
+        assert found[controller] == pytest.approx(expected, rel=0.06), controller
+    assert (found["slots+FPI"] < 0.5 * found["slots"]).all()
+    if name in ("mass_spring_slots", "two_tanks_slots"):
+        assert (found["slots+FPI"] < 0.01 * found["RHC"]).all()
+
+
+def test_slots_of_the_cart_pole_are_the_wrong_plan():
+    """RHC holds the cart within centimetres where slots drive it away, whatever their model."""
+    problem = replace(POLE.problem, duration=3.0)
+    planned = rms(problem, run(problem, POLE.controllers["RHC"]))
+    assert planned[0] < 0.02
+    for name in ("slots", "slots+FPI", "slots exact model"):
+        assert rms(problem, run(problem, POLE.controllers[name]))[0] > 10 * planned[0]
+
+
+# Runs and reports
+
+
+def test_a_saved_run_keeps_its_slots(tmp_path):
+    """The signal, and with it the spans, survive saving; other controllers have none."""
+    found = run(crane({"cart": -1.0}, duration=6.0), CRANE.controllers["slots+FPI"])
+    found.save(tmp_path / "run.npz")
+    loaded = fp.load_run(tmp_path / "run.npz")
+    np.testing.assert_array_equal(loaded["slot"], found["slot"])
+    assert loaded.spans() == found.spans()
+    assert np.array(loaded.spans()) == pytest.approx(np.array([(0, 1.4, 0), (1.4, 5.3, 1), (5.3, 6.0, 0)]))
+    brief = replace(pendulum_problem(), duration=0.02)
+    assert run(brief, fp.ComputedTorque(fp.Exponential(rate=8.0))).spans() == []
+
+
+def test_compare_says_the_radius_and_draws_the_slots(tmp_path, capsys):
+    """The Floquet radius in the text; in the report the bands, their legend, and the times of the slots."""
+    arguments = [
+        str(Path(__file__).parents[1] / "problems" / "crane_slots.py"),
+        "--controllers",
+        "slots",
+        "slots+FPI",
+        "--no-compile",
+        "--out",
+        str(tmp_path),
+    ]
+    assert main(["compare", *arguments]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert (
+        "slots: Floquet radius 0.0485 per period of 5.3 s: near the set-point errors of ideal slots shrink" in printed
+    )
+    assert "(largest real part in each slot alone, 1/s: cart 0, angle 0)" in printed
+    assert "slots+FPI lowers the rms error of cart from 0.49 to 0.00479 m" in printed
+    report = (tmp_path / "report.html").read_text()
+    legend = report.split("<ul id='bands'>")[1].split("</ul>")[0]
+    assert "slot cart" in legend
+    assert "slot angle" in legend
+    assert "(slots, slots+FPI)" in legend
+    assert re.search(r'"slots": ?\[\[0\.0, ?1\.4, ?0\], ?\[1\.4, ?5\.3, ?1\]', report)
