@@ -15,6 +15,9 @@ the filter finds the disturbance in one cycle, and stays at 0.757 mm. Gains of t
 mm, but hundreds with 0.1, which trusts the first responses, far from linear in m. Moving horizon: noise of 0.1, 1, 10 gives
 0.32, 0.32, 1.0 mm.
 
+Tuned alike, `fpirhc tune van_der_pol_duffing --trials 25 --seeds 3 --mismatch 20 --compile`, rms error over the reference's range:
+offset-free 3.6e-4, RHC+FPI 1.2e-4 (gain -2.9), least squares 1.5e-4, moving horizon 1.4e-4.
+
 What the numbers do not say. The disturbance acts through the plan, ten times less often than the deformation: with a
 control cycle of 20 ms RHC+FPI (2.1 mm) is hardly better than offset-free RHC (2.3 mm). And the learners are as good as the
 exact model because its structure is exact: 2 m/s^2 from 6 s on that no parameter stands for give 205 mm with least squares,
@@ -79,3 +82,12 @@ controllers = {
     "RHC exact model": fp.Informed(plain),
 }
 headline = ("RHC", "RHC+FPI")
+tuning = {
+    "RHC+FPI": {"deformation.gain": fp.LogSpan(-3.0, -0.1)},
+    "RHC offset-free": {
+        "estimator.drift.q": fp.LogSpan(1.0, 3e3),  # m/s^2.5
+        "estimator.measured.q'": fp.LogSpan(1e-4, 1e-1),  # m/s
+    },
+    "RHC+RLS": {"estimator.noise.q": fp.LogSpan(0.1, 10.0), "estimator.time": fp.LogSpan(0.5, 20.0)},
+    "RHC+MHE": {"estimator.noise.q": fp.LogSpan(0.1, 10.0), "estimator.time": fp.LogSpan(0.5, 20.0)},
+}
