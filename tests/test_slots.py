@@ -292,7 +292,7 @@ def test_one_slot_is_computed_torque(integral, deformation):
 
 @pytest.mark.parametrize("name", ["slots", "slots+FPI", "slots exact model"])
 def test_command_is_continuous_at_switches(name):
-    """A slot begins with the last command, and what it moves by in the next 0.1 s vanishes with the period; a jump would not."""
+    """A slot begins with the last command, and its steps in the next 0.1 s vanish with the period; a jump would not."""
     largest = []
     for period in (5e-3, 2.5e-3):
         found = run(crane({"cart": -1.0}, period=period, duration=10.6), CRANE.controllers[name])
@@ -470,7 +470,7 @@ SCHEDULES = {
         fp.FixedSchedule([("cart", 0.0, 2.0), ("angle", 2.0, 2.001), ("cart", 2.001, 26.5)]),
         ["'angle' from 2 to 2.001 s is shorter than one control cycle of 0.005 s; let it end later"],
     ),
-    "no span": (fp.FixedSchedule([("cart", 0.0)]), ["('cart', 0.0) is no span; expected (coordinate, start, end)"]),  # type: ignore[list-item]
+    "no span": (fp.FixedSchedule([("cart", 0.0)]), ["('cart', 0.0) is no span; expected (coordinate, start, end)"]),
     "periodic": (
         fp.Periodic({"cart": -1.0, "angle": 1e-3, "angel": 1.0}),
         [
