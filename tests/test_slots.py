@@ -53,17 +53,20 @@ def test_crane_schedule_is_stable_although_no_slot_is():
 
 
 def period_map(problem: fp.Problem, controller: fp.Controller, period: float) -> np.ndarray:
-    """The linear map of the state over one period of the schedule, from runs with one entry of the state disturbed.
+    """The linear map of state and last command over one period of the schedule, from runs with one entry disturbed.
 
-    It is taken from the second period to the third, since a run's first slot begins without an offset.
+    It is taken from the second period on, since a run's first slot begins without an offset; the integral and the offset
+    that the next slot begins with follow from state and last command.
     """
     size, cycles, names = 1e-4, round(period / problem.period), problem.plant.state.elements
-    after = []
+    before, after = [], []
     for name in names:
-        states = run(replace(problem, start={e: size * (e == name) for e in names}), controller)["state"]
-        after.append(states[[cycles, 2 * cycles]] / size)
-    first, second = np.array(after).transpose(1, 2, 0)
-    return second @ np.linalg.pinv(first, rcond=1e-9)
+        found = run(replace(problem, start={e: size * (e == name) for e in names}), controller)
+        at = np.arange(cycles, found.cycles, cycles)
+        ends = np.hstack([found["state"][at], found["command"][at - 1]]) / size
+        before.append(ends[:-1])
+        after.append(ends[1:])
+    return np.linalg.lstsq(np.vstack(before), np.vstack(after), rcond=1e-9)[0].T
 
 
 def test_nonlinear_run_shrinks_by_the_floquet_radius():
@@ -77,6 +80,21 @@ def test_nonlinear_run_shrinks_by_the_floquet_radius():
         away.append(abs(found / radius - 1))
     assert away[0] < 0.03
     assert away[1] < 0.01
+
+
+@pytest.mark.parametrize(
+    ("of_cart", "of_angle", "blend", "radius"),
+    [(True, False, 1.0, 0.150), (False, True, 0.5, 1.266), (True, True, 0.5, 1.460)],
+)
+def test_integrals_and_offsets_are_part_of_the_radius(of_cart, of_angle, blend, radius):
+    """A slow offset, and an integral that starts anew, change the radius from 0.0485 to either side of 1; the run agrees."""
+    slots = CRANE.controllers["slots+FPI"]
+    laws = fp.Exponential(rate=1.0, integral=of_cart), fp.Exponential(rate=3.0, integral=of_angle)
+    pair = tuple(replace(s, tracking=law) for s, law in zip(slots.slots, laws, strict=True))
+    slots = replace(slots, slots=pair, blend=blend)
+    assert fp.floquet_radius(CRANE.problem, pair, slots.schedule, blend=blend).radius == pytest.approx(radius, rel=1e-3)
+    problem = crane({}, period=1e-3, duration=21.3, limits=fp.Limits())
+    assert np.abs(np.linalg.eigvals(period_map(problem, slots, 5.3))).max() == pytest.approx(radius, rel=0.02)
 
 
 def test_an_unstable_schedule_is_seen_and_grows_so():
@@ -274,7 +292,7 @@ def test_one_slot_is_computed_torque(integral, deformation):
 
 @pytest.mark.parametrize("name", ["slots", "slots+FPI", "slots exact model"])
 def test_command_is_continuous_at_switches(name):
-    """A slot begins with the last command, and what it moves by in the next 0.1 s vanishes with the period; a jump would not."""
+    """A slot begins with the last command, and its steps in the next 0.1 s vanish with the period; a jump would not."""
     largest = []
     for period in (5e-3, 2.5e-3):
         found = run(crane({"cart": -1.0}, period=period, duration=10.6), CRANE.controllers[name])
@@ -400,13 +418,16 @@ def test_inputs_of_other_slots_keep_their_command():
         judged=("a", "b"),
     )
     law = fp.Exponential(rate=2.0)
-    pair = (fp.Slot("a", law, input="Fa"), fp.Slot("b", law, input="Fb"))
+    deformation = fp.Sigmoid(gain=-1.0, shift=0.3, scale=5.0)
+    pair = (fp.Slot("a", law, deformation, input="Fa"), fp.Slot("b", law, deformation, input="Fb"))
     found = run(problem, fp.Slotted(pair, fp.Periodic({"a": 0.5, "b": 0.5}), blend=0.05))
     moved, slot = np.abs(np.diff(found["command"], axis=0)) > 0, found["slot"][1:, 0].astype(int)
     assert not moved[slot == 0, 1].any()
     assert not moved[slot == 1, 0].any()
     assert moved[slot == 0, 0].sum() > 90
     assert moved[slot == 1, 1].sum() > 90
+    # What the commands mean by the model, of mass 1, is the stored request of both, whether active or not.
+    np.testing.assert_allclose(found["deformed"], found["command"] - found["state"][:, :2], atol=1e-12)
     assert "needs the name of its input. Valid: Fa, Fb." in refused(
         problem, fp.Slotted((fp.Slot("a", law),), fp.Periodic({"a": 0.5}), blend=0.05)
     )
@@ -449,7 +470,7 @@ SCHEDULES = {
         fp.FixedSchedule([("cart", 0.0, 2.0), ("angle", 2.0, 2.001), ("cart", 2.001, 26.5)]),
         ["'angle' from 2 to 2.001 s is shorter than one control cycle of 0.005 s; let it end later"],
     ),
-    "no span": (fp.FixedSchedule([("cart", 0.0)]), ["('cart', 0.0) is no span; expected (coordinate, start, end)"]),  # type: ignore[list-item]
+    "no span": (fp.FixedSchedule([("cart", 0.0)]), ["('cart', 0.0) is no span; expected (coordinate, start, end)"]),
     "periodic": (
         fp.Periodic({"cart": -1.0, "angle": 1e-3, "angel": 1.0}),
         [
