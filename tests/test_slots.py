@@ -589,11 +589,19 @@ def test_pairs_in_a_queue_are_refused(deformation, culprit):
     assert f"slot 'cart': {culprit} keeps pairs of earlier cycles, which belong to another slot" in message
 
 
+@pytest.mark.parametrize("late", [fp.DeadTime(measurement=0.01), fp.DeadTime(inputs={"F": 0.01})])
+def test_dead_time_is_refused(late):
+    """A slot's first pairs would be those of the slot before."""
+    message = refused(replace(CRANE.problem, dead_time=late), CRANE.controllers["slots+FPI"])
+    assert "leave dead time out" in message
+
+
 def test_sensors_are_refused():
     """They measure states and the plant's own response, not y^(r) of a slot."""
     sensed = replace(CRANE.problem, sensing=fp.Sensing(sensors={"cart": fp.Sensor(quantum=1e-3)}))
     message = refused(sensed, CRANE.controllers["slots+FPI"])
-    assert "Slotted reads responses of its own, which the problem's sensors do not measure" in message
+    assert "Slotted reads responses of its own" in message
+    assert "leave sensing out" in message
 
 
 def test_deformations_that_cannot_converge_are_refused():

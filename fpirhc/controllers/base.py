@@ -77,15 +77,16 @@ def prepared(problem: Problem, controller: Controller) -> Controller:
 
     Raises:
         NotContractive: a deformation with a gain of the wrong sign, or one that its estimator or filter makes
-            unstable. NotSupported: own responses behind sensors. And what the controller's own check raises.
+            unstable. NotSupported: own responses behind sensors or dead time. And what the controller's own check raises.
     """
     chosen = controller.resolved(problem)
     chosen.check(problem)
     if chosen.response(problem) is not None:
-        if not problem.sensing.ideal:
+        late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
+        if late or not problem.sensing.ideal:
+            what = "dead time" if late else "sensing"
             raise NotSupported(
-                f"{type(chosen).__name__} reads responses of its own, which the problem's sensors do not measure; "
-                "leave sensing out of the problem"
+                f"{type(chosen).__name__} reads responses of its own, at once and as they are; leave {what} out of the problem"
             )
     else:
         check_gain_sign(problem, chosen.adaptive)
