@@ -1,13 +1,17 @@
-"""How much faster scenarios run in two processes, with everything that a study does: start, load, run, write to disk.
+"""How much faster scenarios run in two processes: whole commands, from start to report.
 
     python benchmarks/scenarios.py [--write]          --write puts the table into docs/performance.md
 
-Libraries are compiled before anything is timed. One and two processes take turns, so that whatever else the machine does
-falls on both; the ratio is that of the medians.
+Libraries are compiled before anything is timed. In every round the three ways take turns, so that whatever else the machine does
+falls on all: one process, two processes, and, for what the machine can give, the same work cut in halves by hand and run as two
+independent commands at once. Ratios are those of the medians. CPU seconds show what sharing itself costs, also on a
+machine with other work.
 """
 
 from __future__ import annotations
 
+import resource
+import subprocess
 import sys
 import tempfile
 import time
@@ -15,62 +19,79 @@ from pathlib import Path
 
 import numpy as np
 
-import fpirhc as fp
-
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from table import write_table
 
 ROUNDS = 3
-STUDIES = (
-    ("two_mass", ("CTC", "CTC+FPI (eq 6)"), 2000),
-    ("two_mass", ("RHC", "RHC+FPI"), 500),
-    ("van_der_pol", ("RHC", "RHC+FPI", "RHC exact model"), 500),
-)
+STUDIES = (("two_mass", ("CTC", "CTC+FPI (eq 6)"), 2000), ("van_der_pol", ("RHC", "RHC+FPI", "RHC exact model"), 600))
 
 
-def seconds(task, controllers: tuple[str, ...], count: int, processes: int) -> tuple[float, dict]:
-    """Wall time of a whole study in an empty folder, and its records."""
-    with tempfile.TemporaryDirectory() as folder:
-        begin = time.perf_counter()
-        found = fp.compare_scenarios(
-            task, count=count, percent=10.0, seed=0, folder=Path(folder), controllers=controllers, processes=processes
-        )
-        return time.perf_counter() - begin, dict(found.records)
+def command(
+    name: str, controllers: tuple[str, ...], count: int, processes: int, folder: Path, seed: int = 0
+) -> list[str]:
+    return [
+        *(
+            sys.executable,
+            "-m",
+            "fpirhc",
+            "compare",
+            name,
+            "--seeds",
+            f"{count}",
+            "--mismatch",
+            "10",
+            "--seed",
+            f"{seed}",
+        ),
+        *("--processes", f"{processes}", "--out", str(folder), "--controllers", *controllers),
+    ]
+
+
+def measured(*commands: list[str]) -> tuple[float, float]:
+    """Wall and CPU seconds of commands that run at once."""
+    used, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    running = [subprocess.Popen(c, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for c in commands]
+    assert [process.wait() for process in running] == [0] * len(commands)
+    wall, now = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
+    return wall, now.ru_utime + now.ru_stime - used.ru_utime - used.ru_stime
+
+
+def study(name: str, controllers: tuple[str, ...], count: int) -> tuple[str, ...]:
+    """One row: medians over the rounds."""
+    taken: dict[str, list[tuple[float, float]]] = {"one": [], "two": [], "halves": []}
+    for _ in range(ROUNDS):
+        with tempfile.TemporaryDirectory() as base:
+            folders = [Path(base) / f"{k}" for k in range(4)]
+            taken["one"].append(measured(command(name, controllers, count, 1, folders[0])))
+            taken["two"].append(measured(command(name, controllers, count, 2, folders[1])))
+            halves = [command(name, controllers, count // 2, 1, folders[k + 2], seed=k) for k in (0, 1)]
+            taken["halves"].append(measured(*halves))
+            ledgers = [sorted((f / "scenarios.jsonl").read_text().splitlines()) for f in folders[:2]]
+            assert ledgers[0] == ledgers[1], "results depend on the number of processes"
+    wall = {way: float(np.median([w for w, _ in times])) for way, times in taken.items()}
+    cpu = {way: float(np.median([c for _, c in times])) for way, times in taken.items()}
+    return (
+        f"{name}: {', '.join(controllers)}",
+        f"{count * len(controllers)}",
+        f"{wall['one']:.1f}",
+        f"{wall['two']:.1f}",
+        f"{wall['one'] / wall['two']:.2f}",
+        f"{wall['one'] / wall['halves']:.2f}",
+        f"{cpu['one']:.1f}",
+        f"{cpu['two']:.1f}",
+    )
 
 
 def main() -> None:
     """Measure and print."""
     rows = []
     for name, controllers, count in STUDIES:
-        task = fp.load_problem(name)
-        seconds(task, controllers, 1, 1)  # compiles
-        taken = {1: [], 2: []}
-        for _ in range(ROUNDS):
-            (one, alone), (two, shared) = (seconds(task, controllers, count, processes) for processes in (1, 2))
-            assert alone == shared, "results depend on the number of processes"
-            taken[1].append(one)
-            taken[2].append(two)
-        one, two = (float(np.median(taken[k])) for k in (1, 2))
-        runs = count * len(controllers)
-        rows.append(
-            (
-                name,
-                ", ".join(controllers),
-                f"{runs}",
-                f"{one:.1f}",
-                f"{two:.1f}",
-                f"{one / two:.2f}",
-                f"{1e3 * one / runs:.1f}",
-            )
-        )
+        with tempfile.TemporaryDirectory() as folder:
+            measured(command(name, controllers, 1, 1, Path(folder)))  # compiles
+        rows.append(study(name, controllers, count))
     heads = (
-        "problem",
-        "controllers",
-        "runs",
-        "s, one process",
-        "s, two processes",
-        "times faster",
-        "ms per run, one process",
+        *("problem", "runs", "s, one process", "s, two processes", "times faster", "halves by hand: times faster"),
+        *("CPU s, one process", "CPU s, two processes"),
     )
     write_table("scenarios", heads, rows)
 

@@ -171,7 +171,7 @@ def _add_optimisers(command: argparse.ArgumentParser) -> None:
 
 def _add_common(command: argparse.ArgumentParser) -> None:
     _add_problem(command)
-    command.add_argument("--seed", type=int, default=0, help="seed of the disturbances' noise (default: 0)")
+    command.add_argument("--seed", type=int, default=0, help="seed of noise, and of scenarios (default: 0)")
     command.add_argument(
         "--no-compile", action="store_true", help="use CasADi's virtual machine even with a C compiler"
     )

@@ -14,7 +14,7 @@ from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.studies.bench import Bench, Conditions, fingerprint
 from fpirhc.studies.compare import check_gains, select, versions
 from fpirhc.studies.ledger import Ledger
-from fpirhc.studies.paired import Summary, summarise, verdict
+from fpirhc.studies.paired import Record, Summary, summarise, verdict
 from fpirhc.studies.problem_file import Task
 from fpirhc.studies.processes import Workers
 from fpirhc.studies.scenarios import COMPARING
@@ -38,7 +38,7 @@ class ScenarioComparison:
     measure_from: float
     units: Mapping[str, str]
     summaries: tuple[Summary, ...]
-    records: Mapping[str, Sequence[Mapping[str, Any]]]
+    records: Mapping[str, Sequence[Record]]
     skipped: Mapping[str, str]
     verdict: tuple[str, ...]
     tuning: Mapping[str, str]
@@ -98,25 +98,9 @@ def compare_scenarios(
     conditions = Conditions(seed, COMPARING, float(percent), compiled)
     bench, header = Bench(task, conditions), fingerprint(task, conditions)
     opening = {"path": str(task.path.resolve()), "tuned": tuned or {}, "conditions": asdict(conditions)}
-    skipped: dict[str, str] = {}
+    workers = Workers(__package__ + ".worker", opening, header, processes)
     with Ledger(folder / LEDGER, header) as ledger:
-        found = {(r["scenario"], r["controller"]): r for r in ledger.records}
-        jobs = [(k, name) for k in range(count) for name in names if (k, name) not in found]
-        done = {name: sum((k, name) in found for k in range(count)) for name in names}
-        workers = Workers(__package__ + ".worker", opening, header, processes)
-        # Closed whatever happens: the workers end with it.
-        with closing(_answers(bench, workers, processes, jobs)) as answers:
-            for record in answers:
-                name = record["controller"]
-                if "skipped" in record:
-                    skipped[name] = record["skipped"]
-                else:
-                    ledger.append(record)
-                    found[record["scenario"], name] = record
-                done[name] += 1
-                if progress:
-                    progress(name, done[name], count)
-    records = {n: [found[k, n] for k in range(count)] for n in names if n not in skipped}
+        records, skipped = _completed(ledger, bench, workers if processes > 1 else None, count, names, progress)
     summaries = _summaries(records, seed)
     return ScenarioComparison(
         problem=task.name,
@@ -139,11 +123,32 @@ def compare_scenarios(
     )
 
 
-def _answers(
-    bench: Bench, workers: Workers, processes: int, jobs: Sequence[tuple[int, str]]
-) -> Generator[dict[str, Any]]:
-    """Records of the jobs as they come."""
-    if processes == 1 or not jobs:
+def _completed(
+    ledger: Ledger, bench: Bench, workers: Workers | None, count: int, names: Sequence[str], progress: Progress | None
+) -> tuple[dict[str, Sequence[Record]], dict[str, str]]:
+    """Run what the ledger does not hold; return records by controller in the scenarios' order, and who was skipped and why."""
+    found = {(r["scenario"], r["controller"]): r for r in ledger.records}
+    jobs = [(k, name) for k in range(count) for name in names if (k, name) not in found]
+    done = {name: sum((k, name) in found for k in range(count)) for name in names}
+    skipped: dict[str, str] = {}
+    # Closed whatever happens: the workers end with it.
+    with closing(_answers(bench, workers, jobs)) as answers:
+        for record in answers:
+            name = record["controller"]
+            if "skipped" in record:
+                skipped[name] = record["skipped"]
+            else:
+                ledger.append(record)
+                found[record["scenario"], name] = record
+            done[name] += 1
+            if progress:
+                progress(name, done[name], count)
+    return {n: [found[k, n] for k in range(count)] for n in names if n not in skipped}, skipped
+
+
+def _answers(bench: Bench, workers: Workers | None, jobs: Sequence[tuple[int, str]]) -> Generator[dict[str, Any]]:
+    """Records of the jobs as they come; without workers they are made here."""
+    if workers is None:
         for number, name in jobs:
             yield bench.record(number, name)
         return
@@ -154,7 +159,7 @@ def _answers(
             yield record
 
 
-def _summaries(records: Mapping[str, Sequence[Mapping[str, Any]]], seed: int) -> tuple[Summary, ...]:
+def _summaries(records: Mapping[str, Sequence[Record]], seed: int) -> tuple[Summary, ...]:
     if not records:
         return ()
     first, *others = records
