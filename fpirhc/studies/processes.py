@@ -15,7 +15,7 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Self
 
 from fpirhc.errors import FpirhcError, WorkerDied
@@ -53,20 +53,32 @@ class Workers:
         for thread in self._threads:
             thread.join()
 
-    def answers(self, jobs: Sequence[Any]) -> Iterator[Any]:
-        """Yield the answer of every job as it comes, in no particular order."""
+    def answers(self, jobs: Sequence[Any], own: Callable[[Any], Any] | None = None) -> Iterator[Any]:
+        """Yield the answer of every job as it comes, in no particular order.
+
+        With `own`, which answers a job, this process is one of the `count`: one that only waits would cost a start more.
+        """
         waiting: queue.SimpleQueue[Any] = queue.SimpleQueue()
         given: queue.SimpleQueue[Any] = queue.SimpleQueue()
         for job in jobs:
             waiting.put(job)
-        for k in range(min(self._count, len(jobs))):
+        for k in range(min(self._count, len(jobs)) - (own is not None)):
             self._threads.append(threading.Thread(target=self._drive, args=(k, waiting, given), daemon=True))
             self._threads[-1].start()
         for _ in jobs:
-            answer = given.get()
+            answer = self._next(waiting, given, own)
             if isinstance(answer, Exception):
                 raise answer
             yield answer
+
+    def _next(
+        self, waiting: queue.SimpleQueue[Any], given: queue.SimpleQueue[Any], own: Callable[[Any], Any] | None
+    ) -> Any:
+        """What another process has answered, or else an answer of this one; with no job left, the next that comes."""
+        if own is None or not given.empty():
+            return given.get()
+        mine = _taken(waiting, 1)
+        return own(mine[0]) if mine else given.get()
 
     def _drive(self, k: int, waiting: queue.SimpleQueue[Any], given: queue.SimpleQueue[Any]) -> None:
         """Keep worker `k` busy until no job is left."""

@@ -153,7 +153,7 @@ def _answers(bench: Bench, workers: Workers | None, jobs: Sequence[tuple[int, st
             yield bench.record(number, name)
         return
     with workers:
-        for record in workers.answers(jobs):
+        for record in workers.answers(jobs, lambda job: bench.record(*job)):
             if "error" in record and "scenario" not in record:
                 raise FpirhcError(record["error"])
             yield record
