@@ -14,7 +14,8 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
@@ -145,6 +146,23 @@ class Plant:
     def exact(self) -> np.ndarray:
         """Parameters of the plant, shape (np,)."""
         return np.array([p.exact for p in self.parameters.values()], dtype=float)
+
+    def with_exact(self, exact: np.ndarray) -> Plant:
+        """Return the plant with other exact parameters, shape (np,); what was derived from the symbols is shared.
+
+        Raises:
+            InvalidProblem: a parameter that is not finite or outside its bounds.
+        """
+        named = zip(self.parameters.items(), exact, strict=True)
+        parameters = {name: replace(parameter, exact=float(value)) for (name, parameter), value in named}
+        mistakes = Mistakes("plant")
+        _check_parameters(parameters, mistakes)
+        mistakes.raise_if_any()
+        other = copy(self)
+        # Nothing else that is kept depends on the exact values.
+        other.__dict__.pop("exact", None)
+        object.__setattr__(other, "parameters", parameters)
+        return other
 
     def indices(self, derivative: int) -> tuple[int, ...]:
         """Places in the state vector of the given derivative, coordinate by coordinate (order > derivative only)."""

@@ -55,9 +55,7 @@ def with_exact(problem: Problem, exact: np.ndarray) -> Problem:
     Raises:
         InvalidProblem: the plant is not invertible at the start with them, or one of them leaves its bounds.
     """
-    named = zip(problem.plant.parameters.items(), exact, strict=True)
-    parameters = {name: replace(parameter, exact=float(value)) for (name, parameter), value in named}
-    return replace(problem, plant=replace(problem.plant, parameters=parameters))
+    return replace(problem, plant=problem.plant.with_exact(exact))
 
 
 def check_percent(plant: Plant, percent: float) -> None:
