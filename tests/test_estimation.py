@@ -15,6 +15,7 @@ from plants import linear, pendulum
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.estimation.base import Seen
+from fpirhc.symbolic.native import find_compiler
 
 PERIOD = 1e-2
 
@@ -235,6 +236,7 @@ def test_bounds_are_kept(build):
     assert np.abs(np.asarray(fed.memory)).max() < 1e6
 
 
+@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
 @pytest.mark.parametrize("name", ["Kalman", "RLS", "MHE"])
 def test_compiled_and_interpreted_runs_agree(name):
     """Every estimator becomes C, and the C does the same."""

@@ -15,6 +15,7 @@ from fpirhc.controllers import base
 from fpirhc.errors import InvalidProblem, InvalidValue, NotContractive
 from fpirhc.loop import close_loop
 from fpirhc.symbolic.layout import Signal
+from fpirhc.symbolic.native import find_compiler
 
 ESTIMATORS = (
     fp.Measured(),
@@ -149,6 +150,7 @@ def test_series_belong_to_the_seed_and_to_the_sensor():
     assert not np.allclose(third["measured.y'"] - third["plant_state.y'"], drawn)
 
 
+@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
 def test_compiled_loop_is_the_same():
     """Noise, quanta, lost samples, dead time and a window: C and the virtual machine agree to rounding."""
     sensor = fp.Sensor(noise=fp.ColouredNoise(1e-3, 1e-2), quantum=1e-4, dropout=0.1)
