@@ -18,11 +18,11 @@ import numpy as np
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
-from fpirhc.loop import close_loop
-from fpirhc.problem import Problem
-from fpirhc.simulation import disturbance_table, sensing_table
+from fpirhc.simulation.loop import close_loop
+from fpirhc.simulation.simulate import disturbance_table, sensing_table
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import native
+from fpirhc.task.problem import Problem
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from table import write_table

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.loop import close_loop
+from fpirhc.simulation.loop import close_loop
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import native
 

@@ -10,25 +10,16 @@ import fpirhc as fp
 PAGE = Path(__file__).resolve().parent / "api.rst"
 STUB = Path(fp.__file__).with_suffix(".pyi")
 SECTIONS = {
-    "Plants and problems": (
-        "plant",
-        "problem",
-        "reference",
-        "limits",
-        "disturbance",
-        "integrate",
-        "relative_order",
-        "symbolic",
-    ),
-    "Dead time and sensing": ("dead_time", "sensing"),
+    "Plants and problems": ("plant", "task", "problem_files", "symbolic"),
+    "Sensing": ("sensing",),
     "Controllers": ("controllers",),
     "Tracking laws": ("tracking",),
     "Deformations": ("deformation", "contraction"),
     "Horizons and optimisers": ("horizon", "optimisers"),
-    "Learning": ("estimation", "adaptation", "regressor"),
-    "Running and measuring": ("simulation", "run", "stepper", "metrics", "lyapunov", "status"),
-    "Studies and reports": ("studies", "report", "regression"),
-    "Testing and errors": ("testing", "errors"),
+    "Learning": ("learning",),
+    "Running and measuring": ("simulation", "status"),
+    "Review, studies and reports": ("review", "studies", "report", "baselines"),
+    "Testing and errors": ("conformance", "errors"),
 }
 WITH_MEMBERS = {
     "Run",

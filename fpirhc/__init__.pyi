@@ -1,73 +1,71 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
-from .adaptation.lyapunov_rule import LyapunovRule
-from .adaptation.projection import Projection
+from .baselines.check import bless, check_baseline
+from .conformance import check_controller, check_deformation, check_optimiser, check_plant, check_tracking
 from .contraction import assess_gain, check_gain, delayed_limit, response_jacobian, spectrum_over_box, spectrum_over_run
-from .controllers.acceleration_feedback import AccelerationFeedback
-from .controllers.adaptive_inverse_dynamics import AdaptiveInverseDynamics
-from .controllers.backstepping_mrac import BacksteppingMrac
-from .controllers.chosen_schedules import ByError, ByLookAhead
 from .controllers.computed_torque import ComputedTorque
-from .controllers.estimating import Estimating
-from .controllers.floquet import Floquet, floquet_radius
-from .controllers.force_mrac import ForceMrac
-from .controllers.informed import Informed
-from .controllers.lyapunov_mrac import LyapunovMrac
-from .controllers.nominal import OpenPlan, Restart, RestartAndTrack
 from .controllers.on_failure import Feedforward, HoldPlan, StopRun
-from .controllers.pid import Pid
-from .controllers.predicted import ByDesired, ByModel, Predicted
 from .controllers.receding_horizon import RecedingHorizon
-from .controllers.resolved_rate import ResolvedAccelerationRate
-from .controllers.schedules import FixedSchedule, Periodic
-from .controllers.sliding_mode import SlidingMode
-from .controllers.slot import Slot
-from .controllers.slotine_li import SlotineLi
-from .controllers.slotted import Slotted
-from .dead_time import DeadTime
+from .controllers.replanning import FromMeasurement, FromMeasurementTracked, FromPlan
+from .controllers.rivals.acceleration_feedback import AccelerationFeedback
+from .controllers.rivals.adaptive_inverse_dynamics import AdaptiveInverseDynamics
+from .controllers.rivals.backstepping_mrac import BacksteppingMRAC
+from .controllers.rivals.force_mrac import ForceMRAC
+from .controllers.rivals.lyapunov_mrac import LyapunovMRAC
+from .controllers.rivals.pid import PID
+from .controllers.rivals.resolved_rate import ResolvedAccelerationRate
+from .controllers.rivals.sliding_mode import SlidingMode
+from .controllers.rivals.slotine_li import SlotineLi
+from .controllers.slots.chosen_schedules import ByError, ByLookAhead
+from .controllers.slots.floquet import Floquet, floquet_radius
+from .controllers.slots.schedules import FixedSchedule, Periodic
+from .controllers.slots.slot import Slot
+from .controllers.slots.slotted import Slotted
+from .controllers.wrappers.estimating import Estimating
+from .controllers.wrappers.exact_model import ExactModel
+from .controllers.wrappers.predicted import ByDesired, ByModel, Predicted
 from .deformation.affine import Affine
-from .deformation.blended import Blended
-from .deformation.damped import Damped
-from .deformation.delayed import Increment, Paired
-from .deformation.filtered import Filtered
-from .deformation.guarded import Guarded
 from .deformation.identity import Identity
-from .deformation.rfpt import Rfpt
-from .deformation.rfpt_vector import RfptVector
+from .deformation.rfpt import RFPT
+from .deformation.rfpt_vector import RFPTVector
 from .deformation.rotation import Rotation
-from .deformation.self_paired import DelayWatched, SelfPaired
 from .deformation.sigmoid import Sigmoid
-from .deformation.tuned import Tuned
-from .disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
+from .deformation.wrappers.blended import Blended
+from .deformation.wrappers.damped import Damped
+from .deformation.wrappers.delayed import Increment, Paired
+from .deformation.wrappers.filtered import Filtered
+from .deformation.wrappers.guarded import Guarded
+from .deformation.wrappers.self_paired import DelayWatched, SelfPaired
+from .deformation.wrappers.tuned import Tuned
 from .errors import FpirhcError
-from .estimation.disturbance_kalman import DisturbanceKalman
-from .estimation.disturbed import disturbed
-from .estimation.moving_horizon import MovingHorizon
-from .estimation.recursive_least_squares import RecursiveLeastSquares
-from .estimation.uncertain import Uncertain
-from .horizon.cost import General, LqrTerminal, Quadratic
-from .horizon.expansion import ExactHessian, GaussNewton
+from .horizon.cost import CustomCost, LQRTerminal, Quadratic
+from .horizon.hessian_models import ExactHessian, GaussNewton
 from .horizon.problem import Horizon
-from .integrate import Cvodes, Euler, RungeKutta4
-from .limits import Limits, Path
-from .lyapunov import LyapunovView, lyapunov_view
-from .metrics import Metrics, measure
+from .learning.estimators.disturbance_kalman import DisturbanceKalman
+from .learning.estimators.disturbed import disturbed
+from .learning.estimators.moving_horizon import MovingHorizon
+from .learning.estimators.recursive_least_squares import RecursiveLeastSquares
+from .learning.estimators.uncertain import Uncertain
+from .learning.rules.lyapunov_rule import LyapunovRule
+from .learning.rules.projection import Projection
 from .optimisers.anderson import Anderson
 from .optimisers.certificate import Certificate, certify
 from .optimisers.fixed_point import FixedPoint
 from .optimisers.full_space import FullSpaceFixedPoint
 from .optimisers.gradient_fixed_point import GradientFixedPoint
-from .optimisers.nlp import Fatrop, InteriorPoint, Osqp, Qrqp, SequentialQuadratic
+from .optimisers.nlp import Fatrop, Ipopt, Osqp, Qrqp, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.reduced_gradient import ReducedGradient
-from .plant import Parameter, Plant, structural_order
-from .problem import Problem
-from .reference import Table, Trajectory
-from .regression.check import bless, check_baseline
-from .regressor import Combination, Regressor, linear_parameters
-from .relative_order import OutputChain, output_chain
+from .plant.integrators import Cvodes, Euler, RungeKutta4
+from .plant.plant import Parameter, Plant, structural_order
+from .plant.regressor import Combination, Regressor, linear_parameters
+from .plant.relative_order import OutputChain, output_chain
+from .problem_files.problem_file import load_problem
+from .problem_files.settings import with_settings
+from .problem_files.tuning_spans import LogSpan, Span
 from .report.html import write_report
-from .run import Run, load_run
+from .review.answer import Answer, Review
+from .review.review import review
 from .sensing import (
     LowPassDifference,
     Measured,
@@ -78,29 +76,33 @@ from .sensing import (
     StateVariableFilter,
     VelocityDifference,
 )
-from .simulation import simulate
+from .simulation.lyapunov_view import LyapunovView, lyapunov_view
+from .simulation.metrics import Metrics, measure
+from .simulation.run import Run, load_run
+from .simulation.simulate import simulate
+from .simulation.stepper import Stepper
 from .status import Status
-from .stepper import Stepper
-from .studies.compare import Comparison, compare
-from .studies.problem_file import load_problem
-from .studies.review.answer import Answer, Review
-from .studies.review.review import review
-from .studies.scenario_study import ScenarioComparison, compare_scenarios
-from .studies.settings import with_settings
-from .studies.spans import LogSpan, Span
-from .studies.tune import Tuning, tune
+from .studies.comparison.compare import Comparison, compare
+from .studies.scenarios.scenario_study import ScenarioComparison, compare_scenarios
+from .studies.tuning.tune import Tuning, tune
 from .symbolic.functions import signed_power
-from .testing import check_controller, check_deformation, check_optimiser, check_plant, check_tracking
+from .task.dead_time import DeadTime
+from .task.disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
+from .task.limits import Limits, PathConstraint
+from .task.problem import Problem
+from .task.reference import Table, Trajectory
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
 
 __all__ = [
+    "PID",
+    "RFPT",
     "AccelerationFeedback",
     "AdaptiveInverseDynamics",
     "Affine",
     "Anderson",
     "Answer",
-    "BacksteppingMrac",
+    "BacksteppingMRAC",
     "Blended",
     "ByDesired",
     "ByError",
@@ -111,6 +113,7 @@ __all__ = [
     "Combination",
     "Comparison",
     "ComputedTorque",
+    "CustomCost",
     "Cvodes",
     "Damped",
     "DeadTime",
@@ -119,6 +122,7 @@ __all__ = [
     "Estimating",
     "Euler",
     "ExactHessian",
+    "ExactModel",
     "Exponential",
     "Fatrop",
     "Feedforward",
@@ -126,40 +130,39 @@ __all__ = [
     "FixedPoint",
     "FixedSchedule",
     "Floquet",
-    "ForceMrac",
+    "ForceMRAC",
     "Formula",
     "FpirhcError",
     "Fractional",
+    "FromMeasurement",
+    "FromMeasurementTracked",
+    "FromPlan",
     "FullSpaceFixedPoint",
     "GaussNewton",
-    "General",
     "GradientFixedPoint",
     "Guarded",
     "HoldPlan",
     "Horizon",
     "Identity",
     "Increment",
-    "Informed",
-    "InteriorPoint",
+    "Ipopt",
+    "LQRTerminal",
     "Limits",
     "LogSpan",
     "LowPassDifference",
-    "LqrTerminal",
-    "LyapunovMrac",
+    "LyapunovMRAC",
     "LyapunovRule",
     "LyapunovView",
     "Measured",
     "Metrics",
     "MovingHorizon",
     "Noise",
-    "OpenPlan",
     "Osqp",
     "OutputChain",
     "Paired",
     "Parameter",
-    "Path",
+    "PathConstraint",
     "Periodic",
-    "Pid",
     "Plan",
     "Plant",
     "PositionDifference",
@@ -169,16 +172,13 @@ __all__ = [
     "Pulse",
     "Qrqp",
     "Quadratic",
+    "RFPTVector",
     "RecedingHorizon",
     "RecursiveLeastSquares",
     "ReducedGradient",
     "Regressor",
     "ResolvedAccelerationRate",
-    "Restart",
-    "RestartAndTrack",
     "Review",
-    "Rfpt",
-    "RfptVector",
     "Rotation",
     "Run",
     "RungeKutta4",

@@ -2,6 +2,6 @@
 
 import sys
 
-from fpirhc.cli import main
+from fpirhc.cli.main import main
 
 sys.exit(main())

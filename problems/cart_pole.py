@@ -61,7 +61,7 @@ problem = fp.Problem(
     duration=15.0,  # s
     limits=fp.Limits(inputs={"F": (-30.0, 30.0)}),  # N; acados has 80 N
     horizon=fp.Horizon(stages=20, step=5e-2),
-    cost=fp.Quadratic(states={"cart": 1e2, "angle": 1e2, "cart'": 1e-2, "angle'": 1e-2}, correction={"F": 1e-2}),
+    cost=fp.Quadratic(states={"cart": 1e2, "angle": 1e2, "cart'": 1e-2, "angle'": 1e-2}, deviation={"F": 1e-2}),
     measure_from=5.0,  # s
 )
 
@@ -73,6 +73,6 @@ sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=100.0)  # scale in m/s^2: the p
 controllers = {
     "RHC": fp.RecedingHorizon(optimiser),
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
-    "RHC exact model": fp.Informed(fp.RecedingHorizon(optimiser)),
+    "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }
 headline = ("RHC", "RHC+FPI")

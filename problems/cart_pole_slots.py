@@ -50,7 +50,7 @@ problem = fp.Problem(
     duration=6.0,  # s
     limits=fp.Limits(inputs={"F": (-30.0, 30.0)}),  # N
     horizon=fp.Horizon(stages=40, step=5e-2),
-    cost=fp.Quadratic(states={"cart": 1e2, "angle": 1e2, "cart'": 1.0, "angle'": 1.0}, correction={"F": 1e-2}),
+    cost=fp.Quadratic(states={"cart": 1e2, "angle": 1e2, "cart'": 1.0, "angle'": 1.0}, deviation={"F": 1e-2}),
     measure_from=1.2,  # s, after two periods
     judged=("cart", "angle"),
 )
@@ -68,7 +68,7 @@ def slotted(deformation):
 controllers = {
     "slots": slotted(fp.Identity()),
     "slots+FPI": slotted(sigmoid),
-    "slots exact model": fp.Informed(slotted(fp.Identity())),
+    "slots exact model": fp.ExactModel(slotted(fp.Identity())),
     "RHC": fp.RecedingHorizon(optimiser),
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
 }

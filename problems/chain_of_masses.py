@@ -108,7 +108,7 @@ def chain(masses, droop=0.2):
         cost=fp.Quadratic(
             states={**dict.fromkeys(speeds, 0.2), **dict.fromkeys(("xe", "ye", "ze"), 2.0 * (masses - 1))},
             # Free positions are not weighed: where they rest is what the model has wrong.
-            correction=dict.fromkeys(plant.inputs, 2e-2),
+            deviation=dict.fromkeys(plant.inputs, 2e-2),
         ),
         measure_from=4.0,  # s
     )
@@ -121,6 +121,6 @@ sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=5.0)  # scale in m/s
 controllers = {
     "RHC": fp.RecedingHorizon(optimiser),
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
-    "RHC exact model": fp.Informed(fp.RecedingHorizon(optimiser)),
+    "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }
 headline = ("RHC", "RHC+FPI")

@@ -54,7 +54,7 @@ problem = fp.Problem(
     duration=26.5,  # s, five periods of the schedule
     limits=fp.Limits(inputs={"F": (-10.0, 10.0)}),  # N
     horizon=fp.Horizon(stages=30, step=5e-2),
-    cost=fp.Quadratic(states={"cart": 1e1, "angle": 1e1, "cart'": 1.0, "angle'": 1.0}, correction={"F": 1e-1}),
+    cost=fp.Quadratic(states={"cart": 1e1, "angle": 1e1, "cart'": 1.0, "angle'": 1.0}, deviation={"F": 1e-1}),
     measure_from=10.6,  # s, after two periods
     judged=("cart", "angle"),
 )
@@ -73,7 +73,7 @@ def slotted(deformation):
 controllers = {
     "slots": slotted(fp.Identity()),
     "slots+FPI": slotted(sigmoid),
-    "slots exact model": fp.Informed(slotted(fp.Identity())),
+    "slots exact model": fp.ExactModel(slotted(fp.Identity())),
     "RHC": fp.RecedingHorizon(optimiser),
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
 }

@@ -43,7 +43,7 @@ problem = fp.Problem(
     limits=fp.Limits(inputs={"Q": (-100.0, 100.0)}),  # N
     dead_time=fp.DeadTime(inputs={"Q": DEAD_TIME}),
     horizon=fp.Horizon(stages=20, step=2e-2),
-    cost=fp.Quadratic(states={"q": 1e3, "q'": 1.0}, correction={"Q": 1e-3}),
+    cost=fp.Quadratic(states={"q": 1e3, "q'": 1.0}, deviation={"Q": 1e-3}),
     measure_from=4.0,  # s
 )
 

@@ -55,7 +55,7 @@ problem = fp.Problem(
     limits=fp.Limits(inputs={"u": (0.0, 150.0)}),  # ml/s
     dead_time=fp.DeadTime(inputs={"u": DEAD_TIME}, before={"u": 61.4}),  # ml/s: what keeps 0.12 m
     horizon=fp.Horizon(stages=30, step=1.0),
-    cost=fp.Quadratic(states={"h2": 1e4, "h2'": 1e3}, correction={"u": 1e-4}),
+    cost=fp.Quadratic(states={"h2": 1e4, "h2'": 1e3}, deviation={"u": 1e-4}),
     measure_from=30.0,  # s
 )
 
@@ -68,7 +68,7 @@ corrected = fp.ByModel(residual_time=5.0)  # s
 controllers = {
     "RHC": fp.Predicted(plain, inputs=DEAD_TIME, by=corrected),
     "RHC+FPI": fp.Predicted(adaptive, inputs=DEAD_TIME, by=corrected),
-    "RHC exact model": fp.Informed(fp.Predicted(plain, inputs=DEAD_TIME)),
+    "RHC exact model": fp.ExactModel(fp.Predicted(plain, inputs=DEAD_TIME)),
     "RHC uncorrected": fp.Predicted(plain, inputs=DEAD_TIME),
     "RHC uncorrected+FPI": fp.Predicted(adaptive, inputs=DEAD_TIME),
     "RHC not predicting": plain,

@@ -8,7 +8,7 @@ says. A disturbance model with one unknown per level explains both errors, and t
 
     rms error of h2, mm      RHC 29.1    RHC+FPI 32.3    offset-free RHC 0.30    exact model 0.26        (seed 0)
 
-Written in h2 with relative order two, as the tanks behind a long pipe are, the error would be where the input acts; but the
+ConstraintState in h2 with relative order two, as the tanks behind a long pipe are, the error would be where the input acts; but the
 response is then h2'', which holds the differences of the noisy flows of neighbouring cycles. That was not tried here.
 
 How the controllers were tuned, on this very task: drifts of 1e-5, 3e-5, 1e-4, 3e-4, 1e-3 m/s/s^0.5 by noises of the flows
@@ -79,6 +79,6 @@ controllers = {
     "RHC": plain,
     "RHC+FPI": fp.RecedingHorizon(plain.optimiser, sigmoid),
     "RHC offset-free": fp.Estimating(plain, filter),
-    "RHC exact model": fp.Informed(plain),
+    "RHC exact model": fp.ExactModel(plain),
 }
 headline = ("RHC", "RHC+FPI")

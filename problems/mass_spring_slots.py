@@ -44,7 +44,7 @@ problem = fp.Problem(
     duration=20.0,  # s, five periods of the schedule
     limits=fp.Limits(inputs={"F": (-20.0, 20.0)}),  # N
     horizon=fp.Horizon(stages=30, step=5e-2),
-    cost=fp.Quadratic(states={"q1": 1e2, "q2": 1e2, "q1'": 1.0, "q2'": 1.0}, correction={"F": 1e-2}),
+    cost=fp.Quadratic(states={"q1": 1e2, "q2": 1e2, "q1'": 1.0, "q2'": 1.0}, deviation={"F": 1e-2}),
     measure_from=8.0,  # s, after two periods
     judged=("q1", "q2"),
 )
@@ -63,7 +63,7 @@ def slotted(deformation):
 controllers = {
     "slots": slotted(fp.Identity()),
     "slots+FPI": slotted(sigmoid),
-    "slots exact model": fp.Informed(slotted(fp.Identity())),
+    "slots exact model": fp.ExactModel(slotted(fp.Identity())),
     "RHC": fp.RecedingHorizon(optimiser),
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
 }

@@ -56,16 +56,16 @@ sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=50.0)  # scale in rad/s^2
 inertia = 0.5  # kg m^2, of the model: the PID has the gains that computed torque has there
 
 controllers = {
-    "PID": fp.Pid({"angle": 108 * inertia}, {"angle": 216 * inertia}, {"angle": 18 * inertia}),
+    "PID": fp.PID({"angle": 108 * inertia}, {"angle": 216 * inertia}, {"angle": 18 * inertia}),
     "CTC": fp.ComputedTorque(track),
     "CTC+FPI": fp.ComputedTorque(track, sigmoid),
     "sliding mode": fp.SlidingMode(rate=RATE, gain=500.0, width=1.0),  # rad/s^2, rad/s: chatters from 4 ms on
     "acceleration feedback": fp.AccelerationFeedback(track, gain=5.0, time_constant=0.02),
     "acceleration rate": fp.ResolvedAccelerationRate(RATE),
-    "force MRAC, no FPI": fp.ForceMrac(track, fp.Identity()),
-    "force MRAC": fp.ForceMrac(track, fp.Sigmoid(gain=-0.5, shift=0.3, scale=25.0)),  # scale in N m
-    "backstepping, no FPI": fp.BacksteppingMrac(RATE, (RATE, RATE), fp.Identity()),
-    "backstepping MRAC": fp.BacksteppingMrac(RATE, (RATE, RATE), sigmoid),
-    "Lyapunov MRAC": fp.LyapunovMrac(RATE, adaptation=300.0, leakage=0.02),
+    "force MRAC, no FPI": fp.ForceMRAC(track, fp.Identity()),
+    "force MRAC": fp.ForceMRAC(track, fp.Sigmoid(gain=-0.5, shift=0.3, scale=25.0)),  # scale in N m
+    "backstepping, no FPI": fp.BacksteppingMRAC(RATE, (RATE, RATE), fp.Identity()),
+    "backstepping MRAC": fp.BacksteppingMRAC(RATE, (RATE, RATE), sigmoid),
+    "Lyapunov MRAC": fp.LyapunovMRAC(RATE, adaptation=300.0, leakage=0.02),
 }
 headline = ("CTC", "CTC+FPI")

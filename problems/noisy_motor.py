@@ -76,7 +76,7 @@ problem = fp.Problem(
     dead_time=fp.DeadTime(measurement=PERIOD / 2),
     sensing=fp.Sensing({"speed": encoder}, fp.SavitzkyGolay(window=5, degree=2)),
     horizon=fp.Horizon(stages=20, step=2e-2),
-    cost=fp.Quadratic(states={"speed": 1.0, "speed'": 1e-3}, correction={"voltage": 10.0}),
+    cost=fp.Quadratic(states={"speed": 1.0, "speed'": 1e-3}, deviation={"voltage": 10.0}),
     measure_from=4.0,  # s
 )
 
@@ -90,11 +90,11 @@ controllers = {
     "RHC": fp.RecedingHorizon(optimiser),
     "RHC+FPI": fp.RecedingHorizon(optimiser, adaptive),
     "RHC+FPI (eq 3)": fp.RecedingHorizon(
-        optimiser, fp.Increment(fp.Rfpt(offset=1e6, sign=-1.0, gain=4e-7), cycles=late)
+        optimiser, fp.Increment(fp.RFPT(offset=1e6, sign=-1.0, gain=4e-7), cycles=late)
     ),
     "RHC+FPI, filtered error": fp.RecedingHorizon(optimiser, fp.Increment(fp.Filtered(sigmoid, pole=0.5), cycles=late)),
     "RHC+FPI, tuned": fp.RecedingHorizon(optimiser, fp.Increment(fp.Tuned(gentle, largest_gain=0.4), cycles=late)),
     "RHC+FPI, delay not told": fp.RecedingHorizon(optimiser, gentle),
-    "RHC exact model": fp.Informed(fp.RecedingHorizon(optimiser)),
+    "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }
 headline = ("RHC", "RHC+FPI")

@@ -67,7 +67,7 @@ problem = fp.Problem(
     duration=6.0,  # s
     limits=fp.Limits(inputs={"tau1": (-200.0, 200.0), "tau2": (-80.0, 80.0)}),  # N m; the motion needs 174 and 72
     horizon=fp.Horizon(stages=30, step=1e-2),
-    cost=fp.Quadratic(states={"q1": 1e3, "q2": 1e3, "q1'": 1.0, "q2'": 1.0}, correction={"tau1": 1e-3, "tau2": 1e-3}),
+    cost=fp.Quadratic(states={"q1": 1e3, "q2": 1e3, "q1'": 1.0, "q2'": 1.0}, deviation={"tau1": 1e-3, "tau2": 1e-3}),
     measure_from=2.0,  # s
 )
 
@@ -77,6 +77,6 @@ sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=300.0)  # scale in rad/s^2: the
 controllers = {
     "RHC": fp.RecedingHorizon(optimiser),
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
-    "RHC exact model": fp.Informed(fp.RecedingHorizon(optimiser)),
+    "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }
 headline = ("RHC", "RHC+FPI")

@@ -55,7 +55,7 @@ problem = fp.Problem(
     horizon=fp.Horizon(stages=20, step=1e-2),
     # Effort is counted relative to the model's feedforward along the reference: absolute effort would make the optimum
     # of the wrong model trade tracking against the wrong effort, which an adaptive layer then realises faithfully.
-    cost=fp.Quadratic(states={"q1": 1e3, "q2": 1e3, "q1'": 1.0, "q2'": 1.0}, correction={"Q1": 1e-3, "Q2": 1e-3}),
+    cost=fp.Quadratic(states={"q1": 1e3, "q2": 1e3, "q1'": 1.0, "q2'": 1.0}, deviation={"Q1": 1e-3, "Q2": 1e-3}),
     measure_from=3.0,  # s
 )
 
@@ -63,15 +63,15 @@ tracking = fp.Exponential(rate=6.0)  # 1/s
 optimiser = fp.FixedPoint(iterations=1, tolerance=5e-2)  # N
 sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=20.0)  # scale in m/s^2
 absolute = fp.Quadratic(states={"q1": 1e2, "q2": 1e2, "q1'": 1.0, "q2'": 1.0}, effort={"Q1": 1e-3, "Q2": 1e-3})
-stiff = fp.Quadratic(states={"q1": 1e4, "q2": 1e4, "q1'": 1.0, "q2'": 1.0}, correction={"Q1": 1e-3, "Q2": 1e-3})
+stiff = fp.Quadratic(states={"q1": 1e4, "q2": 1e4, "q1'": 1.0, "q2'": 1.0}, deviation={"Q1": 1e-3, "Q2": 1e-3})
 
 controllers = {
     "CTC": fp.ComputedTorque(tracking),
-    "CTC+FPI (eq 3)": fp.ComputedTorque(tracking, fp.RfptVector(offset=1e4, sign=-1.0, gain=2e-5)),
+    "CTC+FPI (eq 3)": fp.ComputedTorque(tracking, fp.RFPTVector(offset=1e4, sign=-1.0, gain=2e-5)),
     "CTC+FPI (eq 6)": fp.ComputedTorque(tracking, fp.Sigmoid(gain=-0.5, shift=0.3, scale=1.0)),
     "RHC": fp.RecedingHorizon(optimiser),
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
-    "RHC exact model": fp.Informed(fp.RecedingHorizon(optimiser)),
+    "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
     # Two cases where the method does not help, recognised and explained by the verdict:
     "RHC, absolute effort": fp.RecedingHorizon(optimiser, cost=absolute),
     "RHC+FPI, absolute effort": fp.RecedingHorizon(optimiser, sigmoid, cost=absolute),

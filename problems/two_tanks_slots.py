@@ -47,7 +47,7 @@ problem = fp.Problem(
     duration=600.0,  # s, five periods of the schedule
     limits=fp.Limits(inputs={"inflow": (0.0, 2.5)}),  # l/s; at rest 0.95
     horizon=fp.Horizon(stages=30, step=5.0),
-    cost=fp.Quadratic(states={"h1": 1.0, "h2": 1.0}, correction={"inflow": 1e-1}),
+    cost=fp.Quadratic(states={"h1": 1.0, "h2": 1.0}, deviation={"inflow": 1e-1}),
     measure_from=240.0,  # s, after two periods
     judged=("h1", "h2"),
 )
@@ -66,7 +66,7 @@ def slotted(deformation):
 controllers = {
     "slots": slotted(fp.Identity()),
     "slots+FPI": slotted(sigmoid),
-    "slots exact model": fp.Informed(slotted(fp.Identity())),
+    "slots exact model": fp.ExactModel(slotted(fp.Identity())),
     "RHC": fp.RecedingHorizon(optimiser),
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
 }

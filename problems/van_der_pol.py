@@ -43,7 +43,7 @@ problem = fp.Problem(
     duration=20.0,  # s
     limits=fp.Limits(inputs={"u": (-15.0, 15.0)}),  # N; the motion itself needs 11 N
     horizon=fp.Horizon(stages=20, step=2e-2),
-    cost=fp.Quadratic(states={"q": 1e2, "q'": 1.0}, correction={"u": 1e-2}),
+    cost=fp.Quadratic(states={"q": 1e2, "q'": 1.0}, deviation={"u": 1e-2}),
     measure_from=3.0,  # s
 )
 
@@ -53,6 +53,6 @@ sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=50.0)  # scale in m/s^2: the pl
 controllers = {
     "RHC": fp.RecedingHorizon(optimiser),
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
-    "RHC exact model": fp.Informed(fp.RecedingHorizon(optimiser)),
+    "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }
 headline = ("RHC", "RHC+FPI")

@@ -56,7 +56,7 @@ problem = fp.Problem(
     duration=12.0,  # s
     limits=fp.Limits(inputs={"u": (-40.0, 40.0)}),  # N
     horizon=fp.Horizon(stages=25, step=2e-2),
-    cost=fp.Quadratic(states={"q": 1e2, "q'": 1.0}, correction={"u": 1e-1}),
+    cost=fp.Quadratic(states={"q": 1e2, "q'": 1.0}, deviation={"u": 1e-1}),
     measure_from=4.0,  # s
 )
 
@@ -79,7 +79,7 @@ controllers = {
     "RHC offset-free": fp.Estimating(plain, filter),
     "RHC+RLS": fp.Estimating(plain, recursive),
     "RHC+MHE": fp.Estimating(plain, window),
-    "RHC exact model": fp.Informed(plain),
+    "RHC exact model": fp.ExactModel(plain),
 }
 headline = ("RHC", "RHC+FPI")
 tuning = {

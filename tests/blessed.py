@@ -26,7 +26,7 @@ problem = fp.Problem(
     measure_from=0.1,
     limits=fp.Limits(inputs={"u": (-25.0, 25.0)}),
     horizon=fp.Horizon(stages=8, step=1e-2),
-    cost=fp.Quadratic(states={"y": 100.0, "y'": 1.0}, correction={"u": 1e-2}),
+    cost=fp.Quadratic(states={"y": 100.0, "y'": 1.0}, deviation={"u": 1e-2}),
 )
 tracking = fp.Exponential(rate=6.0)
 optimiser = fp.FixedPoint(iterations=1, tolerance=1e-3)
@@ -61,8 +61,8 @@ controllers = {"CTC": fp.ComputedTorque(fp.Exponential(rate=6.0))}
 
 def write_problems(folder: Path) -> None:
     """Write both problems and their baselines, measured in the virtual machine."""
-    from fpirhc.regression.check import bless
-    from fpirhc.studies.problem_file import load_problem
+    from fpirhc.baselines.check import bless
+    from fpirhc.problem_files.problem_file import load_problem
 
     for name, text in (("line", LINE), ("noisy", NOISY)):
         path = folder / f"{name}.py"

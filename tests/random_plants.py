@@ -23,8 +23,8 @@ MAPS = (
     fp.Sigmoid(gain=-0.5, scale=5.0),
     fp.Sigmoid(gain=-0.5, scale=50.0),
     fp.Sigmoid(gain=-0.5, scale=1000.0),
-    fp.RfptVector(offset=1e5, sign=-1, gain=5e-6),
-    fp.Rfpt(offset=1e5, sign=-1, gain=5e-6),
+    fp.RFPTVector(offset=1e5, sign=-1, gain=5e-6),
+    fp.RFPT(offset=1e5, sign=-1, gain=5e-6),
     fp.Rotation(fraction=0.4, radius=1e4),
 )
 

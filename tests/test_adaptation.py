@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.deformation.guarded import EVENTS
+from fpirhc.deformation.wrappers.guarded import EVENTS
 from fpirhc.errors import InvalidValue
 
 

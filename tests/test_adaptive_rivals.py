@@ -11,9 +11,9 @@ import pytest
 from plants import chain, pendulum
 
 import fpirhc as fp
-from fpirhc.adaptation.base import Evidence
 from fpirhc.controllers.base import compose_controller
 from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.learning.rules.base import Evidence
 from fpirhc.symbolic.native import native
 
 FREE = (-np.inf, np.inf)
@@ -294,7 +294,7 @@ def test_projection_learns_while_the_command_is_clipped():
 def test_informed_starts_from_the_exact_parameters():
     """An estimate starts from what the controller is told."""
     problem = replace(task(poor, 0.05), disturbances={})
-    run = fp.simulate(problem, fp.Informed(NLMS), seed=0, compiled=False)
+    run = fp.simulate(problem, fp.ExactModel(NLMS), seed=0, compiled=False)
     np.testing.assert_allclose(run["estimate"][0], [1.0, 0.5, 20.0, 3.0])
     np.testing.assert_allclose(run["estimate"][-1], [1.0, 0.5, 20.0, 3.0], rtol=1e-6)
 

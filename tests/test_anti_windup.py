@@ -48,7 +48,7 @@ class Altered(fp.ComputedTorque):
 
 def request_kept(blocks, delays):
     """Store what the deformation wanted, whatever the actuator could do."""
-    return blocks, [Delay(d.now, "_deformed_wanted") if d.now.name == "_request_before" else d for d in delays]
+    return blocks, [Delay(d.now, "_deformed_unclipped") if d.now.name == "_deformed_last" else d for d in delays]
 
 
 def integral_runs(blocks, delays):
@@ -89,11 +89,11 @@ def settled(run):
 def test_with_both_the_step_settles():
     """The step asks for 324 N at first and has 20; it overshoots by a tenth, settles, and the request stays reachable."""
     run = step_of_two_metres()
-    assert run["requested.u"][0] == pytest.approx(1.5 * 108 * 2)
+    assert run["command_unclipped.u"][0] == pytest.approx(1.5 * 108 * 2)
     assert overshoot(run) < 0.3
     assert settled(run) < 2.0
     assert np.abs(run["deformed.q"]).max() < 1.1 * LARGEST
-    assert np.abs(run["requested.u"]).max() < 330
+    assert np.abs(run["command_unclipped.u"]).max() < 330
 
 
 def test_without_the_frozen_integral_it_overshoots_far():
@@ -106,7 +106,7 @@ def test_without_the_frozen_integral_it_overshoots_far():
 def test_without_the_stored_request_it_never_settles(changes):
     """The iteration goes on asking for what cannot be done: thousands of newtons, metres of overshoot, limit to limit."""
     run = step_of_two_metres(*changes)
-    assert np.abs(run["requested.u"]).max() > 1e4
+    assert np.abs(run["command_unclipped.u"]).max() > 1e4
     assert overshoot(run) > 5.0
     assert settled(run) > 9.9
     assert run["clipped"][-2000:].mean() > 0.5

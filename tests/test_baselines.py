@@ -12,7 +12,7 @@ from test_fixed_point import linear_problem, pendulum_problem
 import fpirhc as fp
 from fpirhc.errors import NotContractive, NotSupported
 from fpirhc.horizon.auxiliary import auxiliary_hessian
-from fpirhc.horizon.curvature import steepest_curvature
+from fpirhc.horizon.reference_expansion import steepest_curvature
 from fpirhc.horizon.rollout import reduced_gradient
 
 FIRST = np.array([0.5, -0.5])

@@ -87,7 +87,7 @@ def test_nothing_is_free_when_every_bound_holds():
 def test_a_saddle_is_not_certified():
     """Standing upright with a cost that wants to fall: curvature below zero, no bound."""
     ocp, data = pendulum_problem(
-        fp.Quadratic(states={"angle": 1e-3}, effort={"torque": 1e-4}, terminal_cost={"angle": 50.0}),
+        fp.Quadratic(states={"angle": 1e-3}, effort={"torque": 1e-4}, terminal={"angle": 50.0}),
         horizon=fp.Horizon(stages=30, step=0.1),
     )
     plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6), np.array([np.pi * 3, 0.0]), data, calls=1)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import fpirhc as fp
-from fpirhc.cli import main
+from fpirhc.cli.main import main
 
 GOOD = '''"""A mass on a line with a wrong gain."""
 import casadi as ca
@@ -170,7 +170,7 @@ def test_ended_run_has_its_own_exit_code(folder, capsys):
 
 def test_ctrl_c_keeps_what_is_finished(folder, capsys, monkeypatch):
     """The finished controller is reported, the other is named as interrupted; exit code 130."""
-    from fpirhc.studies import compare as study
+    from fpirhc.studies.comparison import compare as study
 
     ordinary = study.simulate
 
@@ -194,7 +194,7 @@ def test_without_a_compiler_it_says_so(folder, capsys, monkeypatch):
 
 HORIZON = """    measure_from=1.0,
     horizon=fp.Horizon(stages=10, step=1e-2),
-    cost=fp.Quadratic(states={"y": 100.0, "y'": 1.0}, correction={"u": 1e-2}),
+    cost=fp.Quadratic(states={"y": 100.0, "y'": 1.0}, deviation={"u": 1e-2}),
     limits=fp.Limits(inputs={"u": (-30.0, 30.0)}),
 """
 PLANNERS = """controllers = {

@@ -16,21 +16,21 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+import fpirhc.conformance.controller as controller_laws
+import fpirhc.conformance.deformation as deformation_laws
+import fpirhc.conformance.optimiser as optimiser_laws
+import fpirhc.conformance.plant as plant_laws
+import fpirhc.conformance.tracking as tracking_laws
 import fpirhc.controllers
 import fpirhc.optimisers
-import fpirhc.testing.controller as controller_laws
-import fpirhc.testing.deformation as deformation_laws
-import fpirhc.testing.optimiser as optimiser_laws
-import fpirhc.testing.plant as plant_laws
-import fpirhc.testing.tracking as tracking_laws
 import fpirhc.tracking
+from fpirhc.conformance.laws import within
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.optimisers.base import Optimiser
-from fpirhc.studies.problem_file import shipped_problems
+from fpirhc.problem_files.problem_file import shipped_problems
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Layout, Signal, scalar
-from fpirhc.testing.laws import within
 from fpirhc.tracking.base import Tracking
 
 FINE = 1e-6  # tolerance of the optimisers, N
@@ -42,10 +42,8 @@ PLANNER = fp.FixedPoint(iterations=2, tolerance=1e-3)
 def members(package: ModuleType, family: type) -> set[type]:
     """Concrete classes of a family in a package, as `tests/test_deformation.py` finds the maps."""
     found: set[type] = set()
-    for module in pkgutil.iter_modules(package.__path__):
-        for _, member in inspect.getmembers(
-            importlib.import_module(f"{package.__name__}.{module.name}"), inspect.isclass
-        ):
+    for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+        for _, member in inspect.getmembers(importlib.import_module(module.name), inspect.isclass):
             if issubclass(member, family) and not inspect.isabstract(member):
                 found.add(member)
     return found
@@ -109,7 +107,7 @@ class Altered(fp.Exponential):
             if self.change == "hides NaN":
                 s.state = ca.fmin(1e3, ca.fmax(-1e3, s.state))
             if self.change == "remembers":
-                s.started = 1 + 0 * s.started
+                s.warm_up = 1 + 0 * s.warm_up
             given = dict(block.step(s))
             if self.change == "offset":
                 given["desired"] = given["desired"] + 1e-3
@@ -118,7 +116,7 @@ class Altered(fp.Exponential):
             if self.change == "pushes away":
                 given["desired"] = 2 * s.nominal - given["desired"]
             if self.change == "extra":
-                given["more"] = s.started
+                given["more"] = s.warm_up
             return given
 
         return Block(block.name, reads, block.writes, step, block.memory)
@@ -190,7 +188,7 @@ OPTIMISERS: tuple[Optimiser, ...] = (
     fp.ReducedGradient(iterations=200, tolerance=FINE),
     fp.GradientFixedPoint(iterations=100, tolerance=FINE),
     fp.FullSpaceFixedPoint(iterations=300, tolerance=FINE, scaled=True, acceleration=fp.Anderson(8)),
-    fp.InteriorPoint(tolerance=FINE),
+    fp.Ipopt(tolerance=FINE),
     fp.Fatrop(tolerance=FINE),
     fp.SequentialQuadratic(tolerance=FINE),
     fp.SequentialQuadratic(tolerance=FINE, quadratic=fp.Osqp()),
@@ -319,7 +317,7 @@ CONTROLLERS: dict[str, tuple[Controller, fp.Problem | None]] = {
     "CTC": (fp.ComputedTorque(TRACKING), None),
     "CTC+FPI": (fp.ComputedTorque(TRACKING, SIGMOID), None),
     "RHC+FPI": (fp.RecedingHorizon(PLANNER, SIGMOID), None),
-    "informed": (fp.Informed(fp.ComputedTorque(TRACKING)), None),
+    "informed": (fp.ExactModel(fp.ComputedTorque(TRACKING)), None),
     "predicted": (fp.Predicted(fp.ComputedTorque(TRACKING), inputs=0.01), late()),
     "slots": slots(),
     "estimating": (fp.Estimating(fp.ComputedTorque(TRACKING), KALMAN), None),
@@ -376,14 +374,14 @@ class Faulty(fp.ComputedTorque):
 
         def limited(s):
             if self.change == "clamps first":
-                s.requested = ca.fmin(30, ca.fmax(-30, s.requested))
+                s.command_unclipped = ca.fmin(30, ca.fmax(-30, s.command_unclipped))
             given = dict(limit.step(s))
             if self.change == "no limits":
-                given["command"] = s.requested
+                given["command"] = s.command_unclipped
             if self.change == "random":
                 given["command"] = given["command"] * (1 - 1e-6 * random.random())
             if self.change == "counts":
-                given["command"] = given["command"] * (1 - 1e-6 * COUNTER(s.requested[0]))
+                given["command"] = given["command"] * (1 - 1e-6 * COUNTER(s.command_unclipped[0]))
             if self.change == "trusts responses":
                 given["command"] = ca.if_else(s.realised[0] > 1e9, s.realised, given["command"])
             return given

@@ -24,14 +24,14 @@ from fpirhc.contraction import (
     spectrum_over_box,
     spectrum_over_run,
 )
-from fpirhc.deformation import Affine, Deformation, Identity, Rfpt, RfptVector, Rotation, Sigmoid
+from fpirhc.deformation import RFPT, Affine, Deformation, Identity, RFPTVector, Rotation, Sigmoid
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, NotContractive
-from fpirhc.plant import Parameter, Plant
+from fpirhc.plant.plant import Parameter, Plant
 
 MAPS = (
     Affine(gain=-0.5),
-    Rfpt(offset=1e5, sign=-1, gain=5e-6),
-    RfptVector(offset=1e5, sign=-1, gain=5e-6),
+    RFPT(offset=1e5, sign=-1, gain=5e-6),
+    RFPTVector(offset=1e5, sign=-1, gain=5e-6),
     Sigmoid(gain=-0.5, scale=1e4),
     Rotation(fraction=0.4, radius=1e4),
 )

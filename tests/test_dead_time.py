@@ -140,11 +140,11 @@ def test_prediction_with_the_exact_model_undoes_the_dead_time():
         duration=1.5,
     )
     law = fp.ComputedTorque(fp.Exponential(rate=5.0, integral=False))
-    free = fp.simulate(problem, fp.Informed(law), seed=0)
+    free = fp.simulate(problem, fp.ExactModel(law), seed=0)
     for dead_time in (fp.DeadTime(inputs={"torque": 0.1}), fp.DeadTime(inputs={"torque": 0.06}, measurement=0.04)):
         late = replace(problem, dead_time=dead_time)
         predicted = fp.Predicted(law, inputs=dead_time.inputs["torque"], measurement=dead_time.measurement)
-        run = fp.simulate(late, fp.Informed(predicted), seed=0)
+        run = fp.simulate(late, fp.ExactModel(predicted), seed=0)
         moved = run["plant_state" if dead_time.measurement else "state"]
         shift = round(dead_time.inputs["torque"] / problem.period)
         np.testing.assert_allclose(moved[shift:], free["state"][:-shift], atol=2e-8)
@@ -228,9 +228,9 @@ def test_receding_horizon_starts_where_its_command_acts():
     late = replace(problem, dead_time=fp.DeadTime(inputs={"u": 0.1}))
     rhc = task.controllers["RHC"]
     runs = {
-        "free": (problem, fp.Informed(rhc)),
-        "late": (late, fp.Informed(rhc)),
-        "predicted": (late, fp.Informed(fp.Predicted(rhc, inputs=0.1))),
+        "free": (problem, fp.ExactModel(rhc)),
+        "late": (late, fp.ExactModel(rhc)),
+        "predicted": (late, fp.ExactModel(fp.Predicted(rhc, inputs=0.1))),
     }
     errors = {name: fp.measure(p, fp.simulate(p, c, seed=0)).rms_error["q"] for name, (p, c) in runs.items()}
     assert errors["predicted"] < 2 * errors["free"] + 1e-3

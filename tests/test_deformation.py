@@ -17,7 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fpirhc.deformation
+from fpirhc.conformance import check_deformation
 from fpirhc.deformation import (
+    RFPT,
     Affine,
     Blended,
     Damped,
@@ -28,21 +30,19 @@ from fpirhc.deformation import (
     Identity,
     Increment,
     Paired,
-    Rfpt,
-    RfptVector,
+    RFPTVector,
     Rotation,
     SelfPaired,
     Sigmoid,
     Tuned,
 )
 from fpirhc.errors import InvalidValue, NotSupported
-from fpirhc.testing import check_deformation
 
 ITERATING = (
     Affine(gain=-0.5),
-    Rfpt(offset=1e5, sign=-1, gain=5e-6),
-    Rfpt(offset=-1e4, sign=1, gain=4e-5),
-    RfptVector(offset=1e5, sign=-1, gain=5e-6),
+    RFPT(offset=1e5, sign=-1, gain=5e-6),
+    RFPT(offset=-1e4, sign=1, gain=4e-5),
+    RFPTVector(offset=1e5, sign=-1, gain=5e-6),
     Sigmoid(gain=-0.5, scale=1.0),
     Sigmoid(gain=-1.5, shift=0.0, scale=20.0),
     Sigmoid(gain=0.5, shift=-0.3, scale=1.0),
@@ -57,8 +57,8 @@ WRAPPERS = (
     Blended(Sigmoid(gain=-0.5, scale=1.0), smallest_gain=0.04, largest_gain=0.67),
     Blended(Tuned(Affine(gain=-0.5), largest_gain=0.5), smallest_gain=0.25, largest_gain=2.0, copies=2),
     Damped(Sigmoid(gain=-0.5, scale=1.0)),
-    Damped(Blended(RfptVector(offset=1e5, sign=-1, gain=5e-6), smallest_gain=0.1, largest_gain=0.9)),
-    Guarded(Tuned(Rfpt(offset=1e5, sign=-1, gain=5e-6), largest_gain=0.9), largest_deformation=1e12),
+    Damped(Blended(RFPTVector(offset=1e5, sign=-1, gain=5e-6), smallest_gain=0.1, largest_gain=0.9)),
+    Guarded(Tuned(RFPT(offset=1e5, sign=-1, gain=5e-6), largest_gain=0.9), largest_deformation=1e12),
     DelayWatched(Sigmoid(gain=-0.5, scale=1.0), most=5),
 )
 DELAYED = (
@@ -70,8 +70,8 @@ DELAYED = (
 MAPS = (Identity(), *ITERATING)
 NEARLY_LINEAR = (
     Affine(gain=-0.5),
-    Rfpt(offset=1e5, sign=-1, gain=5e-6),
-    RfptVector(offset=1e5, sign=-1, gain=5e-6),
+    RFPT(offset=1e5, sign=-1, gain=5e-6),
+    RFPTVector(offset=1e5, sign=-1, gain=5e-6),
     Sigmoid(gain=-0.5, scale=1e4),
     Rotation(fraction=0.4, radius=1e4),
 )
@@ -105,10 +105,8 @@ def rate(requests: np.ndarray, first: int, last: int) -> float:
 
 def concrete_maps() -> set[type[Deformation]]:
     found = set()
-    for module in pkgutil.iter_modules(fpirhc.deformation.__path__):
-        for _, member in inspect.getmembers(
-            importlib.import_module(f"fpirhc.deformation.{module.name}"), inspect.isclass
-        ):
+    for module in pkgutil.walk_packages(fpirhc.deformation.__path__, "fpirhc.deformation."):
+        for _, member in inspect.getmembers(importlib.import_module(module.name), inspect.isclass):
             if issubclass(member, Deformation) and not inspect.isabstract(member):
                 found.add(member)
     return found
@@ -130,10 +128,10 @@ def test_conformance(deformation: Deformation, elements: tuple[str, ...]) -> Non
 @pytest.mark.parametrize("deformation", WRAPPERS, ids=name_of)
 def test_wrappers_keep_the_laws_of_their_map(deformation: Deformation, elements: tuple[str, ...]) -> None:
     """All but one: a guard answers a response that is not a number with the desired one, and an event."""
-    from fpirhc.testing.deformation import LAWS, _Trial, nan_shows
+    from fpirhc.conformance.deformation import LAWS, _Trial, nan_shows
 
     if deformation == WRAPPERS[-1] and len(elements) > 1:
-        pytest.skip("Rfpt is for one coordinate")
+        pytest.skip("RFPT is for one coordinate")
     trial = _Trial(deformation, elements, 1.0)
     for law in LAWS:
         if law is not nan_shows or not isinstance(deformation, Guarded):
@@ -190,10 +188,10 @@ def test_conformance_finds_faults(wrong: Deformation, sentence: str) -> None:
         lambda: Sigmoid(gain=-0.5, shift=math.nan),
         lambda: Sigmoid(gain=-0.5, scale=0.0),
         lambda: Sigmoid(gain=-0.5, scale=math.inf),
-        lambda: Rfpt(offset=1e5, sign=2, gain=1e-5),
-        lambda: Rfpt(offset=0.0, sign=-1, gain=1e-5),
-        lambda: RfptVector(offset=1e5, sign=0, gain=1e-5),
-        lambda: RfptVector(offset=1e5, sign=-1, gain=math.inf),
+        lambda: RFPT(offset=1e5, sign=2, gain=1e-5),
+        lambda: RFPT(offset=0.0, sign=-1, gain=1e-5),
+        lambda: RFPTVector(offset=1e5, sign=0, gain=1e-5),
+        lambda: RFPTVector(offset=1e5, sign=-1, gain=math.inf),
         lambda: Rotation(fraction=0.0, radius=1.0),
         lambda: Rotation(fraction=0.5, radius=-1.0),
         lambda: Affine(gain="strong"),  # type: ignore[arg-type]
@@ -317,7 +315,7 @@ def test_rfpt_factor(slope: float) -> None:
     fixed = desired / slope
     requests = [fixed + 1e-3]
     for _ in range(4):
-        requests.append(float(advance(Rfpt(offset, -1, 1e-5), requests[-1], slope * requests[-1], desired)[0]))
+        requests.append(float(advance(RFPT(offset, -1, 1e-5), requests[-1], slope * requests[-1], desired)[0]))
     errors = np.array(requests) - fixed
     assert errors[1:] / errors[:-1] == pytest.approx(1 - (offset + fixed) * 1e-5 * slope, abs=1e-4)
 
@@ -326,7 +324,7 @@ def test_rfpt_factor(slope: float) -> None:
 def test_false_fixed_point_repels(slope: float) -> None:
     """The second fixed point r = -K_c has G' = 1 + tanh(f' - d / K_c) > 1 for B_c = -1 and f' > 0 (1.76 for f' = 1)."""
     r = ca.SX.sym("r")
-    deformed = Rfpt(1e5, -1, 1e-5).step(r, slope * r, ca.SX(0), {})[0]
+    deformed = RFPT(1e5, -1, 1e-5).step(r, slope * r, ca.SX(0), {})[0]
     value, derivative = ca.Function("g", [r], [deformed, ca.jacobian(deformed, r)])(-1e5)
     assert float(value) == -1e5
     assert float(derivative) == pytest.approx(1 + math.tanh(slope), rel=1e-12)

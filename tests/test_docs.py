@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fpirhc.cli import main
+from fpirhc.cli.main import main
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = sorted(p for p in DOCS.rglob("*.md") if "_build" not in p.parts)

@@ -14,7 +14,7 @@ from plants import linear, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
-from fpirhc.estimation.base import Seen
+from fpirhc.learning.estimators.base import Seen
 from fpirhc.symbolic.native import find_compiler
 
 PERIOD = 1e-2
@@ -41,7 +41,7 @@ def task(plant: fp.Plant, **changes) -> fp.Problem:
         "duration": 2.0,
         "limits": fp.Limits(inputs={force: (-20.0, 20.0)}),
         "horizon": fp.Horizon(stages=10, step=2 * PERIOD),
-        "cost": fp.Quadratic(states={name: 1e2, f"{name}'": 1.0}, correction={force: 0.1}),
+        "cost": fp.Quadratic(states={name: 1e2, f"{name}'": 1.0}, deviation={force: 0.1}),
     }
     return fp.Problem(**(settings | changes))
 
@@ -68,8 +68,8 @@ def learners(parameters, name: str) -> dict[str, fp.RecursiveLeastSquares | fp.M
 def test_an_exact_model_is_left_alone(name):
     """Without noise and model error nothing is learned, and the plant moves as without the estimator, to rounding."""
     problem = task(pendulum())
-    plain = fp.simulate(problem, fp.Informed(RHC), seed=0, compiled=False)
-    run = fp.simulate(problem, fp.Informed(fp.Estimating(RHC, learners(MASS, "angle")[name])), seed=0, compiled=False)
+    plain = fp.simulate(problem, fp.ExactModel(RHC), seed=0, compiled=False)
+    run = fp.simulate(problem, fp.ExactModel(fp.Estimating(RHC, learners(MASS, "angle")[name])), seed=0, compiled=False)
     np.testing.assert_allclose(run["state"], plain["state"], atol=1e-10)
     np.testing.assert_allclose(run["estimate"], np.broadcast_to(run["estimate"][0], run["estimate"].shape), atol=1e-9)
 
@@ -138,14 +138,14 @@ class Fed:
         symbols = [ca.MX.sym(n, k) for n, k in (("x", 2), ("u", 1), ("f", 1), ("valid", 1), ("m", layout.size))]
         x, u, f, valid, memory = symbols
         given = Seen(x, u, f, ca.DM(plant.approximate), valid)
-        correction, following = estimator.step(problem)(given, layout.split(memory))
-        self.function = ca.Function("fed", symbols, [correction, layout.join(following)])
+        parameter_change, following = estimator.step(problem)(given, layout.split(memory))
+        self.function = ca.Function("fed", symbols, [parameter_change, layout.join(following)])
         self.memory = layout.start()
 
     def __call__(self, x, u, f):
-        """The correction after one more pair."""
-        correction, self.memory = self.function(x, u, f, 1, self.memory)
-        return correction.full().ravel()
+        """The parameter_change after one more pair."""
+        parameter_change, self.memory = self.function(x, u, f, 1, self.memory)
+        return parameter_change.full().ravel()
 
 
 def pairs(count: int, plant: fp.Plant, seed: int = 3):

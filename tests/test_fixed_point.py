@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from plants import pendulum
 
 import fpirhc as fp
-from fpirhc.horizon.expansion import GaussNewton
+from fpirhc.horizon.hessian_models import GaussNewton
 from fpirhc.horizon.problem import stage_data, transcribe
 from fpirhc.horizon.riccati import box_policy
 from fpirhc.horizon.rollout import reduced_gradient
@@ -25,7 +25,7 @@ from fpirhc.symbolic.native import find_compiler, generate, native
 PLANT, REFERENCE = pendulum(), fp.Trajectory(lambda t: {"angle": ca.sin(2 * t)})
 HORIZON = fp.Horizon(stages=12, step=0.05)
 COST = fp.Quadratic(states={"angle": 10.0, "angle'": 0.1}, effort={"torque": 0.05})
-SWING = fp.Quadratic(states={"angle": 0.1}, effort={"torque": 1e-3}, terminal_cost={"angle": 10.0, "angle'": 1.0})
+SWING = fp.Quadratic(states={"angle": 0.1}, effort={"torque": 1e-3}, terminal={"angle": 10.0, "angle'": 1.0})
 
 
 def pendulum_problem(cost=COST, limits=None, horizon=HORIZON):
@@ -71,7 +71,7 @@ def test_same_optimum_as_ipopt(cost, high):
     ocp, data = pendulum_problem(cost, limits)
     first = np.array([1.0, -1.0])
     plan = fp.solve(ocp, fp.FixedPoint(iterations=30, tolerance=1e-9), first, data)
-    other = fp.solve(ocp, fp.InteriorPoint(tolerance=1e-5, accuracy=1e-11), first, data)
+    other = fp.solve(ocp, fp.Ipopt(tolerance=1e-5, accuracy=1e-11), first, data)
     assert plan.status == fp.Status.OK
     assert plan.cost == pytest.approx(other.cost, rel=1e-6)
     np.testing.assert_allclose(plan.inputs, other.inputs, atol=1e-5)
@@ -285,7 +285,7 @@ def test_exact_hessian_converges_quadratically():
     near = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=0.1), first, data).inputs
     iterations = {}
     for bend in (fp.GaussNewton(), fp.ExactHessian()):
-        plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-10, bend=bend), first, data, start=near)
+        plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-10, hessian=bend), first, data, start=near)
         assert plan.status == fp.Status.OK
         iterations[type(bend).__name__] = plan.iterations
     assert iterations["ExactHessian"] <= 5 < 2 * 5 <= iterations["GaussNewton"]
@@ -315,13 +315,13 @@ def test_single_iterations_get_out_of_a_bad_plan():
         parameters={"mass": fp.Parameter(0.2, 0.2, "kg")},
     )
     reference = fp.Trajectory(lambda t: {"height": 2 + 1.5 * ca.sin(1.2 * t)})
-    cost = fp.Quadratic(states={"height": 1e3, "height'": 1.0}, correction={"thrust": 1e-2})
+    cost = fp.Quadratic(states={"height": 1e3, "height'": 1.0}, deviation={"thrust": 1e-2})
     horizon, limits = fp.Horizon(stages=20, step=2e-2), fp.Limits(inputs={"thrust": (0.0, 40.0)})
     ocp = transcribe(plant, reference, horizon, cost, limits)
     data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate).full()
     optimiser, memory = fp.FixedPoint(iterations=1, tolerance=1e-6), None
     first = np.array([2.0, 0.0])
-    best = fp.solve(ocp, fp.InteriorPoint(), first, data)
+    best = fp.solve(ocp, fp.Ipopt(), first, data)
     # As after a plan for another model: nearly all thrust at once.
     memory = optimiser.memory(ocp).start()
     memory[optimiser.memory(ocp).slice("plan_inputs")] = np.linspace(40.0, 0.0, horizon.stages)

@@ -127,7 +127,7 @@ def test_a_fresh_start_forgets():
     first, memory = stepper.step(0.0, state, np.zeros(1), stepper.start())
     for k in range(1, 5):
         running, memory = stepper.step(k * 1e-3, state + 0.1 * k, np.zeros(1), memory)
-    memory[stepper.memory.slice("started")] = 0.0
+    memory[stepper.memory.slice("warm_up")] = 0.0
     again, after = stepper.step(5e-3, state, np.zeros(1), memory)
     assert again == first
     assert running != first

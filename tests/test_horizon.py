@@ -17,16 +17,16 @@ from fpirhc.horizon.rollout import reduced_gradient, rollout
 TASK = fp.load_problem("two_mass")
 PENDULUM_REFERENCE = fp.Trajectory(lambda t: {"angle": 0.5 * ca.sin(2 * t)})
 COSTS = {
-    "correction": fp.Quadratic(states={"angle": 10.0, "angle'": 1.0}, correction={"torque": 0.1}),
+    "deviation": fp.Quadratic(states={"angle": 10.0, "angle'": 1.0}, deviation={"torque": 0.1}),
     "rate": fp.Quadratic(states={"angle": 10.0}, effort={"torque": 0.1}, rate={"torque": 0.3}),
-    "terminal": fp.Quadratic(states={"angle": 1.0}, effort={"torque": 0.1}, terminal_cost={"angle": 50.0}),
-    "lqr": fp.Quadratic(states={"angle": 1.0}, effort={"torque": 0.1}, terminal_cost=fp.LqrTerminal()),
-    "general": fp.General(
+    "terminal": fp.Quadratic(states={"angle": 1.0}, effort={"torque": 0.1}, terminal={"angle": 50.0}),
+    "lqr": fp.Quadratic(states={"angle": 1.0}, effort={"torque": 0.1}, terminal=fp.LQRTerminal()),
+    "general": fp.CustomCost(
         terms=lambda v: {
             "angle": ca.sqrt((v.state.angle - v.reference.angle) ** 2 + 1e-2),
             "torque": 0.1 * v.input.torque**4 + 0.01 * (v.input.torque - v.input_before.torque) ** 2,
         },
-        final=lambda v: 5 * v.state.angle**2,
+        terminal=lambda v: 5 * v.state.angle**2,
         rate=True,
     ),
 }
@@ -74,7 +74,7 @@ def test_adjoint_gradient_agrees_with_finite_differences(name):
 
 def test_kkt_matrix_is_symmetric_and_indefinite():
     """The Hessian of Psi has N (nx + nu) positive and N nx negative eigenvalues at a convex point."""
-    ocp, data = built(COSTS["correction"])
+    ocp, data = built(COSTS["deviation"])
     s0, inputs = point(ocp)
     n = ocp.stages
     states = rollout(ocp)(s0, inputs, data)[0][:, 1:]
@@ -108,7 +108,7 @@ def test_rate_cost_counts_the_change_from_the_last_command():
 def test_lqr_terminal_makes_a_short_horizon_endless():
     """On a linear plant at rest the planned first input is the infinite-horizon LQR input, however short the horizon."""
     plant, reference = chain(2), fp.Trajectory(lambda t: {"y": 0 * t})
-    cost = fp.Quadratic(states={"y": 3.0, "y'": 0.5}, effort={"u": 0.2}, terminal_cost=fp.LqrTerminal())
+    cost = fp.Quadratic(states={"y": 3.0, "y'": 0.5}, effort={"u": 0.2}, terminal=fp.LQRTerminal())
     horizon = fp.Horizon(stages=3, step=0.1)
     ocp = transcribe(plant, reference, horizon, cost, fp.Limits())
     data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
@@ -121,7 +121,7 @@ def test_lqr_terminal_makes_a_short_horizon_endless():
 
 def test_feedforward_makes_the_reference_free():
     """On the reference, with the model's own input, a cost of corrections is zero."""
-    ocp, data = built(COSTS["correction"])
+    ocp, data = built(COSTS["deviation"])
     given = ocp.data.split(data[:, 0])
     value, _ = ocp.stage_cost(given["reference"], given["feedforward"], data[:, 0])
     assert float(value) == pytest.approx(0.0, abs=1e-20)
@@ -132,18 +132,18 @@ BAD_COSTS = {
     "input": (fp.Quadratic(states={"angle": 1.0}, effort={"torqe": 1.0}), "Did you mean 'torque'"),
     "negative": (fp.Quadratic(states={"angle": -1.0}), "finite number of at least 0, got -1.0"),
     "zero": (fp.Quadratic(states={"angle": 0.0}), "every weight is zero"),
-    "term": (fp.General(terms=lambda v: {"log": ca.log(v.state.angle)}), "term 'log' is -inf"),
-    "name": (fp.General(terms=lambda v: {"a": v.state.angel}), "state 'angel' is unknown"),
-    "before": (fp.General(terms=lambda v: {"a": v.input_before.torque}), "say General\\(rate=True\\)"),
-    "lqr": (fp.Quadratic(states={"angle": 1.0}, terminal_cost=fp.LqrTerminal()), "needs a positive effort"),
-    "feedforward": (fp.General(terms=lambda v: {"a": v.feedforward.torque}), "say General\\(feedforward=True\\)"),
+    "term": (fp.CustomCost(terms=lambda v: {"log": ca.log(v.state.angle)}), "term 'log' is -inf"),
+    "name": (fp.CustomCost(terms=lambda v: {"a": v.state.angel}), "state 'angel' is unknown"),
+    "before": (fp.CustomCost(terms=lambda v: {"a": v.input_before.torque}), "say CustomCost\\(rate=True\\)"),
+    "lqr": (fp.Quadratic(states={"angle": 1.0}, terminal=fp.LQRTerminal()), "needs a positive effort"),
+    "feedforward": (fp.CustomCost(terms=lambda v: {"a": v.feedforward.torque}), "say CustomCost\\(feedforward=True\\)"),
     "final": (
-        fp.General(terms=lambda v: {"a": v.input.torque**2}, final=lambda v: 1 / v.state.angle),
+        fp.CustomCost(terms=lambda v: {"a": v.input.torque**2}, terminal=lambda v: 1 / v.state.angle),
         "term 'terminal' is inf",
     ),
-    "shape": (fp.General(terms=lambda v: {"a": v.state.vector}), r"term 'a' must be one scalar, got shape \(2, 1\)"),
-    "empty": (fp.General(terms=lambda v: {}), "at least one entry"),
-    "kind": (fp.General(terms=lambda v: v.input.torque**2), "must be {name: expression}"),
+    "shape": (fp.CustomCost(terms=lambda v: {"a": v.state.vector}), r"term 'a' must be one scalar, got shape \(2, 1\)"),
+    "empty": (fp.CustomCost(terms=lambda v: {}), "at least one entry"),
+    "kind": (fp.CustomCost(terms=lambda v: v.input.torque**2), "must be {name: expression}"),
     "many": (fp.Quadratic(states={"angel": 1.0, "angle": -1.0}, effort={"torqe": np.nan}), "4 mistakes"),
 }
 
@@ -182,10 +182,7 @@ def test_curvature_is_the_bend_of_the_cost_along_the_first_input():
     horizon = fp.Horizon(stages=6, step=0.1)
     for factor in (1.0, 1e-7):
         cost = fp.Quadratic(
-            states={"y": 3.0 * factor},
-            effort={"u": 0.2 * factor},
-            rate={"u": factor},
-            terminal_cost={"y'": 5.0 * factor},
+            states={"y": 3.0 * factor}, effort={"u": 0.2 * factor}, rate={"u": factor}, terminal={"y'": 5.0 * factor}
         )
         ocp = transcribe(plant, reference, horizon, cost, fp.Limits())
         data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
@@ -196,7 +193,7 @@ def test_curvature_is_the_bend_of_the_cost_along_the_first_input():
 
 def test_curvature_of_a_flat_cost_is_positive():
     """|e|^4 has no curvature on the reference; the scale must still be usable."""
-    cost = fp.General(terms=lambda v: {"a": (v.state.angle - v.reference.angle) ** 4})
+    cost = fp.CustomCost(terms=lambda v: {"a": (v.state.angle - v.reference.angle) ** 4})
     assert built(cost)[0].curvature == pytest.approx([1.0])
 
 
@@ -205,7 +202,7 @@ def test_a_table_serves_as_a_reference():
     times = np.linspace(0.0, 2.0, 201)
     table = fp.Table(times, {"angle": 0.5 * np.sin(2 * times)})
     horizon, plant = fp.Horizon(stages=8, step=0.05), pendulum()
-    _, expected = built(COSTS["correction"])
-    given = stage_data(plant, table, horizon, COSTS["correction"])(0.2, plant.approximate)
+    _, expected = built(COSTS["deviation"])
+    given = stage_data(plant, table, horizon, COSTS["deviation"])(0.2, plant.approximate)
     np.testing.assert_allclose(given.full(), expected.full(), atol=1e-5)
-    transcribe(plant, table, horizon, COSTS["correction"], fp.Limits())
+    transcribe(plant, table, horizon, COSTS["deviation"], fp.Limits())

@@ -9,7 +9,7 @@ from plants import pendulum
 
 import fpirhc as fp
 from fpirhc.errors import FpirhcError, NotSupported
-from fpirhc.horizon.augmented import augmented, bounded_states, penalty_weights
+from fpirhc.horizon.augmented_lagrangian import augmented, bounded_states, penalty_weights
 from fpirhc.horizon.problem import stage_data, transcribe
 from fpirhc.horizon.rollout import rollout
 
@@ -17,7 +17,7 @@ PLANT, REFERENCE = pendulum(), fp.Trajectory(lambda t: {"angle": ca.sin(2 * t)})
 COST = fp.Quadratic(states={"angle": 10.0, "angle'": 0.1}, effort={"torque": 0.05})
 FIRST = np.array([0.6, 0.0])
 FIXED = fp.FixedPoint(iterations=1, tolerance=1e-7)
-IPOPT = fp.InteriorPoint(tolerance=1e-4, accuracy=1e-11)
+IPOPT = fp.Ipopt(tolerance=1e-4, accuracy=1e-11)
 
 
 def horizon_of(limits, terminal=(), cost=COST, stages=12):
@@ -35,8 +35,11 @@ CASES = {
     "state": (fp.Limits(states={"angle'": (-0.2, 0.3)}), ()),
     "state and input": (fp.Limits(inputs={"torque": (-4.0, 4.0)}, states={"angle'": (-0.2, 0.5)}), ()),
     "rate": (fp.Limits(rates={"torque": (-10.0, 10.0)}), ()),
-    "path": (fp.Limits(paths={"mix": fp.Path(speed_and_angle, lower=1.0)}), ()),
-    "input path": (fp.Limits(paths={"power": fp.Path(lambda v: v.input.torque * v.state["angle'"], upper=0.5)}), ()),
+    "path": (fp.Limits(paths={"mix": fp.PathConstraint(speed_and_angle, lower=1.0)}), ()),
+    "input path": (
+        fp.Limits(paths={"power": fp.PathConstraint(lambda v: v.input.torque * v.state["angle'"], upper=0.5)}),
+        (),
+    ),
     "terminal": (fp.Limits(), ("angle",)),
     "terminal and rate": (fp.Limits(rates={"torque": (-40.0, 40.0)}), ("angle", "angle'")),
 }
@@ -147,7 +150,7 @@ def test_limits_in_a_closed_loop(case):
         cost=COST,
         measure_from=1.0,
     )
-    controller = fp.Informed(fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=1e-3, feasible=1e-3)))
+    controller = fp.ExactModel(fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=1e-3, feasible=1e-3)))
     run = fp.simulate(problem, controller, seed=0)
     assert run.stop is None
     assert fp.measure(problem, run).statuses["OK"] >= 110
@@ -162,10 +165,10 @@ def test_limits_in_a_closed_loop(case):
     [
         (fp.Limits(rates={"torqe": (-1.0, 1.0)}), (), "torque"),
         (fp.Limits(rates={"torque": (1.0, -1.0)}), (), "swap them"),
-        (fp.Limits(paths={"angle": fp.Path(lambda v: v.state.angle)}), (), "already the name"),
+        (fp.Limits(paths={"angle": fp.PathConstraint(lambda v: v.state.angle)}), (), "already the name"),
         (fp.Limits(paths={"mix": 3.0}), (), "must be a Path"),
-        (fp.Limits(paths={"mix": fp.Path(lambda v: v.state.angel, upper=1.0)}), (), "angle"),
-        (fp.Limits(paths={"mix": fp.Path(lambda v: v.state.vector, upper=1.0)}), (), "one scalar"),
+        (fp.Limits(paths={"mix": fp.PathConstraint(lambda v: v.state.angel, upper=1.0)}), (), "angle"),
+        (fp.Limits(paths={"mix": fp.PathConstraint(lambda v: v.state.vector, upper=1.0)}), (), "one scalar"),
         (fp.Limits(soft={"angle": 1.0}), (), "soft: limit of"),
         (fp.Limits(states={"angle": (0, 1)}, soft={"angle": -1.0}), (), "positive"),
         (fp.Limits(), ("angel",), "angle"),

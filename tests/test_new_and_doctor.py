@@ -12,7 +12,7 @@ from dataclasses import replace
 import pytest
 
 import fpirhc as fp
-from fpirhc.cli import main
+from fpirhc.cli.main import main
 from fpirhc.doctor import machine, traps
 from fpirhc.doctor.examine import Diagnosis
 from fpirhc.doctor.finding import Finding, Outcome, ask
@@ -199,7 +199,7 @@ def test_checks_fail_where_the_guard_is_gone(name, monkeypatch):
 def test_banner_is_noticed(monkeypatch):
     """IPOPT left to itself prints."""
     loud = {"print_time": False, "ipopt.sb": "no", "ipopt.print_level": 5}
-    monkeypatch.setattr("fpirhc.optimisers.nlp.InteriorPoint.options", lambda self, ocp: loud)
+    monkeypatch.setattr("fpirhc.optimisers.nlp.Ipopt.options", lambda self, ocp: loud)
     assert traps.solver_banner()[0] == Outcome.WARN
 
 

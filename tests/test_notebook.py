@@ -14,9 +14,9 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import render
 from fpirhc.report.terminal import progress_bars, show, show_run
-from fpirhc.studies.problem_file import Task
 from fpirhc.summary import printable, table
 
 HOSTILE = "<img src=x onerror=alert(1)>[bold red]$\\frac$ \x1b[31m:bomb: `id` $(id) \"'&"
@@ -43,7 +43,7 @@ def hostile_problem(duration: float = 0.3) -> fp.Problem:
         duration=duration,
         limits=fp.Limits(inputs={"u": (-30.0, 30.0)}),
         horizon=fp.Horizon(stages=4, step=1e-2),
-        cost=fp.General(lambda s: {"<s>cost</s>[/]": 100 * (s.state.y - s.reference.y) ** 2 + 1e-2 * s.input.u**2}),
+        cost=fp.CustomCost(lambda s: {"<s>cost</s>[/]": 100 * (s.state.y - s.reference.y) ** 2 + 1e-2 * s.input.u**2}),
     )
 
 

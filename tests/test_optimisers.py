@@ -22,7 +22,7 @@ from fpirhc.symbolic.native import generate, native
 
 TASK = fp.load_problem("two_mass")
 GRADIENT = fp.ReducedGradient(iterations=60, tolerance=1e-4)
-BACKENDS = (fp.InteriorPoint(), fp.Fatrop(), fp.SequentialQuadratic(), fp.SequentialQuadratic(quadratic=fp.Osqp()))
+BACKENDS = (fp.Ipopt(), fp.Fatrop(), fp.SequentialQuadratic(), fp.SequentialQuadratic(quadratic=fp.Osqp()))
 FIXED = fp.FixedPoint(iterations=8, tolerance=1e-6)
 EVERY = (GRADIENT, FIXED, *BACKENDS)
 BOXES = {
@@ -71,14 +71,14 @@ def test_state_limits_are_kept(optimiser):
 def test_state_limits_are_refused_by_the_reduced_gradient():
     """It says who can."""
     ocp, data, first = two_mass(fp.Limits(states={"q1": (2.0, 2.3)}))
-    with pytest.raises(NotSupported, match="InteriorPoint"):
+    with pytest.raises(NotSupported, match="Ipopt"):
         fp.solve(ocp, GRADIENT, first, data)
 
 
 def test_contradictory_limits_are_infeasible_not_solved():
     """A first state from which the limit cannot be kept: the status says so."""
     ocp, data, first = two_mass(fp.Limits(inputs={"Q1": (-1.0, 1.0)}, states={"q1": (3.0, 3.5)}))
-    plan = fp.solve(ocp, fp.InteriorPoint(), first, data, calls=1)
+    plan = fp.solve(ocp, fp.Ipopt(), first, data, calls=1)
     assert plan.status in (fp.Status.INFEASIBLE, fp.Status.NON_FINITE)
     assert np.isfinite(plan.inputs).all()
 
@@ -145,7 +145,7 @@ def test_settings_are_checked():
     with pytest.raises(InvalidValue, match="at least 1 iteration"):
         fp.ReducedGradient(iterations=0, tolerance=1e-3)
     with pytest.raises(InvalidValue, match="positive tolerance"):
-        fp.InteriorPoint(tolerance=0.0)
+        fp.Ipopt(tolerance=0.0)
     with pytest.raises(NotSupported, match="infeasible points marked as solved"):
         quadratic_solver("fatrop")
     with pytest.raises(InvalidValue, match="Did you mean 'osqp'"):
@@ -172,7 +172,7 @@ def test_all_backends_drive_the_same_loop(optimiser):
 
 @pytest.mark.parametrize(
     "nominal",
-    [fp.Restart(), fp.RestartAndTrack(fp.Exponential(rate=6.0)), fp.OpenPlan(fp.Exponential(rate=6.0))],
+    [fp.FromMeasurement(), fp.FromMeasurementTracked(fp.Exponential(rate=6.0)), fp.FromPlan(fp.Exponential(rate=6.0))],
     ids=lambda n: type(n).__name__,
 )
 def test_every_variant_is_cured_by_adaptation(nominal):
@@ -180,7 +180,7 @@ def test_every_variant_is_cured_by_adaptation(nominal):
     problem = replace(TASK.problem, duration=4.0, measure_from=2.0)
     errors = {}
     for name, deformation in (("plain", fp.Identity()), ("adaptive", fp.Sigmoid(gain=-0.5, scale=20.0))):
-        run = fp.simulate(problem, fp.RecedingHorizon(GRADIENT, deformation, nominal=nominal), seed=0)
+        run = fp.simulate(problem, fp.RecedingHorizon(GRADIENT, deformation, replanning=nominal), seed=0)
         errors[name] = max(fp.measure(problem, run).rms_error.values())
     assert errors["adaptive"] < 0.1 * errors["plain"]
     assert errors["adaptive"] < 5e-3
@@ -197,7 +197,7 @@ def test_bounds_of_the_plan_are_shifted_by_the_correction():
     run = fp.simulate(tight, fp.RecedingHorizon(GRADIENT, fp.Sigmoid(gain=-0.5, scale=20.0)), seed=0)
     assert run["command.Q1"].max() <= 10.0
     fresh = np.arange(10, run.cycles, 10)
-    meant = run["planned.Q1"][fresh] + run["correction.Q1"][fresh - 1]
+    meant = run["planned.Q1"][fresh] + run["command_shift.Q1"][fresh - 1]
     assert meant.max() <= 10.0 + 1e-6
     assert meant.max() > 9.9
 
@@ -209,7 +209,7 @@ POLICIES = {"HoldPlan": (fp.HoldPlan(), fp.Status.HELD), "Feedforward": (fp.Feed
 def test_failed_solves_are_counted_and_follow_the_policy(policy):
     """An infeasible limit from the start: the policy acts, the run goes on, the status counts it."""
     chosen, status = POLICIES[policy]
-    problem, controller = receding(fp.InteriorPoint(iterations=30), on_failure=chosen)
+    problem, controller = receding(fp.Ipopt(iterations=30), on_failure=chosen)
     problem = replace(
         problem,
         limits=fp.Limits(inputs={"Q1": (-5.0, 5.0)}, states={"q1": (3.0, 4.0)}),
@@ -223,7 +223,7 @@ def test_failed_solves_are_counted_and_follow_the_policy(policy):
 
 def test_stop_run_ends_with_the_reason():
     """StopRun makes the failed plan visible at once."""
-    problem, controller = receding(fp.InteriorPoint(iterations=30), on_failure=fp.StopRun())
+    problem, controller = receding(fp.Ipopt(iterations=30), on_failure=fp.StopRun())
     problem = replace(
         problem,
         limits=fp.Limits(inputs={"Q1": (-5.0, 5.0)}, states={"q1": (3.0, 4.0)}),
@@ -256,7 +256,7 @@ def test_chain_of_order_four_under_receding_horizon():
         duration=6.0,
         limits=fp.Limits(inputs={"u": (-50.0, 50.0)}),
         horizon=fp.Horizon(stages=30, step=0.05),
-        cost=fp.Quadratic(states={"y": 1e3, "y'": 1e2, "y''": 10.0, "y'''": 1.0}, correction={"u": 1e-2}),
+        cost=fp.Quadratic(states={"y": 1e3, "y'": 1e2, "y''": 10.0, "y'''": 1.0}, deviation={"u": 1e-2}),
         measure_from=3.0,
     )
     optimiser = fp.SequentialQuadratic()
@@ -273,7 +273,7 @@ def scaled(factor):
         TASK.problem,
         cost=fp.Quadratic(
             states={n: factor * w for n, w in cost.states.items()},
-            correction={n: factor * w for n, w in cost.correction.items()},
+            deviation={n: factor * w for n, w in cost.deviation.items()},
         ),
     )
 
@@ -298,10 +298,8 @@ def test_the_size_of_the_weights_changes_neither_plan_nor_status(factor, iterati
 
 COUPLED = {
     "rate": fp.Quadratic(states={"q1": 1e3, "q2": 1e3}, effort={"Q1": 1e-3}, rate={"Q1": 1e-3, "Q2": 1e-2}),
-    "lqr": fp.Quadratic(
-        states={"q1": 1e3, "q2": 1e3}, correction={"Q1": 1e-3, "Q2": 1e-3}, terminal_cost=fp.LqrTerminal()
-    ),
-    "general": fp.General(
+    "lqr": fp.Quadratic(states={"q1": 1e3, "q2": 1e3}, deviation={"Q1": 1e-3, "Q2": 1e-3}, terminal=fp.LQRTerminal()),
+    "general": fp.CustomCost(
         terms=lambda v: {
             "error": 1e3 * ca.sqrt((v.state.q1 - v.reference.q1) ** 2 + (v.state.q2 - v.reference.q2) ** 2 + 1e-2),
             "input": 1e-3 * (v.input.Q1 - v.input.Q2) ** 2 + 1e-3 * v.input.Q1**2,
@@ -411,7 +409,7 @@ def test_multipliers_away_from_a_limit_do_not_count():
 def test_a_first_state_outside_its_limits_is_infeasible():
     """Too far out to come back within one stage."""
     ocp, data, _ = two_mass(RIDING["upper"])
-    plan = fp.solve(ocp, fp.InteriorPoint(), np.array([2.6, 5.6, 0.2, -0.1]), data)
+    plan = fp.solve(ocp, fp.Ipopt(), np.array([2.6, 5.6, 0.2, -0.1]), data)
     assert plan.status == fp.Status.INFEASIBLE
     assert plan.feasibility > 1e-2
     assert plan.verify()[2] == pytest.approx(plan.feasibility)

@@ -10,7 +10,7 @@ from test_certificate import PROBLEMS, first_horizon
 
 import fpirhc as fp
 from fpirhc.horizon.problem import stage_data, transcribe
-from fpirhc.studies.optimality import with_optimiser
+from fpirhc.studies.comparison.optimality import with_optimiser
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -23,9 +23,7 @@ def test_same_optimum_as_ipopt(name, share):
     scale = float(half.max())
     plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-8 * scale), first, data)
     # IPOPT starts where the other ended: a swing-up has several local optima.
-    other = fp.solve(
-        ocp, fp.InteriorPoint(tolerance=1e-6 * scale, accuracy=1e-11), first, data, start=plan.inputs, calls=3
-    )
+    other = fp.solve(ocp, fp.Ipopt(tolerance=1e-6 * scale, accuracy=1e-11), first, data, start=plan.inputs, calls=3)
     assert plan.status == fp.Status.OK
     assert plan.cost == pytest.approx(other.cost, rel=1e-6)
     np.testing.assert_allclose(plan.inputs, other.inputs, atol=1e-5 * scale)
@@ -86,7 +84,7 @@ def test_indefinite_costs_are_refused_with_what_to_use_instead():
     """A cost that bends downwards has no quadratic model with a minimum."""
     from plants import pendulum
 
-    cost = fp.General(terms=lambda v: {"down": -(v.state.angle**2), "effort": v.input.torque**2})
+    cost = fp.CustomCost(terms=lambda v: {"down": -(v.state.angle**2), "effort": v.input.torque**2})
     ocp = transcribe(pendulum(), fp.Trajectory(lambda t: {"angle": 0 * t}), fp.Horizon(5, 0.1), cost, fp.Limits())
     with pytest.raises(fp.FpirhcError, match=r"bends upwards.*Use ReducedGradient"):
         fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6), np.zeros(2), np.zeros((ocp.data.size, 6)))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fpirhc.cli import main
+from fpirhc.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -14,19 +14,19 @@ import pytest
 from blessed import LINE, NOISY, write_problems
 
 import fpirhc as fp
-from fpirhc.cli import main
+from fpirhc.baselines.bands import FACTOR, Expected, expected
+from fpirhc.baselines.baseline import to_text
+from fpirhc.baselines.catalogue import BANDED, EXACT, FAMILIES, TIGHT, family_of
+from fpirhc.baselines.judging import Judgement, Row, judge
+from fpirhc.baselines.junit import to_junit
+from fpirhc.baselines.markdown import to_markdown
+from fpirhc.baselines.measuring import DIVERGED, FINISHED, Measurement
+from fpirhc.baselines.places import problems_here
+from fpirhc.baselines.reading import read_baseline
+from fpirhc.baselines.settings import fingerprint, settings_of
+from fpirhc.baselines.variants import INTEGRATOR, NOMINAL, ROUNDING, SEEDS, Variant, variants
+from fpirhc.cli.main import main
 from fpirhc.errors import BaselineError, InvalidName
-from fpirhc.regression.bands import FACTOR, Expected, expected
-from fpirhc.regression.baseline import to_text
-from fpirhc.regression.catalogue import BANDED, EXACT, FAMILIES, TIGHT, family_of
-from fpirhc.regression.judging import Judgement, Row, judge
-from fpirhc.regression.junit import to_junit
-from fpirhc.regression.markdown import to_markdown
-from fpirhc.regression.measuring import DIVERGED, FINISHED, Measured
-from fpirhc.regression.places import problems_here
-from fpirhc.regression.reading import read_baseline
-from fpirhc.regression.settings import fingerprint, settings_of
-from fpirhc.regression.variants import INTEGRATOR, NOMINAL, ROUNDING, SEEDS, Variant, variants
 
 pytest_plugins = ["pytester"]
 
@@ -35,7 +35,7 @@ VARIANTS = [Variant(source, source, 0, False) for source in (NOMINAL, SEEDS, ROU
 
 def measured(*values, name="rms_error.y", outcome=FINISHED):
     """One result per variant."""
-    return [Measured(outcome, "", {name: value}) for value in values]
+    return [Measurement(outcome, "", {name: value}) for value in values]
 
 
 @pytest.fixture(scope="module")
@@ -104,13 +104,13 @@ def test_what_only_some_variants_have_is_not_compared():
 
 def test_a_run_that_may_diverge_compares_only_how_it_ends(blessed):
     """Whatever its numbers; another class of outcome is a change."""
-    results = [*measured(1.0, 1.0, 1.0), Measured(DIVERGED, "at 3 s", {})]
+    results = [*measured(1.0, 1.0, 1.0), Measurement(DIVERGED, "at 3 s", {})]
     found = expected(VARIANTS, results, 1e-3)
     assert found == Expected((FINISHED, DIVERGED), {}, {})
     task = fp.load_problem(str(blessed / "noisy.py"))
     whole = replace(read_baseline(blessed / "baselines" / "noisy.json"), controllers={"CTC": found})
     for outcome, holds in ((FINISHED, True), (DIVERGED, True), ("refused (NotSupported)", False)):
-        fresh = {"CTC": Measured(outcome, "", {"rms_error.y": 1e9})}
+        fresh = {"CTC": Measurement(outcome, "", {"rms_error.y": 1e9})}
         assert judge(whole, settings_of(task), fresh).holds == holds
 
 

@@ -17,10 +17,10 @@ import pytest
 from blessed import write_problems
 
 import fpirhc as fp
-from fpirhc.cli import main
+from fpirhc.baselines import measuring
+from fpirhc.baselines.settings import fingerprint
+from fpirhc.cli.main import main
 from fpirhc.errors import NotSupported
-from fpirhc.regression import measuring
-from fpirhc.regression.settings import fingerprint
 
 CHANGED, NO_BASELINE, BAD_INPUT = 5, 6, 2
 CHECK = ("check", "line.py", "--no-compile")
@@ -178,7 +178,7 @@ def refused(folder, patch):
 
 def swapped_results(folder, patch):
     """Results that belong to other controllers."""
-    from fpirhc.regression import check
+    from fpirhc.baselines import check
 
     ordinary = check.measure_all
     patch.setattr(check, "measure_all", lambda *given, **more: ordinary(*given, **more)[::-1])
@@ -336,7 +336,7 @@ def compiler_flags(folder, patch):
 
 def chunk(folder, patch):
     """Another number of cycles per call."""
-    from fpirhc import simulation
+    from fpirhc.simulation import simulate as simulation
 
     patch.setattr(simulation, "CHUNK", 77)
 
@@ -345,7 +345,7 @@ def other_seed(seed):
     """Another draw of the noise."""
 
     def change(folder, patch):
-        from fpirhc.regression import check
+        from fpirhc.baselines import check
 
         ordinary = check.nominal
         patch.setattr(check, "nominal", lambda _, compiled: ordinary(seed, compiled))

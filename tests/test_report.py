@@ -14,10 +14,10 @@ from plants import linear
 
 import fpirhc as fp
 from fpirhc.errors import OutputError
+from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import render, write_report
 from fpirhc.report.series import INTERVALS, chart_data
-from fpirhc.studies.compare import compare
-from fpirhc.studies.problem_file import Task
+from fpirhc.studies.comparison.compare import compare
 
 HOSTILE = "<script>alert('x')</script> \"& </script>"
 

@@ -12,13 +12,13 @@ import pytest
 from random_plants import dies_out, random_case
 
 import fpirhc as fp
-from fpirhc.cli import main
-from fpirhc.studies.problem_file import shipped_problems
-from fpirhc.studies.review.along import along, parameter_box
-from fpirhc.studies.review.loops import loops_along
-from fpirhc.studies.review.margins import margins
-from fpirhc.studies.review.plan_feedback import plan_gains
-from fpirhc.studies.review.review import predict
+from fpirhc.cli.main import main
+from fpirhc.problem_files.problem_file import shipped_problems
+from fpirhc.review.grid import parameter_box, review_grid
+from fpirhc.review.loops import loops_along
+from fpirhc.review.margins import margins
+from fpirhc.review.plan_feedback import plan_gains
+from fpirhc.review.review import predict
 
 PERIOD = 1e-3  # s
 
@@ -90,8 +90,8 @@ def test_loop_of_a_right_model_has_the_poles_of_its_tracking_law():
     A threefold pole is soft, its mean is not.
     """
     problem = mass()
-    controller = fp.Informed(fp.ComputedTorque(fp.Exponential(rate=6.0)))
-    loops = loops_along(along(problem, 0.0, 0), controller)
+    controller = fp.ExactModel(fp.ComputedTorque(fp.Exponential(rate=6.0)))
+    loops = loops_along(review_grid(problem, 0.0, 0), controller)
     slow = loops.loops[0].poles[np.abs(loops.loops[0].poles) > 0.5]
     assert slow.size == 3
     assert np.log(slow).mean() / PERIOD == pytest.approx(-6.0, rel=0.01)
@@ -99,7 +99,7 @@ def test_loop_of_a_right_model_has_the_poles_of_its_tracking_law():
 
 def test_deformation_adds_its_own_pole():
     """J = 1.5 and a = 0.198 (gain -0.5): the fast mode of the loop is 1 - a J, as the contraction says."""
-    loops = loops_along(along(mass(), 0.0, 0), torque(rate=1.0))
+    loops = loops_along(review_grid(mass(), 0.0, 0), torque(rate=1.0))
     assert np.abs(loops.loops[0].poles - (1 - 0.5 * 0.3967373 * 1.5)).min() < 5e-3
 
 
@@ -110,7 +110,7 @@ def test_dead_time_limit_is_where_the_loop_leaves_the_unit_circle(cycles):
     limit = 2 * math.sin(math.pi / (2 * (2 * cycles + 1))) / 1.5
     for share, stable in ((0.95, True), (1.05, False)):
         controller = fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Affine(gain=-2 * share * limit))
-        loops = loops_along(along(problem, 0.0, 0), controller)
+        loops = loops_along(review_grid(problem, 0.0, 0), controller)
         assert (loops.radii.max() < 1) == stable
         verdict = about(answers(problem, controller), "gain admissible").verdict
         assert (verdict == "yes") == stable
@@ -118,7 +118,7 @@ def test_dead_time_limit_is_where_the_loop_leaves_the_unit_circle(cycles):
 
 def test_margins_are_where_the_loop_loses_its_stability():
     """More gain than the gain margin, or more delay than the delay margin, puts a pole outside the unit circle, less does not."""
-    [loop, *_] = loops_along(along(mass(), 0.0, 0), torque()).loops
+    [loop, *_] = loops_along(review_grid(mass(), 0.0, 0), torque()).loops
     gain, phase, delay = margins(loop, 0)
     f, g, c = loop.dynamics, loop.entry[:, [0]], loop.arriving[[0]]
 
@@ -226,9 +226,9 @@ def test_box_spans_model_and_plant_and_a_margin():
     """From the approximate to the exact value, and P percent around the latter."""
     box = parameter_box(mass(), 20.0)
     assert box == {"m": pytest.approx((0.8, 1.5)), "k": pytest.approx((6.0, 12.0))}
-    al = along(mass(), 20.0, 0)
-    assert al.draws[0] == pytest.approx([1.0, 10.0])
-    assert al.draws.min(axis=0) == pytest.approx([0.8, 6.0])
+    grid = review_grid(mass(), 20.0, 0)
+    assert grid.draws[0] == pytest.approx([1.0, 10.0])
+    assert grid.draws.min(axis=0) == pytest.approx([0.8, 6.0])
     wide = answers(mass(), torque(gain=-2.2), mismatch=40.0)
     assert about(wide, "one sign").numbers["largest_over_box"] == pytest.approx(1.5 / 0.6)
     assert (

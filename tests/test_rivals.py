@@ -13,22 +13,22 @@ from plants import chain, linear, pendulum
 import fpirhc as fp
 from fpirhc.controllers.base import compose_controller
 from fpirhc.errors import InvalidProblem
+from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import render
-from fpirhc.studies.compare import compare
-from fpirhc.studies.problem_file import Task
+from fpirhc.studies.comparison.compare import compare
 from fpirhc.symbolic.native import find_compiler
 
 RATE = 6.0
 TRACK = fp.Exponential(rate=RATE)
 SIGMOID = fp.Sigmoid(gain=-0.5, scale=10.0)
 RIVALS = (
-    fp.Pid({"angle": 80.0}, {"angle": 160.0}, {"angle": 12.0}),
+    fp.PID({"angle": 80.0}, {"angle": 160.0}, {"angle": 12.0}),
     fp.ResolvedAccelerationRate(RATE),
     fp.AccelerationFeedback(TRACK, gain=4.0, time_constant=0.02),
     fp.SlidingMode(rate=RATE, gain=50.0, width=1.0),
-    fp.ForceMrac(TRACK, SIGMOID, {"m": 2.0}),
-    fp.BacksteppingMrac(RATE, (RATE, RATE), SIGMOID),
-    fp.LyapunovMrac(RATE, adaptation=1.0),
+    fp.ForceMRAC(TRACK, SIGMOID, {"m": 2.0}),
+    fp.BacksteppingMRAC(RATE, (RATE, RATE), SIGMOID),
+    fp.LyapunovMRAC(RATE, adaptation=1.0),
 )
 by_name = pytest.mark.parametrize("rival", RIVALS, ids=lambda r: type(r).__name__)
 
@@ -68,7 +68,7 @@ def test_pid_on_a_double_integrator_has_the_computed_poles():
     """Poles fitted to the run's own samples are the roots of s^3 + k_d s^2 + k_p s + k_i, up to the sampling."""
     wanted = np.array([-2.0, -4.0 + 3.0j, -4.0 - 3.0j])
     _, derivative, proportional, integral = np.poly(wanted).real
-    controller = fp.Pid({"y": proportional}, {"y": integral}, {"y": derivative}, bumpless=False)
+    controller = fp.PID({"y": proportional}, {"y": integral}, {"y": derivative}, bumpless=False)
     run = simulate(resting(chain(2), period=1e-3), controller)
     states = np.column_stack([run["integral"][:-1], run["state"][1:]])  # the integral is logged after its update
     matrix = np.linalg.lstsq(states[:-1], states[1:], rcond=None)[0].T
@@ -78,7 +78,7 @@ def test_pid_on_a_double_integrator_has_the_computed_poles():
 
 def test_pid_starts_without_a_jump_and_its_integral_waits_for_the_actuator():
     """The first command is zero; while the command is clipped the integral is constant."""
-    controller = fp.Pid({"y": 40.0}, {"y": 60.0}, {"y": 12.0})
+    controller = fp.PID({"y": 40.0}, {"y": 60.0}, {"y": 12.0})
     assert simulate(resting(chain(2)), controller)["command"][0, 0] == pytest.approx(0.0, abs=1e-12)
     weak = resting(chain(2), limits=fp.Limits(inputs={"u": (-0.8, 0.8)}), duration=6.0)
     run = simulate(weak, replace(controller, bumpless=False))
@@ -91,7 +91,7 @@ def test_pid_starts_without_a_jump_and_its_integral_waits_for_the_actuator():
 @pytest.mark.parametrize(("order", "derivative"), [(1, {}), (3, {"y": (12.0, 6.0)})])
 def test_pid_serves_other_relative_orders(order, derivative):
     """The chain of errors goes as far as the state."""
-    run = simulate(resting(chain(order), duration=12.0), fp.Pid({"y": 8.0}, {"y": 2.0}, derivative, bumpless=False))
+    run = simulate(resting(chain(order), duration=12.0), fp.PID({"y": 8.0}, {"y": 2.0}, derivative, bumpless=False))
     assert abs(run["error.y"][-1]) < 0.05
 
 
@@ -191,7 +191,7 @@ def test_force_mrac_believes_in_the_reference_model():
     problem = fp.Problem(plant, moving, {"q": 0.0}, 1e-3, 10.0, measure_from=3.0)
     found = []
     for deformation in (fp.Identity(), SIGMOID):
-        run = simulate(problem, fp.ForceMrac(fp.Exponential(3.7), deformation))
+        run = simulate(problem, fp.ForceMRAC(fp.Exponential(3.7), deformation))
         late = slice(3000, run.cycles)
         desired, before = run["force_desired"][late], run["force_desired"][2999:-1]
         errors = (run["error"][late], run["force_recalculated"][late] - before, run["command"][late] - desired)
@@ -205,9 +205,9 @@ def test_force_mrac_believes_in_the_reference_model():
 def test_force_mrac_is_computed_torque_with_a_deformed_command():
     """Without a deformation they are one; with it the automatic scale, in units of the input, serves as well."""
     problem = swing()
-    plain = [simulate(problem, c) for c in (fp.ForceMrac(TRACK, fp.Identity()), fp.ComputedTorque(TRACK))]
+    plain = [simulate(problem, c) for c in (fp.ForceMRAC(TRACK, fp.Identity()), fp.ComputedTorque(TRACK))]
     np.testing.assert_allclose(plain[0]["command"], plain[1]["command"], atol=1e-9)
-    scaled = [simulate(problem, fp.ForceMrac(TRACK, s)) for s in (SIGMOID, fp.Sigmoid(gain=-0.5))]
+    scaled = [simulate(problem, fp.ForceMRAC(TRACK, s)) for s in (SIGMOID, fp.Sigmoid(gain=-0.5))]
     late = [rms(r["error"][2000:]) for r in (*scaled, plain[0])]
     assert late[1] == pytest.approx(late[0], rel=0.02)
     assert 20 * late[0] < late[2]
@@ -218,7 +218,7 @@ def test_nested_errors_decay_as_prescribed(rates):
     """After a push V = sum z^2 / 2 falls, at the rate -sum k z^2, for relative orders one to three."""
     push = {"y": fp.Pulse(at=0.1, duration=0.2, size=5.0)}
     problem = resting(chain(len(rates)), disturbances=push, period=1e-3, duration=1.5)
-    nested = simulate(problem, fp.BacksteppingMrac(2.0, rates, fp.Identity()))["nested"][310:]
+    nested = simulate(problem, fp.BacksteppingMRAC(2.0, rates, fp.Identity()))["nested"][310:]
     function = 0.5 * np.sum(nested**2, axis=1)
     assert function[0] > 1e-3
     assert np.all(np.diff(function) < 0)
@@ -230,7 +230,7 @@ def test_backstepping_follows_its_model_with_the_iteration():
     """The deformation realises the highest derivative: the deviation from the reference model falls at least 20 times."""
     deviations = []
     for deformation in (fp.Identity(), SIGMOID):
-        run = simulate(swing(), fp.BacksteppingMrac(3.0, (RATE, RATE), deformation))
+        run = simulate(swing(), fp.BacksteppingMRAC(3.0, (RATE, RATE), deformation))
         deviations.append(rms(run["model.angle"] - run["state.angle"]))
     assert 20 * deviations[1] < deviations[0]
 
@@ -246,7 +246,7 @@ def adapted(period, gain, duration=20.0):
     )
     moving = fp.Trajectory(lambda t: {"y": ca.sin(t) + 0.5 * ca.sin(2.7 * t)})
     problem = fp.Problem(plant, moving, {"y": 0.5}, period, duration)
-    law = fp.LyapunovMrac(4.0, adaptation=10.0)
+    law = fp.LyapunovMRAC(4.0, adaptation=10.0)
     run = simulate(problem, law)
     before = np.vstack([run["gains"][:1], run["gains"][:-1]])[1:]  # of the state at the cycle's start
     matched = np.array([3.0, 0.5, 1.0, -1.0]) / gain
@@ -272,7 +272,7 @@ def test_lyapunov_function_falls_and_the_error_goes_to_zero(gain):
 @pytest.mark.parametrize(("share", "grows"), [(0.8, False), (1.25, True)])
 def test_adaptation_has_the_computed_limit(share, grows):
     """At rest only the bias is adapted, |phi| = 1: stable below gamma |B| period / 2 = rate."""
-    law = fp.LyapunovMrac(RATE, adaptation=share * 2 * RATE / 1e-2)
+    law = fp.LyapunovMRAC(RATE, adaptation=share * 2 * RATE / 1e-2)
     load = {"y": fp.Pulse(at=0.1, duration=0.1, size=1e-6)}
     moved = np.abs(simulate(resting(chain(2), 0.0, disturbances=load), law)["state.y'"])
     assert (moved[200:].max() > moved[:60].max()) == grows
@@ -283,7 +283,7 @@ def test_leakage_binds_the_gains_to_the_model():
     problem = swing(disturbances={"torque": fp.Sine(amplitude=2.0, frequency=1.5)}, duration=6.0)
     moved = []
     for leakage in (0.0, 5.0):
-        gains = simulate(problem, fp.LyapunovMrac(RATE, adaptation=20.0, leakage=leakage))["gains"]
+        gains = simulate(problem, fp.LyapunovMRAC(RATE, adaptation=20.0, leakage=leakage))["gains"]
         moved.append(np.abs(gains - gains[0]).max())
     assert moved[1] < 0.7 * moved[0]
 
@@ -298,7 +298,7 @@ def test_lyapunov_mrac_on_a_coupled_plant():
     )
     moving = fp.Trajectory(lambda t: {"a": ca.sin(t), "b": ca.cos(1.7 * t)})
     problem = fp.Problem(plant, moving, {"a": 0.0, "b": 1.0}, 4e-3, 40.0)
-    run = simulate(problem, fp.LyapunovMrac(4.0, adaptation=10.0))
+    run = simulate(problem, fp.LyapunovMRAC(4.0, adaptation=10.0))
     deviation = np.abs(run["model"] - run["state"])[:, :2].max(axis=1)
     assert deviation[-500:].max() < 0.1 * deviation.max()
 
@@ -309,9 +309,9 @@ VIEWED = (
     fp.ComputedTorque(TRACK),
     fp.ComputedTorque(fp.Exponential(RATE, integral=False)),
     fp.ComputedTorque(TRACK, SIGMOID),
-    fp.ForceMrac(TRACK, SIGMOID),
+    fp.ForceMRAC(TRACK, SIGMOID),
     fp.AccelerationFeedback(TRACK, 4.0, 0.02),
-    fp.Informed(fp.ComputedTorque(TRACK)),
+    fp.ExactModel(fp.ComputedTorque(TRACK)),
 )
 
 
@@ -343,15 +343,15 @@ def cart_pole():
 
 
 MISFITS = {
-    "not fully actuated": (cart_pole, fp.LyapunovMrac(RATE, 1.0), "'angle' has no input of its own"),
-    "coordinate not controlled": (cart_pole, fp.Pid({"angle": 1.0}), "controlled coordinate 'angle' is unknown"),
-    "unknown coordinate": (swing, fp.Pid({"angle": 1.0}, {"angel": 1.0}), "Did you mean 'angle'"),
-    "no gain": (swing, fp.Pid({}), "'angle' has no gain"),
-    "wrong sign": (swing, fp.Pid({"angle": -1.0}), "does not bring it back"),
-    "too many gains": (swing, fp.Pid({"angle": 1.0}, {}, {"angle": (1.0, 1.0)}), "at most 1 gains of e'"),
-    "wrong order": (swing, fp.BacksteppingMrac(RATE, (1.0, 1.0, 1.0), SIGMOID), "relative order 2, but rates has 3"),
-    "unknown parameter": (swing, fp.ForceMrac(TRACK, SIGMOID, {"mass": 1.0}), "parameter 'mass' is unknown"),
-    "no number": (swing, fp.ForceMrac(TRACK, SIGMOID, {"m": float("nan")}), "'m' must be a finite number"),
+    "not fully actuated": (cart_pole, fp.LyapunovMRAC(RATE, 1.0), "'angle' has no input of its own"),
+    "coordinate not controlled": (cart_pole, fp.PID({"angle": 1.0}), "controlled coordinate 'angle' is unknown"),
+    "unknown coordinate": (swing, fp.PID({"angle": 1.0}, {"angel": 1.0}), "Did you mean 'angle'"),
+    "no gain": (swing, fp.PID({}), "'angle' has no gain"),
+    "wrong sign": (swing, fp.PID({"angle": -1.0}), "does not bring it back"),
+    "too many gains": (swing, fp.PID({"angle": 1.0}, {}, {"angle": (1.0, 1.0)}), "at most 1 gains of e'"),
+    "wrong order": (swing, fp.BacksteppingMRAC(RATE, (1.0, 1.0, 1.0), SIGMOID), "relative order 2, but rates has 3"),
+    "unknown parameter": (swing, fp.ForceMRAC(TRACK, SIGMOID, {"mass": 1.0}), "parameter 'mass' is unknown"),
+    "no number": (swing, fp.ForceMRAC(TRACK, SIGMOID, {"m": float("nan")}), "'m' must be a finite number"),
     "chattering": (swing, fp.SlidingMode(RATE, 500.0, 0.2), "chatters with any model"),
 }
 
@@ -367,10 +367,10 @@ def test_what_does_not_fit_is_refused_before_a_run(case):
 def test_what_does_not_fit_is_skipped_in_a_comparison():
     """The others run, and the report's table has a row with the reason."""
     problem = swing(duration=0.2, measure_from=0.0)
-    controllers = {"CTC": VIEWED[0], "odd": fp.BacksteppingMrac(RATE, (1.0,), SIGMOID)}
+    controllers = {"CTC": VIEWED[0], "odd": fp.BacksteppingMRAC(RATE, (1.0,), SIGMOID)}
     found = compare(Task("case", Path("case.py"), "title", "", problem, controllers), seed=0, compiled=False)
     assert [e.name for e in found.entries] == ["CTC"]
-    assert "not run: BacksteppingMrac" in render(found)
+    assert "not run: BacksteppingMRAC" in render(found)
 
 
 @pytest.mark.parametrize(
@@ -380,9 +380,9 @@ def test_what_does_not_fit_is_skipped_in_a_comparison():
         lambda: fp.ResolvedAccelerationRate(0.0),
         lambda: fp.AccelerationFeedback(TRACK, float("nan")),
         lambda: fp.AccelerationFeedback(TRACK, 1.0, -1.0),
-        lambda: fp.BacksteppingMrac(RATE, (1.0, -1.0), SIGMOID),
-        lambda: fp.LyapunovMrac(RATE, 0.0),
-        lambda: fp.LyapunovMrac(RATE, 1.0, leakage=-1.0),
+        lambda: fp.BacksteppingMRAC(RATE, (1.0, -1.0), SIGMOID),
+        lambda: fp.LyapunovMRAC(RATE, 0.0),
+        lambda: fp.LyapunovMRAC(RATE, 1.0, leakage=-1.0),
     ],
 )
 def test_settings_are_checked(build):
@@ -429,7 +429,7 @@ def test_measurement_that_is_not_finite_is_survived(rival):
 def test_rival_tracks_with_the_exact_model(rival):
     """Given the exact parameters every law keeps the pendulum on its sine."""
     problem = swing()
-    assert fp.measure(problem, simulate(problem, fp.Informed(rival))).rms_error["angle"] < 0.03
+    assert fp.measure(problem, simulate(problem, fp.ExactModel(rival))).rms_error["angle"] < 0.03
 
 
 def test_problem_of_the_pendulum():

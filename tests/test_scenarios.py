@@ -18,15 +18,15 @@ import pytest
 from scipy import stats
 
 import fpirhc as fp
-from fpirhc.cli import main
+from fpirhc.cli.main import main
 from fpirhc.errors import InvalidProblem, InvalidValue, OutputError, WorkerDied
-from fpirhc.studies.bench import Bench, Conditions
-from fpirhc.studies.bootstrap import median_interval, middle
-from fpirhc.studies.ledger import Ledger
-from fpirhc.studies.paired import summarise, verdict
-from fpirhc.studies.problem_file import Task
-from fpirhc.studies.processes import DEATHS, Workers
-from fpirhc.studies.scenarios import COMPARING, TUNING, check_percent, draw, mismatch_of, with_exact
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.studies.scenarios.bench import Bench, Conditions
+from fpirhc.studies.scenarios.bootstrap import median_interval, middle
+from fpirhc.studies.scenarios.draws import COMPARING, TUNING, check_percent, draw, mismatch_of, with_exact
+from fpirhc.studies.scenarios.ledger import Ledger
+from fpirhc.studies.scenarios.paired import summarise, verdict
+from fpirhc.studies.scenarios.processes import DEATHS, Workers
 
 LINE = '''"""A mass on a line with a wrong gain, pushed by noise."""
 import casadi as ca
@@ -54,7 +54,7 @@ tracking = fp.Exponential(rate=6.0)
 controllers = {
     "CTC": fp.ComputedTorque(tracking),
     "CTC+FPI": fp.ComputedTorque(tracking, fp.Sigmoid(gain=-0.5)),
-    "CTC exact": fp.Informed(fp.ComputedTorque(tracking)),
+    "CTC exact": fp.ExactModel(fp.ComputedTorque(tracking)),
 }
 '''
 SETTINGS = {"percent": 20.0, "seed": 5, "compiled": False}
@@ -220,7 +220,7 @@ def test_failures_are_counted_and_are_worse_than_any_error():
 
 def test_runs_that_end_early_or_stray_are_told_apart(task):
     """A model with nine tenths of the gain too little makes FPI stray; a response that leaves its range ends the run."""
-    wild = fp.ComputedTorque(fp.Exponential(6.0), fp.Rfpt(offset=1e4, sign=-1.0, gain=1.0))
+    wild = fp.ComputedTorque(fp.Exponential(6.0), fp.RFPT(offset=1e4, sign=-1.0, gain=1.0))
     strays = replace(task, controllers={"wild": wild})
     record = Bench(strays, Conditions(0, COMPARING, 0.0, compiled=False)).record(0, "wild")
     assert record["outcome"] in ("diverged", "ended early")

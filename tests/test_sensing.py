@@ -13,7 +13,7 @@ from plants import chain, linear
 import fpirhc as fp
 from fpirhc.controllers import base
 from fpirhc.errors import InvalidProblem, InvalidValue, NotContractive
-from fpirhc.loop import close_loop
+from fpirhc.simulation.loop import close_loop
 from fpirhc.symbolic.layout import Signal
 from fpirhc.symbolic.native import find_compiler
 
@@ -257,7 +257,7 @@ def test_deformation_waits_for_the_window(estimator):
     """Until the window holds samples of the run alone the request is the desired response; estimates are finite from the first."""
     problem = swinging(sensing=fp.Sensing(estimator=estimator), duration=0.05)
     controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Affine(gain=-0.05))
-    found, blind = run(problem, controller), problem.blind_cycles
+    found, blind = run(problem, controller), problem.warm_up_cycles
     assert blind == estimator.fills(2)
     assert np.array_equal(found["deformed"][:blind], found["desired"][:blind])
     assert (found["deformed"][blind:] != found["desired"][blind:]).all()
@@ -274,7 +274,7 @@ def modes(problem, controller):
     memory, step = ca.MX.sym("memory", loop.memory.size), loop.function
     jacobian = ca.Function("jacobian", [memory], [ca.jacobian(step(memory)[0], memory)])
     at = loop.memory.start()
-    for _ in range(problem.blind_cycles + 60):
+    for _ in range(problem.warm_up_cycles + 60):
         at = step(at)[0]
     return np.linalg.eigvals(jacobian(at).full())
 
@@ -428,6 +428,6 @@ def test_state_variable_filter_sees_constant_motions_as_they_are():
         duration=0.5,
         sensing=fp.Sensing({}, fp.StateVariableFilter(bandwidth=100.0)),
     )
-    found = run(problem, fp.Informed(fp.ComputedTorque(fp.Exponential(rate=5.0))))
+    found = run(problem, fp.ExactModel(fp.ComputedTorque(fp.Exponential(rate=5.0))))
     assert found["realised"][450, 0] == pytest.approx(found["plant_realised"][450, 0], rel=1e-2)
     assert found["state"][450, 1] == pytest.approx(found["plant_state"][430, 1], rel=1e-2)

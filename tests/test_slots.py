@@ -12,9 +12,9 @@ import pytest
 from plants import pendulum
 
 import fpirhc as fp
-from fpirhc.cli import main
+from fpirhc.cli.main import main
 from fpirhc.errors import FpirhcError, InvalidValue
-from fpirhc.relative_order import output_chain
+from fpirhc.plant.relative_order import output_chain
 from fpirhc.status import Status
 
 CRANE = fp.load_problem("crane_slots")
@@ -232,9 +232,9 @@ def test_look_ahead_chooses_what_the_runs_show():
         values = []
         for slot in slots.slots:
             alone = replace(slots, slots=[slot], schedule=fp.Periodic({slot.coordinate: dwell}))
-            ended = run(problem, fp.Informed(alone))["state"][round(dwell / problem.period)]
+            ended = run(problem, fp.ExactModel(alone))["state"][round(dwell / problem.period)]
             values.append(float(sizes @ ended**2))
-        first = int(run(problem, fp.Informed(replace(slots, schedule=fp.ByLookAhead(weights, dwell))))["slot"][0, 0])
+        first = int(run(problem, fp.ExactModel(replace(slots, schedule=fp.ByLookAhead(weights, dwell))))["slot"][0, 0])
         assert first == np.argmin(values)
         firsts.append(first)
     assert set(firsts) == {0, 1}
@@ -244,10 +244,10 @@ def test_a_slot_without_gain_is_not_chosen():
     """The angle has the larger error; but tilted by 0.2 rad the force's effect on it is below 99 % of that at the start."""
     schedule = fp.ByError({"cart": 1e-6, "angle": 1.0}, dwell=0.01)
     slots = replace(CRANE.controllers["slots exact model"].controller, schedule=schedule, smallest_gain=0.99)
-    found = run(crane({"cart": 0.1}, duration=2.0), fp.Informed(slots))
+    found = run(crane({"cart": 0.1}, duration=2.0), fp.ExactModel(slots))
     gain = angle_gain(found["state.angle"])
     assert gain.min() > 0.99 * gain[0]
-    found = run(crane({"cart": 0.1, "angle'": 0.9}, duration=2.0), fp.Informed(slots))
+    found = run(crane({"cart": 0.1, "angle'": 0.9}, duration=2.0), fp.ExactModel(slots))
     gain = angle_gain(found["state.angle"])
     low = gain < 0.99 * gain[0]
     # In the dwell of two cycles an active slot may still lose its gain.
@@ -388,7 +388,7 @@ def test_blanked_cycles_keep_the_distance():
 def test_too_little_gain_holds_the_command():
     """Held in exactly the cycles in which the active slot's gain is below its share, and the status says so."""
     slots = replace(CRANE.controllers["slots exact model"].controller, smallest_gain=0.995)
-    found = run(crane({"cart": -1.0}, duration=10.6), fp.Informed(slots))
+    found = run(crane({"cart": -1.0}, duration=10.6), fp.ExactModel(slots))
     gain = angle_gain(found["state.angle"])
     cart_gain = gain / np.cos(found["state.angle"])
     share = np.where(found["slot"][:, 0] == 1, gain / gain[0], cart_gain / cart_gain[0])

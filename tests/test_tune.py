@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 import fpirhc as fp
-from fpirhc.cli import main
+from fpirhc.cli.main import main
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, NotSupported, OutputError, ProblemFileError
-from fpirhc.studies.settings import current_setting, is_whole
-from fpirhc.studies.tune import PENALTY
-from fpirhc.studies.tuned_file import read_tuned, with_tuned
+from fpirhc.problem_files.settings import current_setting, is_whole
+from fpirhc.studies.tuning.tune import PENALTY
+from fpirhc.studies.tuning.tuned_file import read_tuned, with_tuned
 
 LINE = '''"""A mass on a line with a wrong gain."""
 import casadi as ca
@@ -38,7 +38,7 @@ tracking = fp.Exponential(rate=6.0)
 controllers = {
     "CTC": fp.ComputedTorque(tracking),
     "CTC+FPI": fp.ComputedTorque(tracking, fp.Sigmoid(gain=-0.1, scale=20.0)),
-    "CTC exact": fp.Informed(fp.ComputedTorque(tracking)),
+    "CTC exact": fp.ExactModel(fp.ComputedTorque(tracking)),
 }
 tuning = {
     "CTC": {"tracking.rate": fp.Span(2.0, 12.0)},
@@ -60,22 +60,22 @@ def task(tmp_path, monkeypatch):
 
 def test_settings_are_changed_by_path_and_nothing_else_is():
     """Fields, keys of mappings and wrapped controllers; the controller that was given stays as it was."""
-    cost = fp.Quadratic(states={"q": 1.0, "q'": 2.0}, correction={"u": 3.0})
+    cost = fp.Quadratic(states={"q": 1.0, "q'": 2.0}, deviation={"u": 3.0})
     inner = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-2), fp.Sigmoid(gain=-0.5), cost=cost)
     values = {
         "controller.deformation.gain": -0.7,
         "controller.cost.states.q'": 5.0,
         "controller.optimiser.iterations": 3,
     }
-    changed = fp.with_settings(fp.Informed(inner), values)
+    changed = fp.with_settings(fp.ExactModel(inner), values)
     assert changed.controller.deformation == fp.Sigmoid(gain=-0.7)
     assert dict(changed.controller.cost.states) == {"q": 1.0, "q'": 5.0}
     assert changed.controller.optimiser == fp.FixedPoint(iterations=3, tolerance=1e-2)
     assert inner.deformation == fp.Sigmoid(gain=-0.5)
     for path, value in values.items():
         assert current_setting(changed, path) == value
-    assert is_whole(fp.Informed(inner), "controller.optimiser.iterations")
-    assert not is_whole(fp.Informed(inner), "controller.deformation.gain")
+    assert is_whole(fp.ExactModel(inner), "controller.optimiser.iterations")
+    assert not is_whole(fp.ExactModel(inner), "controller.deformation.gain")
 
 
 @pytest.mark.parametrize(

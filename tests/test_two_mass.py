@@ -13,7 +13,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.errors import NotContractive
-from fpirhc.studies.compare import compare
+from fpirhc.studies.comparison.compare import compare
 
 TASK = fp.load_problem("two_mass")
 PROBLEM = TASK.problem

@@ -9,8 +9,8 @@ import pytest
 from plants import linear
 
 import fpirhc as fp
-from fpirhc.studies.compare import compare
-from fpirhc.studies.problem_file import Task
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.studies.comparison.compare import compare
 
 TRACK = fp.Exponential(rate=6.0)
 

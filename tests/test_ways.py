@@ -17,8 +17,8 @@ from fpirhc.symbolic.native import find_compiler
 TRACK = fp.Exponential(rate=6.0)
 MAPS = (
     fp.Sigmoid(gain=-0.5, scale=10.0),
-    fp.Rfpt(offset=1e4, sign=-1.0, gain=2e-5),
-    fp.RfptVector(offset=1e4, sign=-1.0, gain=2e-5),
+    fp.RFPT(offset=1e4, sign=-1.0, gain=2e-5),
+    fp.RFPTVector(offset=1e4, sign=-1.0, gain=2e-5),
     fp.Rotation(fraction=0.2, radius=1e3),
     fp.Affine(gain=-0.4),
 )
@@ -89,7 +89,7 @@ def test_plant_that_is_not_affine_in_its_input():
 
 def test_parameters_are_not_compiled_in():
     """Other exact values give another run with the same Function."""
-    from fpirhc.loop import close_loop
+    from fpirhc.simulation.loop import close_loop
 
     problem = swing()
     heavier = replace(

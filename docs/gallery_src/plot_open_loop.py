@@ -26,7 +26,7 @@ data = stage_data(problem.plant, problem.reference, problem.horizon, problem.cos
 plans = {}
 for name, optimiser in {
     "FixedPoint": fp.FixedPoint(iterations=1, tolerance=1e-6),
-    "IPOPT": fp.InteriorPoint(),
+    "IPOPT": fp.Ipopt(),
 }.items():
     plans[name] = fp.solve(ocp, optimiser, problem.start_state, data)
     print(

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
-from fpirhc.plant import Plant
+from fpirhc.plant.plant import Plant
 
 Array = npt.NDArray[Any]
 

@@ -23,11 +23,11 @@ import numpy as np
 from fpirhc.controllers.gain_check import check_gain_sign, check_response_delay
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotSupported
-from fpirhc.plant import Plant
-from fpirhc.problem import Problem
+from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+from fpirhc.task.problem import Problem
 
 FINITE = 1e300  # |v| <= FINITE is false for NaN and infinity, and CasADi does not simplify it away
 
@@ -158,26 +158,26 @@ def closing_blocks(
     """Return the blocks deform, invert, limit and judge with what they remember; `judged` are solver statuses."""
     plant = problem.plant
     closing, delays = commanding_blocks(problem, judged)
-    blocks = [deform_block(plant, deformation, problem.blind_cycles), invert_block(plant), *closing]
-    return blocks, [*delays, Delay(plant.response_signal("_request_before"), "deformed")]
+    blocks = [deform_block(plant, deformation, problem.warm_up_cycles), invert_block(plant), *closing]
+    return blocks, [*delays, Delay(plant.response_signal("_deformed_last"), "deformed")]
 
 
 def commanding_blocks(problem: Problem, judged: Sequence[Signal] = ()) -> tuple[list[Block], list[Delay]]:
-    """Return the blocks limit, judge and running with what they remember, for a controller that gives 'requested' itself.
+    """Return the blocks limit, judge and running with what they remember, for a controller that gives 'command_unclipped' itself.
 
-    It also gives 'desired', and '_deformed_wanted': the response that its model expects of the requested command.
+    It also gives 'desired', and '_deformed_unclipped': the response that its model expects of the requested command.
     """
-    delays = [Delay(scalar("started"), "_running"), Delay(like(problem.plant.input, "_command_before"), "command")]
-    return [_limit_block(problem), _judge_block(judged), _running_block(problem.blind_cycles)], delays
+    delays = [Delay(scalar("warm_up"), "_warm_up_now"), Delay(like(problem.plant.input, "_command_before"), "command")]
+    return [_limit_block(problem), _judge_block(judged), _warm_up_block(problem.warm_up_cycles)], delays
 
 
-def _running_block(blind: int) -> Block:
+def _warm_up_block(blind: int) -> Block:
     """Block that counts the cycles of a run up to `blind`, after which the response may be used."""
 
     def step(s: Any) -> dict[str, Expression]:
-        return {"_running": ca.fmin(s.started + 1, blind)}
+        return {"_warm_up_now": ca.fmin(s.warm_up + 1, blind)}
 
-    return Block("running", Layout((scalar("started"),)), Layout((scalar("_running"),)), step)
+    return Block("running", Layout((scalar("warm_up"),)), Layout((scalar("_warm_up_now"),)), step)
 
 
 def deform_block(plant: Plant, deformation: Deformation, blind: int = 1) -> Block:
@@ -187,33 +187,33 @@ def deform_block(plant: Plant, deformation: Deformation, blind: int = 1) -> Bloc
     """
     memory = deformation.memory(plant.controlled_names)
     reads = (
-        plant.response_signal("_request_before"),
+        plant.response_signal("_deformed_last"),
         plant.response_signal("realised"),
         plant.response_signal("desired"),
-        scalar("started"),
+        scalar("warm_up"),
     )
 
     def step(s: Any) -> dict[str, Expression]:
         remembered = {m: getattr(s, m) for m in memory.names}
-        deformed, following = deformation.step(s._request_before, s.realised, s.desired, remembered)
-        valid = s.started > blind - 0.5
+        deformed, following = deformation.step(s._deformed_last, s.realised, s.desired, remembered)
+        valid = s.warm_up > blind - 0.5
         kept = {f"{m}_next": ca.if_else(valid, following[m], remembered[m]) for m in memory.names}
         shown = {name: kept[f"{source}_next"] for name, source in deformation.shown().items()}
-        return {"_deformed_wanted": ca.if_else(valid, deformed, s.desired), **shown, **kept}
+        return {"_deformed_unclipped": ca.if_else(valid, deformed, s.desired), **shown, **kept}
 
     logged = tuple(scalar(name) for name in deformation.shown())
-    return Block("deform", Layout(reads), Layout((plant.response_signal("_deformed_wanted"), *logged)), step, memory)
+    return Block("deform", Layout(reads), Layout((plant.response_signal("_deformed_unclipped"), *logged)), step, memory)
 
 
 def invert_block(plant: Plant) -> Block:
-    """Block (state, _deformed_wanted, parameters) -> the command that the model needs for it."""
-    reads = Layout((plant.state, plant.response_signal("_deformed_wanted"), plant.parameter))
+    """Block (state, _deformed_unclipped, parameters) -> the command that the model needs for it."""
+    reads = Layout((plant.state, plant.response_signal("_deformed_unclipped"), plant.parameter))
     inverse = plant.inverse_function
 
     def step(s: Any) -> dict[str, Expression]:
-        return {"requested": inverse(s.state, s._deformed_wanted, s.parameters)}
+        return {"command_unclipped": inverse(s.state, s._deformed_unclipped, s.parameters)}
 
-    return Block("invert", reads, Layout((like(plant.input, "requested"),)), step, opaque=plant.inverse_opaque)
+    return Block("invert", reads, Layout((like(plant.input, "command_unclipped"),)), step, opaque=plant.inverse_opaque)
 
 
 def _limit_block(problem: Problem) -> Block:
@@ -221,8 +221,8 @@ def _limit_block(problem: Problem) -> Block:
     lower, upper = problem.limits.input_bounds(plant)
     meant = _meaning(plant)
     reads = (
-        like(plant.input, "requested"),
-        plant.response_signal("_deformed_wanted"),
+        like(plant.input, "command_unclipped"),
+        plant.response_signal("_deformed_unclipped"),
         plant.response_signal("desired"),
         plant.state,
         plant.parameter,
@@ -232,14 +232,14 @@ def _limit_block(problem: Problem) -> Block:
 
     def step(s: Any) -> dict[str, Expression]:
         # Finiteness is asked before the clamp: fmin and fmax turn NaN into a full-scale command.
-        finite = ca.mmin(ca.fabs(s.requested) <= FINITE)
-        safe = ca.if_else(finite, s.requested, s._command_before)
+        finite = ca.mmin(ca.fabs(s.command_unclipped) <= FINITE)
+        safe = ca.if_else(finite, s.command_unclipped, s._command_before)
         command = clip(safe, lower, upper)
-        clipped_request = meant(s.state, command, safe, s._deformed_wanted, s.parameters)
+        clipped_request = meant(s.state, command, safe, s._deformed_unclipped, s.parameters)
         return {
             "command": command,
             "deformed": ca.if_else(finite, clipped_request, s.desired),
-            "clipped": ca.mmax(command != s.requested),
+            "clipped": ca.mmax(command != s.command_unclipped),
             "_held": 1 - finite,
         }
 

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from fpirhc.controllers.automatic_scale import scaled_for_reference
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block, rename
-from fpirhc.controllers.scale import scaled_for_reference
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
-from fpirhc.problem import Problem
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
 

@@ -15,10 +15,10 @@ import numpy as np
 
 from fpirhc.contraction import Spectrum, assess_gain, delayed_limit, linear_limit, spectrum_over_run
 from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.delayed import Increment, Paired
-from fpirhc.deformation.filtered import Filtered
+from fpirhc.deformation.wrappers.delayed import Increment, Paired
+from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import InvalidValue, NotContractive
-from fpirhc.problem import Problem
+from fpirhc.task.problem import Problem
 
 
 def check_gain_sign(problem: Problem, deformation: Deformation) -> None:

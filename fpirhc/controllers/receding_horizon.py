@@ -19,20 +19,20 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from fpirhc.controllers.automatic_scale import scaled_for_plan
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
-from fpirhc.controllers.nominal import Nominal, Restart
 from fpirhc.controllers.on_failure import HoldPlan, OnFailure
-from fpirhc.controllers.scale import scaled_for_plan
+from fpirhc.controllers.replanning import FromMeasurement, Replanning
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidProblem
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
 from fpirhc.optimisers.base import Optimiser
-from fpirhc.problem import Problem, cycles_per_stage
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, every
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.task.problem import Problem, cycles_per_stage
 
 _SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")
 
@@ -44,14 +44,14 @@ class RecedingHorizon(Controller):
     Parameters:
         optimiser: finds the plan.
         deformation: the map between desired response and request; Identity() is plain RHC.
-        nominal: where each horizon starts and what is tracked in between (Restart, RestartAndTrack, OpenPlan).
+        nominal: where each horizon starts and what is tracked in between (FromMeasurement, FromMeasurementTracked, FromPlan).
         on_failure: what is applied when a solve fails (HoldPlan, Feedforward, StopRun).
         cost: another cost than the problem's own (None: the problem's).
     """
 
     optimiser: Optimiser
     deformation: Deformation = field(default_factory=Identity)
-    nominal: Nominal = field(default_factory=Restart)
+    replanning: Replanning = field(default_factory=FromMeasurement)
     on_failure: OnFailure = field(default_factory=HoldPlan)
     cost: Cost | None = None
 
@@ -82,13 +82,13 @@ class RecedingHorizon(Controller):
         assert problem.horizon is not None
         plant = problem.plant
         cycles = cycles_per_stage(problem.horizon, problem.period)
-        before, after, late, remembered = self.nominal.parts(problem)
+        before, after, late, remembered = self.replanning.parts(problem)
         plan = every(_plan_block(problem, self.optimiser, self.on_failure), cycles)
         closing, delays = closing_blocks(problem, self.deformation, [scalar("_solve_status")])
         blocks = [reference_block(problem), _due_block(cycles), *before, plan, *after, *closing, *late]
         delays = [*delays, *remembered]
         blocks.append(_correction_block(problem, self.deformation))
-        delays.append(Delay(like(plant.input, "_correction_before"), "correction"))
+        delays.append(Delay(like(plant.input, "_command_shift_last"), "command_shift"))
         return blocks, delays
 
     def _planned(self, problem: Problem) -> Problem:
@@ -126,7 +126,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         scalar("time", "s"),
         like(plant.state, "_plan_state"),
         plant.parameter,
-        like(plant.input, "_correction_before"),
+        like(plant.input, "_command_shift_last"),
         like(plant.input, "_command_before"),
     )
     writes = (like(plant.input, "planned"), Signal("solve", _SOLVE), scalar("_solve_status"))
@@ -134,7 +134,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     def step(s: Any) -> dict[str, Expression]:
         data = data_of(s.time, s.parameters)
         first = ocp.start(s._plan_state, s._command_before)
-        lower, upper = ocp.input_lower - s._correction_before, ocp.input_upper - s._correction_before
+        lower, upper = ocp.input_lower - s._command_shift_last, ocp.input_upper - s._command_shift_last
         before = memory.join({m: getattr(s, m) for m in memory.names})
         remembered = ca.if_else(s.plan_begun > 0.5, optimiser.shifted(ocp, before), before)
         inputs, diagnostics, following = solve(first, data, lower, upper, remembered)
@@ -175,7 +175,7 @@ def _correction_block(problem: Problem, deformation: Deformation) -> Block:
 
     def step(s: Any) -> dict[str, Expression]:
         if isinstance(deformation, Identity):
-            return {"correction": 0 * s.command}
-        return {"correction": s.command - inverse(s.state, s.desired, s.parameters)}
+            return {"command_shift": 0 * s.command}
+        return {"command_shift": s.command - inverse(s.state, s.desired, s.parameters)}
 
-    return Block("correction", reads, Layout((like(plant.input, "correction"),)), step, opaque=plant.inverse_opaque)
+    return Block("correction", reads, Layout((like(plant.input, "command_shift"),)), step, opaque=plant.inverse_opaque)

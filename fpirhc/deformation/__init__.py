@@ -2,21 +2,22 @@
 
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.blended import Blended
-from fpirhc.deformation.damped import Damped
-from fpirhc.deformation.delayed import Increment, Paired
-from fpirhc.deformation.filtered import Filtered
-from fpirhc.deformation.guarded import Guarded
 from fpirhc.deformation.identity import Identity
-from fpirhc.deformation.rfpt import Rfpt
-from fpirhc.deformation.rfpt_vector import RfptVector
+from fpirhc.deformation.rfpt import RFPT
+from fpirhc.deformation.rfpt_vector import RFPTVector
 from fpirhc.deformation.rotation import Rotation
-from fpirhc.deformation.self_paired import DelayWatched, SelfPaired
 from fpirhc.deformation.sigmoid import Sigmoid
-from fpirhc.deformation.tuned import Tuned
-from fpirhc.deformation.wrapper import Wrapper
+from fpirhc.deformation.wrappers.base import Wrapper
+from fpirhc.deformation.wrappers.blended import Blended
+from fpirhc.deformation.wrappers.damped import Damped
+from fpirhc.deformation.wrappers.delayed import Increment, Paired
+from fpirhc.deformation.wrappers.filtered import Filtered
+from fpirhc.deformation.wrappers.guarded import Guarded
+from fpirhc.deformation.wrappers.self_paired import DelayWatched, SelfPaired
+from fpirhc.deformation.wrappers.tuned import Tuned
 
 __all__ = [
+    "RFPT",
     "Affine",
     "Blended",
     "Damped",
@@ -27,8 +28,7 @@ __all__ = [
     "Identity",
     "Increment",
     "Paired",
-    "Rfpt",
-    "RfptVector",
+    "RFPTVector",
     "Rotation",
     "SelfPaired",
     "Sigmoid",

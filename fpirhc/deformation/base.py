@@ -22,7 +22,7 @@ from fpirhc.symbolic.layout import Expression, Layout
 class Deformation(ABC):
     """Contract: a map from (request, response, desired) to the next request.
 
-    Concrete maps are frozen dataclasses. `fpirhc.testing.check_deformation` tests that a map keeps this contract.
+    Concrete maps are frozen dataclasses. `fpirhc.conformance.check_deformation` tests that a map keeps this contract.
     """
 
     gain_name: ClassVar[str] = "gain"  # the field that the effective gain is proportional to

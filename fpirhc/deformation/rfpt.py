@@ -14,7 +14,7 @@ from fpirhc.symbolic.layout import Expression
 
 
 @dataclass(frozen=True)
-class Rfpt(Deformation):
+class RFPT(Deformation):
     """r+ = (K_c + r) [1 + B_c tanh(A_c (f - d))] - K_c, for each coordinate by itself.
 
     The gains hold for |K_c| >> |r|; at a request r they are larger by the factor 1 + r / K_c. A second, false fixed
@@ -38,10 +38,10 @@ class Rfpt(Deformation):
     gain: float
 
     def __post_init__(self) -> None:
-        require_numbers("Rfpt", {"offset": self.offset, "gain": self.gain})
+        require_numbers("RFPT", {"offset": self.offset, "gain": self.gain})
         if self.sign not in (-1, 1):
             raise InvalidValue(
-                f"Rfpt(sign={self.sign!r}): expected -1 or 1; -1 for offset > 0 and a model of right sign"
+                f"RFPT(sign={self.sign!r}): expected -1 or 1; -1 for offset > 0 and a model of right sign"
             )
 
     def step(

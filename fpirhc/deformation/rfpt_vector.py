@@ -16,7 +16,7 @@ _FLOOR = 1e-9  # A_c |h| below which the norm is rounded off, so that its deriva
 
 
 @dataclass(frozen=True)
-class RfptVector(Deformation):
+class RFPTVector(Deformation):
     """r+ = (1 + B) r + B K_c h / |h|, with B = B_c tanh(A_c |h|) and h = f - d.
 
     The gains hold for |K_c| >> |r|. One step is at most |r| + |K_c|.
@@ -39,10 +39,10 @@ class RfptVector(Deformation):
     gain: float
 
     def __post_init__(self) -> None:
-        require_numbers("RfptVector", {"offset": self.offset, "gain": self.gain})
+        require_numbers("RFPTVector", {"offset": self.offset, "gain": self.gain})
         if self.sign not in (-1, 1):
             raise InvalidValue(
-                f"RfptVector(sign={self.sign!r}): expected -1 or 1; -1 for offset > 0 and a model of right sign"
+                f"RFPTVector(sign={self.sign!r}): expected -1 or 1; -1 for offset > 0 and a model of right sign"
             )
 
     def step(

@@ -20,6 +20,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from fpirhc.conformance.laws import within
 from fpirhc.controllers.computed_torque import ComputedTorque
 from fpirhc.deformation.identity import Identity
 from fpirhc.doctor.finding import Check, Outcome, fine, judged
@@ -27,17 +28,16 @@ from fpirhc.errors import NotSupported
 from fpirhc.horizon.cost import Quadratic
 from fpirhc.horizon.problem import Horizon, OptimalControl, transcribe
 from fpirhc.horizon.rollout import rollout
-from fpirhc.limits import Limits
 from fpirhc.optimisers.base import is_finite, status_of
-from fpirhc.optimisers.nlp import InteriorPoint, Osqp, SequentialQuadratic, quadratic_solver
-from fpirhc.plant import Parameter, Plant
-from fpirhc.problem import Problem
-from fpirhc.reference import Trajectory
+from fpirhc.optimisers.nlp import Ipopt, Osqp, SequentialQuadratic, quadratic_solver
+from fpirhc.plant.plant import Parameter, Plant
+from fpirhc.simulation.stepper import Stepper
 from fpirhc.status import Status
-from fpirhc.stepper import Stepper
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.functions import signed_power
-from fpirhc.testing.laws import within
+from fpirhc.task.limits import Limits
+from fpirhc.task.problem import Problem
+from fpirhc.task.reference import Trajectory
 from fpirhc.tracking.exponential import Exponential
 
 _REPORT = "this version does not guard against it: report it with the output of 'fpirhc doctor --json'"
@@ -94,7 +94,7 @@ def conic_fatrop() -> tuple[Outcome, str, str]:
 def solver_banner() -> tuple[Outcome, str, str]:
     """IPOPT prints a banner on standard output unless it is told not to, which would spoil --json."""
     ocp, printed = _horizon(Limits()), io.StringIO()
-    optimiser = InteriorPoint(tolerance=1e-3)
+    optimiser = Ipopt(tolerance=1e-3)
     with redirect_stdout(printed):
         memory = optimiser.memory(ocp).start()
         optimiser.step(ocp)(np.array([0.1, 0.0]), ocp.nodes[2], ocp.input_lower, ocp.input_upper, memory)
@@ -104,7 +104,7 @@ def solver_banner() -> tuple[Outcome, str, str]:
 
 def solver_pickle() -> tuple[Outcome, str, str]:
     """A solver takes megabytes to send to a worker, so workers are sent values and build their own."""
-    size = len(pickle.dumps(InteriorPoint(tolerance=1e-3)))
+    size = len(pickle.dumps(Ipopt(tolerance=1e-3)))
     return judged(size < 10_000, f"an optimiser is sent as a value of {size} bytes, never as a solver", _REPORT)
 
 
@@ -175,7 +175,7 @@ def long_horizons() -> tuple[Outcome, str, str]:
 
 def slow_imports() -> tuple[Outcome, str, str]:
     """`control` takes a second to import, so it must not come with the command line."""
-    code = "import fpirhc, fpirhc.cli, sys; print([m for m in ('control', 'casadi', 'matplotlib') if m in sys.modules])"
+    code = "import fpirhc, fpirhc.cli.main, sys; print([m for m in ('control', 'casadi', 'matplotlib') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     found = done.stdout.strip()
     return judged(found == "[]", f"imported with the command line: {found}", _REPORT, Outcome.WARN)

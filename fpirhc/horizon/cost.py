@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes
-from fpirhc.plant import Plant
+from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression, Named
 
 
@@ -72,7 +72,9 @@ class Cost(ABC):
         """Return the stage cost's terms, each as cost per second."""
 
     @abstractmethod
-    def terminal(self, view: View, plant: Plant, linearise: Callable[[], Linearisation], step: float) -> Expression:
+    def terminal_cost(
+        self, view: View, plant: Plant, linearise: Callable[[], Linearisation], step: float
+    ) -> Expression:
         """Return the terminal cost."""
 
 
@@ -85,17 +87,17 @@ class Quadratic(Cost):
     Parameters:
         states: weights of the state errors (q1, q1', ...).
         effort: weights of the absolute inputs.
-        correction: weights of the inputs relative to the model's feedforward along the reference. With a wrong model
+        deviation: weights of the inputs relative to the model's feedforward along the reference. With a wrong model
             prefer it to `effort`: absolute effort biases the plan towards the wrong model's effort.
         rate: weights of the change of the inputs from stage to stage.
-        terminal: None (the state weights at the last state, times the step), weights by state name, or LqrTerminal().
+        terminal: None (the state weights at the last state, times the step), weights by state name, or LQRTerminal().
     """
 
     states: Mapping[str, float]
     effort: Mapping[str, float] = field(default_factory=dict)
-    correction: Mapping[str, float] = field(default_factory=dict)
+    deviation: Mapping[str, float] = field(default_factory=dict)
     rate: Mapping[str, float] = field(default_factory=dict)
-    terminal_cost: Mapping[str, float] | Terminal | None = None
+    terminal: Mapping[str, float] | Terminal | None = None
 
     @property
     def uses_rate(self) -> bool:
@@ -105,7 +107,7 @@ class Quadratic(Cost):
     @property
     def uses_feedforward(self) -> bool:
         """Whether some input is weighed relative to the feedforward."""
-        return bool(self.correction)
+        return bool(self.deviation)
 
     def check(self, plant: Plant) -> None:
         """Raise if a name is unknown or a weight is negative or not finite.
@@ -114,13 +116,13 @@ class Quadratic(Cost):
             InvalidProblem: all mistakes together.
         """
         mistakes = Mistakes("cost")
-        given = self.terminal_cost if isinstance(self.terminal_cost, Mapping) else {}
+        given = self.terminal if isinstance(self.terminal, Mapping) else {}
         groups = {
             "states": (self.states, plant.state.elements),
             "effort": (self.effort, plant.input.elements),
-            "correction": (self.correction, plant.input.elements),
+            "deviation": (self.deviation, plant.input.elements),
             "rate": (self.rate, plant.input.elements),
-            "terminal_cost": (given, plant.state.elements),
+            "terminal": (given, plant.state.elements),
         }
         for what, (weights, valid) in groups.items():
             mistakes.unknown(f"{what}:", weights, valid)
@@ -138,25 +140,27 @@ class Quadratic(Cost):
         terms = {"states": _squares(self.states, view.state, view.reference)}
         if self.effort:
             terms["effort"] = sum(w * view.input[n] ** 2 for n, w in self.effort.items())
-        if self.correction:
-            terms["correction"] = _squares(self.correction, view.input, view.feedforward)
+        if self.deviation:
+            terms["deviation"] = _squares(self.deviation, view.input, view.feedforward)
         if self.rate:
             terms["rate"] = _squares(self.rate, view.input, view.input_before)
         return terms
 
-    def terminal(self, view: View, plant: Plant, linearise: Callable[[], Linearisation], step: float) -> Expression:
+    def terminal_cost(
+        self, view: View, plant: Plant, linearise: Callable[[], Linearisation], step: float
+    ) -> Expression:
         """Return the terminal cost (x - x^N)' P (x - x^N)."""
-        if self.terminal_cost is None:
+        if self.terminal is None:
             return step * _squares(self.states, view.state, view.reference)
-        if isinstance(self.terminal_cost, Mapping):
-            return _squares(self.terminal_cost, view.state, view.reference)
-        weight = self.terminal_cost.weight(self, plant, linearise())
+        if isinstance(self.terminal, Mapping):
+            return _squares(self.terminal, view.state, view.reference)
+        weight = self.terminal.weight(self, plant, linearise())
         error = view.state.vector[: plant.state.size] - view.reference.vector
         return ca.bilin(ca.DM(weight), error, error)
 
 
 @dataclass(frozen=True)
-class LqrTerminal(Terminal):
+class LQRTerminal(Terminal):
     """The infinite-horizon weight: P of the discrete algebraic Riccati equation, from the linearised model.
 
     It makes a short horizon act like an endless one near the reference. `control` is used to solve the equation.
@@ -172,28 +176,28 @@ class LqrTerminal(Terminal):
 
         h = linearisation.step
         q = np.diag([h * cost.states.get(e, 0.0) for e in plant.state.elements])
-        r = np.diag([h * (cost.effort.get(i, 0.0) + cost.correction.get(i, 0.0)) for i in plant.input.elements])
+        r = np.diag([h * (cost.effort.get(i, 0.0) + cost.deviation.get(i, 0.0)) for i in plant.input.elements])
         if np.any(np.diag(r) <= 0):
-            raise InvalidProblem("LqrTerminal needs a positive effort or correction weight for every input")
+            raise InvalidProblem("LQRTerminal needs a positive effort or deviation weight for every input")
         try:
             weight, _, _ = control.dare(linearisation.a, linearisation.b, q, r)
         except (np.linalg.LinAlgError, control.ControlArgument, ValueError) as error:
-            raise InvalidProblem(f"LqrTerminal: the linearised model has no stabilising solution ({error})") from None
+            raise InvalidProblem(f"LQRTerminal: the linearised model has no stabilising solution ({error})") from None
         return np.asarray(weight)
 
 
 @dataclass(frozen=True, eq=False)
-class General(Cost):
+class CustomCost(Cost):
     """Any CasADi cost.
 
     Parameters:
         terms: function of a View that returns {term: cost per second}.
-        final: function of a View that returns the terminal cost, or None for none.
+        terminal: function of a View that returns the terminal cost, or None for none.
         rate: whether `terms` uses view.input_before. feedforward: whether it uses view.feedforward.
     """
 
     terms: Callable[[View], Mapping[str, Expression]]
-    final: Callable[[View], Expression] | None = None
+    terminal: Callable[[View], Expression] | None = None
     rate: bool = False
     feedforward: bool = False
 
@@ -214,9 +218,15 @@ class General(Cost):
         """Return the user's terms."""
         return self.terms(view)
 
-    def terminal(self, view: View, plant: Plant, linearise: Callable[[], Linearisation], step: float) -> Expression:  # noqa: ARG002
+    def terminal_cost(
+        self,
+        view: View,
+        plant: Plant,  # noqa: ARG002
+        linearise: Callable[[], Linearisation],  # noqa: ARG002
+        step: float,  # noqa: ARG002
+    ) -> Expression:
         """Return the user's terminal cost, or zero."""
-        return ca.SX(0) if self.final is None else self.final(view)
+        return ca.SX(0) if self.terminal is None else self.terminal(view)
 
 
 def _squares(weights: Mapping[str, float], value: Named, target: Named) -> Expression:

@@ -17,14 +17,23 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, Mistakes, NotSupported
+from fpirhc.horizon.constraint_states import (
+    ConstraintState,
+    ends,
+    hard,
+    hard_state_bounds,
+    paths,
+    rates,
+    soft_names,
+    softened,
+)
 from fpirhc.horizon.cost import Cost, Linearisation, View
-from fpirhc.horizon.curvature import Along, expand_along, input_curvature
-from fpirhc.horizon.written import Written, ends, hard, hard_state_bounds, paths, rates, soft_names, softened
-from fpirhc.integrate import Integrator, RungeKutta4
-from fpirhc.limits import Limits
-from fpirhc.plant import Plant
-from fpirhc.reference import Reference
+from fpirhc.horizon.reference_expansion import ReferenceExpansion, expand_along, input_curvature
+from fpirhc.plant.integrators import Integrator, RungeKutta4
+from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression, Layout, Named, Signal, scalar
+from fpirhc.task.limits import Limits
+from fpirhc.task.reference import Reference
 
 
 @dataclass(frozen=True)
@@ -82,7 +91,7 @@ class OptimalControl:
     input_upper: np.ndarray
     curvature: np.ndarray
     nodes: tuple[np.ndarray, np.ndarray, np.ndarray]
-    along: Along
+    along: ReferenceExpansion
     written: int
 
     @property
@@ -125,7 +134,7 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
         extra = _written(plant, horizon, limits, view, moved, layout.split(theta))
         soft = softened(extra, limits, plant, x)
         terms = {**_scalar_terms(cost.stage(view)), **soft}
-        given = cost.terminal(view, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.step)
+        given = cost.terminal_cost(view, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.step)
         end = sum((soft[f"soft {e}"] for e in limits.soft if e in limits.states), start=ca.SX(0))
         final = _scalar_terms({"terminal": given})["terminal"] + horizon.step * end
     except InvalidName as error:
@@ -193,7 +202,7 @@ def _check_terminal(plant: Plant, horizon: Horizon) -> None:
     mistakes.raise_if_any()
 
 
-def _stage_state(plant: Plant, keeps_input: bool, binding: list[Written]) -> Signal:
+def _stage_state(plant: Plant, keeps_input: bool, binding: list[ConstraintState]) -> Signal:
     before = tuple(f"{i} before" for i in plant.input.elements) if keeps_input else ()
     units = plant.input.units if keeps_input else ()
     return Signal(
@@ -211,7 +220,7 @@ def _start(plant: Plant, free: int, written: int) -> ca.Function:
 
 def _written(
     plant: Plant, horizon: Horizon, limits: Limits, view: View, moved: Expression, given: Mapping[str, Expression]
-) -> list[Written]:
+) -> list[ConstraintState]:
     found = [*rates(limits, plant, view, horizon.step), *paths(limits, view)]
     for entry in found:
         if ca.SX(entry.expression).numel() != 1:
@@ -296,7 +305,7 @@ def _check_finite(
     mistakes = Mistakes("cost")
     for name, value, where in [*told, ("terminal", final, "at the end of the horizon")]:
         if not np.isfinite(value):
-            hint = "" if cost.uses_rate else "; say General(rate=True) if it uses input_before"
-            hint += "" if cost.uses_feedforward else "; say General(feedforward=True) if it uses feedforward"
+            hint = "" if cost.uses_rate else "; say CustomCost(rate=True) if it uses input_before"
+            hint += "" if cost.uses_feedforward else "; say CustomCost(feedforward=True) if it uses feedforward"
             mistakes.add(f"term '{name}' is {value} on the reference {where}{hint}")
     mistakes.raise_if_any()

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.horizon.expansion import GaussNewton, bent_end, bent_stage, linear_stage
+from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stage, linear_stage
 from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.plan import Plan
 from fpirhc.summary import line, number, table
@@ -140,7 +140,7 @@ def _model(plan: Plan) -> np.ndarray:
     """M (N nu, N nu) at the plan, by propagating the linearised model."""
     ocp, data = plan.problem, plan.data
     n, nu = ocp.stages, ocp.input.size
-    linear, bent = linear_stage(ocp), bent_stage(ocp, GaussNewton())
+    linear, bent = linear_stage(ocp), hessian_stage(ocp, GaussNewton())
     moved, total = np.zeros((ocp.state.size, n * nu)), np.zeros((n * nu, n * nu))
     for i in range(n):
         s, u, theta = plan.states[:, i], plan.inputs[:, i], data[:, i]
@@ -153,5 +153,5 @@ def _model(plan: Plan) -> np.ndarray:
         total[own, own] += r
         moved = a @ moved
         moved[:, own] += b
-    final = np.asarray(bent_end(ocp)(plan.states[:, n], data[:, n])[2].full())
+    final = np.asarray(hessian_end(ocp)(plan.states[:, n], data[:, n])[2].full())
     return np.asarray(total + moved.T @ final @ moved)

@@ -12,7 +12,7 @@ from typing import Any
 
 import casadi as ca
 
-from fpirhc.horizon.augmented import augmented, bounded_states, updated_multipliers
+from fpirhc.horizon.augmented_lagrangian import augmented, bounded_states, updated_multipliers
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.base import FINITE, is_finite, judge, sane, shift, state_violation, status_of

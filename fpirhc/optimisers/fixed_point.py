@@ -41,8 +41,8 @@ import numpy as np
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
-from fpirhc.horizon.augmented import augmented
-from fpirhc.horizon.expansion import Bend, GaussNewton, bent_end, bent_stage, linear_stage
+from fpirhc.horizon.augmented_lagrangian import augmented
+from fpirhc.horizon.hessian_models import GaussNewton, HessianModel, hessian_end, hessian_stage, linear_stage
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import PIVOT, rounds
 from fpirhc.optimisers.base import (
@@ -101,7 +101,7 @@ class FixedPoint(Optimiser):
     iterations: int
     tolerance: float
     map: Deformation = field(default_factory=lambda: Affine(gain=-2.0))
-    bend: Bend = field(default_factory=GaussNewton)
+    hessian: HessianModel = field(default_factory=GaussNewton)
     damping: float = 0.0
     updates: int = 5
     feasible: float = 1e-8
@@ -130,7 +130,7 @@ class FixedPoint(Optimiser):
         if least < -_CONVEX:
             raise NotSupported(
                 f"FixedPoint needs a cost that bends upwards; along the reference the stage or terminal cost has an eigenvalue of "
-                f"{least:.2g} times its largest. Use ReducedGradient() or InteriorPoint(), or add a convex term to the cost"
+                f"{least:.2g} times its largest. Use ReducedGradient() or Ipopt(), or add a convex term to the cost"
             )
 
     def memory(self, ocp: OptimalControl) -> Layout:
@@ -204,8 +204,8 @@ class FixedPoint(Optimiser):
         nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
         leaves = {
             "linear": linear_stage(ocp),
-            "bent": bent_stage(ocp, self.bend),
-            "end": bent_end(ocp),
+            "bent": hessian_stage(ocp, self.hessian),
+            "end": hessian_end(ocp),
             "deformed": deformed_move(self.map, nu * n),
         }
         scale = ", ".join(repr(float(v)) for v in 1 / (ocp.step * ocp.curvature))
@@ -241,7 +241,7 @@ class FixedPoint(Optimiser):
 
     def _graph(self, ocp: OptimalControl, name: str) -> ca.Function:
         """The composed Function: what the driver is tested against, and what runs without a compiler."""
-        search = Search(ocp, self.bend, self.map, self.damping)
+        search = Search(ocp, self.hessian, self.map, self.damping)
         given, memory = self._arguments(ocp)
         anchor = self._begin(ocp, given, memory)
         for _ in range(self.iterations):
@@ -251,7 +251,7 @@ class FixedPoint(Optimiser):
         return ca.Function(name, [*given, memory], self._finish(ocp, given, memory, anchor, self.iterations))
 
     def _converging_graph(self, ocp: OptimalControl, name: str) -> ca.Function:
-        search = Search(ocp, self.bend, self.map, self.damping)
+        search = Search(ocp, self.hessian, self.map, self.damping)
         given, memory = self._arguments(ocp)
         anchor, count = self._begin(ocp, given, memory), ca.MX(0)
         symbols = Anchor(*(ca.MX.sym(name, *v.shape) for name, v in zip(Anchor._fields, anchor, strict=True)))

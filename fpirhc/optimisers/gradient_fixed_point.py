@@ -20,8 +20,8 @@ import casadi as ca
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotContractive, NotSupported
-from fpirhc.horizon.curvature import steepest_curvature
 from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.reference_expansion import steepest_curvature
 from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.anderson import Anderson, iterated
 from fpirhc.optimisers.base import (

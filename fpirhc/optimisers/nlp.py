@@ -240,7 +240,7 @@ class _MultipleShooting(Optimiser):
 
 
 @dataclass(frozen=True)
-class InteriorPoint(_MultipleShooting):
+class Ipopt(_MultipleShooting):
     """IPOPT: the interior-point method that most tools use by default.
 
     Parameters: tolerance of our stationarity, in the unit of the inputs; accuracy that IPOPT is asked for; iterations it may use.

@@ -68,7 +68,7 @@ class ReducedGradient(Optimiser):
         """
         if ocp.bounds_states:
             raise NotSupported(
-                "ReducedGradient keeps input limits only; for state limits use FixedPoint(), InteriorPoint(), Fatrop() or "
+                "ReducedGradient keeps input limits only; for state limits use FixedPoint(), Ipopt(), Fatrop() or "
                 "SequentialQuadratic(), or remove them from Problem(limits=...)"
             )
 

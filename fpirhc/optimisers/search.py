@@ -10,9 +10,9 @@ from typing import NamedTuple
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation
-from fpirhc.horizon.curvature import steepest_curvature
-from fpirhc.horizon.expansion import Bend, bent_end, bent_stage, linear_stage, stage_symbols
+from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, linear_stage, stage_symbols
 from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.reference_expansion import steepest_curvature
 from fpirhc.horizon.riccati import backward_sweep
 from fpirhc.optimisers.base import clip, is_finite
 from fpirhc.symbolic.layout import Expression
@@ -73,11 +73,11 @@ def first_gamma(ocp: OptimalControl) -> float:
 class Search:
     """Builds the expressions of the iteration for one problem."""
 
-    def __init__(self, ocp: OptimalControl, bend: Bend, map: Deformation, damping: float) -> None:
+    def __init__(self, ocp: OptimalControl, hessian: HessianModel, map: Deformation, damping: float) -> None:
         self._ocp = ocp
         self._expand, self._try = _expansion(ocp), _trial(ocp)
         self._judge = _judgement(ocp)
-        self._direct = _direction(ocp, bend, map, damping)
+        self._direct = _direction(ocp, hessian, map, damping)
 
     def tried(self, anchor: Anchor, given: Given) -> tuple[Anchor, Expanded]:
         """Try the anchor's next plan: the new anchor, and the plan expanded."""
@@ -136,24 +136,24 @@ def _expansion(ocp: OptimalControl) -> ca.Function:
     states, inputs = ca.MX.sym("X", ns, n + 1), ca.MX.sym("U", nu, n)
     costs, data = ca.MX.sym("l", 1, n), ca.MX.sym("data", ocp.data.size, n + 1)
     stacked = [ca.MX.sym(f"m{k}", rows, columns * n) for k, (rows, columns) in enumerate(_stage_shapes(ns, nu))]
-    final, last, _ = bent_end(ocp)(states[:, n], data[:, n])
+    final, last, _ = hessian_end(ocp)(states[:, n], data[:, n])
     turned = [_turned(m, n) for m in stacked]
     _, slope, costates = stage.mapaccum("fpirhc_costate_stages", n)(last, *turned)
     results = [ca.sum2(costs) + final, _turned(slope, n), _turned(costates, n)]
     return ca.Function("fpirhc_expansion", [states, inputs, costs, data, *stacked], results)
 
 
-def _direction(ocp: OptimalControl, bend: Bend, map: Deformation, damping: float) -> ca.Function:
+def _direction(ocp: OptimalControl, hessian: HessianModel, map: Deformation, damping: float) -> ca.Function:
     """Function (U, X, A, B, l_s, l_u, costates, data, lower, upper) -> (v, K): the deformed feedforward and its feedback."""
     n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
     inputs, states = ca.MX.sym("U", nu, n), ca.MX.sym("X", ns, n + 1)
     stacked = [ca.MX.sym(f"m{k}", rows, columns * n) for k, (rows, columns) in enumerate(_stage_shapes(ns, nu))]
     costates, data = ca.MX.sym("lambda", ns, n), ca.MX.sym("data", ocp.data.size, n + 1)
     lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
-    bent = bent_stage(ocp, bend).map(n)(states[:, :n], inputs, data[:, :n], costates)
-    _, slope, value = bent_end(ocp)(states[:, n], data[:, n])
+    hessians = hessian_stage(ocp, hessian).map(n)(states[:, :n], inputs, data[:, :n], costates)
+    _, slope, value = hessian_end(ocp)(states[:, n], data[:, n])
     bounds = ca.repmat(lower, 1, n), ca.repmat(upper, 1, n)
-    move, gains = backward_sweep(ocp, damping)(*stacked, *bent, inputs, *bounds, value, slope)
+    move, gains = backward_sweep(ocp, damping)(*stacked, *hessians, inputs, *bounds, value, slope)
     results = [ca.reshape(deformed_move(map, nu * n)(ca.vec(move)), nu, n), gains]
     return ca.Function("fpirhc_direction", [inputs, states, *stacked, costates, data, lower, upper], results)
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from fpirhc.studies.review.answer import Answer, Review
+    from fpirhc.review.answer import Answer, Review
 
 _COLOURS = {"yes": "green", "no": "red", "unknown": "yellow"}
 

@@ -7,7 +7,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fpirhc.studies.compare import Comparison, Entry
+    from fpirhc.studies.comparison.compare import Comparison, Entry
 
 
 def to_json(comparison: Comparison) -> str:

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from fpirhc.problem import Problem
-    from fpirhc.run import Run
-    from fpirhc.studies.compare import Comparison, Entry
+    from fpirhc.simulation.run import Run
+    from fpirhc.studies.comparison.compare import Comparison, Entry
     from fpirhc.studies.open_loop import Solved
+    from fpirhc.task.problem import Problem
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5b4a9c", "#8c6d1f", "#7f7f7f", "#111111")
 BANDS = ("#7f7f7f", "#e69f00", "#56b4e9", "#cc79a7")  # of time slots, drawn pale

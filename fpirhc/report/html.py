@@ -16,7 +16,7 @@ from fpirhc.report.page import text as _text
 from fpirhc.report.series import chart_data
 
 if TYPE_CHECKING:
-    from fpirhc.studies.compare import Comparison, Entry
+    from fpirhc.studies.comparison.compare import Comparison, Entry
 
 _CAPTIONS = {
     "Trajectory tracking": "Nominal (dashed) and realised motion over time.",

@@ -11,12 +11,12 @@ import numpy as np
 
 from fpirhc.report.figures import PALETTE
 from fpirhc.report.page import page, picture, text, write_page
-from fpirhc.studies.paired import Summary, percent, signed
+from fpirhc.studies.scenarios.paired import Summary, percent, signed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from fpirhc.studies.scenario_study import ScenarioComparison
+    from fpirhc.studies.scenarios.scenario_study import ScenarioComparison
 
 _GROUPS = 6  # of scenarios with similar mismatch, whose medians are joined by a line
 _CAPTION = (

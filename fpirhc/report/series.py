@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from fpirhc.run import Run
-    from fpirhc.studies.compare import Comparison
+    from fpirhc.simulation.run import Run
+    from fpirhc.studies.comparison.compare import Comparison
 
 INTERVALS = 300
 _RESPONSES = ("nominal", "desired", "deformed", "realised")

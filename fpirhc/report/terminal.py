@@ -15,16 +15,16 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 from rich.text import Text
 
-from fpirhc.metrics import measure
+from fpirhc.simulation.metrics import measure
 from fpirhc.status import Status
 from fpirhc.summary import printable
 
 if TYPE_CHECKING:
-    from fpirhc.problem import Problem
-    from fpirhc.run import Run
-    from fpirhc.studies.compare import Comparison, Entry
-    from fpirhc.studies.compare import Progress as Report
+    from fpirhc.simulation.run import Run
+    from fpirhc.studies.comparison.compare import Comparison, Entry
+    from fpirhc.studies.comparison.compare import Progress as Report
     from fpirhc.studies.open_loop import Solved
+    from fpirhc.task.problem import Problem
 
 
 @contextmanager

@@ -9,10 +9,10 @@ from importlib.machinery import PathFinder
 from importlib.resources import files
 from pathlib import Path
 
+from fpirhc.baselines.check import bless
+from fpirhc.baselines.places import baseline_path
 from fpirhc.errors import InvalidName, OutputError
-from fpirhc.regression.check import bless
-from fpirhc.regression.places import baseline_path
-from fpirhc.studies.problem_file import load_problem, shipped_problems
+from fpirhc.problem_files.problem_file import load_problem, shipped_problems
 
 _LONGEST = 60  # characters of a name
 _FALLBACK = "my_plant"

@@ -1,6 +1,6 @@
 """Sensing: what a controller is given of the plant, through imperfect sensors and an estimator of what is not measured."""
 
-from fpirhc.sensing.estimator import Estimator
+from fpirhc.sensing.base import DerivativeEstimator
 from fpirhc.sensing.measured import Measured
 from fpirhc.sensing.positions import PositionDifference, SavitzkyGolay
 from fpirhc.sensing.sensing import Sensing
@@ -9,7 +9,7 @@ from fpirhc.sensing.state_filter import StateVariableFilter
 from fpirhc.sensing.velocities import LowPassDifference, VelocityDifference
 
 __all__ = [
-    "Estimator",
+    "DerivativeEstimator",
     "LowPassDifference",
     "Measured",
     "PositionDifference",

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.plant import Plant
-from fpirhc.sensing.estimator import Array, Estimator, response_names
+from fpirhc.plant.plant import Plant
+from fpirhc.sensing.base import Array, DerivativeEstimator, response_names
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 
 @dataclass(frozen=True)
-class Measured(Estimator):
+class Measured(DerivativeEstimator):
     """State and response as the sensors show them: no delay."""
 
     def measures(self, plant: Plant) -> tuple[str, ...]:

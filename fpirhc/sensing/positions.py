@@ -16,15 +16,15 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
-from fpirhc.plant import Plant
-from fpirhc.sensing.estimator import Array, Estimator, backward_difference, combine, spline_weights
+from fpirhc.plant.plant import Plant
+from fpirhc.sensing.base import Array, DerivativeEstimator, backward_difference, combine, spline_weights
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 LONGEST = 1001  # samples: what is remembered is static
 
 
-class _Finite(Estimator):
+class _Finite(DerivativeEstimator):
     """What the formulas have in common."""
 
     @abstractmethod

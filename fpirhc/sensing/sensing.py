@@ -20,14 +20,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from fpirhc.dead_time import delay_block
 from fpirhc.errors import InvalidValue, Mistakes
-from fpirhc.plant import Plant
-from fpirhc.sensing.estimator import Array, Estimator, response_names
+from fpirhc.plant.plant import Plant
+from fpirhc.sensing.base import Array, DerivativeEstimator, response_names
 from fpirhc.sensing.measured import Measured
 from fpirhc.sensing.sensor import Sensor
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
+from fpirhc.task.dead_time import delay_block
 
 _STREAM = 1  # keeps the sensors' random series apart from those of disturbances
 
@@ -44,7 +44,7 @@ class Sensing:
     """
 
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
-    estimator: Estimator = field(default_factory=Measured)
+    estimator: DerivativeEstimator = field(default_factory=Measured)
 
     @property
     def ideal(self) -> bool:
@@ -58,7 +58,7 @@ class Sensing:
             InvalidProblem: all mistakes together.
         """
         mistakes = Mistakes("sensing")
-        if not isinstance(self.estimator, Estimator):
+        if not isinstance(self.estimator, DerivativeEstimator):
             mistakes.add(f"estimator must be one such as VelocityDifference(), got {self.estimator!r}")
             mistakes.raise_if_any()
         measures, every = self.estimator.measures(plant), plant.state.elements + response_names(plant)

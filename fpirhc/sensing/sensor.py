@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from fpirhc.disturbance import Disturbance
 from fpirhc.errors import InvalidValue
+from fpirhc.task.disturbance import Disturbance
 
 
 @dataclass(frozen=True, eq=False)

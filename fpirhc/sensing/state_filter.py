@@ -18,8 +18,8 @@ import numpy as np
 from scipy.special import comb
 
 from fpirhc.errors import InvalidValue
-from fpirhc.plant import Plant
-from fpirhc.sensing.estimator import Array, Estimator, spline_weights
+from fpirhc.plant.plant import Plant
+from fpirhc.sensing.base import Array, DerivativeEstimator, spline_weights
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
@@ -27,7 +27,7 @@ _TAIL = 1e-16  # of a low-pass: what the weights leave out
 
 
 @dataclass(frozen=True)
-class StateVariableFilter(Estimator):
+class StateVariableFilter(DerivativeEstimator):
     """Derivatives of filtered positions.
 
     The filter begins as if the plant had moved at its first velocities for long.

@@ -17,8 +17,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
-from fpirhc.plant import Plant
-from fpirhc.sensing.estimator import Array, Estimator
+from fpirhc.plant.plant import Plant
+from fpirhc.sensing.base import Array, DerivativeEstimator
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
@@ -26,7 +26,7 @@ _TAIL = 1e-9  # share of the low-pass's weights that is left out
 
 
 @dataclass(frozen=True)
-class VelocityDifference(Estimator):
+class VelocityDifference(DerivativeEstimator):
     """Backward difference of the highest measured derivative over the period."""
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
@@ -54,7 +54,7 @@ class VelocityDifference(Estimator):
 
 
 @dataclass(frozen=True)
-class LowPassDifference(Estimator):
+class LowPassDifference(DerivativeEstimator):
     """The same difference through a first-order low-pass, which begins with the first difference.
 
     Where the response is filtered and the desired one is not, their difference is late. `Filtered` filters the difference

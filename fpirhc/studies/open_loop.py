@@ -11,8 +11,8 @@ from fpirhc.errors import InvalidName, InvalidProblem, nearest
 from fpirhc.horizon.problem import stage_data, transcribe
 from fpirhc.optimisers.certificate import Certificate, certify
 from fpirhc.optimisers.plan import Plan, solve
-from fpirhc.studies.problem_file import Task
-from fpirhc.studies.rivals import OPTIMISERS
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.studies.comparison.optimiser_choices import OPTIMISERS
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-from fpirhc.plant import Plant
+from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 
 

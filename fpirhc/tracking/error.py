@@ -6,7 +6,7 @@ from typing import Any
 
 import casadi as ca
 
-from fpirhc.plant import Plant
+from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 

@@ -18,7 +18,7 @@ from typing import Any
 import casadi as ca
 
 from fpirhc.errors import InvalidValue
-from fpirhc.plant import Plant
+from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.tracking.base import Tracking
@@ -58,7 +58,7 @@ class Exponential(Tracking):
             plant.state,
             Signal("_target", plant.state.elements, plant.state.units),
             plant.response_signal("nominal"),
-            scalar("started"),
+            scalar("warm_up"),
             integral_signal(plant, "_integral_before"),
         )
         writes = (error_signal(plant), plant.response_signal("desired"), integral_signal(plant, "_integral_used"))
@@ -66,7 +66,7 @@ class Exponential(Tracking):
         def step(s: Any) -> dict[str, Expression]:
             errors = error_chains(plant, s._target - s.state)
             begin = ca.vertcat(*(self._first_integral(chain) for chain in errors))
-            used = ca.if_else(s.started > 0.5, s._integral_before, begin)
+            used = ca.if_else(s.warm_up > 0.5, s._integral_before, begin)
             feedback = [self._feedback(used[k], chain) for k, chain in enumerate(errors)]
             return {
                 "_target_error": ca.vertcat(*(chain[0] for chain in errors)),

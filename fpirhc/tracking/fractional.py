@@ -31,7 +31,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
-from fpirhc.plant import Plant
+from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.tracking.base import Tracking
@@ -106,7 +106,7 @@ class Fractional(Tracking):
             plant.state,
             Signal("_target", plant.state.elements, plant.state.units),
             plant.response_signal("nominal"),
-            scalar("started"),
+            scalar("warm_up"),
             integral_signal(plant, "_integral_before"),
         )
         writes = (error_signal(plant), plant.response_signal("desired"), integral_signal(plant, "_integral_used"))
@@ -114,7 +114,7 @@ class Fractional(Tracking):
 
         def step(s: Any) -> dict[str, Expression]:
             errors = error_chains(plant, s._target - s.state)
-            running = s.started > 0.5
+            running = s.warm_up > 0.5
             used = ca.if_else(running, s._integral_before, 0)
             decaying, drift = self._decaying(used, errors)
             first = ca.if_else(running, s.decay_first, decaying)

@@ -1,1 +1,0 @@
-"""Adaptation rules: how estimated parameters follow from what a controller sees."""

@@ -1,0 +1,82 @@
+"""A baseline: a readable JSON file with one metric per line, and a checksum that shows edits by hand.
+
+    {"format": 1, "problem", "reason", "date", "seed", "versions", "varied",
+     "settings": {"hash", "problem", "controllers"}, "controllers": {name: {"outcomes", "metrics", "not_compared"}},
+     "checksum"}
+
+The checksum is over the content: white space and the order of keys do not matter. It is no signature.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from fpirhc.baselines.bands import Expected
+from fpirhc.baselines.settings import Settings, fingerprint
+
+FORMAT = 1
+_WIDTH = 118  # of a line that holds a whole object
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """What is expected of a problem, why, and what it was measured with.
+
+    reason: why this baseline was accepted. date: when, in UTC. seed: of the nominal run. varied: variants in words by source.
+    """
+
+    problem: str
+    reason: str
+    date: str
+    seed: int
+    versions: Mapping[str, str]
+    varied: Mapping[str, Sequence[str]]
+    settings: Settings
+    controllers: Mapping[str, Expected]
+
+
+def to_text(baseline: Baseline) -> str:
+    """Return the file's text; controllers by name, so that the order in which they were measured does not show."""
+    settings = asdict(baseline.settings)
+    settings["controllers"] = dict(sorted(settings["controllers"].items()))
+    facts = {
+        "format": FORMAT,
+        "problem": baseline.problem,
+        "reason": baseline.reason,
+        "date": baseline.date,
+        "seed": baseline.seed,
+        "versions": dict(baseline.versions),
+        "varied": {source: list(names) for source, names in baseline.varied.items()},
+        "settings": {"hash": settings_hash(baseline.settings), **settings},
+        "controllers": {name: _entry(one) for name, one in sorted(baseline.controllers.items())},
+    }
+    facts["checksum"] = fingerprint(facts)
+    return _written(facts, "", keep_open=True) + "\n"
+
+
+def settings_hash(settings: Settings) -> str:
+    """Hash of all settings."""
+    return fingerprint(asdict(settings))
+
+
+def _entry(one: Expected) -> dict[str, Any]:
+    metrics = {name: _metric_facts(asdict(metric)) for name, metric in one.metrics.items()}
+    return {"outcomes": list(one.outcomes), "metrics": metrics, "not_compared": dict(one.not_compared)}
+
+
+def _metric_facts(facts: dict[str, Any]) -> dict[str, Any]:
+    """An exact metric has neither band nor spread."""
+    return facts if facts["band"] else {"kind": facts["kind"], "value": facts["value"]}
+
+
+def _written(value: Any, indent: str, *, keep_open: bool = False) -> str:
+    """JSON in which what fits on a line stands on one."""
+    line = json.dumps(value, ensure_ascii=True, allow_nan=False)
+    if not isinstance(value, dict) or not value or (len(indent) + len(line) <= _WIDTH and not keep_open):
+        return line
+    deeper = indent + "  "
+    inside = ",\n".join(f"{deeper}{json.dumps(k)}: {_written(v, deeper)}" for k, v in value.items())
+    return "{\n" + inside + f"\n{indent}}}"

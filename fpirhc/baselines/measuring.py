@@ -1,0 +1,148 @@
+"""Fresh results: one controller under one variant, as numbers by metric; many of them in any number of processes."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from fpirhc.baselines.catalogue import family_of
+from fpirhc.baselines.variants import Variant
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.wrappers.exact_model import ExactModel
+from fpirhc.controllers.wrappers.predicted import Predicted
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import FpirhcError
+from fpirhc.problem_files.problem_file import Task, load_problem
+from fpirhc.simulation.metrics import measure
+from fpirhc.simulation.run import Run
+from fpirhc.simulation.simulate import simulate
+from fpirhc.status import Status
+from fpirhc.studies.comparison.compare import measure_contraction
+from fpirhc.studies.comparison.optimality import planner
+from fpirhc.studies.open_loop import solve_first
+from fpirhc.task.problem import Problem
+
+FINISHED, DIVERGED, REFUSED = "finished", "diverged", "refused"
+Number = float | str
+Progress = Callable[[str, int, int], None]
+
+_CONVERGED = 1e-8  # of the input's range: tolerance of open-loop plans
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What one run achieved: the class of its outcome, why, and its numbers by metric (NaN: there is none)."""
+
+    outcome: str
+    why: str
+    numbers: Mapping[str, Number]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One controller under one variant."""
+
+    controller: str
+    variant: Variant
+
+
+def measure_all(
+    task: Task, jobs: Sequence[Job], *, processes: int = 1, progress: Progress | None = None
+) -> list[Measurement]:
+    """Return the results of all jobs in their order, whatever the number of processes."""
+    if processes <= 1 or len(jobs) < 2:
+        return _collected(task.name, (measure_job(task, job) for job in jobs), len(jobs), progress)
+    # Started afresh: a process that forked shares CasADi's state with its parent.
+    fresh = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=fresh) as pool:
+        results = pool.map(_measure_by_path, [(str(task.path.resolve()), job) for job in jobs])
+        try:
+            return _collected(task.name, results, len(jobs), progress)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _collected(name: str, results: Iterable[Measurement], total: int, progress: Progress | None) -> list[Measurement]:
+    found: list[Measurement] = []
+    for one in results:
+        found.append(one)
+        if progress:
+            progress(name, len(found), total)
+    return found
+
+
+def _measure_by_path(asked: tuple[str, Job]) -> Measurement:
+    path, job = asked
+    return measure_job(_loaded(path), job)
+
+
+@cache
+def _loaded(path: str) -> Task:
+    return load_problem(path)
+
+
+def measure_job(task: Task, job: Job) -> Measurement:
+    """Run one controller under one variant; one that fpirhc refuses has that as its outcome."""
+    variant, controller = job.variant, task.controllers[job.controller]
+    problem = variant.applied(task.problem)
+    try:
+        chosen = controller.resolved(problem)
+        run = simulate(problem, chosen, seed=variant.seed, compiled=variant.compiled, flags=variant.flags)
+        if run.stop is not None:
+            return Measurement(DIVERGED, run.stop, {})
+        numbers = _numbers(problem, chosen, run)
+        for metric, value in numbers.items():
+            if family_of(metric).finite and isinstance(value, float) and not math.isfinite(value):
+                return Measurement(DIVERGED, f"{metric} is not finite", {})
+        plan = first_plan(task, problem, chosen) if variant.plans else {}
+    except FpirhcError as error:
+        return Measurement(f"{REFUSED} ({type(error).__name__})", str(error), {})
+    return Measurement(FINISHED, "", {**numbers, **plan})
+
+
+def _numbers(problem: Problem, controller: Controller, run: Run) -> dict[str, Number]:
+    metrics = measure(problem, run)
+    found: dict[str, Number] = {"cycles": run.cycles}
+    by_element = ("rms_error", "max_error", "iae", "settling", "effort", "cost")
+    for family in by_element:
+        found |= {f"{family}.{element}": value for element, value in getattr(metrics, family).items()}
+    found["clipped_share"] = metrics.clipped_share
+    found |= {f"status.{status.name}": metrics.statuses.get(status.name, 0) for status in Status}
+    if metrics.solve:
+        found |= {f"solve.{name}": metrics.solve[name] for name in ("median_iterations", "worst_iterations")}
+        found["plans"] = int(metrics.solve["plans"])
+    known = None if isinstance(controller.adaptive, Identity) else measure_contraction(problem, controller, run)
+    if known:
+        found |= {"contraction.predicted": known.predicted, "contraction.measured": known.measured}
+    return found
+
+
+def first_plan(task: Task, problem: Problem, controller: Controller) -> dict[str, Number]:
+    """Solve the first horizon with the controller's cost to convergence; empty for one that does not plan."""
+    while isinstance(controller, ExactModel | Predicted):
+        controller = controller.controller
+    planning = planner(controller)
+    cost = (planning.cost or problem.cost) if planning else None
+    if cost is None or problem.horizon is None:
+        return {}
+    lower, upper = problem.limits.input_bounds(problem.plant)
+    reach = np.append((upper - lower)[np.isfinite(upper - lower)], 0.0).max() or 1.0
+    asked = replace(task, problem=replace(problem, cost=cost))
+    try:
+        solved = solve_first(asked, ["fixed-point"], _CONVERGED * float(reach))[0]
+    except FpirhcError as error:
+        return {"plan.status": f"{REFUSED} ({type(error).__name__})"}
+    return {
+        "plan.cost": solved.plan.cost,
+        "plan.stages": solved.plan.inputs.shape[1],
+        "plan.iterations": int(solved.plan.iterations),
+        "plan.status": solved.plan.status.name,
+        "plan.factor": solved.certificate.factor if solved.certificate else math.nan,
+    }

@@ -1,0 +1,117 @@
+"""Baselines in a test suite of one's own: the fixture `fpirhc_check` and the option `--fpirhc-bless REASON`.
+
+    def test_arm(fpirhc_check):
+        fpirhc_check("problems/arm.py", "RHC+FPI")
+
+With the option the same tests measure anew; one process writes the files when all of them are done, also under pytest-xdist.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from fpirhc.baselines.judging import Judgement
+
+_found = pytest.StashKey[list[tuple[str, str]]]()
+_told = pytest.StashKey[list[str]]()
+_OUTPUT = "fpirhc_blessed"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options."""
+    group = parser.getgroup("fpirhc", "baselines of control problems")
+    group.addoption("--fpirhc-bless", metavar="REASON", help="measure anew and write baselines, for this reason")
+    group.addoption("--fpirhc-no-compile", action="store_true", help="run loops in CasADi's virtual machine")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Refuse an empty reason at once."""
+    config.stash[_found] = []
+    config.stash[_told] = []
+    reason = config.getoption("--fpirhc-bless")
+    if reason is not None and not reason.strip():
+        raise pytest.UsageError("--fpirhc-bless needs a reason: say why the new numbers are right")
+
+
+@pytest.fixture
+def fpirhc_check(request: pytest.FixtureRequest) -> Callable[..., Judgement | None]:
+    """Function (problem, controller) that compares a controller with its baseline, or all of them when none is named.
+
+    `problem` is a shipped name, or a path, relative to pytest's root folder. It fails the test with what changed.
+    """
+    config = request.config
+
+    def check(problem: str | Path, controller: str | None = None) -> Judgement | None:
+        __tracebackhide__ = True
+        from fpirhc.baselines.check import check_baseline
+        from fpirhc.baselines.words import headline, remarks, told
+        from fpirhc.problem_files.problem_file import load_problem
+
+        path = config.rootpath / problem
+        task = load_problem(str(path if path.is_file() else problem))
+        names = None if controller is None else [controller]
+        compiled = not config.getoption("--fpirhc-no-compile")
+        if config.getoption("--fpirhc-bless") is not None:
+            _measure(config, task, names, compiled)
+            return None
+        judgement = check_baseline(task, controllers=names, compiled=compiled)
+        if not judgement.holds:
+            lines = [headline(judgement), told(judgement.changed), *remarks(judgement)]
+            pytest.fail("\n".join(line for line in lines if line), pytrace=False)
+        return judgement
+
+    return check
+
+
+def _measure(config: pytest.Config, task: Any, names: list[str] | None, compiled: bool) -> None:
+    """Measure and keep the result, as text, for the process that writes."""
+    from fpirhc.baselines.baseline import to_text
+    from fpirhc.baselines.check import compose_baseline, measure_expected
+    from fpirhc.studies.comparison.compare import select
+
+    found = measure_expected(task, list(select(task, names)), compiled=compiled)
+    baseline = compose_baseline(task, found, config.getoption("--fpirhc-bless"), compiled=compiled)
+    config.stash[_found].append((str(task.path.resolve()), to_text(baseline)))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Collect what a worker of pytest-xdist measured."""
+    for path, text in getattr(node, "workeroutput", {}).get(_OUTPUT, []):
+        node.config.stash[_found].append((path, text))
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Hand over what this worker measured; or write everything that was."""
+    config = session.config
+    if hasattr(config, "workeroutput"):
+        config.workeroutput[_OUTPUT] = config.stash[_found]
+        return
+    found = config.stash[_found]
+    if not found:
+        return
+    from fpirhc.baselines.merging import write_merged
+    from fpirhc.errors import FpirhcError
+
+    texts: dict[str, list[str]] = {}
+    for path, text in sorted(found):
+        texts.setdefault(path, []).append(text)
+    for path, parts in texts.items():
+        try:
+            written = write_merged(Path(path), parts, config.rootpath)
+            config.stash[_told].append(f"wrote {written}")
+        except FpirhcError as error:
+            config.stash[_told].append(str(error))
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """Say which baselines were written."""
+    for line in config.stash[_told]:
+        terminalreporter.write_line(f"fpirhc: {line}")

@@ -1,0 +1,153 @@
+"""Reads a baseline and refuses everything that is not one: truncated, edited by hand, newer, incomplete."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from fpirhc.baselines.bands import Expected, Metric
+from fpirhc.baselines.baseline import FORMAT, Baseline, settings_hash
+from fpirhc.baselines.catalogue import BANDED, EXACT, KINDS, family_of
+from fpirhc.baselines.measuring import FINISHED
+from fpirhc.baselines.settings import Settings, fingerprint
+from fpirhc.baselines.variants import SOURCES
+from fpirhc.errors import BaselineError, InvalidName
+
+_LARGEST = 20_000_000  # bytes; a baseline has some tens of thousands
+
+
+def read_baseline(path: Path) -> Baseline:
+    """Return the baseline in a file.
+
+    Raises:
+        BaselineError: it is missing, damaged, edited by hand, of a newer format, of another problem, or compares nothing.
+    """
+    try:
+        if path.stat().st_size > _LARGEST:
+            raise BaselineError(f"'{path.name}' is larger than {_LARGEST / 1e6:.0f} MB and no baseline; {_BLESS}")
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise BaselineError(f"there is no baseline '{path.name}'; {_BLESS}") from None
+    except OSError as error:
+        raise BaselineError(f"'{path.name}' cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise BaselineError(f"'{path.name}' is no text ({error.reason}); restore it, or {_BLESS}") from None
+    return read_text(text, path)
+
+
+def read_text(text: str, path: Path) -> Baseline:
+    """Return the baseline in a text that is, or will be, in the file at `path`.
+
+    Raises:
+        BaselineError: as `read_baseline`.
+    """
+    facts = _parsed(text, path)
+    found = facts.get("format")
+    if isinstance(found, int) and not isinstance(found, bool) and found > FORMAT:
+        raise BaselineError(
+            f"'{path.name}' has format {found}, this version reads {FORMAT}: it was written by a newer fpirhc; upgrade"
+        )
+    checksum = facts.pop("checksum", None)
+    if found != FORMAT or checksum is None:
+        raise BaselineError(f"'{path.name}' is not a baseline of format {FORMAT}; {_BLESS}")
+    if checksum != fingerprint(facts):
+        raise BaselineError(f"'{path.name}' was edited by hand, its checksum does not fit; restore it, or {_BLESS}")
+    try:
+        baseline = _baseline(facts)
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
+        said = error if isinstance(error, BaselineError | InvalidName) else f"it lacks or misshapes {error}"
+        raise BaselineError(f"'{path.name}': {said}; {_BLESS}") from None
+    if baseline.problem != path.stem:
+        raise BaselineError(f"'{path.name}' is the baseline of '{baseline.problem}', not of '{path.stem}'; {_BLESS}")
+    return baseline
+
+
+_BLESS = "measure it again with: fpirhc bless PROBLEM --reason ..."
+
+
+def _parsed(text: str, path: Path) -> dict[str, Any]:
+    try:
+        facts = json.loads(text, object_pairs_hook=_without_doubles, parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        raise BaselineError(f"'{path.name}' is no complete JSON ({error}); restore it, or {_BLESS}") from None
+    if not isinstance(facts, dict):
+        raise BaselineError(f"'{path.name}' is no baseline: expected an object, got {type(facts).__name__}; {_BLESS}")
+    return facts
+
+
+def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise ValueError("a key stands in it twice")
+    return found
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is no number")
+
+
+def _baseline(facts: dict[str, Any]) -> Baseline:
+    settings = Settings(
+        dict(facts["settings"]["problem"]), {k: dict(v) for k, v in facts["settings"]["controllers"].items()}
+    )
+    if facts["settings"]["hash"] != settings_hash(settings):
+        raise BaselineError("the hash of its settings does not fit them")
+    controllers = {name: _expected(name, one) for name, one in facts["controllers"].items()}
+    if not controllers:
+        raise BaselineError("it holds no controller and would compare nothing")
+    if set(controllers) != set(settings.controllers):
+        raise BaselineError("its controllers and their settings differ")
+    for name in ("problem", "reason", "date"):
+        if not isinstance(facts[name], str) or not facts[name].strip():
+            raise BaselineError(f"it has no {name}")
+    if not isinstance(facts["seed"], int) or facts["seed"] < 0:
+        raise BaselineError("its seed is no whole number of at least 0")
+    return Baseline(
+        facts["problem"],
+        facts["reason"],
+        facts["date"],
+        facts["seed"],
+        {str(k): str(v) for k, v in facts["versions"].items()},
+        {str(k): [str(n) for n in v] for k, v in facts["varied"].items()},
+        settings,
+        controllers,
+    )
+
+
+def _expected(name: str, facts: dict[str, Any]) -> Expected:
+    outcomes = tuple(str(o) for o in facts["outcomes"])
+    metrics = {metric: _metric(f"{name}: {metric}", metric, one) for metric, one in facts["metrics"].items()}
+    skipped = {str(k): str(v) for k, v in facts["not_compared"].items()}
+    if not outcomes:
+        raise BaselineError(f"controller '{name}' has no outcome")
+    if outcomes == (FINISHED,) and not any(m.kind == BANDED for m in metrics.values()):
+        raise BaselineError(f"controller '{name}' has no metric with a band")
+    return Expected(outcomes, metrics, skipped)
+
+
+def _metric(where: str, name: str, facts: dict[str, Any]) -> Metric:
+    family_of(name)
+    kind, value = facts["kind"], facts["value"]
+    if kind not in KINDS:
+        raise BaselineError(f"{where} has class '{kind}'; expected one of {', '.join(KINDS)}")
+    if not (value is None or isinstance(value, str) or _is_number(value)):
+        raise BaselineError(f"{where} has the value {str(value)[:40]!r}; expected a finite number, a word or null")
+    if kind == EXACT:
+        return Metric(kind, value, 0.0, {})
+    if not _is_number(value):
+        raise BaselineError(f"{where} is {kind} and has no number")
+    band, spread = facts.get("band"), facts.get("spread")
+    if not isinstance(band, int | float) or not _is_number(band) or band <= 0:
+        raise BaselineError(f"{where} is {kind} and has no band")
+    if not isinstance(spread, dict) or not all(s in SOURCES and _is_number(v) for s, v in spread.items()):
+        raise BaselineError(f"{where} has no spread by {', '.join(SOURCES)}")
+    return Metric(kind, value, float(band), spread)
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # a whole number beyond all floats
+        return False

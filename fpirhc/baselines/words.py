@@ -1,0 +1,103 @@
+"""Texts that all outputs of a check share: numbers, verdicts, and names that nobody can hide commands in."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Sequence
+from pathlib import Path
+
+from fpirhc.baselines.judging import OUTCOME, Judgement, Row
+from fpirhc.baselines.measuring import Number
+from fpirhc.errors import OutputError
+
+HEADS = ("controller", "metric", "old", "new", "band", "verdict")
+_UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")  # control, format, surrogate, private, line and paragraph marks
+
+
+def clean(text: str) -> str:
+    """The text on one line without control characters; a '::' could be read as a command by a hosted CI."""
+    seen = "".join("\ufffd" if unicodedata.category(c) in _UNSEEN else c for c in text.replace("\n", " "))
+    return seen.replace("::", ": :")
+
+
+def number(value: Number | None) -> str:
+    """A value as it stands in a table."""
+    if value is None:
+        return "-"
+    return clean(value) if isinstance(value, str) else f"{value:.7g}"
+
+
+def cells(row: Row) -> tuple[str, ...]:
+    """The entries of one row, in the order of HEADS."""
+    band = "exact" if row.band is None else f"\u00b1 {row.band:.2g}"
+    return clean(row.controller), clean(row.metric), number(row.old), number(row.new), band, row.verdict
+
+
+def headline(judgement: Judgement) -> str:
+    """One sentence about a problem."""
+    name = clean(judgement.problem)
+    if judgement.broken:
+        return f"{name}: cannot be run"
+    if judgement.unusable:
+        stale = all(text.startswith("stale") for text in judgement.unusable)
+        return f"{name}: the baseline is stale" if stale else f"{name}: no usable baseline"
+    controllers = len({row.controller for row in judgement.rows})
+    if judgement.changed:
+        return f"{name}: {len(judgement.changed)} of {len(judgement.rows)} metrics changed"
+    return f"{name}: {len(judgement.rows)} metrics of {controllers} controllers hold"
+
+
+def remarks(judgement: Judgement) -> list[str]:
+    """Everything about a problem that is no row: why it cannot be judged, why runs ended, and what to do."""
+    said = [clean(text) for text in (judgement.broken, *judgement.unusable, *judgement.notes) if text]
+    if judgement.changed or any(text.startswith("stale") for text in judgement.unusable):
+        said.append(
+            f"baseline of {clean(judgement.date)}: {clean(judgement.reason)}. If the new numbers are right: "
+            "fpirhc bless PROBLEM --reason '...'"
+        )
+    return said
+
+
+def shown(judgement: Judgement, every: bool) -> list[Row]:
+    """The rows to show: all, or those that changed and the rms errors of the others."""
+    if every:
+        return list(judgement.rows)
+    return [r for r in judgement.rows if not r.holds or r.metric.startswith("rms_error.")]
+
+
+def rows_of(judgement: Judgement) -> dict[str, list[Row]]:
+    """Rows by controller."""
+    found: dict[str, list[Row]] = {}
+    for row in judgement.rows:
+        found.setdefault(row.controller, []).append(row)
+    return found
+
+
+def told(rows: Sequence[Row]) -> str:
+    """Rows as lines of plain text."""
+    return "\n".join(
+        f"{c[0]}: {c[1]} was {c[2]}, is {c[3]}" + ("" if row.metric == OUTCOME else f" ({c[4]})") + f": {c[5]}"
+        for row in rows
+        for c in [cells(row)]
+    )
+
+
+def check_replaceable(path: Path, mark: str) -> None:
+    """Raise unless `path` is free or holds an earlier report: a check overwrites nothing else.
+
+    Raises:
+        OutputError: something else is there, or the folder is not.
+    """
+    if not path.parent.is_dir():
+        raise OutputError(f"cannot write to '{path}': there is no folder '{path.parent}'")
+    if not path.exists():
+        return
+    try:
+        with path.open("rb") as file:
+            head = file.read(400)
+    except OSError as error:
+        raise OutputError(f"cannot write to '{path}': {error.strerror}") from None
+    if head and mark.encode() not in head:
+        raise OutputError(
+            f"'{path}' exists and is no report of 'fpirhc check'; it is not overwritten: choose another name"
+        )

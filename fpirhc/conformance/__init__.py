@@ -1,0 +1,19 @@
+"""Laws that every member of a family keeps, to be tried on a class of one's own in one line.
+
+    check_deformation(MyMap(gain=-0.5), seed=1)
+    check_tracking(MyLaw(rate=6.0), seed=1)
+    check_optimiser(MyOptimiser(tolerance=1e-6), tolerance=1e-6, seed=1)
+    check_controller(MyController(...), seed=1)
+    check_plant(my_plant, seed=1)
+
+Each raises one AssertionError for the first law that is broken, with the numbers; nothing is returned. The laws themselves are
+the tuples `LAWS` of the modules, one module per family.
+"""
+
+from fpirhc.conformance.controller import check_controller
+from fpirhc.conformance.deformation import check_deformation
+from fpirhc.conformance.optimiser import check_optimiser
+from fpirhc.conformance.plant import check_plant
+from fpirhc.conformance.tracking import check_tracking
+
+__all__ = ["check_controller", "check_deformation", "check_optimiser", "check_plant", "check_tracking"]

@@ -1,0 +1,263 @@
+"""Laws that every controller keeps, tried in short closed loops."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
+from fpirhc.controllers.base import Controller, compose_controller, prepared
+from fpirhc.horizon.cost import Quadratic
+from fpirhc.horizon.problem import Horizon
+from fpirhc.plant.plant import Parameter, Plant
+from fpirhc.sensing.sensing import Sensing
+from fpirhc.simulation.run import Run
+from fpirhc.simulation.simulate import simulate
+from fpirhc.simulation.stepper import Stepper
+from fpirhc.status import Status
+from fpirhc.task.limits import Limits
+from fpirhc.task.problem import Problem
+from fpirhc.task.reference import Trajectory
+
+Array = npt.NDArray[Any]
+
+_SAME = 1e-9  # relative difference of commands that counts as none
+_TIGHT = 0.5  # share of the largest command that is left by the limits of the law on limits
+_STEPS = 8  # cycles before a bad measurement, and after it
+
+
+def check_controller(
+    controller: Controller, *, seed: int, problem: Problem | None = None, left: float = 0.05, compiled: bool = True
+) -> None:
+    """Check every law on a controller.
+
+    Parameters:
+        seed: of the noise, and of what is drawn.
+        problem: what it controls; None: two masses between springs, with limits, a horizon and a cost, for 2 s.
+        left: share of the largest first error that may be left in the last quarter of a run with the exact model.
+        compiled: also compare with compiled C, which costs a second or more the first time; without a compiler it is skipped.
+
+    Raises:
+        AssertionError: the first law that does not hold, in one sentence.
+        FpirhcError: the controller cannot serve the problem.
+    """
+    keep(controller, _Trial(controller, problem or two_masses(), seed, left, compiled), LAWS, seed)
+
+
+def two_masses() -> Problem:
+    """Two masses between springs with a model that is wrong in mass and stiffness, for 2 s."""
+    plant = Plant(
+        coordinates={"a": "m", "b": "m"},
+        inputs={"Fa": "N", "Fb": "N"},
+        parameters={
+            "m": Parameter(approximate=1.4, exact=1.0, unit="kg"),
+            "k": Parameter(approximate=2.0, exact=3.0, unit="N/m"),
+        },
+        response=lambda q, v, u, p: {
+            "a": (u.Fa - p.k * (2 * q.a - q.b) - 0.2 * v.a) / p.m,
+            "b": (u.Fb - p.k * (2 * q.b - q.a) - 0.2 * v.b) / p.m,
+        },
+    )
+    weights = {"a": 1e2, "b": 1e2, "a'": 1.0, "b'": 1.0}
+    return Problem(
+        plant=plant,
+        reference=Trajectory(lambda t: {"a": 0.3 * ca.sin(2 * t), "b": 0.2 * ca.cos(t)}),
+        start={"a": 0.4, "b": -0.1},
+        period=5e-3,
+        duration=2.0,
+        limits=Limits(inputs={"Fa": (-30.0, 30.0), "Fb": (-30.0, 30.0)}),
+        horizon=Horizon(stages=12, step=2e-2),
+        cost=Quadratic(states=weights, deviation={"Fa": 1e-3, "Fb": 1e-3}),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A controller on a problem."""
+
+    controller: Controller
+    problem: Problem
+    seed: int
+    left: float
+    compiled: bool
+
+    @cached_property
+    def run(self) -> Run:
+        """The closed loop with the wrong model, in CasADi's virtual machine."""
+        return self.simulated(self.problem)
+
+    def simulated(self, problem: Problem) -> Run:
+        return simulate(problem, self.controller, seed=self.seed, compiled=False)
+
+    @cached_property
+    def stepper(self) -> Stepper:
+        """The controller alone, in CasADi's virtual machine."""
+        return Stepper(self.problem, prepared(self.problem, self.controller), compiled=False)
+
+
+def frozen_value(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """A controller is a frozen value that can be hashed, copied and described."""
+    is_a_frozen_value(trial.controller)
+    is_a_frozen_value(trial.controller.resolved(trial.problem))
+
+
+def writes_a_command_and_a_status(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """A cycle writes what every run logs: reference, error, desired, deformed, command, clipped, status."""
+    written = compose_controller(trial.problem, trial.controller).trace
+    expected = ("reference", "error", "desired", "deformed", "command", "clipped", "status")
+    missing = [name for name in expected if name not in written]
+    hold(not missing, f"its blocks do not write {missing}; end them with closing_blocks()")
+    size = trial.problem.plant.input.size
+    hold(
+        written["command"].size == size,
+        f"its command has {written['command'].size} entries, the plant has {size} inputs",
+    )
+
+
+def exact_model_tracks(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """With an exact model, ideal sensors and nothing that disturbs, the error of every judged coordinate goes to zero."""
+    problem = _exact(trial.problem)
+    run = trial.simulated(problem)
+    hold(run.stop is None, f"with the exact model the run ends early: {run.stop}")
+    errors = np.abs(run["true_error"] if "true_error" in run.layout else run["error"])
+    first, late = float(errors[0].max()), errors[-run.cycles // 4 :].max(axis=0)
+    hold(first > 0, "the problem starts on its reference, so nothing can be told; start elsewhere")
+    for name, rest in zip(problem.judged_names, late, strict=True):
+        hold(
+            within(rest, trial.left * first),
+            f"with the exact model the error of '{name}' is still {rest:.3g} in the last quarter of {problem.duration:g} s, "
+            f"of {first:.3g} at first; more than the share {trial.left:g}",
+        )
+
+
+def _exact(problem: Problem) -> Problem:
+    parameters = {
+        name: Parameter(approximate=p.exact, exact=p.exact, unit=p.unit) for name, p in problem.plant.parameters.items()
+    }
+    return replace(problem, plant=replace(problem.plant, parameters=parameters), disturbances={}, sensing=Sensing())
+
+
+def same_command_everywhere(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """The loop, a Stepper, a second Stepper and compiled C give the same command for the same measurements."""
+    run, scale = trial.run, 1 + float(np.abs(trial.run["command"]).max())
+    steppers = {
+        "a Stepper": trial.stepper,
+        "a second Stepper": Stepper(trial.problem, trial.controller, compiled=False),
+    }
+    if trial.compiled:
+        compiled = Stepper(trial.problem, trial.controller)
+        if compiled.compiled:
+            steppers["compiled C"] = compiled
+    for what, stepper in steppers.items():
+        commands = _replayed(stepper, run)
+        missed = np.abs(commands - run["command"]).max(axis=1)
+        worst = int(np.argmax(np.nan_to_num(missed, nan=np.inf)))
+        hold(
+            within(missed, _SAME * scale),
+            f"in cycle {worst} the loop's command is {run['command'][worst]}, from {what} it is {commands[worst]}",
+        )
+
+
+def _replayed(stepper: Stepper, run: Run) -> Array:
+    memory, commands = stepper.start(), np.empty_like(run["command"])
+    for k in range(run.cycles):
+        commands[k], memory = stepper.step(float(run.time[k]), run["state"][k], run["realised"][k], memory)
+    return commands
+
+
+def same_arguments_same_command(trial: _Trial, generator: np.random.Generator) -> None:
+    """A cycle depends on its arguments alone: called twice with them, it answers the same."""
+    run, stepper = trial.run, trial.stepper
+    memory = stepper.start()
+    for k in generator.integers(0, run.cycles, size=5):
+        arguments = float(run.time[k]), run["state"][k], run["realised"][k]
+        one, following = stepper.step(*arguments, memory)
+        other, again = stepper.step(*arguments, memory)
+        hold(
+            np.array_equal(one, other, equal_nan=True) and np.array_equal(following, again, equal_nan=True),
+            f"called twice with the same arguments it answers {one} and then {other}",
+        )
+        memory = following
+
+
+def command_keeps_the_limits(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """No command leaves the limits of the inputs, also where they leave it half of what it would like."""
+    plant, wished = trial.problem.plant, trial.run["command"]
+    middle, most = 0.5 * (wished.max(axis=0) + wished.min(axis=0)), 0.5 * np.ptp(wished, axis=0)
+    inputs = {
+        name: (float(middle[k] - _TIGHT * most[k]), float(middle[k] + _TIGHT * most[k]))
+        for k, name in enumerate(plant.inputs)
+    }
+    for problem in (trial.problem, replace(trial.problem, limits=replace(trial.problem.limits, inputs=inputs))):
+        lower, upper = problem.limits.input_bounds(plant)
+        # A weak actuator may lose the plant: what counts is every command up to there.
+        run = trial.simulated(problem)
+        outside = np.maximum(lower - run["command"], run["command"] - upper)
+        worst = np.unravel_index(int(np.argmax(outside)), outside.shape)
+        name = plant.input.elements[worst[1]]
+        hold(
+            bool((outside <= 0).all()),
+            f"the command '{name}' is {run['command'][worst]:.6g} at t = {run.time[worst[0]]:g} s, outside "
+            f"({lower[worst[1]]:g}, {upper[worst[1]]:g})",
+        )
+        clipped = np.isclose(run["command"], lower).any(axis=1) | np.isclose(run["command"], upper).any(axis=1)
+        silent = clipped & (run["clipped"][:, 0] < 0.5) & ("command_unclipped" in run.layout)
+        if silent.any():
+            at = int(np.argmax(silent))
+            excess = np.abs(run["command_unclipped"][at] - run["command"][at]).max()
+            hold(
+                within(excess, _SAME * (1 + np.abs(run["command"][at]).max())),
+                f"it clips at t = {run.time[at]:g} s without saying so",
+            )
+
+
+def bad_measurement_never_acts(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """A measurement that is not finite gives a finite command within the limits and a status, and does no lasting harm."""
+    for bad in (np.nan, np.inf):
+        for k, name in enumerate(trial.problem.plant.state.elements):
+            _measured_once(trial, bad, k, f"'{name}' measured as {bad} in cycle {_STEPS}")
+
+
+def bad_response_never_acts(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """A measured response that is not finite gives finite commands within the limits, then and later."""
+    for bad in (np.nan, np.inf):
+        _measured_once(trial, bad, None, f"a response measured as {bad} in cycle {_STEPS}")
+
+
+def _measured_once(trial: _Trial, bad: float, entry: int | None, what: str) -> None:
+    """Replay a run with one bad value in one cycle: of an entry of the state, or (None) of the whole response."""
+    run, stepper = trial.run, trial.stepper
+    lower, upper = trial.problem.limits.input_bounds(trial.problem.plant)
+    memory, status = stepper.start(), 0.0
+    for cycle in range(min(2 * _STEPS + 1, run.cycles)):
+        time, state, realised = float(run.time[cycle]), run["state"][cycle].copy(), run["realised"][cycle]
+        matters = False
+        if cycle == _STEPS and entry is None:
+            realised = np.full_like(realised, bad)
+        elif cycle == _STEPS and entry is not None:
+            state[entry] += 0.1
+            matters = not np.array_equal(stepper.step(time, state, realised, memory)[0], run["command"][cycle])
+            state[entry] = bad
+        command, memory = stepper.step(time, state, realised, memory)
+        status = float(stepper.trace()["status"][0])
+        fine = bool(np.isfinite(command).all() and (command >= lower).all() and (command <= upper).all())
+        hold(fine, f"{what}: the command of cycle {cycle} is {command}")
+        hold(not matters or status != Status.OK, f"{what}: the status of that cycle is OK")
+    hold(status != Status.NON_FINITE, f"{what}: {_STEPS} good measurements later the status is still NON_FINITE")
+
+
+LAWS = (
+    frozen_value,
+    writes_a_command_and_a_status,
+    same_arguments_same_command,
+    same_command_everywhere,
+    command_keeps_the_limits,
+    bad_measurement_never_acts,
+    bad_response_never_acts,
+    exact_model_tracks,
+)

@@ -1,0 +1,227 @@
+"""Laws that every optimiser keeps, tried on small horizons whose answers are known by other means."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from fpirhc.conformance.horizons import BOUND, CORRIDOR, STAGES, Trial, TrialHorizon, TrialPlan
+from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
+from fpirhc.errors import InvalidValue
+from fpirhc.optimisers.base import FEASIBLE, Optimiser
+from fpirhc.status import Status
+
+_SLACK = 2.0  # times the tolerance that a claimed stationarity may be off
+_DIFFERENCE = 1e-6  # relative error of central differences of a cost
+_TRIALS = 3
+_FEW = 5  # calls that a problem without solution is given
+
+
+def check_optimiser(optimiser: Optimiser, *, tolerance: float, seed: int, calls: int = 50) -> None:
+    """Check every law on an optimiser.
+
+    Parameters:
+        tolerance: of the stationarity, in the unit of the inputs, below which it calls a plan OK.
+        seed: draws first states and plans. calls: of its step, within which it must solve a small convex problem.
+
+    Raises:
+        AssertionError: the first law that does not hold, in one sentence.
+        InvalidValue: a tolerance that is not positive, or above 1e-3: too coarse to tell a solution by.
+    """
+    if not 0 < tolerance <= 1e-3:
+        raise InvalidValue(f"check_optimiser(tolerance={tolerance!r}): expected a number above 0 and up to 1e-3")
+    keep(optimiser, Trial(optimiser, tolerance, calls), LAWS, seed)
+
+
+def frozen_value(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """An optimiser is a frozen value that can be hashed, copied and described."""
+    is_a_frozen_value(trial.optimiser)
+
+
+def remembers_a_plan(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """The memory holds the plan in `plan_inputs`, and step and shift keep its size."""
+    task = trial.linear
+    layout = task.layout
+    hold("plan_inputs" in layout, f"memory() lays out {list(layout.names)}, but not 'plan_inputs'")
+    size = layout["plan_inputs"].size
+    hold(size == STAGES, f"'plan_inputs' has {size} entries, expected {STAGES}: inputs times stages")
+    shapes = [task.step.size_out(k) for k in range(task.step.n_out())]
+    expected = [(1, STAGES), (5, 1), (layout.size, 1)]
+    hold(shapes == expected, f"step gives {shapes}, expected {expected}: plan, diagnostics, memory")
+    size = task.shifted.numel_out(0)
+    hold(size == layout.size, f"shifted() gives {size} entries, the memory has {layout.size}")
+
+
+def linear_plan_is_riccati(trial: Trial, generator: np.random.Generator) -> None:
+    """On a linear model with a quadratic cost the plan is u_i = -K s_i with K of scipy's Riccati equation."""
+    task = trial.linear
+    (a, b), (_, r, p) = task.model, task.weights
+    gain = np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
+    for _ in range(_TRIALS):
+        found = task.solved(generator.normal(size=2))
+        hold(
+            found.status == Status.OK,
+            f"on {STAGES} stages of a linear model its status after {found.calls} calls is {found.status.name}, stationarity "
+            f"{found.stationarity:.3g}; give more iterations or calls",
+        )
+        s, expected = found.state, []
+        for _ in range(STAGES):
+            expected.append(-float((gain @ s)[0]))
+            s = a @ s + b[:, 0] * expected[-1]
+        missed = float(np.abs(found.inputs[0] - expected).max())
+        allowed = _SLACK * task.reach * trial.tolerance + 1e-9
+        hold(
+            within(missed, allowed), f"an input of its plan is off by {missed:.3g}, the tolerance allows {allowed:.3g}"
+        )
+
+
+def plan_is_stationary(trial: Trial, generator: np.random.Generator) -> None:
+    """On a nonlinear model a plan called OK is stationary by central differences, and costs what it says."""
+    for _ in range(_TRIALS):
+        found = trial.bent.solved(generator.normal(size=2))
+        _judged(trial, trial.bent, found)
+        hold(found.status == Status.OK, f"after {found.calls} calls its status is {found.status.name}")
+
+
+def _judged(trial: Trial, task: TrialHorizon, found: TrialPlan) -> None:
+    """Compare what is said about a plan with what it is."""
+    cost, residual = task.value(found.state, found.inputs), task.residual(found.state, found.inputs)
+    hold(
+        within(found.cost - cost, 1e-9 * (1 + abs(cost))),
+        f"it says the plan costs {found.cost:.9g}, rolled out it costs {cost:.9g}",
+    )
+    allowed = _SLACK * trial.tolerance + _DIFFERENCE * (1 + cost)
+    hold(
+        found.status != Status.OK or residual <= allowed,
+        f"it calls a plan OK whose stationarity by central differences is {residual:.3g}, above {trial.tolerance:g}",
+    )
+    hold(
+        within(found.stationarity - residual, allowed + 0.01 * residual),
+        f"it says stationarity {found.stationarity:.3g}, central differences give {residual:.3g}",
+    )
+
+
+def status_is_honest(trial: Trial, generator: np.random.Generator) -> None:
+    """One call from a bad first plan says OK only if the plan is converged, and the truth about it otherwise."""
+    task = trial.bent
+    for _ in range(_TRIALS):
+        found = task.called(3 * generator.normal(size=2), task.begun(3 * generator.normal(size=STAGES)))
+        if found.status in (Status.OK, Status.NOT_CONVERGED):
+            _judged(trial, task, found)
+        hold(
+            found.status != Status.NOT_CONVERGED or found.stationarity > trial.tolerance * (1 - 1e-9),
+            f"it says not converged at stationarity {found.stationarity:.3g}, which is within {trial.tolerance:g}",
+        )
+
+
+def bounds_of_inputs_are_kept(trial: Trial, generator: np.random.Generator) -> None:
+    """No input leaves its bounds, and the bounded plan is scipy's least-squares solution; or bounds are refused."""
+    task = trial.bounded
+    if not task.served:
+        return
+    by_u, by_s = task.squares
+    for size in (1.0, 3.0, 10.0):
+        found = task.solved(size * generator.normal(size=2))
+        outside = float(np.abs(found.inputs).max()) - BOUND
+        hold(outside <= 1e-9, f"an input is {outside:.3g} outside its bounds of {BOUND:g}")
+        said = f"{found.status.name} after {found.calls} calls"
+        hold(found.status == Status.OK, f"with active bounds its status is {said}")
+        best = lsq_linear(by_u, -by_s @ found.state, (-BOUND, BOUND), tol=1e-14, method="bvls").x
+        missed = float(np.abs(found.inputs[0] - best).max())
+        # Inputs at a bound leave fewer free ones, whose Hessian may be worse than the whole.
+        allowed = 10 * _SLACK * task.reach * trial.tolerance + 1e-7
+        hold(within(missed, allowed), f"with active bounds an input is off by {missed:.3g}, allowed is {allowed:.3g}")
+
+
+def bounds_of_a_call_count(trial: Trial, generator: np.random.Generator) -> None:
+    """The bounds are those given to the call, from the first call on, not those of the problem."""
+    task = trial.bounded
+    if not task.served:
+        return
+    lower, upper = -0.5 * BOUND, 0.1 * BOUND
+    memory = task.begun(generator.normal(size=STAGES))
+    inputs = np.asarray(task.step(3 * generator.normal(size=2), task.data, lower, upper, memory)[0].full())
+    worst = float(np.maximum(lower - inputs, inputs - upper).max())
+    hold(worst <= 1e-9, f"given bounds ({lower:g}, {upper:g}), it plans an input {worst:.3g} outside of them")
+
+
+def infeasible_is_told(trial: Trial, generator: np.random.Generator) -> None:
+    """A limit of a state that cannot be kept is never called OK; or limits of states are refused."""
+    task = trial.impossible
+    if not task.served:
+        return
+    found = task.solved(np.array([2.0, float(generator.uniform(1.0, 2.0))]), most=_FEW)
+    worst = max(float(np.abs(s[0])) for s in task.states(found.state, found.inputs)[1:]) - CORRIDOR
+    hold(found.status != Status.OK, f"it calls a plan OK that violates a limit of a state by {worst:.3g}")
+    said = float(found.diagnostics[2])
+    hold(
+        found.status == Status.NON_FINITE or within(said - worst, FEASIBLE),
+        f"it says a limit is violated by {said:.3g}, rolled out it is {worst:.3g}",
+    )
+
+
+def nan_is_told(trial: Trial, generator: np.random.Generator) -> None:
+    """A state or data that are no numbers give NON_FINITE and a finite plan, and nothing of it is remembered."""
+    task = trial.linear
+    state = generator.normal(size=2)
+    memory = task.begun(task.solved(state).inputs[0])
+    spoilt = task.data.copy()
+    spoilt[task.ocp.data.slice("reference"), STAGES // 2] = np.nan
+    cases = {
+        "a state of NaN": (np.array([np.nan, 0.0]), task.data),
+        "an infinite state": (np.array([0.0, np.inf]), task.data),
+        "a reference of NaN": (state, spoilt),
+    }
+    for what, (first, data) in cases.items():
+        found = task.called(first, memory, data)
+        hold(found.status == Status.NON_FINITE, f"given {what}, its status is {found.status.name}, expected NON_FINITE")
+        hold(bool(np.isfinite(found.inputs).all()), f"given {what}, it plans {found.inputs[0]}")
+        hold(bool(np.isfinite(found.memory).all()), f"given {what}, it remembers values that are not finite")
+        after = task.solved(state, found.memory).status
+        hold(after == Status.OK, f"after {what} it does not recover: its status is {after.name}")
+
+
+def poisoned_memory_is_forgotten(trial: Trial, generator: np.random.Generator) -> None:
+    """A memory that is not finite does not stay so: the next calls solve the problem."""
+    task = trial.linear
+    after = task.solved(generator.normal(size=2), np.full(task.layout.size, np.nan))
+    hold(after.status == Status.OK, f"from a memory of NaN its status after {after.calls} calls is {after.status.name}")
+    hold(bool(np.isfinite(after.memory).all()), "from a memory of NaN it solves the problem, but remembers NaN still")
+
+
+def solution_stays(trial: Trial, generator: np.random.Generator) -> None:
+    """Called once more at a solution, it stays there and says OK; one stage later the shifted plan serves as well."""
+    task = trial.linear
+    (a, b), state = task.model, generator.normal(size=2)
+    solved = task.solved(state)
+    again = task.called(state, solved.memory)
+    moved = float(np.abs(again.inputs - solved.inputs).max())
+    allowed = 2 * _SLACK * task.reach * trial.tolerance + 1e-9
+    hold(
+        within(moved, allowed), f"called again at a solution it moves the plan by {moved:.3g}, allowed is {allowed:.3g}"
+    )
+    hold(again.status == Status.OK, f"called again at a solution its status is {again.status.name}")
+    shifted = np.asarray(task.shifted(again.memory).full())[:, 0]
+    kept = shifted[task.layout.slice("plan_inputs")][:-1]
+    missed = float(np.abs(kept - again.inputs[0, 1:]).max())
+    hold(
+        within(missed, allowed),
+        f"shifted() changes inputs of the plan by {missed:.3g} besides dropping the first stage",
+    )
+    later = task.solved(a @ state + b[:, 0] * again.inputs[0, 0], shifted)
+    hold(later.status == Status.OK, f"from the shifted plan of the stage before its status is {later.status.name}")
+
+
+LAWS = (
+    frozen_value,
+    remembers_a_plan,
+    linear_plan_is_riccati,
+    plan_is_stationary,
+    status_is_honest,
+    bounds_of_inputs_are_kept,
+    bounds_of_a_call_count,
+    infeasible_is_told,
+    nan_is_told,
+    poisoned_memory_is_forgotten,
+    solution_stays,
+)

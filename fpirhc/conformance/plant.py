@@ -1,0 +1,180 @@
+"""Laws that every plant keeps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.conformance.laws import hold, keep, within
+from fpirhc.errors import Mistakes
+from fpirhc.plant.plant import Plant
+
+_POINTS = 20
+_INVERSE = 1e-6  # relative to the response; Newton's method is stopped at 1e-8
+_SLOPE = 1e-5  # relative, of central differences
+
+
+def check_plant(plant: Plant, *, seed: int, box: Mapping[str, tuple[float, float]] | None = None) -> None:
+    """Check every law on a plant at random points.
+
+    Parameters: `seed` draws the points; `box` gives the interval of a state (q1, q1', ...) or input by name from which they
+    are drawn, (-1, 1) where none is given.
+
+    Raises:
+        AssertionError: the first law that does not hold, in one sentence.
+        InvalidProblem: a name in `box` that the plant does not have.
+    """
+    mistakes = Mistakes("box")
+    mistakes.unknown("state or input", box or {}, [*plant.state.elements, *plant.inputs])
+    mistakes.raise_if_any()
+    keep(plant, _Trial(plant, dict(box or {})), LAWS, seed)
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A plant with the box that its points are drawn from."""
+
+    plant: Plant
+    box: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def parameters(self) -> dict[str, np.ndarray]:
+        return {"approximate": self.plant.approximate, "exact": self.plant.exact}
+
+    @cached_property
+    def invertible(self) -> bool:
+        """Whether as many coordinates are controlled as there are inputs."""
+        plant = self.plant
+        return plant.controlled is not None or len(plant.inputs) == len(plant.coordinates)
+
+    def points(self, generator: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray]]:
+        """States and inputs."""
+        return [
+            (self._drawn(self.plant.state.elements, generator), self._drawn(self.plant.input.elements, generator))
+            for _ in range(_POINTS)
+        ]
+
+    def where(self, x: np.ndarray, u: np.ndarray) -> str:
+        """A point in words."""
+        names = [*self.plant.state.elements, *self.plant.input.elements]
+        return "at " + ", ".join(f"{n} = {v:.4g}" for n, v in zip(names, [*x, *u], strict=True))
+
+    def _drawn(self, names: tuple[str, ...], generator: np.random.Generator) -> np.ndarray:
+        return np.array([generator.uniform(*self.box.get(n, (-1.0, 1.0))) for n in names])
+
+
+def _numbers(function: ca.Function, *arguments: Any) -> np.ndarray:
+    return np.asarray(function(*arguments).full())[:, 0]
+
+
+def response_is_finite(trial: _Trial, generator: np.random.Generator) -> None:
+    """The response is finite at every point of the box, with the approximate and with the exact parameters."""
+    plant = trial.plant
+    for x, u in trial.points(generator):
+        for which, p in trial.parameters.items():
+            found = _numbers(plant.response_function, x, u, p)
+            for name, value in zip(plant.names, found, strict=True):
+                hold(
+                    bool(np.isfinite(value)),
+                    f"the response of '{name}' ({which} parameters) is {value} {trial.where(x, u)}",
+                )
+
+
+def both_parameter_sets_enter(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """A parameter whose approximate and exact values differ enters the response, else model and plant are secretly one."""
+    plant = trial.plant
+    size = len(plant.parameters)
+    for which, values in trial.parameters.items():
+        hold(values.shape == (size,), f"the {which} parameters have shape {values.shape}, expected ({size},)")
+    x, u, p = plant._symbols()
+    pattern = ca.DM(ca.jacobian_sparsity(plant.response_function(x, u, p), p), 1)
+    entering = np.asarray(pattern.full()).sum(axis=0) > 0
+    for k, name in enumerate(plant.parameters):
+        approximate, exact = plant.approximate[k], plant.exact[k]
+        hold(
+            bool(entering[k]) or approximate == exact,
+            f"the response does not depend on parameter '{name}' (approximate {approximate:g}, exact {exact:g}); "
+            f"write p.{name} where a number or another name stands",
+        )
+
+
+def response_is_pure(trial: _Trial, generator: np.random.Generator) -> None:
+    """Building the response once more gives the same response: it neither draws numbers nor remembers."""
+    again = replace(trial.plant)
+    for x, u in trial.points(generator):
+        one, other = (_numbers(p.response_function, x, u, p.exact) for p in (trial.plant, again))
+        hold(np.array_equal(one, other), f"built twice it answers {one} and then {other} {trial.where(x, u)}")
+
+
+def derivative_is_the_chain(trial: _Trial, generator: np.random.Generator) -> None:
+    """dx/dt holds the next derivative of every coordinate, in the highest place the response plus what is forced on it."""
+    plant = trial.plant
+    elements = plant.state.elements
+    for x, u in trial.points(generator):
+        forcing = generator.normal(size=len(plant.names))
+        forced = _numbers(plant.response_function, x, u, plant.exact) + forcing
+        rate = _numbers(plant.forced_derivative_function, x, u, plant.exact, forcing)
+        for k, name in enumerate(elements):
+            higher = f"{name}'"
+            what = x[elements.index(higher)] if higher in elements else forced[plant.names.index(name.rstrip("'"))]
+            hold(
+                within(rate[k] - what, 1e-12 * max(1.0, abs(what))), f"d{name}/dt is {rate[k]:.6g}, expected {what:.6g}"
+            )
+
+
+def slopes_are_true(trial: _Trial, generator: np.random.Generator) -> None:
+    """The derivatives of the response agree with central differences, so that an optimiser may trust them."""
+    plant = trial.plant
+    x, u, p = plant._symbols()
+    z = ca.vertcat(x, u)
+    slope = ca.Function("slope", [z, p], [ca.densify(ca.jacobian(plant.response_function(x, u, p), z))])
+    split = plant.state.size
+    names = [*plant.state.elements, *plant.input.elements]
+    for x0, u0 in trial.points(generator):
+        at = np.concatenate([x0, u0])
+        found = np.asarray(slope(at, plant.exact).full())
+        for k, name in enumerate(names):
+            step = 1e-5 * max(1.0, abs(at[k]))
+            ends = [at + side * step * np.eye(at.size)[k] for side in (1, -1)]
+            up, down = (_numbers(plant.response_function, end[:split], end[split:], plant.exact) for end in ends)
+            expected = (up - down) / (2 * step)
+            scale = max(1.0, float(np.abs(expected).max()), float(np.abs(up).max()))
+            missed = float(np.abs(found[:, k] - expected).max())
+            hold(
+                within(missed, _SLOPE * scale),
+                f"the derivative of the response by '{name}' is {found[:, k]}, central differences give {expected} "
+                f"{trial.where(x0, u0)}",
+            )
+
+
+def inverse_inverts(trial: _Trial, generator: np.random.Generator) -> None:
+    """The input that the inverse finds for a response causes that response, with either parameter set."""
+    plant = trial.plant
+    if not trial.invertible:
+        return
+    for x, u in trial.points(generator):
+        for which, p in trial.parameters.items():
+            wanted = _numbers(plant.controlled_response_function, x, u, p)
+            command = _numbers(plant.inverse_function, x, wanted, p)
+            got = _numbers(plant.controlled_response_function, x, command, p)
+            missed = float(np.abs(got - wanted).max())
+            hold(
+                within(missed, _INVERSE * (1 + float(np.abs(wanted).max()))),
+                f"for the response {wanted} the inverse ({which} parameters) gives the input {command}, whose response is "
+                f"{got} {trial.where(x, u)}",
+            )
+
+
+LAWS = (
+    response_is_finite,
+    both_parameter_sets_enter,
+    response_is_pure,
+    derivative_is_the_chain,
+    slopes_are_true,
+    inverse_inverts,
+)

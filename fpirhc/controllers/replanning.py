@@ -1,0 +1,119 @@
+"""Where a horizon starts and what is tracked between two plans: three documented values.
+
+`FromMeasurement` -- every plan starts from the measured state; the model's response to the plan's first input at the measured
+state is the nominal and desired response, q^Des = f(x, u_0). There is no tracking law: feedback comes from restarting. As
+the response error goes to zero the plant becomes the model for the optimiser, so the plan's stability carries over.
+
+`FromMeasurementTracked` -- every plan starts from the measured state; between plans the model propagates the planned motion and a
+tracking law keeps the plant on it. It corrects what happens within a stage, and forgets the tracking error at restarts.
+
+`FromPlan` -- the plan starts from the model's own propagated state and never sees the measured one; a tracking law keeps
+the plant on the planned motion. The optimiser cannot be destabilised by the plant, but limits bind the model's motion,
+not the plant's.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+
+from fpirhc.controllers.base import like
+from fpirhc.plant.integrators import runge_kutta_4
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.base import Tracking
+
+Parts = tuple[list[Block], list[Block], list[Block], list[Delay]]
+
+
+class Replanning(ABC):
+    """Contract: blocks before the plan (-> _plan_state), after it (-> nominal, desired), after the command; delays."""
+
+    @abstractmethod
+    def parts(self, problem: Problem) -> Parts:
+        """Blocks before the plan, after the plan, and after the command is limited; what is remembered."""
+
+
+@dataclass(frozen=True)
+class FromMeasurement(Replanning):
+    """Plan from the measured state; the plan's first response is the desired one (no tracking law)."""
+
+    def parts(self, problem: Problem) -> Parts:
+        """Blocks of this choice."""
+        plant = problem.plant
+        start = _choose("plan_state", plant, lambda s: {"_plan_state": s.state}, ["_plan_state"])
+        response = plant.controlled_response_function
+        reads = Layout((plant.state, like(plant.input, "planned"), plant.parameter))
+        writes = Layout((plant.response_signal("nominal"), plant.response_signal("desired")))
+
+        def step(s: Any) -> dict[str, Expression]:
+            planned = response(s.state, s.planned, s.parameters)
+            return {"nominal": planned, "desired": planned}
+
+        return [start], [Block("nominal", reads, writes, step)], [], []
+
+
+@dataclass(frozen=True)
+class FromMeasurementTracked(Replanning):
+    """Plan from the measured state; between plans track the motion that the model propagates."""
+
+    tracking: Tracking
+
+    def parts(self, problem: Problem) -> Parts:
+        """Blocks of this choice."""
+
+        def start(s: Any) -> dict[str, Expression]:
+            fresh = ca.logic_or(s.warm_up < 0.5, s._due > 0.5)
+            return {"_plan_state": s.state, "_target": ca.if_else(fresh, s.state, s._target_before)}
+
+        return _tracked(problem, self.tracking, start)
+
+
+@dataclass(frozen=True)
+class FromPlan(Replanning):
+    """Plan from the model's own state and track the planned motion."""
+
+    tracking: Tracking
+
+    def parts(self, problem: Problem) -> Parts:
+        """Blocks of this choice."""
+
+        def start(s: Any) -> dict[str, Expression]:
+            target = ca.if_else(s.warm_up < 0.5, s.state, s._target_before)
+            return {"_plan_state": target, "_target": target}
+
+        return _tracked(problem, self.tracking, start)
+
+
+def _tracked(problem: Problem, tracking: Tracking, start: Callable[[Any], dict[str, Expression]]) -> Parts:
+    plant = problem.plant
+    begin = _choose("plan_state", plant, start, ["_plan_state", "_target"])
+    delay = Delay(like(plant.state, "_target_before"), "target")
+    after = [_propagate(plant, problem.period), tracking.law(plant, problem.period)]
+    return [begin], after, [tracking.update(plant, problem.period)], [delay, *tracking.delays(plant)]
+
+
+def _choose(name: str, plant: Plant, step: Callable[[Any], dict[str, Expression]], writes: list[str]) -> Block:
+    reads = [plant.state]
+    if len(writes) > 1:
+        reads += [scalar("warm_up"), scalar("_due"), like(plant.state, "_target_before")]
+    return Block(name, Layout(tuple(reads)), Layout(tuple(like(plant.state, w) for w in writes)), step)
+
+
+def _propagate(plant: Plant, period: float) -> Block:
+    """Block (target, planned input) -> (nominal response, target one cycle later by the model)."""
+    reads = Layout((like(plant.state, "_target"), like(plant.input, "planned"), plant.parameter))
+    writes = Layout((plant.response_signal("nominal"), like(plant.state, "target")))
+    response, rate = plant.controlled_response_function, plant.derivative_function
+
+    def step(s: Any) -> dict[str, Expression]:
+        following = runge_kutta_4(lambda x: rate(x, s.planned, s.parameters), s._target, period)
+        return {"nominal": response(s._target, s.planned, s.parameters), "target": following}
+
+    return Block("propagate", reads, writes, step)

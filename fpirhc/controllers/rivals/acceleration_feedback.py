@@ -1,0 +1,104 @@
+"""Computed torque with feedback of the measured response: u = model(q^Des) + K (q^Des - q^(n)).
+
+K is kappa times the model's inertia: the request is r_k = d_k - kappa h_k with h_k = f_k - d_k, f_k the response to the last
+request and d_k the desired one; h may be low-passed with the pole p = exp(-period / time_constant). Where the response is
+f = J r + c with constant eigenvalues of J,
+
+    error left by a constant residual w = c - (1 - J) d:  h = w / (1 + kappa J),
+    stable for  kappa lambda_max(J) < (1 + p) / (1 - p).
+
+So without a filter the error can at most be halved, and with one it is divided by as much as the filter is slow: a
+proportional law on the response, where a deformation is a summing one. Nothing is remembered but the filter.
+
+References: J. Studenny, P. R. Bélanger, Robot manipulator control by acceleration feedback, IEEE CDC 1984. B. de Jager,
+Acceleration assisted tracking control, IEEE Control Systems 14(5), 1994. In their spirit: there K and the filter are designed
+in continuous time.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+
+from fpirhc.controllers.base import FINITE, Controller, commanding_blocks, invert_block, like, reference_block, rename
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import InvalidValue
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.base import Tracking
+
+
+@dataclass(frozen=True)
+class AccelerationFeedback(Controller):
+    """Inverse dynamics of q^Des + kappa (q^Des - q^(n)), with the measured response q^(n).
+
+    Parameters:
+        tracking: the law that gives the desired response.
+        gain: kappa, dimensionless.
+        time_constant: of the low-pass on the response error, s; 0 is none.
+
+    Raises:
+        InvalidValue: a gain that is not positive, or a negative time constant.
+    """
+
+    tracking: Tracking
+    gain: float
+    time_constant: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.gain) and self.gain > 0):
+            raise InvalidValue(f"AccelerationFeedback(gain={self.gain!r}): expected a positive number")
+        if not 0 <= self.time_constant < math.inf:
+            raise InvalidValue(
+                f"AccelerationFeedback(time_constant={self.time_constant!r}): expected 0 or more seconds"
+            )
+
+    @property
+    def adaptive(self) -> Deformation:
+        """None: the request is not iterated."""
+        return Identity()
+
+    def pole(self, period: float) -> float:
+        """Pole p of the low-pass, in control cycles of that period, s."""
+        return math.exp(-period / self.time_constant) if self.time_constant > 0 else 0.0
+
+    def largest_gain(self, period: float) -> float:
+        """Stability limit of kappa lambda_max(J), (1 + p) / (1 - p)."""
+        return (1 + self.pole(period)) / (1 - self.pole(period))
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Blocks reference, tracking, feedback, invert, limit, judge, tracking update."""
+        plant = problem.plant
+        closing, delays = commanding_blocks(problem)
+        blocks = [
+            reference_block(problem),
+            rename("target", like(plant.state, "reference"), like(plant.state, "_target")),
+            rename("nominal", plant.response_signal("_reference_response"), plant.response_signal("nominal")),
+            self.tracking.law(plant, problem.period),
+            self._feedback_block(problem),
+            invert_block(plant),
+            *closing,
+            self.tracking.update(plant, problem.period),
+        ]
+        return blocks, [*delays, *self.tracking.delays(plant)]
+
+    def _feedback_block(self, problem: Problem) -> Block:
+        """Block (desired, realised) -> request; without a response yet it passes the desired one."""
+        plant, pole, blind = problem.plant, self.pole(problem.period), problem.warm_up_cycles
+        memory = Layout((plant.response_signal("filtered_error"),))
+
+        def step(s: Any) -> dict[str, Expression]:
+            error = pole * s.filtered_error + (1 - pole) * (s.realised - s.desired)
+            # A measurement that is not finite must not stay in the filter.
+            running = s.warm_up > blind - 0.5
+            usable = ca.logic_and(running, ca.mmin(ca.fabs(error) <= FINITE))
+            request = s.desired - self.gain * ca.if_else(running, error, 0)
+            return {"_deformed_unclipped": request, "filtered_error_next": ca.if_else(usable, error, s.filtered_error)}
+
+        reads = (plant.response_signal("desired"), plant.response_signal("realised"), scalar("warm_up"))
+        return Block("feedback", Layout(reads), Layout((plant.response_signal("_deformed_unclipped"),)), step, memory)

@@ -1,0 +1,113 @@
+"""Adaptive inverse dynamics: computed torque whose model learns its parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import solve_continuous_lyapunov
+
+from fpirhc.controllers.automatic_scale import scaled_for_reference
+from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block, rename
+from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, fed, learning_delays
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.learning.rules.base import Pair, Rule
+from fpirhc.plant.regressor import Combination
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Expression
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.error import error_chains, integral_signal
+from fpirhc.tracking.exponential import Exponential
+
+
+@dataclass(frozen=True, eq=False)
+class AdaptiveInverseDynamics(Controller):
+    """u = Y(q, q', r) p_hat + Q0 with r the desired response of the tracking law, or what a deformation makes of it.
+
+    With x = (e_int, e, e') of every coordinate the errors obey x' = A x + B M_hat^-1 Y(q, q', q'') (p - p_hat), and with
+    A^T P + P A = -Q_L the Lyapunov function x^T P x + (p - p_hat)^T Gamma^-1 (p - p_hat) falls under p_hat' = Gamma G^T w,
+    G = M_hat^-1 Y and w = B^T P x. Q_L is diagonal, (rate^4, rate^2, 1), in units of e'. The measured response is needed, and
+    M_hat^-1, so the bounds must keep M_hat positive definite. A deformation keeps the errors small whatever p_hat is; the Lyapunov
+    rule then has little to learn from, a Projection as much as without.
+
+    Parameters:
+        tracking: the law that gives the desired response.
+        rule: how the estimate moves: LyapunovRule or Projection.
+        bounds: parameter or combination -> (lower, upper); these are learned, from their approximate values on.
+        combinations: expressions of parameters that enter linearly as a whole, by name.
+        deformation: the fixed-point map between desired response and request.
+
+    Raises:
+        When the loop is built: NotSupported where the plant is not fully actuated mechanics or has dead time; InvalidValue where
+        parameters enter nonlinearly or the bounds do not keep the mass matrix positive definite.
+
+    References:
+        J. J. Craig, P. Hsu, S. S. Sastry, Adaptive control of mechanical manipulators, Int. J. Robotics Research 6(2), 1987.
+    """
+
+    tracking: Exponential
+    rule: Rule
+    bounds: Mapping[str, tuple[float, float]]
+    combinations: Mapping[str, Combination] = field(default_factory=dict)
+    deformation: Deformation = field(default_factory=Identity)
+
+    @property
+    def adaptive(self) -> Deformation:
+        """The deformation in use."""
+        return self.deformation
+
+    def resolved(self, problem: Problem) -> AdaptiveInverseDynamics:
+        """Return the controller with the deformation's scale chosen."""
+        return replace(self, deformation=scaled_for_reference(self.deformation, problem))
+
+    def check(self, problem: Problem) -> None:
+        """Raise if plant, bounds or rule do not fit (see Learning.check)."""
+        self._learning.check(problem, inverts=True, reads_response=True)
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Blocks reference, tracking, learn, deform, invert, limit, judge, tracking update."""
+        plant, regressor = problem.plant, self._learning.regressor(problem)
+        closing, delays = closing_blocks(replace(problem, plant=regressor.believed), self.deformation)
+        believed = like(regressor.believed.parameter, "_believed")
+        response = plant.response_signal("_reference_response")
+        blocks = [
+            reference_block(problem),
+            rename("target", like(plant.state, "reference"), like(plant.state, "_target")),
+            rename("nominal", response, plant.response_signal("nominal")),
+            self.tracking.law(plant, problem.period),
+            self._learn_block(problem),
+            *(fed(block, "parameters", believed) for block in closing),
+            self.tracking.update(plant, problem.period),
+        ]
+        return blocks, [*delays, *learning_delays(), *self.tracking.delays(plant)]
+
+    @property
+    def _learning(self) -> Learning:
+        return Learning(self.rule, self.bounds, dict(self.combinations))
+
+    def _learn_block(self, problem: Problem) -> Block:
+        plant, learning = problem.plant, self._learning
+        equation, weights = equation_function(learning.regressor(problem)), self.lyapunov_row()
+
+        def gradient(s: Any, estimate: Expression) -> Pair:
+            matrix, _ = equation(s.state, s.realised, s._command_before, estimate, s.parameters)
+            chains = error_chains(plant, s._target - s.state)
+            if self.tracking.integral:
+                chains = [[s._integral_used[k], *chain] for k, chain in enumerate(chains)]
+            along = [sum(w * e for w, e in zip(weights, chain, strict=True)) for chain in chains]
+            return matrix, ca.vertcat(*along)
+
+        given = (like(plant.state, "_target"), integral_signal(plant, "_integral_used"))
+        return learning.block(problem, given, gradient)
+
+    def lyapunov_row(self) -> np.ndarray:
+        """B^T P: weights of (e_int, e, e'), or of (e, e') without the integral, in w."""
+        gains = self.tracking.gains(2)
+        size = len(gains)
+        companion = np.vstack([np.eye(size)[1:], -np.array(gains)])
+        weights = np.diag([self.tracking.rate ** (2.0 * (size - 1 - k)) for k in range(size)])
+        return np.asarray(solve_continuous_lyapunov(companion.T, -weights)[-1])

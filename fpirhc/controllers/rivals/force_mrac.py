@@ -1,0 +1,122 @@
+"""Model reference adaptive control by fixed-point iteration: the command is deformed against a reference model.
+
+The outer loop believes that it commands the reference model q^(n) = f_r(x, Q), whose inverse is Q = M_r q^(n) + c_r for a
+mechanical plant. It asks for, and from the measured response recalculates,
+
+    Q^Des = M_r q^(n),Des + c_r,       Q^Rec = M_r q^(n) + c_r,
+
+and the plant is given the deformed Q^Def+ = G(Q^Def, Q^Rec, Q^Des), G any deformation. Where Q^Rec = Q^Des the plant moves as
+the reference model would under Q^Des: the outer loop cannot tell them apart, although Q^Def is another force. The Jacobian of
+Q^Def -> Q^Rec is M_r M^-1, with the eigenvalues of M^-1 M_r, so gains and limits are those of a deformed response; scales are
+forces.
+
+In the spirit of J. K. Tar, J. F. Bitó, I. Rudas, Replacement of Lyapunov's direct method in model reference adaptive control
+with robust fixed point transformations, IEEE INES 2010.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.controllers.automatic_scale import scaled_for_command
+from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block, rename
+from fpirhc.deformation.base import Deformation
+from fpirhc.errors import Mistakes
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.base import Tracking
+
+
+@dataclass(frozen=True, eq=False)
+class ForceMRAC(Controller):
+    """Tracking of the reference model, made true by deforming the command.
+
+    Parameters:
+        tracking: the law that gives the desired response.
+        deformation: the fixed-point map on commands; a scale is in units of the inputs.
+        model: values of the reference model's parameters by name; those not named are the plant's approximate ones.
+    """
+
+    tracking: Tracking
+    deformation: Deformation
+    model: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def adaptive(self) -> Deformation:
+        """The deformation in use."""
+        return self.deformation
+
+    def parameters(self, plant: Plant) -> np.ndarray:
+        """Parameters of the reference model."""
+        return np.array([self.model.get(n, p.approximate) for n, p in plant.parameters.items()], dtype=float)
+
+    def resolved(self, problem: Problem) -> ForceMRAC:
+        """Return the controller with the deformation's scale chosen."""
+        values = self.parameters(problem.plant)
+        return replace(self, deformation=scaled_for_command(self.deformation, problem, values))
+
+    def check(self, problem: Problem) -> None:
+        """Raise if the reference model has parameters that the plant does not have, or values that are no numbers.
+
+        Raises:
+            InvalidProblem: all mistakes together.
+        """
+        mistakes = Mistakes("ForceMRAC")
+        mistakes.unknown("model: parameter", self.model, problem.plant.parameters)
+        for name, value in self.model.items():
+            if not isinstance(value, int | float) or not math.isfinite(value):
+                mistakes.add(f"model: '{name}' must be a finite number, got {value!r}")
+        mistakes.raise_if_any()
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Blocks reference, tracking, force, limit, judge, tracking update."""
+        plant = problem.plant
+        closing, delays = commanding_blocks(problem)
+        blocks = [
+            reference_block(problem),
+            rename("target", like(plant.state, "reference"), like(plant.state, "_target")),
+            rename("nominal", plant.response_signal("_reference_response"), plant.response_signal("nominal")),
+            self.tracking.law(plant, problem.period),
+            self._force_block(plant, problem.warm_up_cycles),
+            *closing,
+            self.tracking.update(plant, problem.period),
+        ]
+        return blocks, [*delays, *self.tracking.delays(plant)]
+
+    def _force_block(self, plant: Plant, blind: int) -> Block:
+        """Block (state, desired, realised, last command) -> Q^Des, Q^Rec, Q^Def, and the model's response to it."""
+        memory = self.deformation.memory(plant.input.elements)
+        inverse, response = plant.inverse_function, plant.controlled_response_function
+
+        def step(s: Any) -> dict[str, Expression]:
+            remembered = {m: getattr(s, m) for m in memory.names}
+            running = s.warm_up > blind - 0.5
+            desired = inverse(s.state, s.desired, s.parameters)
+            recalculated = ca.if_else(running, inverse(s.state, s.realised, s.parameters), desired)
+            deformed, following = self.deformation.step(s._command_before, recalculated, desired, remembered)
+            kept = {f"{m}_next": ca.if_else(running, following[m], remembered[m]) for m in memory.names}
+            shown = {name: kept[f"{source}_next"] for name, source in self.deformation.shown().items()}
+            requested = ca.if_else(running, deformed, desired)
+            return {
+                "force_desired": desired,
+                "force_recalculated": recalculated,
+                "command_unclipped": requested,
+                "_deformed_unclipped": response(s.state, requested, s.parameters),
+                **shown,
+                **kept,
+            }
+
+        responses = [plant.response_signal(n) for n in ("desired", "realised")]
+        reads = (plant.state, plant.parameter, *responses, like(plant.input, "_command_before"), scalar("warm_up"))
+        forces = [like(plant.input, n) for n in ("force_desired", "force_recalculated", "command_unclipped")]
+        shown = [scalar(name) for name in self.deformation.shown()]
+        writes = Layout((*forces, plant.response_signal("_deformed_unclipped"), *shown))
+        return Block("force", Layout(reads), writes, step, memory, opaque=plant.inverse_opaque)

@@ -1,0 +1,216 @@
+"""The estimated parameters of a controller that learns: the block that moves them, and what is checked before a run.
+
+The equation that rules learn from uses the last command u and the response q'' that it had: u = Q(q, q', q''; p) is exact, so
+
+    h = M_hat^-1 (u - Q(q, q', q''; p_hat)) = M_hat^-1 Y(q, q', q'') (p - p_hat),
+
+which is the deformation's r - q'' with r what the model now takes the last command for.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.controllers.base import FINITE, clip, like
+from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.learning.rules.base import Bounds, Evidence, Pair, Rule
+from fpirhc.plant.regressor import Combination, Regressor
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.task.problem import Problem
+
+_STATES = 25  # places along the reference at which the mass matrix is tried
+_CORNERS = 4096  # corners of the box that are tried at most
+_DEFINITE = 1e-9  # smallest over largest eigenvalue of a mass matrix that counts as positive definite
+
+
+@dataclass(frozen=True, eq=False)
+class Learning:
+    """Which parameters are learned, within which bounds, by which rule.
+
+    Parameters:
+        rule: how the estimate moves.
+        bounds: parameter or combination -> (lower, upper); these are the ones that are learned.
+        combinations: expressions of parameters that enter linearly as a whole, by name.
+    """
+
+    rule: Rule
+    bounds: Bounds
+    combinations: dict[str, Combination] = field(default_factory=dict)
+
+    def regressor(self, problem: Problem) -> Regressor:
+        """The plant's regressor for the learned parameters."""
+        return Regressor(problem.plant, tuple(self.bounds), self.combinations)
+
+    def check(self, problem: Problem, *, inverts: bool, reads_response: bool) -> None:
+        """Raise if plant, bounds, or rule do not fit each other.
+
+        Raises:
+            NotSupported: not fully actuated, not of order 2, no symmetric mass matrix; dead time where the rule pairs command
+            and response. InvalidValue: parameters that enter nonlinearly, a first estimate outside its bounds, or bounds that
+            admit a mass matrix that is not positive definite where the controller inverts it.
+        """
+        _check_order(problem)
+        regressor = self.regressor(problem)
+        self.rule.check(self.bounds)
+        _check_bounds(regressor, self.bounds)
+        if (reads_response or self.rule.reads_response) and (problem.dead_time.inputs or problem.dead_time.measurement):
+            raise NotSupported(
+                "the last command and the response measured now belong together only without dead time; use SlotineLi with a "
+                "LyapunovRule and no deformation, or a controller that does not learn"
+            )
+        states = _states(problem)
+        resting = states * [name in problem.plant.coordinates for name in problem.plant.state.elements]
+        coefficients = _mass_coefficients(regressor, states)
+        _check_mechanical(coefficients, _mass_coefficients(regressor, resting))
+        if inverts or self.rule.reads_response:
+            _check_definite(self.bounds, coefficients)
+
+    def block(self, problem: Problem, given: Sequence[Signal], gradient: Callable[[Any, Expression], Pair]) -> Block:
+        """Block (what every controller reads, what was issued, `given`) -> (estimate, _believed).
+
+        Parameters: `gradient` returns (G, w) from the signals and the estimate; `_believed` are the parameters of
+        `Regressor.believed`.
+        """
+        plant, regressor = problem.plant, self.regressor(problem)
+        believed = like(regressor.believed.parameter, "_believed")
+        others = [k for k in range(len(plant.parameters)) if k not in regressor.covered]
+        lower, upper = (np.array([b[k] for b in self.bounds.values()], dtype=float) for k in (0, 1))
+        equation = equation_function(regressor)
+        learned = Signal("learned", regressor.signal.elements, regressor.signal.units)
+        reads = (
+            plant.state,
+            plant.response_signal("realised"),
+            plant.parameter,
+            like(plant.input, "_command_before"),
+            scalar("warm_up"),
+            scalar("_clipped_before"),
+            *given,
+        )
+
+        def step(s: Any) -> dict[str, Expression]:
+            running = s.warm_up > 0.5
+            old = ca.if_else(running, s.learned, clip(regressor.theta_function(s.parameters), lower, upper))
+            evidence = Evidence(
+                lambda: gradient(s, old),
+                lambda: equation(s.state, s.realised, s._command_before, old, s.parameters),
+                s._clipped_before,
+            )
+            moved = old + self.rule.change(evidence, self.bounds, problem.period)
+            good = ca.logic_and(running, ca.mmin(ca.fabs(moved) <= FINITE))
+            new = ca.if_else(good, clip(moved, lower, upper), old)
+            return {"estimate": new, "_believed": ca.vertcat(new, s.parameters[others]), "learned_next": new}
+
+        return Block("learn", Layout(reads), Layout((regressor.signal, believed)), step, Layout((learned,)))
+
+
+def learning_delays() -> list[Delay]:
+    """What learning carries to the next cycle besides the closing blocks' delays."""
+    return [Delay(scalar("_clipped_before"), "clipped")]
+
+
+def fed(block: Block, name: str, source: Signal) -> Block:
+    """The block, reading `source` where it would read the signal `name`, if it does."""
+    if name not in block.reads:
+        return block
+    reads = tuple(source if s.name == name else s for s in block.reads.signals)
+
+    def step(s: Any) -> Any:
+        return block.step(SimpleNamespace(**{**vars(s), name: getattr(s, source.name)}))
+
+    return Block(block.name, Layout(reads), block.writes, step, block.memory, block.opaque)
+
+
+def equation_function(regressor: Regressor) -> ca.Function:
+    """Function (state, response, last command, estimate, parameters) -> (M_hat^-1 Y, h)."""
+    x, r, p = regressor._symbols()
+    u, theta = ca.SX.sym("u", len(regressor.plant.inputs)), ca.SX.sym("theta", len(regressor.names))
+    y, rest = regressor.function(x, r, p)
+    both = ca.solve(regressor.mass_function(x, theta, p), ca.horzcat(y, u - rest - ca.mtimes(y, theta)))
+    return ca.Function("fpirhc_equation", [x, r, u, theta, p], [both[:, :-1], both[:, -1]])
+
+
+def _check_order(problem: Problem) -> None:
+    odd = [f"'{n}' of order {r}" for n, r in zip(problem.plant.names, problem.plant.orders, strict=True) if r != 2]
+    if odd:
+        raise NotSupported(
+            f"learning inverse dynamics is for mechanics, order 2 throughout, but this plant has {odd[0]}; "
+            "use ComputedTorque with a deformation"
+        )
+
+
+def _check_bounds(regressor: Regressor, bounds: Bounds) -> None:
+    first = regressor.theta_function(regressor.plant.approximate).full().ravel()
+    for (name, (lower, upper)), value in zip(bounds.items(), first, strict=True):
+        if not lower < upper:
+            raise InvalidValue(f"bounds of '{name}' are ({lower!r}, {upper!r}); expected lower < upper")
+        if not lower <= value <= upper:
+            raise InvalidValue(
+                f"the first estimate of '{name}', {value:g} by the approximate parameters, is outside its bounds "
+                f"({lower:g}, {upper:g}); widen them"
+            )
+
+
+def _states(problem: Problem) -> np.ndarray:
+    """The start and states along the reference, shape (count, nx)."""
+    times = np.linspace(0.0, problem.duration, _STATES)
+    along = problem.reference.function(problem.plant).map(times.size)(times[None, :])[0]
+    return np.vstack([problem.start_state, np.asarray(along.full()).T])
+
+
+def _mass_coefficients(regressor: Regressor, states: np.ndarray) -> np.ndarray:
+    """M = A_0 + sum_j theta_j A_j at every state, shape (count, m + 1, n, n)."""
+    x, _, p = regressor._symbols()
+    theta = ca.SX.sym("theta", len(regressor.names))
+    mass = ca.vec(regressor.mass_function(x, theta, p))
+    zero = ca.substitute(mass, theta, ca.SX.zeros(theta.numel()))
+    function = ca.Function("fpirhc_coefficients", [x, p], [ca.densify(ca.horzcat(zero, ca.jacobian(mass, theta)))])
+    n = len(regressor.plant.names)
+    found = [np.asarray(function(state, regressor.plant.approximate).full()) for state in states]
+    return np.stack([f.T.reshape((-1, n, n)) for f in found])
+
+
+def _check_mechanical(coefficients: np.ndarray, resting: np.ndarray) -> None:
+    skew = np.abs(coefficients - coefficients.transpose(0, 1, 3, 2)).max()
+    moving = np.abs(coefficients - resting).max()
+    if not max(skew, moving) <= 1e-6 * np.abs(coefficients).max():
+        what = "symmetric" if moving <= skew else "independent of q'"
+        raise NotSupported(
+            f"learning inverse dynamics is for mechanics, but the matrix dQ/dq'' of this plant is not {what}; write the "
+            "response so that input k does work along coordinate k and inertia does not depend on velocity"
+        )
+
+
+def _check_definite(bounds: Bounds, coefficients: np.ndarray) -> None:
+    """The smallest eigenvalue is a concave function of theta, so over a box it is smallest at a corner."""
+    entering = np.abs(coefficients[:, 1:]).max(axis=(0, 2, 3)) > 0
+    ends = np.array([b if e else (0.0, 0.0) for b, e in zip(bounds.values(), entering, strict=True)], dtype=float)
+    if not np.isfinite(ends).all():
+        name = list(bounds)[int(np.argmin(np.isfinite(ends).all(axis=1)))]
+        raise InvalidValue(f"'{name}' enters the mass matrix, which must stay positive definite: give it finite bounds")
+    corners = _corners(ends, int(entering.sum()))
+    for at in coefficients:
+        masses = at[0] + np.einsum("cj,jab->cab", corners, at[1:])
+        values = np.linalg.eigvalsh(masses)
+        worst = int(np.argmin(values[:, 0]))
+        if not values[worst, 0] > _DEFINITE * values[worst, -1]:
+            corner = ", ".join(f"{n} = {v:g}" for n, v, e in zip(bounds, corners[worst], entering, strict=True) if e)
+            raise InvalidValue(
+                f"the bounds admit a mass matrix that is not positive definite (smallest eigenvalue {values[worst, 0]:.3g}) at "
+                f"{corner}; narrow them, or learn parameters whose every positive value is possible (masses and inertias)"
+            )
+
+
+def _corners(ends: np.ndarray, free: int) -> np.ndarray:
+    """Corners of the box: all of them, or as many random ones as are tried at most."""
+    if 2**free <= _CORNERS:
+        return np.array(list(itertools.product(*(sorted(set(pair)) for pair in ends.tolist()))))
+    sides = np.random.default_rng(0).integers(2, size=(_CORNERS, len(ends)))
+    return np.asarray(ends[np.arange(len(ends)), sides])

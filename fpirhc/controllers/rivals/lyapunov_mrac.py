@@ -1,0 +1,193 @@
+"""Direct model reference adaptive control by Lyapunov's method: gains adapted by the rule e'PB, the classical counterpart.
+
+With the reference model's motion y (see `reference_model`), e = y - q and v the reference model's equation at the plant's
+state,
+
+    v = q^(n),N + sum_{s<n} C(n, s) rate^(n-s) (q^N - q)^(s),     u = Theta phi,     phi = (x, v, 1).
+
+On a linear plant q^(n) = A x + B u + c with a symmetric, definite B (one coordinate, or a mechanical system near a posture)
+some Theta makes the plant the reference model; with z = (rate^(n-1) e, ..., e^(n-1)) per coordinate, A_m'P + P A_m = -I for
+rate 1, and the last row p of P
+
+    Theta' = sign(B) gamma (p z) phi' - leakage (Theta - Theta_0),
+
+V = sum z'P z + tr(dTheta' |B| dTheta) / gamma has V' = -rate |z|^2 without leakage: e goes to zero, Theta need not converge.
+Theta_0 is the model's own inverse, linearised at the start. Where the plant is not linear in x, or under disturbances, Theta
+drifts; leakage (P. Ioannou, P. Kokotovic 1984) bounds it, for an error that stays. The rule is stepped once per period, and
+stands still while the command is clipped: for n = 2 the adaptation oscillates at about
+w = (gamma |B| |phi|^2 / 2)^(1/2) rad/s, rings where w is far above the rate, and grows from w^2 period = rate on.
+
+References: K. S. Narendra, A. M. Annaswamy, Stable Adaptive Systems, Prentice Hall 1989. I. D. Landau, Adaptive Control: The
+Model Reference Approach, Dekker 1979. J.-J. E. Slotine, W. Li, Applied Nonlinear Control, Prentice Hall 1991, ch. 8.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import solve_continuous_lyapunov
+
+from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
+from fpirhc.controllers.rivals.reference_model import companion, decay_gains, model_block
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.error import error_chains
+
+
+@dataclass(frozen=True)
+class LyapunovMRAC(Controller):
+    """Gains on state, reference and bias, adapted so that the plant becomes the reference model.
+
+    Parameters:
+        rate: of the reference model, 1/s.
+        adaptation: gamma, in units of the input times s^(2n-1) per squared unit of the coordinate.
+        leakage: pull of the gains to those of the model, 1/s.
+
+    Raises:
+        InvalidValue: a rate or adaptation that is not positive, a negative leakage.
+    """
+
+    rate: float
+    adaptation: float
+    leakage: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in (("rate", self.rate), ("adaptation", self.adaptation)):
+            if not (math.isfinite(value) and value > 0):
+                raise InvalidValue(f"LyapunovMRAC({name}={value!r}): expected a positive number")
+        if not 0 <= self.leakage < math.inf:
+            raise InvalidValue(f"LyapunovMRAC(leakage={self.leakage!r}): expected 0 or more, 1/s")
+
+    @property
+    def adaptive(self) -> Deformation:
+        """None: gains are adapted, no request is iterated."""
+        return Identity()
+
+    def weights(self, order: int) -> np.ndarray:
+        """P of the scaled error z for one coordinate, shape (order, order)."""
+        return np.asarray(solve_continuous_lyapunov(companion(decay_gains(1.0, order)).T, -np.eye(order)))
+
+    def check(self, problem: Problem) -> None:
+        """Raise if the plant is not one that the proof of the rule covers.
+
+        Raises:
+            InvalidProblem: not fully actuated, or the inputs' effect on the response is not of one sign at the start.
+        """
+        plant, mistakes = problem.plant, Mistakes("LyapunovMRAC")
+        if len(plant.controlled_names) != len(plant.names):
+            free = [c for c in plant.names if c not in plant.controlled_names]
+            mistakes.add(f"the plant is not fully actuated: '{free[0]}' has no input of its own; use ComputedTorque")
+        elif _sign(problem) == 0:
+            mistakes.add(
+                "the inputs' effect on the response is not definite at the start, so the rule may go uphill; "
+                "order the inputs as the coordinates, each with a positive effect on its own"
+            )
+        mistakes.raise_if_any()
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Blocks reference, reference model, law, limit, judge, adapt."""
+        plant = problem.plant
+        closing, delays = commanding_blocks(problem)
+        blocks = [
+            reference_block(problem),
+            model_block(plant, self.rate, problem.period),
+            self._law_block(plant),
+            *closing,
+            self._adapt_block(plant, problem.period, _sign(problem)),
+        ]
+        gains, first = _gains(plant, "_gains_before"), _gains(plant, "_gains_first_before")
+        return blocks, [*delays, Delay(gains, "gains"), Delay(first, "_gains_first")]
+
+    def _law_block(self, plant: Plant) -> Block:
+        """Block (state, model, reference, gains) -> command, regressor, p z, and the gains in use."""
+        rows = [self.weights(plant.orders[k])[-1] for k in plant.controlled_indices]
+        start, response, rate = _start_gains(plant), plant.controlled_response_function, self.rate
+
+        def pull(row: np.ndarray, chain: list[Expression]) -> Expression:
+            return sum(w * rate ** (len(chain) - 1 - j) * e for j, (w, e) in enumerate(zip(row, chain, strict=True)))
+
+        def step(s: Any) -> dict[str, Expression]:
+            errors = error_chains(plant, s.reference - s.state)
+            feedback = [ca.dot(ca.DM(list(decay_gains(rate, len(c)))), ca.vertcat(*c)) for c in errors]
+            wanted = s._reference_response + ca.vertcat(*feedback)
+            begun = start(s.state, wanted, s.parameters)
+            first = ca.if_else(s.warm_up > 0.5, s._gains_first_before, begun)
+            gains = ca.if_else(s.warm_up > 0.5, s._gains_before, begun)
+            regressor = ca.vertcat(s.state, wanted, 1)
+            requested = ca.mtimes(ca.reshape(gains, wanted.numel(), regressor.numel()), regressor)
+            chains = error_chains(plant, s.model - s.state)
+            return {
+                "desired": wanted,
+                "command_unclipped": requested,
+                "_deformed_unclipped": response(s.state, requested, s.parameters),
+                "_pull": ca.vertcat(*(pull(row, chain) for row, chain in zip(rows, chains, strict=True))),
+                "_regressor": regressor,
+                "_gains_used": gains,
+                "_gains_first": first,
+            }
+
+        before = [_gains(plant, n) for n in ("_gains_before", "_gains_first_before")]
+        states = [like(plant.state, n) for n in ("model", "reference")]
+        reads = (plant.state, *states, plant.response_signal("_reference_response"), plant.parameter, scalar("warm_up"))
+        writes = (
+            plant.response_signal("desired"),
+            like(plant.input, "command_unclipped"),
+            plant.response_signal("_deformed_unclipped"),
+            *_adapted(plant),
+        )
+        return Block("law", Layout((*reads, *before)), Layout(writes), step, opaque=plant.inverse_opaque)
+
+    def _adapt_block(self, plant: Plant, period: float, sign: int) -> Block:
+        """Block that steps the gains, except while the command is clipped."""
+
+        def step(s: Any) -> dict[str, Expression]:
+            rule = sign * self.adaptation * ca.vec(ca.mtimes(s._pull, s._regressor.T))
+            change = rule - self.leakage * (s._gains_used - s._gains_first)
+            return {"gains": s._gains_used + period * ca.if_else(s.clipped, 0, change)}
+
+        reads = Layout((scalar("clipped"), *_adapted(plant)))
+        return Block("adapt", reads, Layout((_gains(plant, "gains"),)), step)
+
+
+def _regressed(plant: Plant) -> tuple[str, ...]:
+    return (*plant.state.elements, *(f"v_{c}" for c in plant.controlled_names), "bias")
+
+
+def _gains(plant: Plant, name: str) -> Signal:
+    """Theta column by column: torque_angle is the gain of the angle in the torque."""
+    return Signal(name, tuple(f"{u}_{x}" for x in _regressed(plant) for u in plant.input.elements))
+
+
+def _adapted(plant: Plant) -> tuple[Signal, ...]:
+    """What the adaptation reads of the law."""
+    own = (Signal("_pull", plant.controlled_names), Signal("_regressor", _regressed(plant)))
+    return (*own, _gains(plant, "_gains_used"), _gains(plant, "_gains_first"))
+
+
+def _start_gains(plant: Plant) -> ca.Function:
+    """Function (state, wanted response, parameters) -> Theta_0: the model's inverse, linearised there."""
+    x, r = ca.MX.sym("x", plant.state.size), ca.MX.sym("r", len(plant.controlled_names))
+    p = ca.MX.sym("p", len(plant.parameters))
+    command = plant.inverse_function(x, r, p)
+    by_state, by_response = ca.densify(ca.jacobian(command, x)), ca.densify(ca.jacobian(command, r))
+    bias = command - ca.mtimes(by_state, x) - ca.mtimes(by_response, r)
+    return ca.Function("fpirhc_start_gains", [x, r, p], [ca.vec(ca.horzcat(by_state, by_response, bias))])
+
+
+def _sign(problem: Problem) -> int:
+    """Sign of the inputs' effect on the response by the model at the start; 0 where it is not definite."""
+    plant = problem.plant
+    x, u, p = plant._symbols()
+    effect = ca.Function("fpirhc_effect", [x, u, p], [ca.jacobian(plant.controlled_response_function(x, u, p), u)])
+    matrix = np.asarray(effect(problem.start_state, [0] * len(plant.inputs), plant.approximate).full())
+    values = np.linalg.eigvalsh(matrix + matrix.T)
+    return 1 if values.min() > 0 else -1 if values.max() < 0 else 0

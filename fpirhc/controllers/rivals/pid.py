@@ -1,0 +1,139 @@
+"""PID control, without any model: one input per controlled coordinate.
+
+With e = q^N - q of a controlled coordinate and the integral of its error,
+
+    u = k_i e_int + k_p e + k_d e' + ...,
+
+the k-th input for the k-th controlled coordinate. The chain may go on to e^(n-1), all that is measured for the relative order
+n; without it no PID stabilises a chain of three or more integrators. On n integrators with the gain b the error obeys
+e^(n+1) + b (... + k_d e'' + k_p e' + k_i e) = 0 (Routh: b k_d k_p > k_i for n = 2).
+
+The integral stands still while some command is clipped (conditional integration), and starts where the first command is zero.
+
+References: K. J. Åström, T. Hägglund, PID Controllers: Theory, Design, and Tuning, 2nd ed., ISA 1995.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+
+from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block, rename
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import Mistakes
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.error import error_chains, error_signal, integral_delay, integral_signal, integral_update
+
+
+@dataclass(frozen=True, eq=False)
+class PID(Controller):
+    """One PID loop per controlled coordinate.
+
+    Parameters:
+        proportional: k_p of every controlled coordinate by name, in units of the input per unit of the coordinate.
+        integral: k_i by name, per s more; a coordinate that is not named has none.
+        derivative: by name the gain of e', or of (e', e'', ...), one less than the relative order at most.
+        bumpless: start the integral so that the first command is zero (needs k_i).
+    """
+
+    proportional: Mapping[str, float]
+    integral: Mapping[str, float] = field(default_factory=dict)
+    derivative: Mapping[str, float | Sequence[float]] = field(default_factory=dict)
+    bumpless: bool = True
+
+    @property
+    def adaptive(self) -> Deformation:
+        """None: there is no model whose request could be deformed."""
+        return Identity()
+
+    def gains(self, name: str, order: int) -> tuple[float, ...]:
+        """Gains of (e_int, e, e', ...) of a coordinate of that relative order, shape (order + 1,)."""
+        given = self.derivative.get(name, ())
+        higher = list(given) if isinstance(given, Sequence) else [given]
+        padded = [*higher, *[0.0] * (order - 1 - len(higher))]
+        return (self.integral.get(name, 0.0), self.proportional[name], *padded)
+
+    def check(self, problem: Problem) -> None:
+        """Raise if the gains do not fit the plant.
+
+        Raises:
+            InvalidProblem: all mistakes together: gains by name, and inputs that do not bring their coordinates back.
+        """
+        plant, mistakes = problem.plant, Mistakes("PID")
+        names = plant.controlled_names
+        for what in ("proportional", "integral", "derivative"):
+            mistakes.unknown(f"{what}: controlled coordinate", getattr(self, what), names)
+        for name in names:
+            if name not in self.proportional:
+                mistakes.add(f"proportional: controlled coordinate '{name}' has no gain; add '{name}': ...")
+        mistakes.raise_if_any()
+        x, u, p = plant._symbols()
+        effect = ca.Function("fpirhc_effect", [x, u, p], [ca.jacobian(plant.controlled_response_function(x, u, p), u)])
+        at_start = effect(problem.start_state, [0] * len(plant.inputs), plant.approximate)
+        for k, (name, index) in enumerate(zip(names, plant.controlled_indices, strict=True)):
+            gains, order = self.gains(name, plant.orders[index]), plant.orders[index]
+            if len(gains) > order + 1:
+                mistakes.add(
+                    f"derivative: '{name}' of relative order {order} has at most {order - 1} gains of e', e'', ..."
+                )
+            if not all(isinstance(g, int | float) and math.isfinite(g) for g in gains):
+                mistakes.add(f"the gains of '{name}' must be finite numbers, got {gains!r}")
+            elif float(at_start[k, k]) * self.proportional[name] <= 0:
+                mistakes.add(
+                    f"input '{plant.input.elements[k]}' moves '{name}' by {float(at_start[k, k]):.3g} per unit at the start: "
+                    f"proportional = {self.proportional[name]:g} does not bring it back; pair inputs and coordinates in order"
+                )
+        mistakes.raise_if_any()
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Blocks reference, pid, limit, judge, integral."""
+        plant = problem.plant
+        response = plant.response_signal("_reference_response")
+        closing, delays = commanding_blocks(problem)
+        blocks = [
+            reference_block(problem),
+            rename("nominal", response, plant.response_signal("nominal")),
+            rename("desired", response, plant.response_signal("desired")),
+            self._law(problem),
+            *closing,
+            integral_update(plant, problem.period),
+        ]
+        return blocks, [*delays, *integral_delay(plant)]
+
+    def _law(self, problem: Problem) -> Block:
+        """Block (state, reference, integral, started) -> command, and what the model expects of it (for the reader only)."""
+        plant = problem.plant
+        orders = [plant.orders[k] for k in plant.controlled_indices]
+        gains = [self.gains(n, order) for n, order in zip(plant.controlled_names, orders, strict=True)]
+
+        def step(s: Any) -> dict[str, Expression]:
+            errors = error_chains(plant, s.reference - s.state)
+            direct = [
+                sum(g * e for g, e in zip(k[1:], chain, strict=True)) for k, chain in zip(gains, errors, strict=True)
+            ]
+            starts = [-d / k[0] if self.bumpless and k[0] else 0 * d for k, d in zip(gains, direct, strict=True)]
+            used = ca.if_else(s.warm_up > 0.5, s._integral_before, ca.vertcat(*starts))
+            requested = ca.vertcat(*(k[0] * used[i] + d for i, (k, d) in enumerate(zip(gains, direct, strict=True))))
+            return {
+                "_target_error": ca.vertcat(*(chain[0] for chain in errors)),
+                "_integral_used": used,
+                "command_unclipped": requested,
+                "_deformed_unclipped": plant.controlled_response_function(s.state, requested, s.parameters),
+            }
+
+        before, used = integral_signal(plant, "_integral_before"), integral_signal(plant, "_integral_used")
+        reads = (plant.state, like(plant.state, "reference"), plant.parameter, scalar("warm_up"), before)
+        writes = (
+            error_signal(plant),
+            used,
+            like(plant.input, "command_unclipped"),
+            plant.response_signal("_deformed_unclipped"),
+        )
+        return Block("pid", Layout(reads), Layout(writes), step)

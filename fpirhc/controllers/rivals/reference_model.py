@@ -1,0 +1,74 @@
+"""The reference model of model reference adaptive control: a motion from the plant's start to the nominal one.
+
+Per controlled coordinate of relative order n its deviation eps = q^N - y obeys (d/dt + rate)^n eps = 0, that is
+
+    y^(n) = q^(n),N + sum_{s<n} C(n, s) rate^(n-s) (q^N - y)^(s),     y(0) = q(0), y'(0) = q'(0), ...
+
+The deviation is carried by its exact solution over one period, so the model has no integration error.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import expm
+
+from fpirhc.controllers.base import like
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.tracking.error import error_chains
+
+
+def decay_gains(rate: float, order: int) -> tuple[float, ...]:
+    """Gains of (e, e', ...) in (d/dt + rate)^n e = 0, lowest derivative first."""
+    return tuple(math.comb(order, s) * rate ** (order - s) for s in range(order))
+
+
+def companion(gains: tuple[float, ...]) -> np.ndarray:
+    """Matrix A of x' = A x for the chain x = (e, e', ...) with e^(n) = -gains . x, shape (n, n)."""
+    matrix = np.diag(np.ones(len(gains) - 1), 1)
+    matrix[-1] = -np.array(gains)
+    return matrix
+
+
+def model_block(plant: Plant, rate: float, period: float) -> Block:
+    """Block (state, reference and its response, started) -> model: the model's state and its response 'nominal'.
+
+    Coordinates that are not controlled follow the reference.
+    """
+    chains = [_chain(plant, k) for k in plant.controlled_indices]
+    gains = [decay_gains(rate, len(chain)) for chain in chains]
+    steps = [expm(companion(g) * period) for g in gains]
+    memory = Layout((Signal("model_deviation", tuple(e for chain in chains for e in chain)),))
+    ends = np.cumsum([0, *(len(chain) for chain in chains)]).tolist()
+
+    def step(s: Any) -> dict[str, Expression]:
+        first = ca.vertcat(*(e for chain in error_chains(plant, s.reference - s.state) for e in chain))
+        deviation = ca.vertsplit(ca.if_else(s.warm_up > 0.5, s.model_deviation, first), ends)
+        spread = dict(zip(memory.signals[0].elements, ca.vertsplit(ca.vertcat(*deviation)), strict=True))
+        lag = ca.vertcat(*(spread.get(e, 0) for e in plant.state.elements))
+        pull = [ca.dot(ca.DM(list(g)), d) for g, d in zip(gains, deviation, strict=True)]
+        following = [ca.mtimes(ca.DM(m), d) for m, d in zip(steps, deviation, strict=True)]
+        return {
+            "model": s.reference - lag,
+            "nominal": s._reference_response + ca.vertcat(*pull),
+            "model_deviation_next": ca.vertcat(*following),
+        }
+
+    reads = (
+        plant.state,
+        like(plant.state, "reference"),
+        plant.response_signal("_reference_response"),
+        scalar("warm_up"),
+    )
+    writes = (like(plant.state, "model"), plant.response_signal("nominal"))
+    return Block("reference_model", Layout(reads), Layout(writes), step, memory)
+
+
+def _chain(plant: Plant, index: int) -> list[str]:
+    """Names of a coordinate and its derivatives in the state."""
+    return [plant.names[index] + "'" * s for s in range(plant.orders[index])]

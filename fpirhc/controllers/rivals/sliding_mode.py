@@ -1,0 +1,107 @@
+"""Sliding mode control with a boundary layer, on the inverse of the model: a high gain instead of an iteration.
+
+With e = q^N - q and S = (d/dt + rate)^(n-1) e the desired response
+
+    q^(n),Des = q^(n),N + sum_{s=1}^{n-1} C(n-1, s-1) rate^(n-s) e^(s) + K tanh(S / w)
+
+makes S' = -K tanh(S / w) - h with the response error h = q^(n) - q^(n),Des of the wrong model. A residual |h| < K is held at
+|S| = w atanh(|h| / K), and e at S / rate^(n-1): the law is a proportional one of gain K / w, so a constant residual leaves an
+error, while a deformation sums its errors and leaves none. In control cycles S is multiplied by 1 - K period / w near
+zero: from K period / w = 2 on it chatters, with a model whose gain is wrong by J from K period J / w = 2 on.
+
+References: V. I. Utkin, Variable structure systems with sliding modes, IEEE Trans. Automatic Control 22(2), 1977. J.-J. E.
+Slotine, W. Li, Applied Nonlinear Control, Prentice Hall 1991, ch. 7 (boundary layer; there a saturation instead of tanh).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+
+from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block, rename
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Expression, Layout, vector
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.error import error_chains
+
+
+@dataclass(frozen=True)
+class SlidingMode(Controller):
+    """Inverse dynamics with the switching term K tanh(S / w).
+
+    Parameters:
+        rate: Lambda, decay of the error on S = 0, 1/s.
+        gain: K, above the largest response error of the model, in units of the response (m/s^2 for n = 2).
+        width: w, boundary layer, in units of the response times s (m/s for n = 2); K period / w must stay below 2.
+
+    Raises:
+        InvalidValue: a setting that is not a positive number.
+    """
+
+    rate: float
+    gain: float
+    width: float
+
+    def __post_init__(self) -> None:
+        for name in ("rate", "gain", "width"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise InvalidValue(f"SlidingMode({name}={value!r}): expected a positive number")
+
+    @property
+    def adaptive(self) -> Deformation:
+        """None: the model is trusted up to the switching term."""
+        return Identity()
+
+    def check(self, problem: Problem) -> None:
+        """Raise if the loop would chatter even with an exact model.
+
+        Raises:
+            InvalidProblem: K period / w is 2 or more.
+        """
+        mistakes, product = Mistakes("SlidingMode"), self.gain * problem.period / self.width
+        if product >= 2:
+            mistakes.add(
+                f"gain x period / width = {product:.3g} chatters with any model; "
+                f"take a width above {0.5 * self.gain * problem.period:.3g} "
+                f"or a gain below {2 * self.width / problem.period:.3g}"
+            )
+        mistakes.raise_if_any()
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Blocks reference, surface, deform, invert, limit, judge."""
+        response = problem.plant.response_signal("_reference_response")
+        closing, delays = closing_blocks(problem, self.adaptive)
+        blocks = [
+            reference_block(problem),
+            rename("nominal", response, problem.plant.response_signal("nominal")),
+            self._surface_block(problem.plant),
+            *closing,
+        ]
+        return blocks, delays
+
+    def _surface_block(self, plant: Plant) -> Block:
+        """Block (state, reference, nominal) -> (S, desired)."""
+        units = [f"{plant.response_units[k]} s" for k in plant.controlled_indices]
+
+        def step(s: Any) -> dict[str, Expression]:
+            surfaces, drifts = [], []
+            for chain in error_chains(plant, s.reference - s.state):
+                degree = len(chain) - 1
+                gains = [math.comb(degree, k) * self.rate ** (degree - k) for k in range(degree + 1)]
+                surfaces.append(sum(g * e for g, e in zip(gains, chain, strict=True)))
+                drifts.append(sum((g * e for g, e in zip(gains, chain[1:], strict=False)), start=0 * chain[0]))
+            surface = ca.vertcat(*surfaces)
+            switching = self.gain * ca.tanh(surface / self.width)
+            return {"surface": surface, "desired": s.nominal + ca.vertcat(*drifts) + switching}
+
+        reads = Layout((plant.state, like(plant.state, "reference"), plant.response_signal("nominal")))
+        writes = Layout((vector("surface", plant.controlled_names, units), plant.response_signal("desired")))
+        return Block("surface", reads, writes, step)

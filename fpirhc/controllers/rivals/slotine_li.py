@@ -1,0 +1,176 @@
+"""The adaptive controller of Slotine and Li: passivity instead of inversion, and no measured acceleration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import casadi as ca
+
+from fpirhc.controllers.automatic_scale import scaled_for_reference
+from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
+from fpirhc.controllers.rivals.learned_parameters import Learning, fed, learning_delays
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import InvalidValue
+from fpirhc.learning.rules.base import Pair, Rule
+from fpirhc.plant.regressor import Combination, Regressor
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
+from fpirhc.task.problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class SlotineLi(Controller):
+    """u = Y_s(q, q', v, v') p_hat + Q0_s + K_D rho,  v = q'^N + rate e,  rho = e' + rate e.
+
+    Then M rho' + C rho + K_D rho = Y_s (p - p_hat), and because M' - 2 C is skew-symmetric the Lyapunov function
+    (rho^T M rho + (p - p_hat)^T Gamma^-1 (p - p_hat)) / 2 falls by rho^T K_D rho under p_hat' = Gamma Y_s^T rho. Neither q'' nor
+    M_hat^-1 is needed: p_hat may be anything.
+
+    A deformation acts on v'. The model makes of the law the response d = v' + M_hat^-1 (C_hat + K_D) rho, which is the desired
+    response of the pair; then q'' and M_hat^-1 are needed as elsewhere, and the bounds must keep M_hat positive definite. Without a
+    deformation 'desired' is logged as v'.
+
+    Parameters:
+        rate: Lambda, 1/s.
+        damping: diagonal of K_D by coordinate, input per unit of rho.
+        rule: how the estimate moves: LyapunovRule or Projection.
+        bounds: parameter or combination -> (lower, upper); these are learned, from their approximate values on. May be infinite
+            with a LyapunovRule and no deformation.
+        combinations: expressions of parameters that enter linearly as a whole, by name.
+        deformation: the fixed-point map between desired response and request.
+
+    Raises:
+        InvalidValue: rate or damping not positive. When the loop is built: NotSupported where the plant is not fully actuated
+        mechanics; InvalidValue where parameters enter nonlinearly or the bounds do not do.
+
+    References:
+        J.-J. E. Slotine, W. Li, On the adaptive control of robot manipulators, Int. J. Robotics Research 6(3), 1987.
+    """
+
+    rate: float
+    damping: Mapping[str, float]
+    rule: Rule
+    bounds: Mapping[str, tuple[float, float]]
+    combinations: Mapping[str, Combination] = field(default_factory=dict)
+    deformation: Deformation = field(default_factory=Identity)
+
+    def __post_init__(self) -> None:
+        for name, value in {"rate": self.rate, **self.damping}.items():
+            if not (math.isfinite(value) and value > 0):
+                raise InvalidValue(f"SlotineLi: '{name}' is {value!r}; expected a positive number")
+
+    @property
+    def adaptive(self) -> Deformation:
+        """The deformation in use."""
+        return self.deformation
+
+    def resolved(self, problem: Problem) -> SlotineLi:
+        """Return the controller with the deformation's scale chosen."""
+        return replace(self, deformation=scaled_for_reference(self.deformation, problem))
+
+    def check(self, problem: Problem) -> None:
+        """Raise if plant, damping, bounds or rule do not fit (see Learning.check)."""
+        self._learning.check(problem, inverts=self._deforms, reads_response=self._deforms)
+        odd = sorted(set(self.damping) ^ set(problem.plant.names))
+        if odd:
+            raise InvalidValue(
+                f"SlotineLi: damping must name every coordinate and no other; '{odd[0]}' is on one side only"
+            )
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Blocks reference, sliding, learn, demand, deform, force, limit, judge; invert instead of force with a deformation."""
+        regressor = self._learning.regressor(problem)
+        believed = like(regressor.believed.parameter, "_believed")
+        front = [reference_block(problem), self._sliding_block(problem), self._learn_block(problem, regressor)]
+        if self._deforms:
+            closing, delays = closing_blocks(replace(problem, plant=regressor.believed), self.deformation)
+            closing = [fed(block, "parameters", believed) for block in closing]
+            return [*front, self._demand_block(problem, regressor), *closing], [*delays, *learning_delays()]
+        closing, delays = closing_blocks(problem, self.deformation)
+        # What a clipped command means is asked of the approximate model: the estimated one may have no inverse.
+        deform, _, *rest = closing
+        return [*front, deform, self._force_block(problem, regressor), *rest], [*delays, *learning_delays()]
+
+    @property
+    def _deforms(self) -> bool:
+        return not isinstance(self.deformation, Identity)
+
+    @property
+    def _learning(self) -> Learning:
+        return Learning(self.rule, self.bounds, dict(self.combinations))
+
+    def _sliding_block(self, problem: Problem) -> Block:
+        """Block (state, reference) -> (sliding rho, v, v'); v' is also 'desired' where nothing is deformed."""
+        plant = problem.plant
+        at, moving = list(plant.indices(0)), list(plant.indices(1))
+        reads = (plant.state, like(plant.state, "reference"), plant.response_signal("_reference_response"))
+        slope = plant.response_signal("_velocity_slope" if self._deforms else "desired")
+        writes = (_rates(problem, "sliding"), _rates(problem, "_velocity"), slope, plant.response_signal("nominal"))
+
+        def step(s: Any) -> dict[str, Expression]:
+            error = s.reference - s.state
+            velocity = s.reference[moving] + self.rate * error[at]
+            return {
+                "sliding": velocity - s.state[moving],
+                "_velocity": velocity,
+                slope.name: s._reference_response + self.rate * error[moving],
+                "nominal": s._reference_response,
+            }
+
+        return Block("sliding", Layout(reads), Layout(writes), step)
+
+    def _learn_block(self, problem: Problem, regressor: Regressor) -> Block:
+        slope = problem.plant.response_signal("_velocity_slope" if self._deforms else "desired")
+
+        def gradient(s: Any, estimate: Expression) -> Pair:
+            del estimate
+            matrix, _ = regressor.split_function(s.state, s._velocity, getattr(s, slope.name), s.parameters)
+            return matrix, s.sliding
+
+        given = (_rates(problem, "sliding"), _rates(problem, "_velocity"), slope)
+        return self._learning.block(problem, given, gradient)
+
+    def _demand_block(self, problem: Problem, regressor: Regressor) -> Block:
+        """Block -> desired: the response that the model makes of the law."""
+        plant, damping = problem.plant, self._damping(problem)
+        slope = plant.response_signal("_velocity_slope")
+        reads = (plant.state, plant.parameter, regressor.signal, _rates(problem, "sliding"), slope)
+
+        def step(s: Any) -> dict[str, Expression]:
+            mass = regressor.mass_function(s.state, s.estimate, s.parameters)
+            pull = ca.mtimes(regressor.coriolis_function(s.state, s.estimate, s.parameters), s.sliding)
+            return {"desired": s._velocity_slope + ca.solve(mass, pull + damping * s.sliding)}
+
+        return Block("demand", Layout(reads), Layout((plant.response_signal("desired"),)), step)
+
+    def _force_block(self, problem: Problem, regressor: Regressor) -> Block:
+        """Block -> command_unclipped: the law itself, linear in the estimate."""
+        plant, damping = problem.plant, self._damping(problem)
+        slope = plant.response_signal("_deformed_unclipped")
+        reads = (
+            plant.state,
+            plant.parameter,
+            regressor.signal,
+            _rates(problem, "sliding"),
+            _rates(problem, "_velocity"),
+            slope,
+        )
+
+        def step(s: Any) -> dict[str, Expression]:
+            matrix, rest = regressor.split_function(s.state, s._velocity, s._deformed_unclipped, s.parameters)
+            return {"command_unclipped": ca.mtimes(matrix, s.estimate) + rest + damping * s.sliding}
+
+        return Block("force", Layout(reads), Layout((like(plant.input, "command_unclipped"),)), step)
+
+    def _damping(self, problem: Problem) -> ca.DM:
+        return ca.DM([self.damping[name] for name in problem.plant.names])
+
+
+def _rates(problem: Problem, name: str) -> Signal:
+    """A signal of velocities."""
+    plant = problem.plant
+    return vector(name, plant.names, [f"{plant.coordinates[c]}/s" for c in plant.names])

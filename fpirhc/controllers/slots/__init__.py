@@ -1,0 +1,1 @@
+"""One input for several coordinates in turn: time slots."""

@@ -1,0 +1,162 @@
+"""Schedules that choose the next slot by the state.
+
+    ByError        at the end of a slot, the coordinate with the largest weighted error
+    ByLookAhead    at the end of a slot, the slot whose linearised closed loop brings the state closest in one dwell
+
+Both choose only among admissible slots, those whose gain d y^(r)/du is large enough.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeGuard
+
+import casadi as ca
+import numpy as np
+import scipy.linalg
+
+from fpirhc.controllers.base import error_signal, like
+from fpirhc.controllers.slots.schedules import Schedule, check_stretch
+from fpirhc.controllers.slots.slot import Channel
+from fpirhc.controllers.slots.slot_modes import linear_modes
+from fpirhc.errors import Mistakes, NotSupported
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.task.problem import Problem
+
+_NEVER = -1e300  # score of a slot that may not be chosen
+Scores = Callable[[Any], list[Expression]]
+
+
+@dataclass(frozen=True, eq=False)
+class ByError(Schedule):
+    """The coordinate with the largest weighted error is next.
+
+    A slot that has lasted `dwell` ends in the first cycle in which some admissible slot has w|e| above (1 + hysteresis) times
+    that of the active one.
+
+    Parameters:
+        weights: coordinate -> weight, in 1 / unit of the coordinate. dwell: shortest duration of a slot, s.
+        hysteresis: by how much another weighted error must be larger, relative.
+    """
+
+    weights: Mapping[str, float]
+    dwell: float
+    hysteresis: float = 0.1
+
+    def check(self, names: Sequence[str], problem: Problem, mistakes: Mistakes) -> None:
+        """Note unknown or missing weights and what is out of range."""
+        mistakes.unknown("ByError: weight of coordinate", self.weights, names)
+        for name in names:
+            weight = self.weights.get(name)
+            if not (_is_number(weight) and weight > 0):
+                mistakes.add(f"ByError: the weight of '{name}' must be a positive number, got {weight!r}")
+        _check_choice("ByError", self.dwell, self.hysteresis, problem, mistakes)
+
+    def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
+        """The shortest duration of a slot."""
+        del problem
+        return dict.fromkeys(names, self.dwell)
+
+    def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
+        """Block (error, ...) -> slot."""
+        weights = [self.weights[c.slot.coordinate] for c in channels]
+        places = [problem.judged_names.index(c.slot.coordinate) for c in channels]
+
+        def score(s: Any) -> list[Expression]:
+            return [w * ca.fabs(s.error[k]) for w, k in zip(weights, places, strict=True)]
+
+        return _chosen(problem, channels, score, self.dwell, self.hysteresis)
+
+
+@dataclass(frozen=True, eq=False)
+class ByLookAhead(Schedule):
+    """The slot that brings the state closest to the reference within one dwell, by the linearised closed loop, is next.
+
+        argmin_j V(e^(A_j T) (x - x^N)),    V(x) = sum w x^2,   T = dwell
+
+    A slot that has lasted `dwell` ends in the first cycle in which some admissible slot's V is below that of the active one by
+    the share that the hysteresis says. The matrices A_j are the model's at the reference's last point.
+
+    Parameters:
+        weights: state -> weight of its square. dwell: shortest duration of a slot, s.
+        hysteresis: by how much the active slot's V must exceed the best one's, relative.
+    """
+
+    weights: Mapping[str, float]
+    dwell: float
+    hysteresis: float = 0.1
+
+    def check(self, names: Sequence[str], problem: Problem, mistakes: Mistakes) -> None:
+        """Note unknown weights and what is out of range."""
+        del names
+        mistakes.unknown("ByLookAhead: weight of state", self.weights, problem.plant.state.elements)
+        weights = list(self.weights.values())
+        if not all(_is_number(w) and w >= 0 for w in weights) or not any(weights):
+            mistakes.add(f"ByLookAhead: weights must be numbers of at least 0, one of them positive, got {weights}")
+        _check_choice("ByLookAhead", self.dwell, self.hysteresis, problem, mistakes)
+
+    def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
+        """The shortest duration of a slot."""
+        del problem
+        return dict.fromkeys(names, self.dwell)
+
+    def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
+        """Block (state, reference, ...) -> slot.
+
+        Raises:
+            NotSupported: the closed loops cannot be linearised at the reference's last point.
+        """
+        modes, reason = linear_modes(problem, channels, problem.plant.approximate, 0.0)
+        if reason:
+            raise NotSupported(f"ByLookAhead: {reason}; use ByError")
+        n = problem.plant.state.size
+        weight = np.diag([self.weights.get(e, 0.0) for e in problem.plant.state.elements])
+        moved = [(scipy.linalg.expm(m.generator * self.dwell) @ m.start(m))[:n, :n] for m in modes]
+        forms = [phi.T @ weight @ phi for phi in moved]
+
+        def score(s: Any) -> list[Expression]:
+            away = s.state - s.reference
+            return [-ca.bilin(ca.DM(form), away, away) for form in forms]
+
+        return _chosen(problem, channels, score, self.dwell, self.hysteresis)
+
+
+def _check_choice(owner: str, dwell: float, hysteresis: float, problem: Problem, mistakes: Mistakes) -> None:
+    check_stretch(f"{owner}: dwell", dwell, problem, mistakes)
+    if not (_is_number(hysteresis) and hysteresis >= 0):
+        mistakes.add(f"{owner}: hysteresis must be a number of at least 0, got {hysteresis!r}")
+
+
+def _is_number(value: object) -> TypeGuard[float]:
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
+def _chosen(problem: Problem, channels: Sequence[Channel], score: Scores, dwell: float, hysteresis: float) -> Block:
+    """Block that stays with a slot for the dwell and then leaves it for an admissible one whose score is clearly larger."""
+    plant = problem.plant
+    names = tuple(c.slot.coordinate for c in channels)
+    reads = (
+        error_signal(problem, "error"),
+        plant.state,
+        like(plant.state, "reference"),
+        scalar("_slot_before"),
+        scalar("_age_before"),
+        scalar("warm_up"),
+        Signal("_admissible", names),
+    )
+    shortest = round(dwell / problem.period)
+
+    def step(s: Any) -> dict[str, Expression]:
+        scores = [ca.if_else(s._admissible[k] > 0.5, v, _NEVER) for k, v in enumerate(score(s))]
+        best, slot, active = scores[0], ca.SX(0), scores[0]
+        for k, value in enumerate(scores[1:], 1):
+            slot, best = ca.if_else(value > best, k, slot), ca.fmax(best, value)
+            active = ca.if_else(s._slot_before > k - 0.5, value, active)
+        clear = best - active > hysteresis * ca.fmin(ca.fabs(best), ca.fabs(active))
+        free = ca.logic_and(s._age_before + 1 > shortest - 0.5, clear)
+        return {"slot": ca.if_else(ca.logic_or(s.warm_up < 0.5, free), slot, s._slot_before)}
+
+    return Block("schedule", Layout(reads), Layout((scalar("slot"),)), step)

@@ -1,0 +1,174 @@
+"""Schedules of time slots: which slot a control cycle belongs to.
+
+    FixedSchedule  spans of time, given one by one
+    Periodic       durations, repeated
+
+Every slot begins with a control cycle: times are rounded to whole cycles. Schedules that choose by the state are in
+`chosen_schedules`.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+
+from fpirhc.controllers.slots.slot import Channel
+from fpirhc.errors import Mistakes
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.task.problem import Problem
+
+SlotSpans = tuple[tuple[str, float], ...]
+
+
+class Schedule(ABC):
+    """Contract: which slot is active, cycle by cycle."""
+
+    @abstractmethod
+    def check(self, names: Sequence[str], problem: Problem, mistakes: Mistakes) -> None:
+        """Note every mistake of the schedule for slots of these coordinates."""
+
+    @abstractmethod
+    def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
+        """How long each slot may last at least at a stretch, s: the longest of its known stretches."""
+
+    def sequence(self, problem: Problem) -> SlotSpans:  # noqa: ARG002
+        """One period as (coordinate, duration in s); empty where the schedule is not periodic."""
+        return ()
+
+    @abstractmethod
+    def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
+        """Block (time, error, state, reference, _slot_before, _age_before, _admissible, started) -> slot, its number."""
+
+
+@dataclass(frozen=True)
+class FixedSchedule(Schedule):
+    """Slots at given times.
+
+    Parameters:
+        spans: (coordinate, start, end) in s, without gaps from 0 s to the end of the run.
+    """
+
+    spans: Sequence[tuple[str, float, float]]
+
+    def check(self, names: Sequence[str], problem: Problem, mistakes: Mistakes) -> None:
+        """Note unknown and missing coordinates, overlaps, gaps, and spans beyond the run."""
+        wrong = [span for span in self.spans if not _is_span(span)]
+        for span in wrong:
+            mistakes.add(f"FixedSchedule: {span!r} is no span; expected (coordinate, start, end) with times in s")
+        if wrong:
+            return
+        _check_visits("FixedSchedule", [c for c, _, _ in self.spans], names, mistakes)
+        at, half = 0.0, 0.5 * problem.period
+        for name, start, end in self._ordered():
+            where = f"FixedSchedule: '{name}' from {start:g} to {end:g} s"
+            if end - start < problem.period * (1 - 1e-9):
+                mistakes.add(f"{where} is shorter than one control cycle of {problem.period:g} s; let it end later")
+            if start < at - half:
+                mistakes.add(f"{where} overlaps what came before, which ends at {at:g} s; let it start there")
+            elif start > at + half:
+                mistakes.add(f"FixedSchedule: no slot from {at:g} to {start:g} s; let '{name}' start at {at:g} s")
+            at = max(at, end)
+        end = problem.duration
+        if at > end + half:
+            mistakes.add(f"FixedSchedule: the last slot ends at {at:g} s, after the run's {end:g} s; let it end there")
+        elif at < end - half:
+            mistakes.add(f"FixedSchedule: no slot from {at:g} s to the end of the run at {end:g} s; add one")
+
+    def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
+        """The longest stretch of each coordinate; spans that follow each other are one."""
+        del problem
+        longest, before, stretch = dict.fromkeys(names, 0.0), "", 0.0
+        for name, start, end in self._ordered():
+            stretch = end - start + (stretch if name == before else 0.0)
+            longest[name], before = max(longest[name], stretch), name
+        return longest
+
+    def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
+        """Block time -> slot."""
+        starts = [(name, start / problem.period) for name, start, _ in self._ordered()]
+        return _timed(problem, channels, starts, math.inf)
+
+    def _ordered(self) -> list[tuple[str, float, float]]:
+        return sorted(self.spans, key=lambda span: span[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Periodic(Schedule):
+    """Slots in turn, again and again.
+
+    Parameters:
+        durations: coordinate -> s, in the order of the slots.
+    """
+
+    durations: Mapping[str, float]
+
+    def check(self, names: Sequence[str], problem: Problem, mistakes: Mistakes) -> None:
+        """Note unknown and missing coordinates, and durations that are not positive or shorter than a cycle."""
+        _check_visits("Periodic", self.durations, names, mistakes)
+        for name, duration in self.durations.items():
+            check_stretch(f"Periodic: duration of '{name}'", duration, problem, mistakes)
+
+    def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
+        """The durations; alone, a slot lasts as long as the run."""
+        if len(self.durations) == 1:
+            return dict.fromkeys(self.durations, problem.duration)
+        return {n: self.durations.get(n, 0.0) for n in names}
+
+    def sequence(self, problem: Problem) -> SlotSpans:
+        """One period, in whole cycles."""
+        return tuple((n, round(d / problem.period) * problem.period) for n, d in self.durations.items())
+
+    def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
+        """Block time -> slot."""
+        starts, at = [], 0
+        for name, duration in self.durations.items():
+            starts.append((name, float(at)))
+            at += round(duration / problem.period)
+        return _timed(problem, channels, starts, at)
+
+
+def _is_span(span: object) -> bool:
+    return (
+        isinstance(span, tuple | list)
+        and len(span) == 3
+        and all(isinstance(t, int | float) and math.isfinite(t) for t in span[1:])
+    )
+
+
+def _check_visits(owner: str, visited: Iterable[str], names: Sequence[str], mistakes: Mistakes) -> None:
+    """Note coordinates that have no slot, and slots that are never active."""
+    found = list(visited)
+    mistakes.unknown(f"{owner}: coordinate", found, names)
+    for name in names:
+        if name not in found:
+            mistakes.add(f"{owner}: slot '{name}' is never active; give it time, or leave the slot out")
+
+
+def check_stretch(what: str, value: float, problem: Problem, mistakes: Mistakes) -> None:
+    """Note a length of time that is no positive number or shorter than one control cycle."""
+    if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
+        mistakes.add(f"{what} must be a positive number of seconds, got {value!r}")
+    elif value < problem.period * (1 - 1e-9):
+        mistakes.add(f"{what} is {value:g} s, shorter than one control cycle of {problem.period:g} s")
+
+
+def _timed(problem: Problem, channels: Sequence[Channel], starts: Sequence[tuple[str, float]], cycles: float) -> Block:
+    """Block time -> slot from the cycles in which slots start, repeated after `cycles`."""
+    numbers = {c.slot.coordinate: c.number for c in channels}
+    order = [numbers[name] for name, _ in starts]
+
+    def step(s: Any) -> dict[str, Expression]:
+        cycle = ca.floor(s.time / problem.period + 0.5)
+        phase = ca.fmod(cycle, cycles) if math.isfinite(cycles) else cycle
+        slot = ca.SX(order[0])
+        for before, number, (_, start) in zip(order, order[1:], starts[1:], strict=False):
+            slot += (number - before) * (phase > start - 0.5)
+        return {"slot": slot}
+
+    return Block("schedule", Layout((scalar("time", "s"),)), Layout((scalar("slot"),)), step)

@@ -1,0 +1,160 @@
+"""A time slot: one coordinate, controlled alone with its own relative order, tracking law and deformation.
+
+A slot is lowered onto a plant as a `Channel`: the coordinate's chain of derivatives, and a light plant that has nothing but
+that chain, y^(r) = u, so that tracking laws and deformations serve a slot as they serve a whole plant.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Set
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.deformation.wrappers.base import Wrapper
+from fpirhc.deformation.wrappers.delayed import Increment, Paired
+from fpirhc.deformation.wrappers.self_paired import SelfPaired
+from fpirhc.errors import InvalidProblem, NotInvertible, NotSupported
+from fpirhc.plant.plant import Plant
+from fpirhc.plant.relative_order import OutputChain, output_chain
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.base import Tracking
+
+
+@dataclass(frozen=True)
+class Slot:
+    """What is controlled while the slot lasts, and how.
+
+    Parameters:
+        coordinate: the coordinate y that follows its reference.
+        tracking: the law that gives the desired y^(r).
+        deformation: the fixed-point map between desired y^(r) and request, its scale given; Identity() is no adaptation.
+        order: the relative order r from the input to y; None: found from the model. A wrong one is refused.
+        input: the input that acts; may be left out where the plant has only one. Other inputs keep their last command.
+    """
+
+    coordinate: str
+    tracking: Tracking
+    deformation: Deformation = field(default_factory=Identity)
+    order: int | None = None
+    input: str | None = None
+
+    @property
+    def adapts(self) -> bool:
+        """Whether the slot has a deformation."""
+        return not isinstance(self.deformation, Identity)
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """A slot on a plant.
+
+    Parameters:
+        slot, chain: the slot and its coordinate's derivatives. number: place among the slots.
+        plant: the light plant y^(r) = u. start_gain: d y^(r)/du of the model at the problem's start.
+    """
+
+    slot: Slot
+    chain: OutputChain
+    number: int
+    plant: Plant
+    start_gain: float
+
+    def wire(self, name: str) -> str:
+        """Name of this slot's own copy of a signal."""
+        return f"_{name.lstrip('_')}_{self.number}"
+
+    def signal(self, name: str, elements: tuple[str, ...] = ()) -> Signal:
+        """A signal of this slot's own: a scalar, or with named elements."""
+        return Signal(self.wire(name), elements)
+
+
+def channel(problem: Problem, slot: Slot, number: int) -> Channel:
+    """Return the slot on the problem's plant.
+
+    Raises:
+        InvalidName, NotInvertible: see `output_chain`; y^(r) not affine in the input, or its gain zero at the start.
+        InvalidProblem: the given order is not the model's. NotSupported: a deformation that queues pairs.
+    """
+    plant = problem.plant
+    chain = output_chain(plant, slot.coordinate, slot.input)
+    if slot.order is not None and slot.order != chain.order:
+        raise InvalidProblem(
+            f"order={slot.order} is not the relative order from '{chain.input}' to '{slot.coordinate}', which is {chain.order}; "
+            f"write order={chain.order} or leave it out"
+        )
+    if not chain.affine:
+        raise NotInvertible(
+            f"derivative {chain.order} of '{slot.coordinate}' is not affine in '{chain.input}', which a slot needs"
+        )
+    _check_deformation(slot.deformation)
+    rest = np.zeros(plant.input.size)
+    gain = float(chain.gain(problem.start_state, rest, plant.approximate))
+    if not (np.isfinite(gain) and gain != 0):
+        raise NotInvertible(f"'{chain.input}' has no effect on '{slot.coordinate}' at the start (gain {gain:g})")
+    return Channel(slot, chain, number, _light_plant(plant, chain), gain)
+
+
+def _check_deformation(deformation: Deformation) -> None:
+    inner = deformation
+    while isinstance(inner, Wrapper) and not isinstance(inner, Paired | Increment | SelfPaired):
+        inner = inner.map
+    if isinstance(inner, Paired | Increment | SelfPaired):
+        raise NotSupported(
+            f"{type(inner).__name__} keeps pairs of earlier cycles, which belong to another slot after a switch; "
+            "use the map itself"
+        )
+
+
+def _light_plant(plant: Plant, chain: OutputChain) -> Plant:
+    """The plant y^(r) = u that has the chain as its state; only its signals are used."""
+
+    def response(*given: Any) -> dict[str, Expression]:
+        return {chain.coordinate: given[-2].vector}
+
+    names = [f"d{k}" for k in range(chain.order)] + ["u", "p"]
+    kind = inspect.Parameter.POSITIONAL_ONLY
+    response.__signature__ = inspect.Signature([inspect.Parameter(n, kind) for n in names])  # type: ignore[attr-defined]
+    return Plant({chain.coordinate: chain.unit}, {chain.input: plant.inputs[chain.input]}, {}, response, chain.order)
+
+
+def for_channel(block: Block, one: Channel, shared: Set[str], names: Mapping[str, str]) -> Block:
+    """The block on the slot's own copies of all signals that are not `shared`; `names` renames some differently.
+
+    What the block itself remembers starts afresh with every slot.
+    """
+
+    def renamed(signal: Signal) -> Signal:
+        name = signal.name if signal.name in shared else names.get(signal.name, one.wire(signal.name))
+        return Signal(name, signal.elements, signal.units, signal.start)
+
+    begun = one.signal("warm_up")
+    reads = [renamed(s) for s in block.reads.signals]
+    own = [renamed(s) for s in block.memory.signals]
+    reads_begun = [] if not own or begun.name in [s.name for s in reads] else [begun]
+
+    def step(s: Any) -> dict[str, Expression]:
+        kept = [ca.if_else(getattr(s, begun.name) > 0.5, getattr(s, m.name), ca.DM(m.start_vector())) for m in own]
+        given = block.function(*(getattr(s, r.name) for r in reads), *kept)
+        values = given if isinstance(given, tuple) else (given,)
+        results = [renamed(w).name for w in block.writes.signals] + [f"{m.name}_next" for m in own]
+        return dict(zip(results, values, strict=True))
+
+    writes = Layout(tuple(renamed(w) for w in block.writes.signals))
+    layout = Layout((*reads, *reads_begun))
+    return Block(f"{block.name}_{one.number}", layout, writes, step, Layout(tuple(own)), opaque=block.opaque)
+
+
+def delays_for_channel(delays: tuple[Delay, ...], one: Channel) -> list[Delay]:
+    """What a law carries to the next cycle, on the slot's own copies."""
+    return [
+        Delay(Signal(one.wire(d.now.name), d.now.elements, d.now.units, d.now.start), one.wire(d.source))
+        for d in delays
+    ]

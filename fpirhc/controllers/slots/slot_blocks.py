@@ -1,0 +1,219 @@
+"""The blocks of a control cycle in time slots, in the order in which they run.
+
+    reference   the reference state, and the error of every judged coordinate
+    state       per slot: its chain, what it is to be, alpha and beta of the model, and whether beta is large enough
+    admissible  which slots have gain enough, for the schedule
+    switch      which slot is active, and whether it was in the last cycle too
+    join        per slot: the desired response, joined to what the plant did before, and the pair that came before
+    command     the active slot's request inverted and clipped, and what the command means for every slot
+    judge       one status for the cycle
+
+Each slot has signals of its own (`Channel.signal`), computed in every cycle; those of the active one are used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import casadi as ca
+
+from fpirhc.controllers.base import FINITE, clip, error_signal, like
+from fpirhc.controllers.slots.slot import Channel
+from fpirhc.status import Status
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.task.problem import Problem
+
+
+def by_slot(channels: Sequence[Channel], name: str) -> Signal:
+    """A signal that holds a y^(r) of every slot."""
+    return Signal(name, tuple(c.slot.coordinate for c in channels), tuple(c.chain.response_unit for c in channels))
+
+
+def reference_block(problem: Problem) -> Block:
+    """Block (time, state) -> (reference state, error of the judged coordinates)."""
+    plant, function = problem.plant, problem.reference.function(problem.plant)
+    places = [plant.state.elements.index(c) for c in problem.judged_names]
+
+    def step(s: Any) -> dict[str, Expression]:
+        reference = function(s.time)[0]
+        return {"reference": reference, "error": reference[places] - s.state[places]}
+
+    writes = Layout((like(plant.state, "reference"), error_signal(problem, "error")))
+    reads = Layout((scalar("time", "s"), plant.state))
+    return Block("reference", reads, writes, step, opaque=problem.reference.opaque)
+
+
+def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
+    """Block -> the slot's chain and its target, y^(r),N, and alpha, beta of the model; whether beta is large enough."""
+    plant, chain = problem.plant, one.chain
+    derivatives = problem.reference.derivatives(chain.coordinate, chain.order)
+    place = plant.input.elements.index(chain.input)
+    smallest = smallest_gain * abs(one.start_gain)
+
+    def step(s: Any) -> dict[str, Expression]:
+        nominal = derivatives(s.time)
+        others = ca.vertcat(*(0 if k == place else s._command_before[k] for k in range(plant.input.size)))
+        gain = chain.gain(s.state, others, s.parameters)
+        good = ca.fabs(gain) >= smallest
+        values = {
+            "state": chain.states(s.state, s.parameters),
+            "target": nominal[: chain.order] if chain.order > 1 else nominal[0],
+            "nominal": nominal[chain.order],
+            "free": chain.response(s.state, others, s.parameters, ca.DM.zeros(len(plant.names))),
+            "gain": gain,
+            "good": good,
+            # Not zero, so that no slot that is not chosen divides by it.
+            "divisor": ca.if_else(good, gain, math.copysign(smallest, one.start_gain)),
+        }
+        return {one.wire(name): value for name, value in values.items()}
+
+    elements = one.plant.state.elements
+    writes = [one.signal(n, elements) for n in ("state", "target")]
+    writes += [one.signal(n) for n in ("nominal", "free", "gain", "good", "divisor")]
+    reads = Layout((scalar("time", "s"), plant.state, plant.parameter, like(plant.input, "_command_before")))
+    return Block(f"slot_state_{one.number}", reads, Layout(tuple(writes)), step, opaque=problem.reference.opaque)
+
+
+def admissible_block(channels: Sequence[Channel]) -> Block:
+    """Block that puts together which slots have gain enough."""
+    writes = Signal("_admissible", tuple(c.slot.coordinate for c in channels))
+    reads = Layout(tuple(c.signal("good") for c in channels))
+    return Block("admissible", reads, Layout((writes,)), lambda s: {"_admissible": _column(s, channels, "good")})
+
+
+def _column(s: Any, channels: Sequence[Channel], name: str) -> Expression:
+    return ca.vertcat(*(getattr(s, c.wire(name)) for c in channels))
+
+
+def switch_block(channels: Sequence[Channel]) -> Block:
+    """Block -> per slot whether it is active, and whether it was in the last cycle too; cycles since it began."""
+    reads = Layout((scalar("slot"), scalar("_slot_before"), scalar("_age_before"), scalar("warm_up")))
+
+    def step(s: Any) -> dict[str, Expression]:
+        goes_on = ca.logic_and(s.warm_up > 0.5, s.slot == s._slot_before)
+        found = {"_age": ca.if_else(goes_on, s._age_before + 1, 0)}
+        for one in channels:
+            active = s.slot == one.number
+            found[one.wire("active")] = active
+            found[one.wire("warm_up")] = ca.logic_and(active, goes_on)
+        return found
+
+    writes = [c.signal(n) for c in channels for n in ("active", "warm_up")]
+    return Block("switch", reads, Layout((scalar("_age"), *writes)), step)
+
+
+def join_block(problem: Problem, channels: Sequence[Channel], one: Channel, blend: float, blank: int) -> Block:
+    """Block that joins the slot's law to what the plant did before: the desired response, and the pair that came before."""
+    decay = math.exp(-problem.period / blend) if blend > 0 else 0.0
+    place = problem.plant.input.elements.index(one.chain.input)
+    names = ("law", "free", "gain", "active", "warm_up")
+
+    def step(s: Any) -> dict[str, Expression]:
+        law, free, gain, active, goes_on = (getattr(s, one.wire(name)) for name in names)
+        running, realised = s.warm_up > 0.5, s.realised[one.number]
+        switched = ca.logic_and(ca.logic_and(active, running), ca.logic_not(goes_on))
+        meant = free + gain * s._command_before[place]
+        as_it_is = realised if one.slot.adapts else meant
+        offset = ca.if_else(switched, as_it_is - law, decay * s._offset_before)
+        desired = law + ca.if_else(active, offset, 0)
+        blanked = ca.logic_and(ca.logic_and(active, running), s._age < blank - 0.5)
+        values = {
+            "offset": offset,
+            "desired": desired,
+            "kept": ca.if_else(switched, meant - desired, s._kept_before),
+            "deformed_last": ca.if_else(switched, meant, s._deformed_before[one.number]),
+            "realised": realised,
+            "valid": ca.logic_and(ca.logic_and(active, running), ca.logic_not(blanked)),
+            "blanked": blanked,
+        }
+        return {one.wire(name): value for name, value in values.items()}
+
+    shared = [scalar(n) for n in ("warm_up", "_age", "_offset_before", "_kept_before")]
+    columns = [by_slot(channels, n) for n in ("realised", "_deformed_before")]
+    reads = [*(one.signal(n) for n in names), *shared, *columns, like(problem.plant.input, "_command_before")]
+    results = ("offset", "desired", "kept", "deformed_last", "realised", "valid", "blanked")
+    return Block(f"join_{one.number}", Layout(tuple(reads)), Layout(tuple(one.signal(n) for n in results)), step)
+
+
+_OF_A_SLOT = (
+    "active",
+    "good",
+    "nominal",
+    "desired",
+    "deformed_wanted",
+    "blanked",
+    "kept",
+    "offset",
+    "free",
+    "gain",
+    "divisor",
+)
+
+
+def command_block(problem: Problem, channels: Sequence[Channel]) -> Block:
+    """Block that inverts the active slot's request, clips the command, and says what it means for every slot."""
+    plant = problem.plant
+    lower, upper = problem.limits.input_bounds(plant)
+    places = [plant.input.elements.index(c.chain.input) for c in channels]
+
+    def step(s: Any) -> dict[str, Expression]:
+        per_slot = {name: _column(s, channels, name) for name in _OF_A_SLOT}
+        active, free, gain = per_slot["active"], per_slot["free"], per_slot["gain"]
+        wanted = ca.if_else(per_slot["blanked"], per_slot["desired"] + per_slot["kept"], per_slot["deformed_wanted"])
+        requests = (wanted - free) / per_slot["divisor"]
+        good = _pick(active, per_slot["good"]) > 0.5
+        requested = [
+            _pick(active * ca.DM([p == k for p in places]), requests, s._command_before[k])
+            for k in range(plant.input.size)
+        ]
+        asked = ca.vertcat(*requested)
+        finite = ca.mmin(ca.fabs(asked) <= FINITE)
+        usable = ca.logic_and(finite, good)
+        command = clip(ca.if_else(usable, asked, s._command_before), lower, upper)
+        entries = ca.vertcat(*(command[p] for p in places))
+        # Exactly the wanted response where nothing was clipped.
+        moved = wanted + gain * (entries - requests)
+        exact = ca.logic_and(active, usable)
+        return {
+            "command": command,
+            "nominal": per_slot["nominal"],
+            "desired": per_slot["desired"],
+            "deformed": ca.if_else(exact, moved, free + gain * entries),
+            "clipped": ca.mmax(command != asked),
+            "slot_held": ca.logic_not(good),
+            "_held": ca.logic_not(finite),
+            "_offset": _finite(_pick(active, per_slot["offset"])),
+            "_kept": _finite(_pick(active, per_slot["kept"])),
+            "_warm_up_now": 1,
+        }
+
+    reads = [c.signal(n) for c in channels for n in _OF_A_SLOT]
+    responses = [by_slot(channels, n) for n in ("nominal", "desired", "deformed")]
+    scalars = [scalar(n) for n in ("clipped", "slot_held", "_held", "_offset", "_kept", "_warm_up_now")]
+    writes = (plant.input, *responses, *scalars)
+    return Block("command", Layout((*reads, like(plant.input, "_command_before"))), Layout(writes), step)
+
+
+def _pick(active: Expression, values: Expression, otherwise: Expression = 0) -> Expression:
+    """The value of the active slot; no sum, in which a value that is not finite would spoil the others."""
+    found = otherwise
+    for k in range(values.numel()):
+        found = ca.if_else(active[k] > 0.5, values[k], found)
+    return found
+
+
+def _finite(value: Expression) -> Expression:
+    """Zero in place of a number that is not finite, which would otherwise be remembered for the rest of the slot."""
+    return ca.if_else(ca.fabs(value) <= FINITE, value, 0)
+
+
+def judge_block() -> Block:
+    """Block that says whether the command was held: because it was not finite, or because the gain is too small."""
+
+    def step(s: Any) -> dict[str, Expression]:
+        return {"status": ca.fmax(s._held * int(Status.NON_FINITE), s.slot_held * int(Status.HELD))}
+
+    return Block("judge", Layout((scalar("_held"), scalar("slot_held"))), Layout((scalar("status"),)), step)

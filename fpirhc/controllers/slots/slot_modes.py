@@ -1,0 +1,130 @@
+"""The closed loop in one slot, linearised at the set-point.
+
+With an ideal deformation the plant realises the desired response exactly, y^(r) = y^(r),Des, so a slot's motion near an
+equilibrium (x*, u*) is z' = A z with z = (x - x*, e_int, offset): the state, the law's integral and the offset that a switch
+leaves behind. The input is a linear function of z. All coordinates but y follow the zero dynamics of y.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.controllers.slots.slot import Channel
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.exponential import Exponential
+
+_STILL = 1e-6  # size of a derivative, relative to its terms, that counts as zero
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """One slot near the set-point; n states.
+
+    Parameters:
+        generator: A, shape (n + 2, n + 2). command: row k with u - u* = k z, shape (n + 2,).
+        own: row of y^(r) in (x - x*) and its gain b. law: row of y^(r),Des in z without the offset.
+        first_integral: row of the integral at the start of the slot in x - x*, shape (n,).
+        blends: whether a switch leaves an offset. integrates: whether the law has an integral.
+    """
+
+    generator: np.ndarray
+    command: np.ndarray
+    own: np.ndarray
+    gain: float
+    law: np.ndarray
+    first_integral: np.ndarray
+    blends: bool
+    integrates: bool
+
+    @property
+    def eigenvalues(self) -> np.ndarray:
+        """Of the motion within the slot, apart from the offset's own decay."""
+        used = self.generator.shape[0] - (1 if self.integrates else 2)
+        return np.linalg.eigvals(self.generator[:used, :used])
+
+    @property
+    def rate(self) -> float:
+        """Largest real part of the eigenvalues, 1/s: how fast the slot's zero dynamics diverge."""
+        return float(self.eigenvalues.real.max())
+
+    def start(self, before: Mode) -> np.ndarray:
+        """Matrix that turns z at the end of the slot `before` into z at the start of this one; the command is continuous."""
+        n = self.own.size
+        matrix = np.zeros((n + 2, n + 2))
+        matrix[:n, :n] = np.eye(n)
+        matrix[n, :n] = self.first_integral
+        if self.blends:
+            realised = np.concatenate([self.own, [0, 0]]) + self.gain * before.command
+            matrix[n + 1] = realised - self.law @ matrix
+        return matrix
+
+    def goes_on(self) -> np.ndarray:
+        """Matrix that turns z into z where no switch happens: integral kept where the law has one, and never an offset."""
+        return np.diag([*np.ones(self.own.size), float(self.integrates), 0.0])
+
+
+def linear_modes(
+    problem: Problem, channels: Sequence[Channel], parameters: np.ndarray, blend: float
+) -> tuple[list[Mode], str]:
+    """Return the modes at the reference's last point, or none and the reason why there are none.
+
+    Parameters: `parameters` of the plant, shape (np,); `blend` as in Slotted, s.
+    """
+    other = [c.slot.coordinate for c in channels if not isinstance(c.slot.tracking, Exponential)]
+    if other:
+        return [], f"the tracking law of slot '{other[0]}' is not Exponential, whose gains are known"
+    found = _set_point(problem, parameters)
+    if isinstance(found, str):
+        return [], found
+    return [_mode(problem, one, parameters, blend, *found) for one in channels], ""
+
+
+def _set_point(problem: Problem, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray] | str:
+    plant = problem.plant
+    given = problem.reference.function(plant)(problem.duration)
+    state, response = (np.asarray(v.full()).ravel() for v in given)
+    moving = [abs(v) for e, v in zip(plant.state.elements, state, strict=True) if "'" in e]
+    if max([*moving, *np.abs(response)]) > _STILL:
+        return f"the reference still moves at its end, t = {problem.duration:g} s"
+    x, u, p = plant._symbols()
+    rate = plant.derivative_function(x, u, p)
+    function = ca.Function("fpirhc_rate", [x, u, p], [rate, ca.densify(ca.jacobian(rate, u))])
+    free, gain = (np.asarray(v.full()) for v in function(state, np.zeros(u.numel()), parameters))
+    command = np.linalg.lstsq(gain, -free, rcond=None)[0].ravel()
+    left = np.abs(np.asarray(function(state, command, parameters)[0].full())).max()
+    if not left <= _STILL * (1 + np.abs(free).max()):
+        return f"the reference's last point is no equilibrium: no input brings |x'| below {left:.3g}"
+    return state, command
+
+
+def _mode(
+    problem: Problem, one: Channel, parameters: np.ndarray, blend: float, state: np.ndarray, command: np.ndarray
+) -> Mode:
+    plant, law = problem.plant, one.slot.tracking
+    assert isinstance(law, Exponential)
+    x, u, p = plant._symbols()
+    rate, calm = plant.derivative_function(x, u, p), ca.SX.zeros(len(plant.names))
+    chosen = u[plant.input.elements.index(one.chain.input)]
+    realised = one.chain.response(x, u, p, calm)
+    wanted = [(rate, x), (rate, chosen), (one.chain.states(x, p), x), (realised, x), (realised, chosen)]
+    function = ca.Function("fpirhc_linear", [x, u, p], [ca.densify(ca.jacobian(f, v)) for f, v in wanted])
+    a, b, chain, own, gain = (np.asarray(v.full()) for v in function(state, command, parameters))
+    n, gains = a.shape[0], np.array(law.gains(one.chain.order))
+    integral, proportional = (gains[0], gains[1:]) if law.integral else (0.0, gains)
+    feedback = proportional @ chain
+    desired = np.concatenate([-feedback, [integral, 0.0]])
+    offset = np.eye(n + 2)[n + 1] if blend > 0 else np.zeros(n + 2)
+    through = (desired + offset - np.concatenate([own.ravel(), [0, 0]])) / gain.item()
+    generator = np.zeros((n + 2, n + 2))
+    generator[:n, :n] = a
+    generator[:n] += b @ through[None, :]
+    if law.integral:
+        generator[n, :n] = -chain[0]
+    if blend > 0:
+        generator[n + 1, n + 1] = -1 / blend
+    first = feedback / integral if law.integral and law.bumpless else np.zeros(n)
+    return Mode(generator, through, own.ravel(), gain.item(), desired, first, blend > 0, law.integral)

@@ -1,0 +1,215 @@
+"""Time slots: one input serves several coordinates in turn.
+
+A plant with fewer inputs than coordinates cannot prescribe all of them at once. Instead of weighing them in one cost, time is cut
+into slots: in each one coordinate y follows its reference with its own relative order r,
+
+    y^(r) = alpha(x) + beta(x) u,        u = (r^Def - alpha) / beta  by the model,
+
+while the others follow the zero dynamics of y. A slot need not be stable alone; the schedule must be, see `floquet_radius`.
+
+At a switch the command is continuous. The first request of a slot is what the last command means for it by the model,
+r_0 = alpha + beta u, and the law is joined without a step,
+
+    desired = law + offset e^(-(t - t_0) / blend),    offset = y^(r) as it is - law  at t_0,
+
+where y^(r) as it is means the realised one for a slot that adapts (its deformation then begins at a fixed point: the request r_0
+was just realised) and r_0 for one that does not. So the command of the first cycle of a slot is the last command, and the
+change per cycle afterwards is at most
+
+    ( |offset| (1 - e^(-period / blend)) + |change of law and of alpha| + |step of the deformation| ) / |beta|.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.contraction import Spectrum, assess_gain
+from fpirhc.controllers.base import Controller, Response, deform_block, like
+from fpirhc.controllers.slots.floquet import radius_of
+from fpirhc.controllers.slots.schedules import Schedule
+from fpirhc.controllers.slots.slot import Channel, Slot, channel, delays_for_channel, for_channel
+from fpirhc.controllers.slots.slot_blocks import (
+    admissible_block,
+    by_slot,
+    command_block,
+    join_block,
+    judge_block,
+    reference_block,
+    state_block,
+    switch_block,
+)
+from fpirhc.controllers.slots.slot_modes import linear_modes
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import FpirhcError, InvalidValue, Mistakes, NotContractive
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import scalar
+from fpirhc.task.problem import Problem
+
+
+@dataclass(frozen=True)
+class Slotted(Controller):
+    """One coordinate at a time, by a schedule.
+
+    Parameters:
+        slots: what each slot controls; one per coordinate.
+        schedule: which slot is active (FixedSchedule, Periodic, ByError, ByLookAhead).
+        blend: time constant with which the offset of a switch decays, s; 0: the law is joined at once, and the command jumps
+            one cycle after the switch.
+        blank: cycles at the start of a slot in which the request keeps its distance from the desired response, for measurements
+            of y^(r) that need as many cycles after a switch.
+        smallest_gain: share of its size at the start that |beta| must keep; below it the command is held (signal `slot_held`).
+        largest_growth: by how much a diverging zero dynamics may grow within one slot.
+
+    Raises:
+        InvalidValue: a number out of range.
+
+    References:
+        J. K. Tar, J. F. Bito, I. J. Rudas, Contradiction resolution in the adaptive control of underactuated mechanical systems
+        evading the framework of optimal controllers, Acta Polytechnica Hungarica 13(1), 2016, for the idea; the switching is
+        our own.
+    """
+
+    slots: Sequence[Slot]
+    schedule: Schedule
+    blend: float
+    blank: int = 0
+    smallest_gain: float = 0.05
+    largest_growth: float = 100.0
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.blend, int | float) and math.isfinite(self.blend) and self.blend >= 0):
+            raise InvalidValue(f"Slotted(blend={self.blend!r}): expected a number of seconds of at least 0")
+        if not (isinstance(self.blank, int) and self.blank >= 0):
+            raise InvalidValue(f"Slotted(blank={self.blank!r}): expected a whole number of cycles of at least 0")
+        if not (isinstance(self.smallest_gain, int | float) and 0 < self.smallest_gain < 1):
+            raise InvalidValue(f"Slotted(smallest_gain={self.smallest_gain!r}): expected a share between 0 and 1")
+        if not (isinstance(self.largest_growth, int | float) and self.largest_growth > 1):
+            raise InvalidValue(f"Slotted(largest_growth={self.largest_growth!r}): expected a factor above 1")
+
+    @property
+    def adaptive(self) -> Deformation:
+        """The first slot's deformation that iterates, or Identity."""
+        return next((s.deformation for s in self.slots if s.adapts), Identity())
+
+    def response(self, problem: Problem) -> Response:
+        """y^(r) of every slot's coordinate."""
+        channels = self.channels(problem)
+        x, u, p = problem.plant._symbols()
+        w = ca.SX.sym("w", len(problem.plant.names))
+        found = ca.vertcat(*(c.chain.response(x, u, p, w) for c in channels))
+        return Response(by_slot(channels, "realised"), ca.Function("fpirhc_slots_realised", [x, u, p, w], [found]))
+
+    def notes(self, problem: Problem) -> tuple[str, ...]:
+        """The Floquet radius of the schedule, and each slot's fastest divergence."""
+        found = radius_of(problem, self.channels(problem), self.schedule, self.blend)
+        if found.radius is None:
+            return (f"no Floquet radius: {found.reason}",)
+        alone = ", ".join(
+            f"{name} {round(values.real.max(), 6) + 0.0:.3g}" for name, values in found.eigenvalues.items()
+        )
+        verb = "shrink" if found.radius < 1 else "grow"
+        return (
+            f"Floquet radius {found.radius:.3g} per period of {found.period:g} s: near the set-point errors of ideal slots {verb} "
+            f"(largest real part in each slot alone, 1/s: {alone})",
+        )
+
+    def channels(self, problem: Problem) -> list[Channel]:
+        """The slots on the plant."""
+        return [channel(problem, slot, k) for k, slot in enumerate(self.slots)]
+
+    def check(self, problem: Problem) -> None:
+        """Raise if the slots or the schedule do not fit the problem.
+
+        Raises:
+            InvalidProblem: all mistakes together, of slots and schedule; slots that last too long. NotContractive: a
+            deformation's gain of the wrong sign or too large at the start.
+        """
+        mistakes = Mistakes("Slotted")
+        names = [s.coordinate for s in self.slots]
+        if not names:
+            mistakes.add("there are no slots; give at least one Slot(coordinate, tracking)")
+        for name in sorted({n for n in names if names.count(n) > 1}):
+            mistakes.add(
+                f"coordinate '{name}' has more than one slot; a schedule may visit one slot as often as it likes"
+            )
+        for slot in self.slots:
+            _check_slot(problem, slot, mistakes)
+        if names:
+            self.schedule.check(list(dict.fromkeys(names)), problem, mistakes)
+        mistakes.raise_if_any()
+        channels = self.channels(problem)
+        for one in channels:
+            _check_gain(problem, one)
+        self._check_growth(problem, channels)
+
+    def _check_growth(self, problem: Problem, channels: Sequence[Channel]) -> None:
+        """By the model, at the reference's last point; without a set-point nothing is said."""
+        modes, _ = linear_modes(problem, channels, problem.plant.approximate, 0.0)
+        dwells = self.schedule.dwells([c.slot.coordinate for c in channels], problem)
+        mistakes = Mistakes("Slotted")
+        for one, mode in zip(channels, modes, strict=False):
+            name, exponent = one.slot.coordinate, mode.rate * dwells[one.slot.coordinate]
+            if exponent > math.log(self.largest_growth):
+                mistakes.add(
+                    f"slot '{name}' lasts {dwells[name]:g} s, in which its zero dynamics, diverging at {mode.rate:.3g} 1/s, grow "
+                    f"e^{exponent:.3g} times, more than largest_growth = {self.largest_growth:g}; make it shorter than "
+                    f"{math.log(self.largest_growth) / mode.rate:.3g} s"
+                )
+        mistakes.raise_if_any()
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Blocks reference, schedule; per slot tracking, join, deform; then command, judge, tracking updates."""
+        channels = self.channels(problem)
+        blocks = [reference_block(problem)]
+        blocks += [state_block(problem, one, self.smallest_gain) for one in channels]
+        blocks += [admissible_block(channels), self.schedule.block(problem, channels), switch_block(channels)]
+        delays: list[Delay] = []
+        for one in channels:
+            light, law = one.plant, one.slot.tracking
+            blocks.append(for_channel(law.law(light, problem.period), one, {"time"}, {"desired": one.wire("law")}))
+            blocks.append(join_block(problem, channels, one, self.blend, self.blank))
+            names = {name: f"{name}_{one.slot.coordinate}" for name in one.slot.deformation.shown()}
+            names["warm_up"] = one.wire("valid")
+            blocks.append(for_channel(deform_block(light, one.slot.deformation), one, set(), names))
+            delays += delays_for_channel(law.delays(light), one)
+        blocks += [command_block(problem, channels), judge_block()]
+        blocks += [
+            for_channel(c.slot.tracking.update(c.plant, problem.period), c, {"clipped", "time"}, {}) for c in channels
+        ]
+        remembered = {"warm_up": "_warm_up_now", "_slot_before": "slot", "_age_before": "_age"}
+        remembered |= {"_offset_before": "_offset", "_kept_before": "_kept"}
+        delays += [Delay(scalar(now), source) for now, source in remembered.items()]
+        delays.append(Delay(like(problem.plant.input, "_command_before"), "command"))
+        delays.append(Delay(by_slot(channels, "_deformed_before"), "deformed"))
+        return blocks, delays
+
+
+def _check_slot(problem: Problem, slot: Slot, mistakes: Mistakes) -> None:
+    name = slot.coordinate
+    try:
+        channel(problem, slot, 0)
+        slot.deformation.largest_step()  # says so where a scale is still to be chosen
+    except FpirhcError as error:
+        mistakes.add(f"slot '{name}': {error}")
+        return
+    if name not in problem.judged_names:
+        every = ", ".join(repr(n) for n in [*problem.judged_names, name])
+        mistakes.add(
+            f"slot '{name}' is not among the coordinates that are judged; write Problem(..., judged=({every}))"
+        )
+
+
+def _check_gain(problem: Problem, one: Channel) -> None:
+    """J = beta / beta of the model, at the start."""
+    if not one.slot.adapts:
+        return
+    exact = float(one.chain.gain(problem.start_state, np.zeros(problem.plant.input.size), problem.plant.exact))
+    report = assess_gain(one.slot.deformation, Spectrum(np.array([exact / one.start_gain])))
+    if not report.contractive:
+        raise NotContractive(f"slot '{one.slot.coordinate}': {report.text}")

@@ -1,0 +1,127 @@
+"""A controller whose model is learned on line: an estimator corrects the parameters that the wrapped controller believes.
+
+    command = controller(state; p + parameter_change),      parameter_change = estimator(state, last command, response; p).
+
+Offset-free receding-horizon control is RecedingHorizon with DisturbanceKalman; adaptive receding-horizon control in the
+sense of certainty equivalence is RecedingHorizon with RecursiveLeastSquares or MovingHorizon. They are what an engineer
+would use instead of a deformation, or with one. The parameter_change is used where the controller evaluates its model: in the
+inverse every cycle, in a receding horizon whenever it plans.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.controllers.base import FINITE, Controller, compose_controller, embedded, like
+from fpirhc.deformation.base import Deformation
+from fpirhc.errors import NotSupported
+from fpirhc.learning.estimators.base import Estimator, Seen
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.task.problem import Problem
+
+
+@dataclass(frozen=True)
+class Estimating(Controller):
+    """The wrapped controller with the parameters of its model corrected every cycle.
+
+    Parameters:
+        controller: any controller that uses its model. estimator: what learns, and what is learned.
+    """
+
+    controller: Controller
+    estimator: Estimator
+
+    @property
+    def adaptive(self) -> Deformation:
+        """The wrapped controller's deformation."""
+        return self.controller.adaptive
+
+    def parameters(self, plant: Plant) -> np.ndarray:
+        """The wrapped controller's parameters, from which the estimate starts."""
+        return self.controller.parameters(plant)
+
+    def resolved(self, problem: Problem) -> Estimating:
+        """Return the wrapped controller resolved."""
+        return replace(self, controller=self.controller.resolved(self._modelled(problem)))
+
+    def notes(self, problem: Problem) -> tuple[str, ...]:
+        """The wrapped controller's."""
+        return self.controller.notes(self._modelled(problem))
+
+    def check(self, problem: Problem) -> None:
+        """Raise what the wrapped controller and the estimator raise.
+
+        Raises:
+            NotSupported: dead time, with which the response answers another command than the last; or a controller that
+            reads a response of its own.
+        """
+        modelled = self._modelled(problem)
+        self.estimator.check(modelled)
+        self.controller.check(modelled)
+        if problem.dead_time.measurement or any(problem.dead_time.inputs.values()):
+            raise NotSupported(
+                "Estimating pairs a response with the command of one cycle before: no dead time is supported"
+            )
+        if self.controller.response(modelled) is not None:
+            raise NotSupported(
+                f"Estimating needs the response of the controlled coordinates; {type(self.controller).__name__} reads another"
+            )
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Blocks estimate, and the wrapped controller as one."""
+        modelled = self._modelled(problem)
+        inner = compose_controller(modelled, self.controller)
+        believed = Signal("_believed", modelled.plant.parameter.elements, modelled.plant.parameter.units)
+        acted = like(problem.plant.input, "_acted")
+        blocks = [
+            _estimate_block(problem, modelled, self.estimator, believed, acted),
+            embedded("controller", inner, {"parameters": believed}),
+        ]
+        return blocks, [Delay(acted, problem.plant.input.name)]
+
+    def _modelled(self, problem: Problem) -> Problem:
+        """The problem as the wrapped controller sees it."""
+        model = self.estimator.model(problem.plant)
+        return problem if model is problem.plant else replace(problem, plant=model)
+
+
+def _estimate_block(
+    problem: Problem, modelled: Problem, estimator: Estimator, believed: Signal, acted: Signal
+) -> Block:
+    """Block (state, realised, parameters, command of the last cycle) -> (believed parameters, the learned ones)."""
+    plant, model = problem.plant, modelled.plant
+    names = estimator.learned()
+    places = [model.parameter.elements.index(n) for n in names]
+    count = len(plant.parameters)
+    estimate = Signal("estimate", names, tuple(model.parameters[n].unit for n in names))
+    memory = estimator.memory(modelled)
+    correct = estimator.step(modelled)
+    own = memory + Layout((like(estimate, "estimate_change"), scalar("estimate_begun")))
+
+    def step(s: Any) -> dict[str, Expression]:
+        given = ca.vertcat(s.parameters[:count], ca.DM(model.approximate[count:]))
+        before = {m: getattr(s, m) for m in memory.names}
+        seen = Seen(s.state, s._acted, s.realised, given, s.estimate_begun)
+        parameter_change, following = correct(seen, before)
+        # What is not finite is not learned: one bad measurement must not spoil the model for ever.
+        finite = ca.mmin(ca.fabs(ca.vertcat(parameter_change, *following.values())) <= FINITE)
+        used = ca.if_else(finite, parameter_change, s.estimate_change)
+        values = given + 0
+        values[places] += used
+        kept = {f"{m}_next": ca.if_else(finite, following[m], before[m]) for m in memory.names}
+        return {
+            believed.name: values,
+            "estimate": values[places],
+            "estimate_change_next": used,
+            "estimate_begun_next": 1,
+            **kept,
+        }
+
+    reads = Layout((plant.state, plant.response_signal("realised"), plant.parameter, acted))
+    return Block("estimate", reads, Layout((believed, estimate)), step, own, opaque=True)

@@ -1,0 +1,55 @@
+"""A low-pass on the response error of a map.
+
+    g_k = p g_{k-1} + (1 - p) (f_k - d_k),     r_{k+1} = G(r_k, d_k + g_k, d_k).
+
+The error is filtered, not the response: a filtered response compared with an unfiltered desired one differs from it
+wherever the task moves, and the map would correct what is no error. On f = lambda r with the effective gain a the loop is
+
+    z^2 - (1 + p - a lambda (1 - p)) z + p = 0,
+
+stable for 0 < a lambda < 2 (1 + p) / (1 - p). Beyond a lambda = (1 - sqrt(p))^2 / (1 - p) it is no faster than sqrt(p) per
+cycle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from fpirhc.deformation.wrappers.base import Wrapper, of_map
+from fpirhc.errors import InvalidValue
+from fpirhc.symbolic.layout import Expression, Layout, Signal
+
+
+@dataclass(frozen=True)
+class Filtered(Wrapper):
+    """The wrapped map on a low-passed response error.
+
+    Parameters:
+        map: any deformation that iterates.
+        pole: p of the filter, from 0 (none) to below 1; exp(-period / time constant).
+
+    Raises:
+        InvalidValue: a pole outside [0, 1).
+    """
+
+    pole: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.pole < 1:
+            raise InvalidValue(
+                f"Filtered(pole={self.pole!r}): expected a number from 0 to below 1; exp(-period / time constant) is one"
+            )
+
+    def memory(self, elements: tuple[str, ...]) -> Layout:
+        """The filtered error, and the map's own memory."""
+        return Layout((Signal("filter_error", elements),)) + self.map.memory(elements)
+
+    def step(
+        self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+    ) -> tuple[Expression, dict[str, Expression]]:
+        """Return the map's next request for the filtered error."""
+        inner = of_map(self, memory, request.numel())
+        error = self.pole * memory["filter_error"] + (1 - self.pole) * (response - desired)
+        wanted, following = self.map.step(request, desired + error, desired, inner)
+        return wanted, {"filter_error": error, **following}

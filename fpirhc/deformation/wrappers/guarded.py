@@ -1,0 +1,145 @@
+"""Watches an iteration that may leave its basin of attraction, and brings it back.
+
+A trip sets the request to the desired response, halves the step, forgets what the map remembers and pauses. Four things trip:
+
+    1  oscillation  errors alternate in sign while the step is at its limit, for 20 cycles
+    2  growth       errors alternate and their mean over 20 cycles is four times that over 200, for 20 cycles
+    3  size         the request is further from the desired response than it may be
+    4  non-finite   the response or the request is not a number
+
+A disturbance step does none of these: its errors do not alternate. After 1000 clean cycles the step grows again by 5 % every 8
+cycles (6 when it is whole). After the third trip within about 1000 cycles the guard gives up adaptation for the rest of the run
+(5, fallback). Every event is in the run: signal `adaptation_event` is its number in the cycle in which it happens, and
+`EVENTS` has the words.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+
+from fpirhc.deformation.base import smooth_norm
+from fpirhc.deformation.wrappers.base import Wrapper, of_map, start_of_map
+from fpirhc.deformation.wrappers.forgetting import forget
+from fpirhc.errors import InvalidValue
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+
+EVENTS = {1: "oscillation at the step limit", 2: "growing oscillation", 3: "request too far from the desired response"}
+EVENTS |= {4: "not finite", 5: "fallback: no adaptation any more", 6: "recovered: full gain again"}
+_ALTERNATING, _PATIENCE = -0.8, 20
+_FAST, _SLOW, _GROWTH = 1 / 20, 1 / 200, 4.0
+_AT_LIMIT = 0.5  # share of the map's largest step that counts as saturated
+_PAUSE, _CLEAN, _EVERY, _REGROW = 10, 1000, 8, 1.05
+_TRIPS, _MEMORY = 2.5, 1 - 1 / 1000
+_FINITE = 1e300
+
+
+@dataclass(frozen=True)
+class Guarded(Wrapper):
+    """The wrapped map, watched.
+
+    Parameters:
+        map: any deformation that iterates.
+        largest_deformation: |r - d| beyond which the iteration has left its basin, in units of the response.
+
+    Raises:
+        InvalidValue: a limit that is not positive.
+    """
+
+    largest_deformation: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.largest_deformation < math.inf:
+            raise InvalidValue(f"Guarded(largest_deformation={self.largest_deformation!r}): expected a positive number")
+
+    def memory(self, elements: tuple[str, ...]) -> Layout:
+        """What the guard has seen, and the map's own memory."""
+        numbers = ("sign", "oscillating", "growing", "fast", "slow", "pause", "trips", "clean", "event", "fallback")
+        own = (scalar("guard_factor", start=1.0), *(scalar(f"guard_{n}") for n in numbers))
+        return Layout((*own, Signal("guard_error", elements))) + self.map.memory(elements)
+
+    def shown(self) -> Mapping[str, str]:
+        """The event of each cycle and the factor, and what the map shows."""
+        return {"adaptation_event": "guard_event", "adaptation_factor": "guard_factor", **self.map.shown()}
+
+    def step(
+        self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+    ) -> tuple[Expression, dict[str, Expression]]:
+        """Return the map's next request, or the desired response after a trip and in a pause."""
+        own = {name.removeprefix("guard_"): v for name, v in memory.items() if name.startswith("guard_")}
+        inner = of_map(self, memory, request.numel())
+        wanted, following = self.map.step(request, response, desired, inner)
+        candidate = request + own["factor"] * (wanted - request)
+        active = ca.logic_not(ca.logic_or(own["pause"] > 0.5, own["fallback"] > 0.5))
+        seen = self._watched(request, response, desired, candidate, own)
+        trip = ca.logic_and(active, seen["event"] > 0.5)
+        trips = _MEMORY * own["trips"] + trip
+        fallback = ca.logic_or(own["fallback"] > 0.5, trips > _TRIPS)
+        kept = self._kept(own, seen, trip, active, trips, fallback)
+        running = ca.logic_and(active, ca.logic_not(trip))
+        start = start_of_map(self, request.numel())
+        forgotten = {name: ca.if_else(running, value, start[name]) for name, value in following.items()}
+        return ca.if_else(running, candidate, desired), {**kept, **forgotten}
+
+    def _watched(
+        self,
+        request: Expression,
+        response: Expression,
+        desired: Expression,
+        candidate: Expression,
+        own: Mapping[str, Expression],
+    ) -> dict[str, Expression]:
+        """What this cycle shows: the error, its means, the counts, and the number of the event (0: none)."""
+        finite = ca.logic_and(_finite(candidate), _finite(response))
+        error = ca.if_else(finite, response - desired, 0)
+        size = smooth_norm(error, 1e-12)
+        sign = forget(own["sign"], ca.sign(ca.dot(error, own["error"])))
+        limit = own["factor"] * self.map.largest_step()
+        at_limit = (
+            smooth_norm(candidate - request, 1e-12) >= _AT_LIMIT * limit
+            if math.isfinite(self.map.largest_step())
+            else 0
+        )
+        fast = own["fast"] + _FAST * (size - own["fast"])
+        slow = own["slow"] + _SLOW * (size - own["slow"])
+        oscillating = ca.if_else(ca.logic_and(sign < _ALTERNATING, at_limit), own["oscillating"] + 1, 0)
+        grown = ca.logic_and(fast > _GROWTH * slow, fast > 1e-3 * self.largest_deformation)
+        growing = ca.if_else(ca.logic_and(sign < _ALTERNATING, grown), own["growing"] + 1, 0)
+        far = smooth_norm(candidate - desired, 1e-12) > self.largest_deformation
+        event = ca.if_else(oscillating > _PATIENCE, 1, 0)
+        event = ca.if_else(growing > _PATIENCE, 2, event)
+        event = ca.if_else(far, 3, event)
+        event = ca.if_else(finite, event, 4)
+        found = {"error": error, "sign": sign, "fast": fast, "slow": slow}
+        return {**found, "oscillating": oscillating, "growing": growing, "event": event}
+
+    def _kept(
+        self,
+        own: Mapping[str, Expression],
+        seen: Mapping[str, Expression],
+        trip: Expression,
+        active: Expression,
+        trips: Expression,
+        fallback: Expression,
+    ) -> dict[str, Expression]:
+        clean = ca.if_else(trip, 0, own["clean"] + 1)
+        due = ca.logic_and(clean > _CLEAN, ca.fmod(clean, _EVERY) < 0.5)
+        grown = ca.if_else(ca.logic_and(due, own["factor"] < 1), ca.fmin(1, _REGROW * own["factor"]), own["factor"])
+        factor = ca.if_else(trip, 0.5 * own["factor"], grown)
+        recovered = ca.logic_and(own["factor"] < 1, factor >= 1)
+        first_fallback = ca.logic_and(fallback, own["fallback"] < 0.5)
+        event = ca.if_else(first_fallback, 5, ca.if_else(trip, seen["event"], ca.if_else(recovered, 6, 0)))
+        watching = ca.logic_and(active, ca.logic_not(trip))
+        counted = {
+            k: ca.if_else(watching, seen[k], 0) for k in ("sign", "oscillating", "growing", "error", "fast", "slow")
+        }
+        pause = ca.if_else(trip, _PAUSE, ca.fmax(own["pause"] - 1, 0))
+        whole = {"factor": factor, "pause": pause, "trips": trips, "clean": clean, "event": event, "fallback": fallback}
+        return {f"guard_{name}": value for name, value in {**counted, **whole}.items()}
+
+
+def _finite(value: Expression) -> Expression:
+    return ca.mmin(ca.fabs(value) <= _FINITE)

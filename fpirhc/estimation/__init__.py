@@ -1,1 +1,0 @@
-"""Estimators of what a model gets wrong: disturbances and parameters, from what was commanded and measured."""

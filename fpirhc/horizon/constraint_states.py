@@ -1,0 +1,102 @@
+"""Limits on what is not a state: rates of inputs, paths, and the end of the horizon.
+
+Each becomes an entry z of the stage's state that is written one stage later, z_{i+1} = c(s_i, u_i, theta_i), and is bounded there.
+So every optimiser that keeps bounds of states keeps them too, and they are verified and named like states.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.horizon.cost import View
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.layout import Expression
+from fpirhc.task.limits import Limits
+
+_HAIR = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class ConstraintState:
+    """One entry: its name, unit, expression, and bounds (infinite where free)."""
+
+    name: str
+    unit: str
+    expression: Expression
+    lower: float
+    upper: float
+
+
+def rates(limits: Limits, plant: Plant, view: View, step: float) -> list[ConstraintState]:
+    """Change of inputs per second, (u_i - u_{i-1}) / step, for inputs with a limited rate."""
+    return [
+        ConstraintState(
+            f"{name} rate", f"{plant.inputs[name]}/s", (view.input[name] - view.input_before[name]) / step, *bounds
+        )
+        for name, bounds in limits.rates.items()
+    ]
+
+
+def paths(limits: Limits, view: View) -> list[ConstraintState]:
+    """Expressions of state and input of stages 0 ... N-1 that are to stay in an interval."""
+    return [
+        ConstraintState(name, path.unit, path.expression(view), path.lower, path.upper)
+        for name, path in limits.paths.items()
+    ]
+
+
+def ends(
+    names: tuple[str, ...], plant: Plant, following: Expression, target: Expression, last: Expression
+) -> list[ConstraintState]:
+    """State minus reference at the end of the horizon, zero before whatever the state is.
+
+    The bounds leave a hair's breadth: interior-point solvers count a fixed variable as an equation, and would find too many.
+    """
+    places = {e: k for k, e in enumerate(plant.state.elements)}
+    units = dict(zip(plant.state.elements, plant.state.units, strict=True))
+    return [
+        ConstraintState(f"{e} at the end", units[e], last * (following[places[e]] - target[places[e]]), -_HAIR, _HAIR)
+        for e in names
+    ]
+
+
+def hard(written: list[ConstraintState], soft: frozenset[str]) -> list[ConstraintState]:
+    """Those that bind: not soft."""
+    return [w for w in written if w.name not in soft]
+
+
+def softened(written: list[ConstraintState], limits: Limits, plant: Plant, state: Expression) -> dict[str, Expression]:
+    """Cost rate of every soft limit by name: weight times the violation squared."""
+    lower, upper = limits.state_bounds(plant)
+    values = {w.name: (w.expression, w.lower, w.upper) for w in written}
+    values |= {e: (state[k], lower[k], upper[k]) for k, e in enumerate(plant.state.elements)}
+    return {
+        f"soft {name}": weight * _violation(*values[_entry(name, plant)]) ** 2 for name, weight in limits.soft.items()
+    }
+
+
+def hard_state_bounds(limits: Limits, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of the plant's states without the soft ones."""
+    lower, upper = limits.state_bounds(plant)
+    free = np.array([e in limits.soft for e in plant.state.elements])
+    return np.where(free, -math.inf, lower), np.where(free, math.inf, upper)
+
+
+def soft_names(limits: Limits, plant: Plant) -> frozenset[str]:
+    """Names of the entries that are soft."""
+    return frozenset(_entry(name, plant) for name in limits.soft)
+
+
+def _entry(name: str, plant: Plant) -> str:
+    """A rate is softened by the name of its input."""
+    return f"{name} rate" if name in plant.inputs else name
+
+
+def _violation(value: Expression, lower: float, upper: float) -> Expression:
+    above = ca.fmax(value - upper, 0) if math.isfinite(upper) else 0
+    below = ca.fmax(lower - value, 0) if math.isfinite(lower) else 0
+    return above + below

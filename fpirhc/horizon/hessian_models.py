@@ -1,0 +1,79 @@
+"""The stage of a horizon expanded around a trajectory: what second-order sweeps need.
+
+    s+ = F(s, u, theta),   A = dF/ds,  B = dF/du,   l_s, l_u,   and the bend Q = l_ss, S = l_us, R = l_uu.
+
+How the bend is modelled is a choice. `GaussNewton` takes the cost's own second derivatives and linear dynamics: positive
+semi-definite for convex stage costs whatever the model is. `ExactHessian` adds lambda' d^2F of the dynamics.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import casadi as ca
+
+from fpirhc.horizon.problem import OptimalControl
+
+
+class HessianModel(ABC):
+    """Contract: the second derivatives of a stage that a sweep uses."""
+
+    @abstractmethod
+    def curved(self, cost: ca.SX, following: ca.SX, costate: ca.SX) -> ca.SX:
+        """Return the scalar whose Hessian with respect to (s, u) is used."""
+
+
+@dataclass(frozen=True)
+class GaussNewton(HessianModel):
+    """The Hessian of the stage cost alone."""
+
+    def curved(self, cost: ca.SX, following: ca.SX, costate: ca.SX) -> ca.SX:  # noqa: ARG002
+        """Return l."""
+        return cost
+
+
+@dataclass(frozen=True)
+class ExactHessian(HessianModel):
+    """The Hessian of the stage's Hamiltonian: quadratic convergence near a strict minimum, indefinite far from it."""
+
+    def curved(self, cost: ca.SX, following: ca.SX, costate: ca.SX) -> ca.SX:
+        """Return l + lambda' F."""
+        return cost + ca.dot(costate, following)
+
+
+def linear_stage(ocp: OptimalControl) -> ca.Function:
+    """Function (s, u, theta) -> (s+, l, A (ns, ns), B (ns, nu), l_s, l_u)."""
+    s, u, theta = stage_symbols(ocp)
+    following, (cost, _) = ocp.dynamics(s, u, theta), ocp.stage_cost(s, u, theta)
+    jacobians = [ca.jacobian(following, s), ca.jacobian(following, u)]
+    gradients = [ca.gradient(cost, s), ca.gradient(cost, u)]
+    return _dense("fpirhc_linear_stage", [s, u, theta], [following, cost, *jacobians, *gradients])
+
+
+def hessian_stage(ocp: OptimalControl, hessian: HessianModel) -> ca.Function:
+    """Function (s, u, theta, lambda of s+) -> (Q (ns, ns), S (nu, ns), R (nu, nu))."""
+    s, u, theta = stage_symbols(ocp)
+    costate = ca.SX.sym("lambda", ocp.state.size)
+    cost, _ = ocp.stage_cost(s, u, theta)
+    curved = hessian.curved(cost, ocp.dynamics(s, u, theta), costate)
+    slope = ca.gradient(curved, u)
+    results = [ca.hessian(curved, s)[0], ca.jacobian(slope, s), ca.jacobian(slope, u)]
+    return _dense("fpirhc_bent_stage", [s, u, theta, costate], results)
+
+
+def hessian_end(ocp: OptimalControl) -> ca.Function:
+    """Function (s_N, theta_N) -> (T, T_s, T_ss)."""
+    s, _, theta = stage_symbols(ocp)
+    final = ocp.terminal_cost(s, theta)
+    hessian, slope = ca.hessian(final, s)
+    return _dense("fpirhc_bent_end", [s, theta], [final, slope, hessian])
+
+
+def stage_symbols(ocp: OptimalControl) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """Symbols (s, u, theta) of one stage."""
+    return ca.SX.sym("s", ocp.state.size), ca.SX.sym("u", ocp.input.size), ca.SX.sym("theta", ocp.data.size)
+
+
+def _dense(name: str, arguments: list[ca.SX], results: list[ca.SX]) -> ca.Function:
+    return ca.Function(name, arguments, ca.cse([ca.densify(r) for r in results]))

@@ -1,0 +1,1 @@
+"""Learning the model: estimators of parameters and rules of adaptation."""

@@ -1,0 +1,177 @@
+"""Moving-horizon estimation of parameters: least squares over the last W pairs and a prior for all that came before.
+
+    minimise  |z - z_a|^2_M + sum_{last W} |e_i(z)|^2      within bounds,
+
+by Gauss-Newton steps, a fixed number per cycle, from the last estimate. Components at a bound towards which the gradient
+points stay there and the others are solved for, because a clipped Newton step does not stop at the constrained optimum
+(Bertsekas 1982). A pair that leaves the window is linearised once more and joins the prior (arrival cost),
+
+    M <- lambda M + (1 - lambda) I + H'H,     z_a <- z_a + M^-1 H' (e + H (z - z_a)),     lambda = exp(-period / time),
+
+so that with a response linear in its parameters and lambda = 1 nothing is lost: the estimate is that of all pairs since the
+start.
+
+References: C. V. Rao, J. B. Rawlings and D. Q. Mayne, Constrained state estimation for nonlinear discrete-time systems,
+IEEE Trans. Automatic Control 48(2), 2003. D. P. Bertsekas, Projected Newton methods for optimization problems with simple
+constraints, SIAM J. Control and Optimization 20(2), 1982.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import InvalidValue
+from fpirhc.learning.estimators.base import Correct, Estimator, Seen
+from fpirhc.learning.estimators.uncertain import (
+    Uncertain,
+    between,
+    bounds_of,
+    check_learner,
+    deviations,
+    forgetting_factor,
+    require_positive,
+    residual_function,
+)
+from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.task.problem import Problem
+
+MOST = 2000  # pairs in a window: what is remembered is static
+
+
+@dataclass(frozen=True, eq=False)
+class MovingHorizon(Estimator):
+    """Learn parameters from a window of pairs of command and response.
+
+    Parameters:
+        parameters: name -> Uncertain(lower, upper, deviation) of what is learned.
+        noise: controlled coordinate -> deviation of what the response has besides the model, in the response's unit.
+        window: number W of pairs.
+        time: time constant with which the prior forgets what left the window, s; math.inf: nothing is forgotten.
+        iterations: Gauss-Newton steps per cycle.
+
+    Raises:
+        InvalidValue: nothing to learn; a noise or time that is not positive; a window or iterations outside their range.
+    """
+
+    parameters: Mapping[str, Uncertain]
+    noise: Mapping[str, float]
+    window: int
+    time: float
+    iterations: int = 1
+
+    def __post_init__(self) -> None:
+        if not self.parameters:
+            raise InvalidValue("MovingHorizon(parameters={}): name at least one parameter to learn")
+        require_positive("MovingHorizon.noise", self.noise)
+        if not self.time > 0:
+            raise InvalidValue(f"MovingHorizon(time={self.time!r}): expected a positive number of seconds, or math.inf")
+        for name, value, most in (("window", self.window, MOST), ("iterations", self.iterations, 20)):
+            if not isinstance(value, int) or not 1 <= value <= most:
+                raise InvalidValue(f"MovingHorizon({name}={value!r}): expected a whole number from 1 to {most}")
+
+    def learned(self) -> tuple[str, ...]:
+        """The named parameters."""
+        return tuple(self.parameters)
+
+    def check(self, problem: Problem) -> None:
+        """Raise if names or bounds do not fit the plant.
+
+        Raises:
+            InvalidProblem: all mistakes together.
+        """
+        check_learner("MovingHorizon", problem.plant, self.parameters, self.noise)
+
+    def memory(self, problem: Problem) -> Layout:
+        """The scaled estimate z, the prior's mean and information, and the window, newest pair first."""
+        size, names = len(self.parameters), self.learned()
+        information = tuple(f"{i},{j}" for j in range(size) for i in range(size))
+        row = _row_size(problem)
+        window = tuple(f"{k}@{i}" for i in range(1, self.window + 1) for k in range(row))
+        return Layout(
+            (
+                Signal("window_estimate", names),
+                Signal("window_prior", names),
+                Signal("window_information", information, start=tuple(np.eye(size).ravel())),
+                Signal("window_pairs", window),
+            )
+        )
+
+    def step(self, problem: Problem) -> Correct:
+        """One pair in, one pair out, and the Gauss-Newton steps."""
+        plant, size, row = problem.plant, len(self.parameters), _row_size(problem)
+        residual = residual_function(plant, self.parameters, [self.noise[c] for c in plant.controlled_names])
+        pair = _pair_function(problem, residual)
+        newton, absorb = _newton_function(size), _absorb_function(size, forgetting_factor(self.time, problem.period))
+
+        def correct(seen: Seen, memory: Mapping[str, Expression]) -> tuple[Expression, dict[str, Expression]]:
+            z, given = memory["window_estimate"], seen.parameters
+            newest = ca.vertcat(seen.valid, seen.state, seen.command, seen.response)
+            oldest, rest = memory["window_pairs"][-row:], memory["window_pairs"][:-row]
+            window = ca.vertcat(newest, rest)
+            prior, information = absorb(
+                memory["window_prior"], memory["window_information"], z, *pair(z, oldest, given), oldest[0]
+            )
+            lower, upper = bounds_of(problem, self.parameters, given)
+            table, same = ca.reshape(window, row, self.window), ca.repmat(given, 1, self.window)
+            for _ in range(self.iterations):
+                squares, slopes = pair.map(self.window)(ca.repmat(z, 1, self.window), table, same)
+                z = newton(z, prior, information, ca.sum2(squares), ca.sum2(slopes), lower, upper)
+            kept = {
+                "window_estimate": z,
+                "window_prior": prior,
+                "window_information": information,
+                "window_pairs": window,
+            }
+            return deviations(self.parameters) * z, kept
+
+        return correct
+
+
+def _row_size(problem: Problem) -> int:
+    plant = problem.plant
+    return 1 + plant.state.size + plant.input.size + len(plant.controlled_names)
+
+
+def _pair_function(problem: Problem, residual: ca.Function) -> ca.Function:
+    """Function (z, pair, given parameters) -> (H'H as a column, H'e), zero for a pair that is not valid."""
+    plant = problem.plant
+    z, row = ca.SX.sym("z", residual.size1_in(0)), ca.SX.sym("row", _row_size(problem))
+    given = ca.SX.sym("p", plant.parameter.size)
+    x_end, u_end = 1 + plant.state.size, 1 + plant.state.size + plant.input.size
+    error, slope = residual(z, row[1:x_end], row[x_end:u_end], row[u_end:], given)
+    valid = row[0] > 0.5
+    # A choice and not a product: the model may be infinite at the zeros that fill an empty window.
+    squares = ca.if_else(valid, ca.vec(slope.T @ slope), 0)
+    slopes = ca.if_else(valid, slope.T @ error, 0)
+    return ca.Function("fpirhc_pair", [z, row, given], [ca.densify(squares), ca.densify(slopes)])
+
+
+def _newton_function(size: int) -> ca.Function:
+    """Function (z, prior, information, sum H'H, sum H'e, lower, upper) -> z after one step within the bounds."""
+    z, prior, lower, upper = (ca.SX.sym(n, size) for n in ("z", "prior", "lower", "upper"))
+    information, squares = ca.SX.sym("information", size * size), ca.SX.sym("squares", size * size)
+    slopes = ca.SX.sym("slopes", size)
+    before = ca.reshape(information, size, size)
+    downhill = slopes - before @ (z - prior)
+    stuck = ca.logic_or(ca.logic_and(z <= lower, downhill < 0), ca.logic_and(z >= upper, downhill > 0))
+    free = ca.diag(1 - stuck)
+    matrix = free @ (before + ca.reshape(squares, size, size)) @ free + ca.diag(stuck)
+    step = ca.solve(ca.densify(matrix), free @ downhill)
+    moved = between(z + step, lower, upper)
+    return ca.Function("fpirhc_newton", [z, prior, information, squares, slopes, lower, upper], [ca.densify(moved)])
+
+
+def _absorb_function(size: int, factor: float) -> ca.Function:
+    """Function (prior, information, z, H'H, H'e of the oldest pair, valid) -> (prior, information) with that pair."""
+    prior, z, slopes = (ca.SX.sym(n, size) for n in ("prior", "z", "slopes"))
+    information, squares, valid = (ca.SX.sym("i", size * size), ca.SX.sym("s", size * size), ca.SX.sym("valid"))
+    square = ca.reshape(squares, size, size)
+    left = ca.reshape(information, size, size)
+    joined = factor * left + (1 - factor) * ca.SX.eye(size) + square
+    moved = prior + ca.solve(ca.densify(joined), slopes + square @ (z - prior))
+    found = [ca.if_else(valid > 0.5, moved, prior), ca.if_else(valid > 0.5, ca.vec(joined), information)]
+    return ca.Function("fpirhc_absorb", [prior, information, z, squares, slopes, valid], [ca.densify(v) for v in found])

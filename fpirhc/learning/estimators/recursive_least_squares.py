@@ -1,0 +1,112 @@
+"""Recursive least squares on the response equation, with exponential forgetting and bounds.
+
+    S = lambda I + H P H',    K = P H' S^-1,    z <- z + K e,    P <- (P - K H P) / lambda,    lambda = exp(-period / time),
+
+with e and H of the last pair at the current estimate, so that a response that is not linear in its parameters is followed
+by an extended filter. For a linear one, z minimises
+
+    lambda^k |z|^2 + sum_i lambda^(k-i) |e_i - H_i z|^2.
+
+Without excitation forgetting would let P grow for ever and the first disturbance would be blamed on parameters (wind-up): P
+is scaled back where its trace exceeds that of the prior. Estimates are clipped to their bounds.
+
+References: K. J. Astrom and B. Wittenmark, Adaptive Control, 2nd ed., Addison-Wesley 1995, ch. 2 and 11 (forgetting,
+wind-up).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import InvalidValue
+from fpirhc.learning.estimators.base import Correct, Estimator, Seen
+from fpirhc.learning.estimators.uncertain import (
+    Uncertain,
+    between,
+    bounds_of,
+    check_learner,
+    deviations,
+    forgetting_factor,
+    require_positive,
+    residual_function,
+)
+from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.task.problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class RecursiveLeastSquares(Estimator):
+    """Learn parameters from every pair of command and response.
+
+    Parameters:
+        parameters: name -> Uncertain(lower, upper, deviation) of what is learned.
+        noise: controlled coordinate -> deviation of what the response has besides the model, in the response's unit.
+        time: time constant of forgetting, s; math.inf: nothing is forgotten.
+
+    Raises:
+        InvalidValue: nothing to learn, or a noise or time that is not positive.
+    """
+
+    parameters: Mapping[str, Uncertain]
+    noise: Mapping[str, float]
+    time: float
+
+    def __post_init__(self) -> None:
+        if not self.parameters:
+            raise InvalidValue("RecursiveLeastSquares(parameters={}): name at least one parameter to learn")
+        require_positive("RecursiveLeastSquares.noise", self.noise)
+        if not self.time > 0:
+            raise InvalidValue(
+                f"RecursiveLeastSquares(time={self.time!r}): expected a positive number of seconds, or math.inf"
+            )
+
+    def learned(self) -> tuple[str, ...]:
+        """The named parameters."""
+        return tuple(self.parameters)
+
+    def check(self, problem: Problem) -> None:
+        """Raise if names or bounds do not fit the plant.
+
+        Raises:
+            InvalidProblem: all mistakes together.
+        """
+        check_learner("RecursiveLeastSquares", problem.plant, self.parameters, self.noise)
+
+    def memory(self, problem: Problem) -> Layout:  # noqa: ARG002
+        """The scaled estimate z and its covariance P, column by column."""
+        size = len(self.parameters)
+        return Layout((_estimate(self.learned()), _covariance(size)))
+
+    def step(self, problem: Problem) -> Correct:
+        """One update."""
+        plant, size = problem.plant, len(self.parameters)
+        residual = residual_function(plant, self.parameters, [self.noise[c] for c in plant.controlled_names])
+        factor = forgetting_factor(self.time, problem.period)
+
+        def correct(seen: Seen, memory: Mapping[str, Expression]) -> tuple[Expression, dict[str, Expression]]:
+            z, p = memory["least_squares_estimate"], ca.reshape(memory["least_squares_covariance"], size, size)
+            error, slope = residual(z, seen.state, seen.command, seen.response, seen.parameters)
+            error, slope = seen.valid * error, seen.valid * slope
+            innovation = factor * ca.DM.eye(error.numel()) + slope @ p @ slope.T
+            gain = ca.solve(innovation, slope @ p).T
+            lower, upper = bounds_of(problem, self.parameters, seen.parameters)
+            found = between(z + gain @ error, lower, upper)
+            left = (p - gain @ slope @ p) / factor
+            left = (left + left.T) / 2 * ca.fmin(1, size / ca.trace(left))
+            kept = {"least_squares_estimate": found, "least_squares_covariance": ca.vec(left)}
+            return deviations(self.parameters) * found, kept
+
+        return correct
+
+
+def _estimate(names: tuple[str, ...]) -> Signal:
+    return Signal("least_squares_estimate", names)
+
+
+def _covariance(size: int) -> Signal:
+    entries = tuple(f"{i},{j}" for j in range(size) for i in range(size))
+    return Signal("least_squares_covariance", entries, start=tuple(np.eye(size).ravel()))

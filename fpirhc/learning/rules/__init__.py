@@ -1,0 +1,1 @@
+"""Rules by which an adaptive controller moves its parameters."""

@@ -1,0 +1,73 @@
+"""Learning driven by the fixed-point iteration's own equation: projection onto what the last response says."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import casadi as ca
+
+from fpirhc.errors import InvalidValue
+from fpirhc.learning.rules.base import Bounds, Evidence, Rule
+from fpirhc.symbolic.layout import Expression
+
+_RELATIVE, _FLOOR = 1e-9, 1e-12  # of the matrix that is inverted: where a response says nothing, nothing moves
+
+
+@dataclass(frozen=True)
+class Projection(Rule):
+    """p_hat+ = p_hat + gamma W G^T (G W G^T + eps I)^-1 h, gated; h = G (p - p_hat) is the response error of the model.
+
+    With exact data every step shrinks |W^(-1/2) (p - p_hat)|, for 0 < gamma < 2 and excited or not (Kaczmarz; normalised least mean
+    squares). W is diagonal, the squared widths of the parameters' bounds, so that units do not matter. Unlike a gradient of
+    tracking errors it learns while a deformation keeps those small, and while the command is clipped. A moving estimate is itself a
+    disturbance, and noise of the response is taken for a wrong model: gamma well below 1, and a dead zone above the noise.
+
+    Parameters:
+        gain: gamma, between 0 and 2.
+        dead_zone: |h| below which nothing moves, in units of the response; beyond it the step grows as (|h| - dead_zone) / |h|.
+
+    Raises:
+        InvalidValue: a gain outside (0, 2), a negative dead zone; when the loop is built, bounds that are not finite.
+
+    References:
+        G. C. Goodwin, K. S. Sin, Adaptive Filtering, Prediction and Control, Prentice-Hall 1984, ch. 3 (projection, dead zone).
+    """
+
+    gain: float
+    dead_zone: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.gain < 2:
+            raise InvalidValue(f"Projection(gain={self.gain!r}): expected a number between 0 and 2, both excluded")
+        if not (math.isfinite(self.dead_zone) and self.dead_zone >= 0):
+            raise InvalidValue(f"Projection(dead_zone={self.dead_zone!r}): expected a number of at least 0")
+
+    @property
+    def reads_response(self) -> bool:
+        """The equation is about the measured response."""
+        return True
+
+    def check(self, bounds: Bounds) -> None:
+        """Raise if some bound is infinite.
+
+        Raises:
+            InvalidValue: naming the parameter.
+        """
+        for name, (lower, upper) in bounds.items():
+            if not math.isfinite(upper - lower):
+                raise InvalidValue(
+                    f"Projection: '{name}' needs finite bounds, which scale it; got ({lower:g}, {upper:g})"
+                )
+
+    def change(self, evidence: Evidence, bounds: Bounds, period: float) -> Expression:
+        """Return the gated projection step; `period` does not matter."""
+        del period
+        matrix, error = evidence.equation()
+        widths = ca.DM([(upper - lower) ** 2 for lower, upper in bounds.values()])
+        spread = ca.mtimes(matrix, ca.diag(widths))
+        square = ca.mtimes(spread, matrix.T)
+        square += (_RELATIVE * ca.trace(square) + _FLOOR) * ca.DM.eye(error.numel())
+        size = ca.sqrt(ca.sumsqr(error) + _FLOOR**2)
+        share = self.gain * ca.fmax(size - self.dead_zone, 0) / size
+        return share * ca.mtimes(spread.T, ca.solve(square, error))

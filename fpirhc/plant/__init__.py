@@ -1,0 +1,1 @@
+"""Plants: states, inputs, parameters, the response and its inverse; integrators."""

@@ -1,0 +1,308 @@
+"""The parameter regressor of a fully actuated plant: its inverse dynamics as a product with unknown parameters.
+
+    Q = Y(q, q', q'') theta + Q0(q, q', q''),     M = dQ/dq'',     C = (M' + E - E^T) / 2,  E = d(M q')/dq,
+
+where theta are parameters of the plant, or combinations of them that the user names, and Q0 is what does not depend on them.
+C is the Coriolis matrix of Christoffel's symbols, linear in a velocity of its own, so that M' - 2 C is skew-symmetric; with it
+
+    Q = M v' + C v + (Q(q, q', 0) - C q') = Y_s(q, q', v, v') theta + Q0_s
+
+splits a second velocity v from the actual one. All of it comes from the plant's symbols. With dQ/dp = Y dtheta/dp at one or more
+fixed p, Y = [dQ/dp ...] [dtheta/dp ...]^+; that Y theta + Q0 is the inverse dynamics for every p is then tried at random points,
+where an identity that does not hold fails with probability one.
+
+References: J. J. Craig, P. Hsu, S. S. Sastry, Int. J. Robotics Research 6(2), 1987. J.-J. E. Slotine, W. Li, Int. J. Robotics
+Research 6(3), 1987.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import InvalidName, InvalidValue, NotSupported, nearest
+from fpirhc.plant.plant import Parameter, Plant
+from fpirhc.symbolic.layout import Expression, Named, Signal, vector
+
+_TRIES = 12  # random points
+_TOLERANCE = 1e-7  # relative error at which an identity holds
+_SPREAD = 0.3  # share by which parameters are varied
+
+
+@dataclass(frozen=True, eq=False)
+class Combination:
+    """An expression of the plant's parameters that enters linearly as a whole: Combination(lambda p: p.m * p.l**2, "kg m^2")."""
+
+    expression: Callable[[Named], Expression]
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class Regressor:
+    """Q = Y theta + Q0 of a plant for the parameters theta.
+
+    Parameters:
+        plant: as many inputs as coordinates, all of them controlled, with an inverse response made of symbols.
+        names: of theta: parameters of the plant, or keys of `combinations`. Parameters that neither name stay what the model
+            believes them to be.
+        combinations: expressions of parameters that enter linearly as a whole.
+
+    Raises:
+        NotSupported: the plant is not fully actuated, or its inverse response needs a root finder.
+        InvalidName: a name that is neither a parameter nor a combination.
+        InvalidValue: the inverse dynamics is not linear in theta; says which parameters make it so, and what to do.
+    """
+
+    plant: Plant
+    names: Sequence[str]
+    combinations: Mapping[str, Combination] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _check_plant(self.plant)
+        valid = [*self.plant.parameters, *self.combinations]
+        for name in self.names:
+            if name not in valid:
+                raise InvalidName(
+                    f"Regressor: '{name}' is neither a parameter nor a combination.{nearest(name, valid)}"
+                )
+        if not self.names or len(set(self.names)) < len(self.names):
+            raise InvalidValue(f"Regressor(names={tuple(self.names)}): expected different names, at least one")
+        _check_linear(self)
+
+    @cached_property
+    def signal(self) -> Signal:
+        """The signal of theta, named 'estimate'."""
+        return vector("estimate", tuple(self.names), tuple(p.unit for p in self._own.values()))
+
+    @cached_property
+    def theta_function(self) -> ca.Function:
+        """Function (plant's parameters) -> theta (m)."""
+        p = ca.SX.sym("p", len(self.plant.parameters))
+        named = Named(tuple(self.plant.parameters), p, "parameter")
+        entries = [self.combinations[n].expression(named) if n in self.combinations else named[n] for n in self.names]
+        return ca.Function("fpirhc_theta", [p], [ca.densify(ca.vertcat(*(ca.SX(e) for e in entries)))])
+
+    @cached_property
+    def covered(self) -> tuple[int, ...]:
+        """Places, among the plant's parameters, of those that theta depends on."""
+        _, _, p = self.plant._symbols()
+        pattern = ca.DM(ca.jacobian_sparsity(self.theta_function(p), p), 1).full()
+        return tuple(int(k) for k in np.flatnonzero(pattern.any(axis=0)))
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """Function (state, response, plant's parameters) -> (Y (n x m), Q0 (n)); covered parameters are not read."""
+        x, r, p = self._symbols()
+        inverse, points = self.plant.inverse_function, self._points
+        slope = ca.Function("fpirhc_slope", [x, r, p], [ca.jacobian(inverse(x, r, p), p)])
+        given = [slope(x, r, self._placed(p, point))[:, list(self.covered)] for point in points]
+        y = ca.mtimes(ca.horzcat(*given), ca.DM(np.linalg.pinv(self._slopes(points))))
+        first = self._placed(p, points[0])
+        rest = inverse(x, r, first) - ca.mtimes(y, self.theta_function(first))
+        return ca.Function("fpirhc_regressor", [x, r, p], ca.cse([ca.densify(y), ca.densify(rest)]))
+
+    @cached_property
+    def force_function(self) -> ca.Function:
+        """Function (state, response, theta, plant's parameters) -> Y theta + Q0."""
+        x, r, p = self._symbols()
+        theta = ca.SX.sym("theta", len(self.names))
+        y, rest = self.function(x, r, p)
+        return ca.Function("fpirhc_force", [x, r, theta, p], [ca.mtimes(y, theta) + rest])
+
+    @cached_property
+    def mass_function(self) -> ca.Function:
+        """Function (state, theta, plant's parameters) -> M (n x n)."""
+        x, r, p = self._symbols()
+        theta = ca.SX.sym("theta", len(self.names))
+        mass = ca.jacobian(self.force_function(x, r, theta, p), r)
+        mass = ca.substitute(mass, r, ca.SX.zeros(r.numel()))
+        return ca.Function("fpirhc_mass", [x, theta, p], [ca.cse(ca.densify(mass))])
+
+    @cached_property
+    def coriolis_function(self) -> ca.Function:
+        """Function (state, theta, plant's parameters) -> C (n x n) with M' - 2 C skew-symmetric."""
+        x, _, p = self._symbols()
+        theta = ca.SX.sym("theta", len(self.names))
+        mass = self.mass_function(x, theta, p)
+        q, v = x[list(self.plant.indices(0))], x[list(self.plant.indices(1))]
+        change = ca.jtimes(ca.reshape(mass, -1, 1), q, v).reshape(mass.shape)
+        # M does not depend on q': the velocity in M q' is the only one that is not differentiated.
+        slope = ca.jacobian(ca.mtimes(mass, v), q)
+        return ca.Function("fpirhc_coriolis", [x, theta, p], [ca.cse(ca.densify((change + slope - slope.T) / 2))])
+
+    @cached_property
+    def split_function(self) -> ca.Function:
+        """Function (state, v, v', plant's parameters) -> (Y_s (n x m), Q0_s (n)), v a second velocity."""
+        x, v, p = self._symbols()
+        slope, theta = ca.SX.sym("slope", v.numel()), ca.SX.sym("theta", len(self.names))
+        # M v' + C v + Q(q, q', 0) - C q' is affine in theta as Q is.
+        force = self.force_function(x, slope, theta, p)
+        force += ca.mtimes(self.coriolis_function(x, theta, p), v - x[list(self.plant.indices(1))])
+        y = ca.jacobian(force, theta)
+        rest = ca.substitute(force, theta, ca.SX.zeros(theta.numel()))
+        return ca.Function("fpirhc_split", [x, v, slope, p], ca.cse([ca.densify(y), ca.densify(rest)]))
+
+    @cached_property
+    def believed(self) -> Plant:
+        """The plant with theta, and the parameters that theta does not cover, in place of its parameters."""
+        plant = self.plant
+        every = list(plant.parameters)
+        others = {n: q for k, (n, q) in enumerate(plant.parameters.items()) if k not in self.covered}
+
+        def split(p: Named) -> tuple[Expression, Expression]:
+            known = ca.vertcat(*(p[n] if n in others else plant.approximate[every.index(n)] for n in every))
+            return p.vector[: len(self.names)], known
+
+        def response(q: Named, v: Named, u: Named, p: Named) -> dict[str, Expression]:
+            theta, known = split(p)
+            x, still = ca.vertcat(q.vector, v.vector), ca.SX.zeros(len(plant.names))
+            free = self.force_function(x, still, theta, known)
+            found = ca.solve(self.mass_function(x, theta, known), u.vector - free)
+            return dict(zip(plant.names, ca.vertsplit(found), strict=True))
+
+        def inverse(q: Named, v: Named, r: Named, p: Named) -> dict[str, Expression]:
+            theta, known = split(p)
+            found = self.force_function(ca.vertcat(q.vector, v.vector), r.vector, theta, known)
+            return dict(zip(plant.inputs, ca.vertsplit(found), strict=True))
+
+        return Plant(plant.coordinates, plant.inputs, {**self._own, **others}, response, inverse=inverse)
+
+    @cached_property
+    def _own(self) -> dict[str, Parameter]:
+        approximate = self.theta_function(self.plant.approximate).full().ravel()
+        exact = self.theta_function(self.plant.exact).full().ravel()
+        units = [
+            self.combinations[n].unit if n in self.combinations else self.plant.parameters[n].unit for n in self.names
+        ]
+        values = zip(self.names, approximate, exact, units, strict=True)
+        return {n: Parameter(float(believed), float(true), unit) for n, believed, true, unit in values}
+
+    @cached_property
+    def _points(self) -> list[np.ndarray]:
+        """Parameters at which the dtheta/dp, side by side, have full rank: one point where theta are parameters themselves."""
+        random, points = np.random.default_rng(0), [self.plant.approximate]
+        while np.linalg.matrix_rank(self._slopes(points)) < len(self.names):
+            if len(points) > len(self.names):
+                raise InvalidValue(
+                    f"Regressor(names={tuple(self.names)}): the combinations depend on each other (one is a sum of multiples "
+                    "of others), so they cannot be told apart; leave one out"
+                )
+            points.append(_varied(self.plant, random))
+        return points
+
+    def _slopes(self, points: list[np.ndarray]) -> np.ndarray:
+        _, _, p = self.plant._symbols()
+        slope = ca.Function("fpirhc_theta_slope", [p], [ca.jacobian(self.theta_function(p), p)])
+        return np.hstack([slope(point).full()[:, list(self.covered)] for point in points])
+
+    def _placed(self, p: Expression, point: np.ndarray) -> Expression:
+        return ca.vertcat(*(point[k] if k in self.covered else p[k] for k in range(p.numel())))
+
+    def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        x, _, p = self.plant._symbols()
+        return x, ca.SX.sym("r", len(self.plant.names)), p
+
+
+def linear_parameters(plant: Plant) -> tuple[str, ...]:
+    """Return the parameters in which the inverse dynamics is linear, jointly with every other one.
+
+    Those whose second derivatives, mixed ones included, vanish at random points. A Regressor of all of them exists.
+
+    Raises:
+        NotSupported: the plant is not fully actuated, or its inverse response needs a root finder.
+    """
+    _check_plant(plant)
+    bent = _bent(plant)
+    return tuple(name for k, name in enumerate(plant.parameters) if not bent[k].any())
+
+
+def _check_plant(plant: Plant) -> None:
+    if len(plant.inputs) != len(plant.names) or plant.controlled_names != plant.names:
+        raise NotSupported(
+            f"a regressor needs a fully actuated plant: {len(plant.names)} coordinates but {len(plant.inputs)} input(s), "
+            f"controlled: {', '.join(plant.controlled_names)}; use ComputedTorque, whose model needs no regressor"
+        )
+    if plant.inverse_opaque:
+        raise NotSupported(
+            "a regressor needs an inverse response made of symbols, and this one needs a root finder; "
+            "give Plant(inverse=...) that solves the response for the inputs"
+        )
+
+
+def _check_linear(regressor: Regressor) -> None:
+    """Compare Y theta + Q0 with the inverse dynamics where all covered parameters are others."""
+    plant, random = regressor.plant, np.random.default_rng(1)
+    worst, entering, tried = 0.0, np.zeros(len(regressor.names), dtype=bool), 0
+    for _ in range(_TRIES):
+        x, r, p = _point(plant, random)
+        wanted = plant.inverse_function(x, r, p).full()
+        y, rest = (m.full() for m in regressor.function(x, r, p))
+        error = y @ regressor.theta_function(p).full() + rest - wanted
+        if np.isfinite(error).all():
+            tried += 1
+            worst = max(worst, float(np.abs(error).max() / (1 + np.abs(wanted).max())))
+            entering |= np.abs(y).max(axis=0) > _TOLERANCE
+    if not tried:
+        raise InvalidValue("Regressor: the inverse dynamics is not finite at any random state; give Plant(inverse=...)")
+    if worst > _TOLERANCE:
+        raise InvalidValue(_not_linear(regressor, worst))
+    if not entering.all():
+        absent = [n for n, e in zip(regressor.names, entering, strict=True) if not e]
+        raise InvalidValue(
+            f"Regressor: '{absent[0]}' does not enter the inverse dynamics, so nothing can be learned about it"
+        )
+
+
+def _not_linear(regressor: Regressor, worst: float) -> str:
+    plant, every = regressor.plant, list(regressor.plant.parameters)
+    bent = _bent(plant)
+    covered = [k for k in range(len(every)) if k in regressor.covered]
+    alone = [f"'{every[k]}'" for k in covered if bent[k, k]]
+    pairs = [f"'{every[j]}' with '{every[k]}'" for j in covered for k in covered if j < k and bent[j, k]]
+    found = []
+    if alone:
+        found.append(f"{', '.join(alone)} enter(s) nonlinearly")
+    if pairs:
+        found.append(f"in products: {', '.join(pairs)}")
+    good = [every[k] for k in range(len(every)) if not bent[k].any()]
+    return (
+        f"the inverse dynamics is not linear in {', '.join(regressor.names)} (relative error {worst:.1e}): "
+        f"{'; '.join(found) or 'the combinations leave something out'}. Learn others, which leaves these at the model's values "
+        f"(linear jointly with all: {', '.join(good) or 'none'}), or name what enters as a whole, as in "
+        "combinations={'inertia': Combination(lambda p: p.m * p.l**2, 'kg m^2')}"
+    )
+
+
+def _bent(plant: Plant) -> np.ndarray:
+    """Which pairs of parameters have a second derivative of the inverse dynamics, shape (np, np), found at random points."""
+    x, _, p = plant._symbols()
+    r, count = ca.SX.sym("r", len(plant.names)), len(plant.parameters)
+    force = plant.inverse_function(x, r, p)
+    slope = ca.jacobian(force, p)
+    second = ca.Function("fpirhc_second", [x, r, p], [force, slope, ca.jacobian(ca.vec(slope), p)])
+    random, found = np.random.default_rng(2), np.zeros((count, count), dtype=bool)
+    for _ in range(_TRIES):
+        point = _point(plant, random)
+        value, first, curved = (np.asarray(m.full()) for m in second(*point))
+        if not np.isfinite(curved).all():
+            continue
+        sizes = np.abs(point[2]) + 1e-3
+        terms = np.abs(curved.reshape((count, len(plant.names), count))).max(axis=1) * np.outer(sizes, sizes)
+        found |= terms > _TOLERANCE * (1 + np.abs(value).max() + np.abs(first * sizes).max())
+    return found
+
+
+def _point(plant: Plant, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A random (state, response, parameters)."""
+    state = random.standard_normal(plant.state.size)
+    return state, 10 * random.standard_normal(len(plant.names)), _varied(plant, random)
+
+
+def _varied(plant: Plant, random: np.random.Generator) -> np.ndarray:
+    sizes = np.maximum(np.abs(plant.approximate), np.abs(plant.exact))
+    sizes[sizes == 0] = 1.0
+    return np.asarray(plant.approximate + _SPREAD * sizes * random.uniform(-1, 1, size=sizes.size))

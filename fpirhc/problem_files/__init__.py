@@ -1,0 +1,1 @@
+"""Problem files: loaded, checked, and changed by settings."""

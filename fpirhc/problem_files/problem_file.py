@@ -1,0 +1,136 @@
+"""Finds and loads a problem: a shipped one by name, or a user's Python file by path.
+
+A problem file defines `problem` (a Problem) and `controllers` ({name: Controller}); its docstring's first line is its
+title. Optional: `headline`, a pair (controller without adaptation, controller with) that the verdict is about; `tuning`,
+{controller: {path of a setting: Span or LogSpan}}, where `fpirhc tune` looks for better settings.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import sys
+import traceback
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+
+from fpirhc.controllers.base import Controller
+from fpirhc.errors import FpirhcError, Mistakes, ProblemFileError, nearest
+from fpirhc.problem_files.tuning_spans import TuningSpans, check_tuning
+from fpirhc.task.problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A loaded problem file."""
+
+    name: str
+    path: Path
+    title: str
+    description: str
+    problem: Problem
+    controllers: Mapping[str, Controller]
+    headline: tuple[str, str] | None = None
+    tuning: Mapping[str, TuningSpans] = field(default_factory=dict)
+
+
+def shipped_folders() -> list[Path]:
+    """Folders that shipped problems may be in: inside the installed package, or beside it in a source checkout."""
+    package = Path(__file__).resolve().parents[1]
+    return [f for f in (package / "_problems", package.parent / "problems") if f.is_dir()]
+
+
+def shipped_problems() -> dict[str, Path]:
+    """Return the shipped problems: name -> path."""
+    found: dict[str, Path] = {}
+    for folder in shipped_folders():
+        for path in sorted(folder.glob("*.py")):
+            if not path.name.startswith("_"):
+                found.setdefault(path.stem, path)
+    return found
+
+
+def title_of(path: Path) -> str:
+    """First line of a problem file's docstring, without running the file."""
+    try:
+        text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+    except (OSError, SyntaxError, ValueError):
+        return ""
+    return (text or "").strip().partition("\n")[0]
+
+
+def find_problem(name_or_path: str) -> Path:
+    """Return the path of a shipped problem or of a user's file.
+
+    Raises:
+        ProblemFileError: nothing is there; the nearest shipped name is offered.
+    """
+    path = Path(name_or_path)
+    if path.suffix == ".py" or path.parent != Path():
+        if path.is_file():
+            return path
+        raise ProblemFileError(
+            f"no file at '{name_or_path}'; give the path of a problem file, or a name from 'fpirhc list'"
+        )
+    shipped = shipped_problems()
+    if name_or_path in shipped:
+        return shipped[name_or_path]
+    raise ProblemFileError(f"problem '{name_or_path}' is unknown.{nearest(name_or_path, shipped)}")
+
+
+def load_problem(name_or_path: str) -> Task:
+    """Import a problem file and check what it defines.
+
+    Raises:
+        ProblemFileError: the file raises on import (its own line is shown) or lacks what a problem file defines.
+    """
+    path = find_problem(name_or_path)
+    module = _import(path)
+    mistakes = Mistakes(f"problem file '{path.name}'")
+    problem, controllers = getattr(module, "problem", None), getattr(module, "controllers", None)
+    if not isinstance(problem, Problem):
+        mistakes.add("it must define problem = fpirhc.Problem(...)")
+    if not isinstance(controllers, Mapping) or not controllers:
+        mistakes.add("it must define controllers = {'name': fpirhc.ComputedTorque(...), ...}")
+        controllers = {}
+    for name, controller in controllers.items():
+        if not isinstance(controller, Controller):
+            mistakes.add(f"controllers['{name}'] must be a controller, got {type(controller).__name__}")
+    headline = getattr(module, "headline", None)
+    mistakes.unknown("headline: controller", headline or (), controllers)
+    tuning = getattr(module, "tuning", {})
+    try:
+        mistakes.raise_if_any()
+        check_tuning(tuning, controllers)
+    except FpirhcError as error:
+        raise ProblemFileError(str(error)) from None
+    assert isinstance(problem, Problem)
+    title, _, description = (module.__doc__ or path.stem).strip().partition("\n")
+    return Task(path.stem, path, title, description.strip(), problem, controllers, headline, tuning)
+
+
+def _import(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"fpirhc_problem_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise ProblemFileError(f"'{path}' is not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    try:
+        spec.loader.exec_module(module)
+    except SyntaxError as error:
+        raise ProblemFileError(
+            f"{path.name}, line {error.lineno}: {error.msg}\n    {(error.text or '').strip()}"
+        ) from None
+    except Exception as error:  # noqa: BLE001 -- whatever a user's file raises is shown with its own line
+        raise ProblemFileError(f"{_own_line(path, error)}\n    {type(error).__name__}: {error}") from None
+    return module
+
+
+def _own_line(path: Path, error: BaseException) -> str:
+    """The last line of the user's own file in the traceback."""
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).resolve() == path.resolve()]
+    if not frames:
+        return path.name
+    return f"{path.name}, line {frames[-1].lineno}: {frames[-1].line}"

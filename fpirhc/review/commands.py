@@ -1,0 +1,50 @@
+"""Are the commands along the reference inside the limits? Inverse dynamics of the exact plant, over the box."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.grid import ReviewGrid
+
+QUESTION = "Are the commands that the reference needs inside the limits?"
+
+
+def commands_inside(grid: ReviewGrid) -> Answer:
+    """Return the largest share of its limits that the reference needs of an input."""
+    plant = grid.problem.plant
+    lower, upper = grid.problem.limits.input_bounds(plant)
+    ranges = [f"{i} {low:.3g} to {high:.3g}" for i, low, high in zip(plant.inputs, *_range(grid), strict=True)]
+    text = "needed: " + ", ".join(ranges)
+    used = _used(grid.commands, lower, upper)
+    if not np.isfinite(used).any():
+        return Answer(QUESTION, Verdict.UNKNOWN, "no finite command is known", "See whether the problem is well posed.")
+    own, widest = float(np.nanmax(used[0])), float(np.nanmax(used))
+    numbers = {"share_of_limits": own, "share_over_box": widest}
+    if not np.isfinite(np.concatenate([lower, upper])).any():
+        return Answer(QUESTION, Verdict.YES, f"{text}; no input has limits", "", numbers)
+    text += f"; {100 * own:.3g} % of the limits, {100 * widest:.3g} % over the box"
+    change = f"Slow the reference down, or widen the limits {max(own, widest):.2g} times."
+    if own > 1:
+        return Answer(QUESTION, Verdict.NO, text, change, numbers)
+    return Answer(QUESTION, Verdict.UNKNOWN if widest > 1 else Verdict.YES, text, change if widest > 1 else "", numbers)
+
+
+def _range(grid: ReviewGrid) -> tuple[np.ndarray, np.ndarray]:
+    own = grid.commands[0][np.isfinite(grid.commands[0]).all(axis=1)]
+    if not len(own):
+        nothing = np.full(len(grid.problem.plant.inputs), np.nan)
+        return nothing, nothing
+    return own.min(axis=0), own.max(axis=0)
+
+
+def _used(commands: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """How much of the way from the middle to its limit a command needs, 0 or 2 where one side is free; above 1: beyond."""
+    both = np.isfinite(lower) & np.isfinite(upper)
+    middle = np.where(both, 0.5 * (np.where(both, lower, 0) + np.where(both, upper, 0)), 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        above = np.where(np.isfinite(upper), (commands - middle) / np.abs(upper - middle), 0.0)
+        below = np.where(np.isfinite(lower), (middle - commands) / np.abs(middle - lower), 0.0)
+    one_sided = np.where(commands > upper, 2.0, np.where(commands < lower, 2.0, 0.0))
+    shares = np.where(both, np.maximum(above, below), one_sided)
+    return np.asarray(np.where(np.isfinite(commands), shares, np.nan))

@@ -1,0 +1,94 @@
+"""Does the deformation converge? The verdict of a review.
+
+The linear closed loop decides: with rho the largest |pole| at a point of the reference and N the cycles of the run,
+
+    rho^N < 1/100 at every point                converges, if nothing below speaks against it
+    rho^N > 100 at every point                  diverges
+    else                                        unknown.
+
+What linear loops do not show makes a convergence unknown: the steepest secant of the map beyond its limit, on or near the
+reference (large errors may end in a bounded oscillation), a map that is too slow or whose range is too short for the
+requests, commands outside their limits, and a gain or a pairing that changes on line.
+
+The verdict is about the plant with its exact parameters; `box_converges` asks for those of the box.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller
+from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.grid import ReviewGrid
+from fpirhc.review.loops import Loops
+from fpirhc.review.maps import constant, largest_product
+from fpirhc.review.neighbourhood import eigenvalues_near
+
+QUESTION = "Does the deformation converge?"
+_SURE = math.log(100)
+
+
+def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: list[str]) -> Answer:
+    """Return whether the deformation of a controller converges; `doubts` are other answers that speak against it."""
+    if not loops.loops:
+        return Answer(QUESTION, Verdict.UNKNOWN, f"no linear loop: {loops.reason}", "Run it and look at the factor.")
+    growth = np.log(np.maximum(loops.radii, 1e-300)) * grid.problem.cycles
+    worst = float(loops.radii.max())
+    found = f"the slowest mode of the linear loop changes by {worst:.6g} per cycle"
+    numbers = {"radius": worst, "smallest_radius": float(loops.radii.min())}
+    deformation = controller.adaptive
+    if not constant(deformation):
+        change = f"{type(deformation).__name__} changes its map on line; the factor is that of its start."
+        return Answer(QUESTION, Verdict.UNKNOWN, found, change, numbers)
+    if growth.min() > _SURE:
+        return Answer(QUESTION, Verdict.NO, f"{found}: it grows all along the reference", _mend(loops), numbers)
+    if growth.max() > -_SURE:
+        where = f"between {loops.radii.min():.6g} and {worst:.6g} along the reference"
+        return Answer(QUESTION, Verdict.UNKNOWN, f"{found} ({where})", _mend(loops), numbers)
+    against = [*_steep(grid, controller), *doubts]
+    if against:
+        return Answer(
+            QUESTION, Verdict.UNKNOWN, f"{found}, but {'; '.join(against)}", "See the questions named.", numbers
+        )
+    return Answer(QUESTION, Verdict.YES, found, "", numbers)
+
+
+def box_converges(loops: Loops) -> Answer:
+    """Return in how many draws of the parameters the linear loop converges; unknown where it is not all of them."""
+    question = "Does it converge all over the box of parameters?"
+    if not loops.loops:
+        return Answer(question, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
+    # Without draws the box is a point: approximate and exact parameters are the same.
+    radii = np.array([one.radius for one in loops.drawn or loops.loops])
+    share, worst = float((radii < 1).mean()), float(radii.max())
+    text = f"in {100 * share:.3g} % of {len(radii)} draws; the worst mode changes by {worst:.6g} per cycle"
+    numbers = {"share": share, "radius": worst}
+    if share == 1:
+        return Answer(question, Verdict.YES, text, "", numbers)
+    return Answer(question, Verdict.UNKNOWN, text, "Lower the gain, or know the parameters better.", numbers)
+
+
+def _mend(loops: Loops) -> str:
+    if loops.ideal is not None and loops.ideal.radius >= 1:
+        return (
+            "The outer loop does not converge even with the right model: lower its rate, or predict over the dead time."
+        )
+    return "Change the gain as the question about it says; under dead time pair the deformation."
+
+
+def _steep(grid: ReviewGrid, controller: Controller) -> list[str]:
+    """Whether the steepest secant of the map leaves its limit near the reference."""
+    deformation = controller.adaptive
+    believed = controller.parameters(grid.problem.plant)
+    eigenvalues = eigenvalues_near(grid, believed, grid.draws[:1], near=True).ravel()
+    if not eigenvalues.size:
+        return ["the response Jacobian is not finite near the reference"]
+    reached = float((deformation.secant_gain() * np.abs(eigenvalues) ** 2 / eigenvalues.real).max())
+    limit = largest_product(grid.problem, deformation)
+    if (deformation.secant_gain() * eigenvalues.real).min() <= 0:
+        return ["near the reference the response Jacobian changes its sign"]
+    if reached <= limit:
+        return []
+    return [f"its steepest secant makes {reached:.3g} of the {limit:.3g} that converge near the reference"]

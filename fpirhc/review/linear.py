@@ -1,0 +1,188 @@
+"""The closed loop near its fixed point, as one matrix per cycle.
+
+At a point of the reference plant and model are replaced by their linearisations in deviations from it,
+
+    plant   y^(r) = A x + B u   (exact parameters),        model   y^(r) = A^ x + B^ u   (believed ones),
+
+both at the input u* that the reference needs. This is a plant like any other, whose parameters are the entries of the matrices,
+so the library's own closed loop is built around it once - tracking law, deformation with what it remembers, prediction, dead
+time and integrator as they are - and differentiated at rest:
+
+    z+ = F z + G w,        v = C z,
+
+z all that the loop remembers, w what is added to the plant's inputs, v the commands that arrive there. What only counts, stays what
+it is, or is read by nothing else has been left out of z.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.controllers.base import Controller
+from fpirhc.errors import NotSupported
+from fpirhc.plant.integrators import RungeKutta4
+from fpirhc.plant.plant import Parameter, Plant
+from fpirhc.sensing import Sensing
+from fpirhc.simulation.loop import close_loop
+from fpirhc.symbolic.layout import Expression
+from fpirhc.task.dead_time import DeadTime
+from fpirhc.task.disturbance import Step
+from fpirhc.task.problem import Problem
+from fpirhc.task.reference import Trajectory
+
+LARGEST = 1500  # entries of the loop's memory, beyond which its eigenvalues take too long
+
+
+@dataclass(frozen=True, eq=False)
+class LinearLoop:
+    """One cycle of the loop, z+ = F z + G w, v = C z; `state` are the places of the plant's state in z."""
+
+    dynamics: np.ndarray
+    entry: np.ndarray
+    arriving: np.ndarray
+    state: np.ndarray
+    period: float
+
+    @cached_property
+    def poles(self) -> np.ndarray:
+        """Eigenvalues of F."""
+        return np.asarray(np.linalg.eigvals(self.dynamics))
+
+    @property
+    def radius(self) -> float:
+        """The factor by which the slowest or fastest growing mode changes per cycle."""
+        return float(np.abs(self.poles).max())
+
+
+@dataclass(frozen=True, eq=False)
+class LoopMatrices:
+    """Turns linearisations of plant and model into the loop's matrices; build it with `loop_matrices`."""
+
+    function: ca.Function
+    rest: np.ndarray
+    exact: slice
+    believed: slice
+    state: slice
+    period: float
+
+    def at(self, exact: np.ndarray, believed: np.ndarray) -> LinearLoop:
+        """Return the loop of a plant and a model given by `linear_parameters`."""
+        memory = self.rest.copy()
+        memory[self.exact], memory[self.believed] = exact, believed
+        f, g, c = (np.asarray(m.full()) for m in self.function(memory, np.zeros(self.function.size1_in(1))))
+        moving = np.any(f != np.eye(len(f)), axis=1)
+        moving[self.exact] = moving[self.believed] = False
+        moving[self.state] = True
+        kept = _read(f, c, moving)
+        kept[self.state] = True
+        state = np.cumsum(kept)[self.state] - 1
+        return LinearLoop(f[np.ix_(kept, kept)], g[kept], c[:, kept], state, self.period)
+
+
+def _read(f: np.ndarray, c: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """Those entries that another one or the command depends on: an integral that no law uses is none of the loop's modes."""
+    kept = among.copy()
+    others = (f != 0) & ~np.eye(len(f), dtype=bool)
+    while True:
+        used = kept & (others[kept].any(axis=0) | (c != 0).any(axis=0))
+        if (used == kept).all():
+            return kept
+        kept = used
+
+
+def response_slopes(plant: Plant) -> ca.Function:
+    """Function (state, input, parameters) -> A (n, nx), B (n, nu) of the responses."""
+    x, u, p = plant._symbols()
+    response = plant.response_function(x, u, p)
+    slopes = [ca.densify(ca.jacobian(response, v)) for v in (x, u)]
+    return ca.Function("fpirhc_slopes", [x, u, p], slopes)
+
+
+def linear_parameters(
+    slopes: ca.Function, state: np.ndarray, command: np.ndarray, parameters: np.ndarray, feedback: np.ndarray
+) -> np.ndarray:
+    """Return what `linear_plant` takes as parameters: A, B of the responses at a point, and a plan's feedback (nu, nx)."""
+    a, b = (np.asarray(m.full()) for m in slopes(state, command, parameters))
+    return np.concatenate([a.ravel(), b.ravel(), feedback.ravel()])
+
+
+def linear_plant(plant: Plant, sign: float) -> Plant:
+    """Return a plant of the same coordinates and inputs whose parameters are the entries of A and B.
+
+    The first n nx entries are A, the next B, the last K of a plan's feedback, which the plant itself does not use. Its own values
+    are A = 0, and B = 1 on the controlled coordinates, times `sign` on the exact side.
+    """
+    n, nx, nu = len(plant.names), plant.state.size, len(plant.inputs)
+    gain = np.zeros((n, nu))
+    gain[list(plant.controlled_indices), range(nu)] = 1.0
+    names = [f"a{k}" for k in range(n * nx)] + [f"b{k}" for k in range(n * nu)]
+    names += [f"f{k}" for k in range(nu * nx)]
+    values = np.concatenate([np.zeros(n * nx), gain.ravel(), np.zeros(nu * nx)])
+    parameters = {name: Parameter(v, sign * v, "1") for name, v in zip(names, values, strict=True)}
+
+    def response(*given: Any) -> Mapping[str, Expression]:
+        *derivatives, u, p = given
+        entries = p.vector
+        by_name = {c + "'" * k: d[c] for k, d in enumerate(derivatives) for c in d}
+        x = ca.vertcat(*(by_name[e] for e in plant.state.elements))
+        a = ca.reshape(entries[: n * nx], nx, n).T
+        b = ca.reshape(entries[n * nx : n * (nx + nu)], nu, n).T
+        found = a @ x + b @ u.vector
+        return {c: found[k] for k, c in enumerate(plant.names)}
+
+    kind = inspect.Parameter.POSITIONAL_ONLY
+    arguments = [f"d{k}" for k in range(max(plant.orders))] + ["u", "p"]
+    response.__signature__ = inspect.Signature([inspect.Parameter(a, kind) for a in arguments])  # type: ignore[attr-defined]
+    order = dict(zip(plant.names, plant.orders, strict=True))
+    return Plant(plant.coordinates, plant.inputs, parameters, response, order, plant.controlled_names)
+
+
+def loop_matrices(problem: Problem, controller: Controller) -> LoopMatrices:
+    """Return the loop of the problem's plants and the controller, to be evaluated at linearisations.
+
+    Raises:
+        what the controller raises about a linear plant. NotSupported: a memory of too many entries.
+    """
+    linear = _linear_problem(problem, controller)
+    loop = close_loop(linear, controller)
+    if loop.memory.size > LARGEST:
+        raise NotSupported(f"the loop remembers {loop.memory.size} numbers, more than {LARGEST}")
+    names = loop.trace.names
+    arriving = loop.trace.slice("arriving" if "arriving" in names else "command")
+    z, w = ca.MX.sym("z", loop.memory.size), ca.MX.sym("w", len(problem.plant.inputs))
+    following, trace = loop.function(z, w)
+    results = [ca.jacobian(following, z), ca.jacobian(following, w), ca.jacobian(trace[arriving], z)]
+    function = ca.Function("fpirhc_loop_matrices", [z, w], [ca.densify(r) for r in results])
+    exact, believed, state = (loop.memory.slice(name) for name in ("_exact", "parameters", "_state_before"))
+    return LoopMatrices(function, _at_rest(loop.function, loop.memory.start()), exact, believed, state, problem.period)
+
+
+def _linear_problem(problem: Problem, controller: Controller) -> Problem:
+    plant = linear_plant(problem.plant, -1.0 if controller.adaptive.effective_gain() < 0 else 1.0)
+    integrator = RungeKutta4() if problem.integrator.opaque else problem.integrator
+    return Problem(
+        plant=plant,
+        reference=Trajectory(lambda t: dict.fromkeys(plant.names, 0 * t)),
+        start=dict.fromkeys(plant.names, 0.0),
+        period=problem.period,
+        duration=problem.duration,
+        disturbances={name: Step(at=0.0, size=0.0) for name in plant.inputs},
+        dead_time=DeadTime(inputs=problem.dead_time.inputs, measurement=problem.dead_time.measurement),
+        sensing=Sensing(estimator=problem.sensing.estimator),
+        integrator=integrator,
+        judged=plant.controlled_names,
+    )
+
+
+def _at_rest(function: ca.Function, start: np.ndarray) -> np.ndarray:
+    """The memory after so many cycles at rest that every queue is full."""
+    cycles = start.size + 2
+    moved: Any = function.mapaccum("fpirhc_resting", cycles)(start, np.zeros((function.size1_in(1), cycles)))
+    return np.asarray(moved[0].full())[:, -1]

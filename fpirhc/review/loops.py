@@ -1,0 +1,139 @@
+"""The linear closed loop of a controller at points of the reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.computed_torque import ComputedTorque
+from fpirhc.controllers.receding_horizon import RecedingHorizon
+from fpirhc.controllers.replanning import FromMeasurement, FromPlan
+from fpirhc.controllers.wrappers.exact_model import ExactModel
+from fpirhc.controllers.wrappers.predicted import Predicted
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import FpirhcError, NotSupported
+from fpirhc.review.grid import ReviewGrid
+from fpirhc.review.linear import LinearLoop, linear_parameters, loop_matrices, response_slopes
+from fpirhc.review.plan_feedback import PlanFeedback, plan_gains
+from fpirhc.task.problem import Problem
+
+_WORK = 2e7  # entries^3 of all loops together: eigenvalues of large ones are asked for at fewer points
+_FEWEST = 3
+_DRAWN = 24  # draws of the parameters, of all points together
+
+
+@dataclass(frozen=True, eq=False)
+class Loops:
+    """Linear loops with the exact parameters at points (indices into the reference's points), or the reason for none.
+
+    `ideal` is the loop of a controller without deformation whose model is the plant: what the outer loop does by itself. `drawn`
+    are loops of plants from the box of parameters.
+    """
+
+    places: tuple[int, ...]
+    loops: tuple[LinearLoop, ...]
+    ideal: LinearLoop | None
+    drawn: tuple[LinearLoop, ...] = ()
+    reason: str = ""
+
+    @property
+    def radii(self) -> np.ndarray:
+        """Largest |pole| at every point."""
+        return np.array([one.radius for one in self.loops])
+
+
+def loops_along(grid: ReviewGrid, controller: Controller) -> Loops:
+    """Return the controller's linear loops along the reference; where there are none, the reason."""
+    try:
+        return _loops(grid, controller)
+    except FpirhcError as error:
+        return Loops((), (), None, reason=str(error))
+    except np.linalg.LinAlgError as error:
+        return Loops((), (), None, reason=f"the linear loop has no eigenvalues: {error}")
+
+
+def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
+    problem, plant = grid.problem, grid.problem.plant
+    believed = controller.parameters(plant)
+    stand_in, plan = linear_stand_in(controller)
+    matrices = loop_matrices(problem, stand_in)
+    usable = [k for k in range(len(grid.times)) if np.isfinite(grid.commands[0, k]).all()]
+    if not usable:
+        raise NotSupported("the inverse does not exist along the reference")
+    places = _thinned(usable, int(_WORK / max(len(matrices.rest), 1) ** 3))
+    gains = dict(zip(places, _gains(problem, plan, [float(grid.times[k]) for k in places], believed), strict=True))
+
+    slopes = response_slopes(plant)
+
+    def at(place: int, draw: int) -> LinearLoop:
+        here = (grid.states[place], grid.commands[draw, place])
+        own, model = (linear_parameters(slopes, *here, p, gains[place]) for p in (grid.draws[draw], believed))
+        return matrices.at(own, model)
+
+    first = (grid.states[places[0]], grid.commands[0, places[0]])
+    model = linear_parameters(slopes, *first, believed, gains[places[0]])
+    ideal = loop_matrices(problem, without_deformation(stand_in)).at(model, model)
+    drawn = [at(k, d) for k, d in _pairs(grid, places) if np.isfinite(grid.commands[d, k]).all()]
+    return Loops(tuple(places), tuple(at(k, 0) for k in places), ideal, tuple(drawn))
+
+
+def _pairs(grid: ReviewGrid, places: list[int]) -> list[tuple[int, int]]:
+    """Points and draws, each point with draws of its own; few where the loops are large and the points few."""
+    count = min(len(grid.draws) - 1, _DRAWN, 2 * len(places))
+    if count <= 0:
+        return []
+    draws = np.unique(np.linspace(1, len(grid.draws) - 1, count).astype(int))
+    return [(places[i % len(places)], int(d)) for i, d in enumerate(draws)]
+
+
+def _thinned(places: list[int], most: int) -> list[int]:
+    count = min(len(places), max(_FEWEST, most))
+    return [places[int(k)] for k in np.unique(np.linspace(0, len(places) - 1, count).astype(int))]
+
+
+def _gains(
+    problem: Problem, plan: RecedingHorizon | None, times: list[float], believed: np.ndarray
+) -> list[np.ndarray]:
+    if plan is None:
+        return [np.zeros((len(problem.plant.inputs), problem.plant.state.size))] * len(times)
+    cost = plan.cost or problem.cost
+    assert problem.horizon is not None
+    assert cost is not None
+    return plan_gains(problem, problem.horizon, cost, times, believed)
+
+
+def linear_stand_in(controller: Controller) -> tuple[Controller, RecedingHorizon | None]:
+    """Return what serves a linear plant as the controller does near the reference, and the plan whose feedback it needs.
+
+    Raises:
+        NotSupported: a plan that is restarted and tracked.
+    """
+    if isinstance(controller, ExactModel):
+        return linear_stand_in(controller.controller)
+    if isinstance(controller, Predicted):
+        inner, plan = linear_stand_in(controller.controller)
+        return replace(controller, controller=inner), plan
+    if not isinstance(controller, RecedingHorizon):
+        return controller, None
+    if isinstance(controller.replanning, FromMeasurement):
+        return ComputedTorque(PlanFeedback(), controller.deformation), controller
+    if isinstance(controller.replanning, FromPlan):
+        return ComputedTorque(controller.replanning.tracking, controller.deformation), None
+    raise NotSupported("a plan that is restarted and tracked is not constant near the reference")
+
+
+def without_deformation(controller: Controller) -> Controller:
+    """Return the controller with Identity() for its deformation."""
+    if isinstance(controller, Predicted):
+        return replace(controller, controller=without_deformation(controller.controller))
+    if isinstance(controller.adaptive, Identity):
+        return controller
+    if isinstance(controller, ComputedTorque):
+        return replace(controller, deformation=Identity())
+    settings: Any = controller
+    if hasattr(settings, "deformation"):
+        return replace(settings, deformation=Identity())
+    raise NotSupported(f"{type(controller).__name__} has no deformation that can be left out")

@@ -1,0 +1,88 @@
+"""How robust is the linear loop? Poles, and gain, phase and delay margin of each input's loop, opened where it enters the plant.
+
+With z+ = F z + G w and v = C z (commands that arrive) the loop of input i is opened by w_i = w_i' - v_i:
+
+    L_i(zeta) = -C_i (zeta I - F + G_i C_i)^-1 G_i,
+
+all other loops closed. The deformation, dead time and prediction are in it.
+
+References: K. J. Astrom, R. M. Murray, Feedback Systems, 2008, section 9.3, for the margins.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import scipy.linalg
+
+from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.linear import LinearLoop
+from fpirhc.review.loops import Loops
+from fpirhc.task.problem import Problem
+
+QUESTION = "Has the linear loop enough margin?"
+LEAST_GAIN = 1.4  # as a factor, up or down
+LEAST_PHASE = 25.0  # degrees
+_LARGEST = 400  # states of a loop whose margins are computed
+_FREQUENCIES = 300
+_LOWEST = 1e-5  # of the Nyquist frequency
+
+
+def margins_enough(problem: Problem, loops: Loops) -> Answer:
+    """Return the smallest margins of all inputs at the first point of the reference and where the largest |pole| is."""
+    if not loops.loops:
+        return Answer(QUESTION, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
+    if len(loops.loops[0].dynamics) > _LARGEST:
+        radius = float(loops.radii.max())
+        text = f"largest |pole| {radius:.6g}; no margins of a loop of {len(loops.loops[0].dynamics)} states"
+        return Answer(QUESTION, Verdict.UNKNOWN, text, "", {"radius": radius})
+    chosen = {0, int(np.argmax(loops.radii))}
+    found = [margins(loops.loops[k], i) for k in sorted(chosen) for i in range(len(problem.plant.inputs))]
+    gain, phase, delay = (min(column) for column in zip(*found, strict=True))
+    radius = float(loops.radii.max())
+    numbers = {"radius": radius, "gain_margin": gain, "phase_margin": phase, "delay_margin": delay}
+    text = (
+        f"largest |pole| {radius:.6g}; gain may change {gain:.3g} times, phase by {phase:.3g} deg, delay by {delay:.3g} s "
+        f"({delay / problem.period:.3g} cycles)"
+    )
+    if radius >= 1:
+        everywhere = float(loops.radii.min()) >= 1
+        text += (
+            f"; a pole is outside the unit circle {'all along' if everywhere else 'at some points of'} the reference"
+        )
+        verdict = Verdict.NO if everywhere else Verdict.UNKNOWN
+        return Answer(QUESTION, verdict, text, "See the convergence and the rates.", numbers)
+    good = gain >= LEAST_GAIN and phase >= LEAST_PHASE
+    change = "" if good else "Lower the map's gain or the rate."
+    return Answer(QUESTION, Verdict.YES if good else Verdict.UNKNOWN, text, change, numbers)
+
+
+def margins(loop: LinearLoop, place: int) -> tuple[float, float, float]:
+    """Return (gain margin as a factor >= 1 up or down, phase margin in degrees, delay margin in s) of one input's loop."""
+    import control  # slow to import, and only margins need it
+
+    nyquist = math.pi / loop.period
+    frequencies = nyquist * np.geomspace(_LOWEST, 0.9999, _FREQUENCIES)
+    values = _response(loop, place, np.append(frequencies, nyquist))
+    opened = control.FrequencyResponseData(values[:-1], frequencies, loop.period)
+    gains, phases, _, _, crossings, _ = control.stability_margins(opened, returnall=True)
+    # At the Nyquist frequency, where most sampled loops leave the unit circle, L is real and crosses no phase.
+    ends = [-1 / values[-1].real] if values[-1].real < 0 else []
+    factors = [max(m, 1 / m) for m in [*np.atleast_1d(gains), *ends] if m > 0 and math.isfinite(m)]
+    pairs = [
+        (float(p), float(w)) for p, w in zip(np.atleast_1d(phases), np.atleast_1d(crossings), strict=True) if w > 0
+    ]
+    angles = [abs((p + 180) % 360 - 180) for p, _ in pairs]
+    delays = [math.radians(p % 360) / w for p, w in pairs]
+    return min(factors, default=math.inf), min(angles, default=math.inf), min(delays, default=math.inf)
+
+
+def _response(loop: LinearLoop, place: int, frequencies: np.ndarray) -> np.ndarray:
+    """L_i on the unit circle; from the matrices, because polynomials of so many states lose all digits."""
+    g, c = loop.entry[:, place], loop.arriving[place]
+    generator = loop.dynamics - np.outer(g, c)
+    points = np.exp(1j * frequencies * loop.period)
+    form, turn = scipy.linalg.schur(generator, output="complex")
+    left, right, unit = c @ turn, turn.conj().T @ g, np.eye(len(form))
+    return np.array([-left @ scipy.linalg.solve_triangular(point * unit - form, right) for point in points])

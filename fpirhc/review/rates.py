@@ -1,0 +1,41 @@
+"""Are rate x period and rate x dead time inside their limits? They are where the loop converges with the right model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fpirhc.controllers.base import Controller
+from fpirhc.review.answer import Answer, Verdict, decided
+from fpirhc.review.grid import ReviewGrid
+from fpirhc.review.loops import Loops
+from fpirhc.review.maps import dead_cycles
+
+QUESTION = "Are rate x period and rate x dead time small enough?"
+
+
+def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answer:
+    """Return the products and whether the loop of plant = model, without deformation, converges."""
+    period, cycles = grid.problem.period, dead_cycles(grid.problem)
+    rate = _rate(controller)
+    numbers = {} if rate is None else {"rate_period": rate * period, "rate_dead_time": rate * cycles * period}
+    text = f"dead time {cycles:g} cycles"
+    if rate is not None:
+        text = f"rate x period {rate * period:.3g}, rate x dead time {rate * cycles * period:.3g}"
+    if loops.ideal is None:
+        return Answer(QUESTION, Verdict.UNKNOWN, f"{text}; no linear loop: {loops.reason}", "", numbers)
+    radius = loops.ideal.radius
+    numbers["ideal_radius"] = radius
+    text += f"; with the right model the slowest mode changes by {radius:.6g} per cycle"
+    change = "Lower the rate, shorten the period, or predict over the dead time (Predicted)."
+    return Answer(QUESTION, decided(radius < 1), text, "" if radius < 1 else change, numbers)
+
+
+def _rate(controller: Controller) -> float | None:
+    """Rate of the tracking law, 1/s, where the controller or the one that it wraps has such a law."""
+    one: Any = controller
+    while one is not None:
+        rate = getattr(getattr(one, "tracking", None), "rate", None)
+        if rate is not None:
+            return float(rate)
+        one = getattr(one, "controller", None)
+    return None

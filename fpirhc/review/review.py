@@ -1,0 +1,108 @@
+"""All questions about a problem and its controllers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.slots.slotted import Slotted
+from fpirhc.controllers.wrappers.exact_model import ExactModel
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import FpirhcError, InvalidValue
+from fpirhc.review.answer import Answer, Review, Verdict
+from fpirhc.review.commands import commands_inside
+from fpirhc.review.convergence import box_converges, converges
+from fpirhc.review.gain import gain_admissible
+from fpirhc.review.grid import ReviewGrid, review_grid
+from fpirhc.review.horizon import horizon_long_enough
+from fpirhc.review.inverse import inverse_exists
+from fpirhc.review.loops import Loops, loops_along
+from fpirhc.review.maps import largest_product
+from fpirhc.review.margins import margins_enough
+from fpirhc.review.neighbourhood import spectrum_near
+from fpirhc.review.orders import relative_orders
+from fpirhc.review.rates import rates_inside
+from fpirhc.review.reach import range_enough
+from fpirhc.review.schedule import schedule_stable
+from fpirhc.review.signs import one_sign
+from fpirhc.review.slew import slew_enough
+from fpirhc.review.well_posed import well_posed
+from fpirhc.review.zero_dynamics import is_planned, zero_dynamics, zero_dynamics_rate
+from fpirhc.task.problem import Problem
+
+LARGEST_MISMATCH = 100.0  # percent; beyond it a parameter may change its sign
+
+
+def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch: float, seed: int) -> Review:
+    """Return the answers to all questions that can be asked before a run.
+
+    Parameters: `mismatch`: margin around the exact parameters, percent, 0 <= P < 100; the box spans the approximate values too.
+    `seed` of the draws from the box.
+
+    Raises:
+        InvalidValue: a mismatch out of range. NotInvertible: the inputs and the controlled coordinates differ in number.
+    """
+    if not (math.isfinite(mismatch) and 0 <= mismatch < LARGEST_MISMATCH):
+        raise InvalidValue(f"mismatch={mismatch!r}: expected percent of at least 0 and below {LARGEST_MISMATCH:g}")
+    grid = review_grid(problem, mismatch, seed)
+    general = [well_posed(grid), relative_orders(grid), inverse_exists(grid), commands_inside(grid)]
+    far = horizon_long_enough(grid)
+    if far is not None:
+        general.append(far)
+    return Review(tuple(general), {name: _of(grid, one, general) for name, one in controllers.items()}, mismatch)
+
+
+def predict(problem: Problem, controller: Controller) -> Answer:
+    """Return the verdict alone: whether the deformation of a controller converges on the plant with its exact parameters.
+
+    Raises:
+        NotInvertible: see `review`. And what the controller raises about the problem.
+    """
+    grid = review_grid(problem, 0.0, 0)
+    own = replace(grid, draws=grid.draws[:1])  # the box does not matter
+    chosen = controller.resolved(problem)
+    general = [well_posed(own), inverse_exists(own), commands_inside(own)]
+    loops = loops_along(own, chosen)
+    return converges(own, chosen, loops, _doubts([*general, *_speed_and_range(own, chosen, loops)]))
+
+
+def _of(grid: ReviewGrid, controller: Controller, general: list[Answer]) -> tuple[Answer, ...]:
+    try:
+        chosen = controller.resolved(grid.problem)
+        chosen.check(grid.problem)
+    except FpirhcError as error:
+        return (Answer("Does the controller fit the problem?", Verdict.NO, str(error), "See the message."),)
+    inside = chosen.controller if isinstance(chosen, ExactModel) else chosen
+    if isinstance(inside, Slotted):
+        return (schedule_stable(grid.problem, inside),)
+    loops = loops_along(grid, chosen)
+    outer = [rates_inside(grid, chosen, loops), zero_dynamics(zero_dynamics_rate(grid), is_planned(chosen), loops)]
+    inner = [] if isinstance(chosen.adaptive, Identity) else _of_map(grid, chosen, loops, general)
+    return (*inner, *outer, margins_enough(grid.problem, loops))
+
+
+def _of_map(grid: ReviewGrid, controller: Controller, loops: Loops, general: list[Answer]) -> list[Answer]:
+    deformation = controller.adaptive
+    believed = controller.parameters(grid.problem.plant)
+    try:
+        own, boxed = (spectrum_near(grid, believed, draws, near=False) for draws in (grid.draws[:1], grid.draws))
+    except InvalidValue as error:
+        return [Answer("Do the eigenvalues of the response Jacobian have one sign?", Verdict.UNKNOWN, str(error))]
+    limit = largest_product(grid.problem, deformation)
+    suited = _speed_and_range(grid, controller, loops)
+    verdict = converges(grid, controller, loops, _doubts([*general, *suited]))
+    gains = [one_sign(own, boxed), gain_admissible(deformation, own, boxed, limit)]
+    return [verdict, box_converges(loops), *gains, *suited]
+
+
+def _speed_and_range(grid: ReviewGrid, controller: Controller, loops: Loops) -> list[Answer]:
+    deformation, believed = controller.adaptive, controller.parameters(grid.problem.plant)
+    ideal = loops.ideal if is_planned(controller) else None
+    found = [slew_enough(grid, deformation, believed, ideal), range_enough(grid, deformation, believed)]
+    return [a for a in found if a is not None]
+
+
+def _doubts(answers: list[Answer]) -> list[str]:
+    return [f"'{a.question}' is answered no" for a in answers if a.verdict == Verdict.NO]

@@ -1,0 +1,28 @@
+"""Is a schedule of slots stable? By its Floquet radius, with ideal deformations."""
+
+from __future__ import annotations
+
+from fpirhc.controllers.slots.floquet import floquet_radius
+from fpirhc.controllers.slots.slotted import Slotted
+from fpirhc.errors import FpirhcError
+from fpirhc.review.answer import Answer, Verdict, decided
+from fpirhc.task.problem import Problem
+
+QUESTION = "Is the schedule of slots stable?"
+
+
+def schedule_stable(problem: Problem, controller: Slotted) -> Answer:
+    """Return the radius of one period, whose gains of the wrong sign the controller has already refused."""
+    try:
+        found = floquet_radius(problem, controller.slots, controller.schedule, blend=controller.blend)
+    except FpirhcError as error:
+        return Answer(QUESTION, Verdict.UNKNOWN, str(error))
+    if found.radius is None:
+        return Answer(
+            QUESTION, Verdict.UNKNOWN, f"no Floquet radius: {found.reason}", "Use a periodic schedule to know one."
+        )
+    text = f"near the set-point errors change by {found.radius:.3g} per period of {found.period:g} s, with ideal deformations"
+    change = "" if found.radius < 1 else "Change the slots' durations or rates; see floquet_radius."
+    return Answer(
+        QUESTION, decided(found.radius < 1), text, change, {"floquet_radius": found.radius, "period": found.period}
+    )

@@ -1,0 +1,102 @@
+"""Is the map fast enough? Its largest step per cycle against how fast the request must change.
+
+Along the reference it changes by |d r*/dt|. After a start off the reference a plan asks for more: what the linear loop of
+plant = model does from there, B^ (v_{k+1} - v_k) in the commands v, must fit the step as well.
+"""
+
+from __future__ import annotations
+
+import math
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.deformation.base import Deformation
+from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.grid import ReviewGrid
+from fpirhc.review.linear import LinearLoop
+from fpirhc.task.disturbance import Disturbance, Pulse, Sine, Step
+
+QUESTION = "Is the map fast enough for reference and disturbances?"
+_SPARE = 2.0  # how many times faster than the reference it should be
+_POINTS = 2001
+_CYCLES = 1000  # after the start
+
+
+def slew_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray, ideal: LinearLoop | None) -> Answer:
+    """Return the slew limit of the map beside what reference, disturbances and the start ask for.
+
+    Parameters: `ideal`: the linear loop of a plan with the right model; None where no plan is in the loop.
+    """
+    problem = grid.problem
+    begun = 0.0 if ideal is None else _speed_after_start(grid, believed, ideal)
+    speed = max(_speed(grid, believed), begun)
+    sudden = max((abs(_jump(d)) * _effect(grid, name) for name, d in problem.disturbances.items()), default=0.0)
+    steady = sum(_swing(d) * _effect(grid, name) for name, d in problem.disturbances.items())
+    needed, step = speed + steady, deformation.largest_step()
+    numbers = {"needed": needed, "limit": step / problem.period, "jump": sudden}
+    text = f"the request changes by up to {needed:.3g} per second"
+    if begun == speed > 0:
+        text += " after the start"
+    if not math.isfinite(step):
+        return Answer(QUESTION, Verdict.YES, f"{text}; the map's step has no bound", "", numbers)
+    text += f", the map by {step / problem.period:.3g}"
+    if sudden:
+        text += f"; a jump of a disturbance takes it {math.ceil(sudden / step)} cycles"
+    ratio = step / problem.period / max(needed, 1e-300)
+    change = f"Raise the map's scale at least {_SPARE / ratio:.2g} times, or leave it out to have it chosen."
+    if ratio >= _SPARE:
+        return Answer(QUESTION, Verdict.YES, text, "", numbers)
+    return Answer(QUESTION, Verdict.NO if ratio < 1 else Verdict.UNKNOWN, text, change, numbers)
+
+
+def _speed(grid: ReviewGrid, believed: np.ndarray) -> float:
+    """Largest |d r*/dt|, by differences between points much closer than those of the review."""
+    problem, plant = grid.problem, grid.problem.plant
+    times = np.linspace(0.0, problem.duration, _POINTS)
+    states, responses = (np.asarray(v.full()) for v in problem.reference.function(plant).map(_POINTS)(times[None, :]))
+    exact, model = (np.repeat(p[:, None], _POINTS, axis=1) for p in (plant.exact, believed))
+    commands = plant.inverse_function.map(_POINTS)(states, responses[list(plant.controlled_indices)], exact)
+    requests = np.asarray(plant.controlled_response_function.map(_POINTS)(states, commands, model).full())
+    speeds = np.linalg.norm(np.diff(requests, axis=1), axis=0) / (times[1] - times[0])
+    return float(speeds[np.isfinite(speeds)].max(initial=0.0))
+
+
+def _speed_after_start(grid: ReviewGrid, believed: np.ndarray, ideal: LinearLoop) -> float:
+    """Largest |d r/dt| that the plan's feedback asks for from the problem's start."""
+    plant = grid.problem.plant
+    z = np.zeros(len(ideal.dynamics))
+    z[ideal.state] = grid.problem.start_state - grid.states[0]
+    commands = np.empty((_CYCLES, len(plant.inputs)))
+    for k in range(_CYCLES):
+        commands[k] = ideal.arriving @ z
+        z = ideal.dynamics @ z
+    x, u, p = plant._symbols()
+    slope = ca.jacobian(plant.controlled_response_function(x, u, p), u)
+    function = ca.Function("fpirhc_input_gain", [x, u, p], [slope])
+    gain = np.asarray(function(grid.states[0], np.nan_to_num(grid.commands[0, 0]), believed).full())
+    changes = np.linalg.norm(np.diff(commands, axis=0) @ gain.T, axis=1)
+    return float(changes.max() / grid.problem.period)
+
+
+def _jump(disturbance: Disturbance) -> float:
+    return disturbance.size if isinstance(disturbance, Step | Pulse) else 0.0
+
+
+def _swing(disturbance: Disturbance) -> float:
+    """How fast it changes, per second; noise is no motion that a map should follow."""
+    if not isinstance(disturbance, Sine):
+        return 0.0
+    return abs(2 * math.pi * disturbance.frequency * disturbance.amplitude)
+
+
+def _effect(grid: ReviewGrid, name: str) -> float:
+    """What one unit of a disturbance changes in the responses: 1 on a coordinate, the exact gain on an input."""
+    plant = grid.problem.plant
+    if name not in plant.inputs:
+        return 1.0
+    unit = np.array([1.0 if i == name else 0.0 for i in plant.inputs])
+    command = np.nan_to_num(grid.commands[0, 0])
+    respond = plant.controlled_response_function
+    moved = respond(grid.states[0], command + unit, plant.exact) - respond(grid.states[0], command, plant.exact)
+    return float(np.linalg.norm(moved.full()))

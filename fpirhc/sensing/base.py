@@ -1,0 +1,81 @@
+"""The contract of estimators: how state and response follow from what the sensors show.
+
+A request r_{k-1} is held from t_{k-1} to t_k, so every linear estimate of the response is a weighted sum of past requests,
+
+    f_k = lambda sum_j w_j r_{k-j},     sum_j w_j = 1,
+
+and is later than the ideal pair (r_{k-1}, f_k), for which w_1 = 1, by the weights' centre: sum_j (j - 1) w_j cycles. A
+deformation that compares f_k with r_{k-1} all the same needs a smaller gain; one that is told the delay, Paired(map,
+cycles=...), does not.
+
+An n-th difference of positions over T^n answers requests held over T with the weights of a B-spline, A(n, j) / n! (A:
+Eulerian numbers): 1; 1/2, 1/2; 1/6, 4/6, 1/6; ... . Any other formula for the n-th derivative is an average of such
+differences.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.layout import Expression, Signal
+
+Array = npt.NDArray[Any]
+
+
+class DerivativeEstimator(ABC):
+    """Contract: a block from the measured quantities to the controller's 'state' and 'realised'."""
+
+    @abstractmethod
+    def measures(self, plant: Plant) -> tuple[str, ...]:
+        """Names of the quantities that need a sensor: state elements, and highest derivatives of controlled coordinates."""
+
+    @abstractmethod
+    def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
+        """Block (seen) -> (state, realised); `seen` holds the entries of `measures`, `start` (nx,) is the problem's."""
+
+    @abstractmethod
+    def weights(self, order: int, period: float) -> Array:
+        """Weights w_1, w_2, ... of past requests in the estimated response of a coordinate of that order."""
+
+    @abstractmethod
+    def delay(self, order: int, period: float) -> float:
+        """Delay of the response in cycles, beyond the ideal pair: the weights' centre."""
+
+    @abstractmethod
+    def fills(self, order: int) -> int:
+        """Number of the first cycle (from 0) whose response is made of this run's samples alone."""
+
+    def check(self, plant: Plant) -> None:  # noqa: B027 -- most estimators serve every plant
+        """Raise InvalidValue where the estimator cannot serve the plant."""
+
+
+def response_names(plant: Plant) -> tuple[str, ...]:
+    """Names of the highest derivatives of the controlled coordinates: "q1''"."""
+    return tuple(plant.names[k] + "'" * plant.orders[k] for k in plant.controlled_indices)
+
+
+def spline_weights(order: int) -> Array:
+    """Weights A(n, j) / n! of the last n held values of y^(n) in the n-th difference of y over T^n."""
+    row = np.ones(1)
+    for n in range(2, order + 1):
+        j = np.arange(n)
+        row = (j + 1) * np.append(row, 0.0) + (n - j) * np.append(0.0, row)
+    return np.asarray(row / math.factorial(order))
+
+
+def backward_difference(degree: int) -> Array:
+    """Coefficients of y_k, y_{k-1}, ... in the difference of that degree."""
+    return np.array([(-1.0) ** j * math.comb(degree, j) for j in range(degree + 1)])
+
+
+def combine(coefficients: Array, samples: Sequence[Expression]) -> Expression:
+    """Return the sum of samples (newest first) times coefficients; zeros cost nothing."""
+    return sum(c * s for c, s in zip(coefficients, samples, strict=True) if c != 0)

@@ -1,0 +1,1 @@
+"""Closed loops: composed, run, measured."""

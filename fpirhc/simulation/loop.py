@@ -1,0 +1,187 @@
+"""Closes the loop: controller blocks and the exact plant as ONE step.
+
+Per cycle k the loop holds the plant's state x_k and the response that was realised just before t_k under the command
+held since t_{k-1}; the controller turns them into a command; the plant moves on by one period with that command held.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.controllers.base import Controller, Response, error_signal, like, prepared
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.block import Block, Composite, Delay, compose
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.task.dead_time import delay_block
+from fpirhc.task.problem import Problem
+
+
+def close_loop(problem: Problem, controller: Controller) -> Composite:
+    """Return the closed loop as one step: (memory, [disturbance], [sensing]) -> (memory, trace).
+
+    Both parameter sets are part of the memory (constant), so that other values need no new Function. The disturbance
+    input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples.
+    """
+    chosen = prepared(problem, controller)
+    blocks, delays = chosen.blocks(problem)
+    disturbed = disturbance_signals(problem)
+    seeing = _sense_blocks(
+        problem, chosen.response(problem), predicts="state_ahead" in [n for b in blocks for n in b.writes.names]
+    )
+    around = [_clock_block(problem.period), *seeing, *blocks, *_actuate(problem, disturbed)]
+    return compose(
+        "loop", Layout((*disturbed, *problem.sensing.drawn)), around, [*_plant_delays(problem, chosen), *delays]
+    )
+
+
+def start_memory(loop: Composite, problem: Problem, controller: Controller) -> np.ndarray:
+    """Return the first memory of a loop for a problem that differs from the loop's in its exact parameters only.
+
+    `controller` is the loop's, resolved.
+    """
+    sensing = _sense_blocks(problem, controller.response(problem), predicts=False)
+    remembered = [s for block in sensing for s in block.memory.signals]
+    remembered += [delay.now for delay in _plant_delays(problem, controller)]
+    return loop.memory.pack({s.name: s.start_vector() for s in remembered})
+
+
+def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:
+    """Return the signal of all disturbances in the order of the problem, or nothing when there are none."""
+    if not problem.disturbances:
+        return ()
+    return (Signal("disturbance", tuple(problem.disturbances)),)
+
+
+def _plant_delays(problem: Problem, controller: Controller) -> list[Delay]:
+    plant = problem.plant
+    start = tuple(float(v) for v in problem.start_state)
+    approximate = tuple(float(v) for v in controller.parameters(plant))
+    exact = tuple(float(v) for v in plant.exact)
+    acting = problem.dead_time.commands_before(plant)
+    return [
+        Delay(Signal("_state_before", plant.state.elements, plant.state.units, start), "_state_after"),
+        Delay(Signal("_acting_before", plant.input.elements, plant.input.units, acting), "_acting"),
+        Delay(_forcing(plant, "_forcing_before"), "_forcing"),
+        Delay(Signal("parameters", plant.parameter.elements, plant.parameter.units, approximate), "parameters"),
+        Delay(Signal("_exact", plant.parameter.elements, plant.parameter.units, exact), "_exact"),
+    ]
+
+
+def _forcing(plant: Plant, name: str) -> Signal:
+    """What disturbances add to the response of every coordinate."""
+    return Signal(name, plant.names, plant.response_units)
+
+
+def _clock_block(period: float) -> Block:
+    """Time from a counter: no rounding error grows in a long run."""
+
+    def step(s: Any) -> dict[str, Expression]:
+        return {"time": s.cycle * period, "cycle_next": s.cycle + 1}
+
+    return Block("clock", Layout(), Layout((scalar("time", "s"),)), step, Layout((scalar("cycle"),)))
+
+
+def _sense_blocks(problem: Problem, asked: Response | None, *, predicts: bool) -> list[Block]:
+    """State and response as the controller gets them; where these are not the plant's own, also the true ones and error."""
+    plant, behind = problem.plant, problem.dead_time.measurement / problem.period
+    response = asked or _own_response(plant)
+    if not _hidden(problem):
+        sense = [_sense_block(plant, plant.state, response)]
+        return [*sense, _truth_block(problem, plant.state)] if predicts or problem.dead_time.inputs else sense
+    true_state, true_response = like(plant.state, "plant_state"), like(response.signal, "plant_realised")
+    true = [
+        _sense_block(plant, true_state, Response(true_response, response.function)),
+        _truth_block(problem, true_state),
+    ]
+    if not problem.sensing.ideal:
+        signals = true_state, true_response
+        return [*true, *problem.sensing.blocks(plant, problem.period, problem.start_state, behind, signals)]
+    start, calm = tuple(float(v) for v in problem.start_state), np.zeros(len(plant.names))
+    resting = response.function(start, np.zeros(plant.input.size), plant.exact, calm).full().ravel()
+    seen = Signal("realised", true_response.elements, true_response.units, tuple(map(float, resting)))
+    return [
+        *true,
+        delay_block("see_state", true_state, replace(plant.state, start=start), [behind] * plant.state.size),
+        delay_block("see_response", true_response, seen, [behind] * seen.size),
+    ]
+
+
+def _hidden(problem: Problem) -> bool:
+    """Whether the controller is given something else than the plant's own state and response."""
+    return bool(problem.dead_time.measurement) or not problem.sensing.ideal
+
+
+def _truth_block(problem: Problem, state: Signal) -> Block:
+    """Block (time, true state) -> true error of the judged coordinates, by which a run is judged."""
+    plant, function = problem.plant, problem.reference.function(problem.plant)
+    places = [plant.state.elements.index(c) for c in problem.judged_names]
+    writes = Layout((error_signal(problem, "true_error"),))
+
+    def step(s: Any) -> dict[str, Expression]:
+        return {"true_error": (function(s.time)[0] - getattr(s, state.name))[places]}
+
+    return Block("truth", Layout((scalar("time", "s"), state)), writes, step, opaque=problem.reference.opaque)
+
+
+def _own_response(plant: Plant) -> Response:
+    """The response of the controlled coordinates."""
+    x, u, p = plant._symbols()
+    w = ca.SX.sym("w", len(plant.names))
+    found = plant.controlled_response_function(x, u, p) + w[list(plant.controlled_indices)]
+    return Response(plant.response_signal("realised"), ca.Function("fpirhc_realised", [x, u, p, w], [found]))
+
+
+def _sense_block(plant: Plant, state: Signal, response: Response) -> Block:
+    """What the controller measures: the true state, and the true response just before this cycle's command.
+
+    The response is computed here and not at the end of the last cycle, because it shares its costly terms with the first
+    Runge-Kutta evaluation of this cycle.
+    """
+    reads = (
+        like(plant.state, "_state_before"),
+        like(plant.input, "_acting_before"),
+        _forcing(plant, "_forcing_before"),
+        like(plant.parameter, "_exact"),
+    )
+
+    def step(s: Any) -> dict[str, Expression]:
+        found = response.function(s._state_before, s._acting_before, s._exact, s._forcing_before)
+        return {state.name: s._state_before, response.signal.name: found}
+
+    return Block("sense", Layout(reads), Layout((state, response.signal)), step)
+
+
+def _actuate(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:
+    """The command's way to the plant, and the plant over one period."""
+    cycles = [problem.dead_time.inputs.get(name, 0.0) / problem.period for name in problem.plant.inputs]
+    if not any(cycles):
+        return [_advance_block(problem, disturbed, problem.plant.input)]
+    plant = problem.plant
+    arriving = Signal("arriving", plant.input.elements, plant.input.units, problem.dead_time.commands_before(plant))
+    return [
+        delay_block("send_command", problem.plant.input, arriving, cycles),
+        _advance_block(problem, disturbed, arriving),
+    ]
+
+
+def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Signal) -> Block:
+    """The exact plant over one period with the arriving command held."""
+    plant = problem.plant
+    advance = problem.integrator.step(plant, problem.period)
+    state = like(plant.state, "plant_state") if _hidden(problem) else plant.state
+    reads = (state, arriving, like(plant.parameter, "_exact"), *disturbed)
+    writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
+
+    def step(s: Any) -> dict[str, Expression]:
+        u, w = getattr(s, arriving.name), ca.DM.zeros(len(plant.names))
+        if disturbed:
+            added = dict(zip(problem.disturbances, ca.vertsplit(s.disturbance), strict=True))
+            u = u + ca.vertcat(*(added.get(name, 0) for name in plant.inputs))
+            w = ca.vertcat(*(added.get(name, 0) for name in plant.names))
+        return {"_state_after": advance(getattr(s, state.name), u, s._exact, w), "_acting": u, "_forcing": w}
+
+    return Block("advance", Layout(reads), Layout(writes), step, opaque=problem.integrator.opaque)

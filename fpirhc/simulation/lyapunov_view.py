@@ -1,0 +1,97 @@
+"""Lyapunov's view of a run with an exponential tracking law: V = S^2 / 2, and the bound that the response error sets.
+
+With S = (d/dt + rate)^n e_int (without integral: (d/dt + rate)^(n-1) e) the law prescribes S' = -rate S. The plant answers
+with the response error h = q^(n) - q^(n),Des, so S' = -rate S - h and
+
+    V' <= -2 rate V + |h| (2 V)^(1/2),     ultimately |S| <= sup|h| / rate.
+
+A deformation makes |h| small: it drives V near zero and keeps it there, not to zero for a task that varies in time. Several
+coordinates are taken together, with Euclidean norms. The h of a cycle is the mean over it, from the change of e^(n-1): with a
+small h it matters that the plant moves on between two samples.
+
+References: J.-J. E. Slotine, W. Li, Applied Nonlinear Control, Prentice Hall 1991, ch. 7. In the spirit of the Lyapunov
+interpretations of fixed-point transformations by the group of J. K. Tar.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.wrappers.exact_model import ExactModel
+from fpirhc.simulation.run import Run
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.exponential import Exponential
+
+
+@dataclass(frozen=True, eq=False)
+class LyapunovView:
+    """S and h along a run.
+
+    Parameters:
+        surface: S, shape (cycles, controlled coordinates). response_error: h, shape (cycles - 1, controlled coordinates).
+        rate: of the law, 1/s. since: first cycle of the measured part.
+    """
+
+    surface: np.ndarray
+    response_error: np.ndarray
+    rate: float
+    since: int
+
+    @property
+    def function(self) -> np.ndarray:
+        """V = |S|^2 / 2, shape (cycles,)."""
+        return np.asarray(0.5 * np.sum(self.surface**2, axis=1))
+
+    @property
+    def largest(self) -> float:
+        """Largest |S| of the measured part."""
+        return float(np.sqrt(2 * self.function[self.since :].max()))
+
+    @property
+    def bound(self) -> float:
+        """Ultimate bound of |S|: sup|h| of the measured part over the rate."""
+        return float(np.linalg.norm(self.response_error[self.since :], axis=1).max()) / self.rate
+
+    @property
+    def text(self) -> str:
+        """One sentence for a reader of results."""
+        return f"Lyapunov: |S| at most {self.largest:.3g}; ultimate bound sup|h| / rate = {self.bound:.3g}"
+
+
+def lyapunov_view(problem: Problem, controller: Controller, run: Run) -> LyapunovView | None:
+    """Return V and its bound along a run; None where the controller does not track the reference with an Exponential law.
+
+    None too behind sensors or a late measurement: what the law knows is then not what the plant does.
+    """
+    law, since = exponential_law(controller), round(problem.measure_from / problem.period)
+    if law is None or "reference" not in run.layout or "plant_state" in run.layout or run.cycles < since + 2:
+        return None
+    surface, response_error = _signals(problem, law, run)
+    return LyapunovView(surface, response_error, law.rate, since)
+
+
+def exponential_law(controller: Controller) -> Exponential | None:
+    """The Exponential law by which a controller tracks the reference itself."""
+    inner = controller.controller if isinstance(controller, ExactModel) else controller
+    law = getattr(inner, "tracking", None)
+    return law if isinstance(law, Exponential) else None
+
+
+def _signals(problem: Problem, law: Exponential, run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """S and h. The feedback that the run logged is rate S plus what S' has below the highest derivative."""
+    plant = problem.plant
+    errors, feedback = run["reference"] - run["state"], run["desired"] - run["nominal"]
+    surface, response_error = [], []
+    for k, index in enumerate(plant.controlled_indices):
+        name, order = plant.names[index], plant.orders[index]
+        chain = [errors[:, plant.state.elements.index(name + "'" * s)] for s in range(order)]
+        degree = order if law.integral else order - 1
+        rising = chain if law.integral else chain[1:]
+        drift = sum(math.comb(degree, s) * law.rate ** (degree - s) * e for s, e in enumerate(rising))
+        surface.append((feedback[:, k] - drift) / law.rate)
+        response_error.append(-np.diff(chain[-1]) / problem.period - feedback[:-1, k])
+    return np.column_stack(surface), np.column_stack(response_error)

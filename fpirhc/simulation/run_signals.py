@@ -1,0 +1,72 @@
+"""Signals that judge a run and take no part in it: computed afterwards, from what was logged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.contraction import contraction_along
+from fpirhc.controllers.base import Controller
+from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
+from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.task.problem import Problem
+
+_CHUNK = 500  # cycles whose costs are evaluated in one call
+Judgement = tuple[Signal, np.ndarray]
+
+
+def judgements(problem: Problem, controller: Controller, layout: Layout, log: np.ndarray) -> list[Judgement]:
+    """Return 'cost' by term where the problem has a cost, and 'contraction' where the controller adapts."""
+    found = []
+    if problem.cost is not None and problem.horizon is not None:
+        found.append(_costs(problem, layout, log))
+    gain = controller.adaptive.effective_gain()
+    if gain != 0 and log.shape[0] and controller.response(problem) is None:
+        plant = problem.plant
+        states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]
+        factors = contraction_along(plant, states, deformed, gain, approximate=controller.parameters(plant))
+        found.append((scalar("contraction"), factors[:, None]))
+    return found
+
+
+def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, np.ndarray]:
+    """Return the stage cost of every cycle by term, at the actual state and command, with the exact parameters.
+
+    All controllers of a problem are judged by the same cost, whatever they believe: effort relative to a feedforward
+    means the plant's own.
+    """
+    assert problem.horizon is not None
+    assert problem.cost is not None
+    plant = problem.plant
+    one_cycle = replace(problem.horizon, stages=1, step=problem.period, terminal=())
+    ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits)
+    data_of = stage_data(plant, problem.reference, one_cycle, problem.cost)
+    states = log[:, layout.slice("plant_state" if "plant_state" in layout else "state")]
+    commands = log[:, layout.slice("command")]
+    states = np.asarray(ocp.start(states.T, np.vstack([commands[:1], commands[:-1]]).T).full()).T
+    times = log[:, layout.slice("time")]
+    function = _cost_function(ocp, data_of, _CHUNK)
+    evaluator = Evaluator(function)
+    found = np.empty((log.shape[0], len(ocp.terms)))
+    evaluator.arguments[3][:] = plant.exact
+    for at in range(0, log.shape[0], _CHUNK):
+        size = min(_CHUNK, log.shape[0] - at)
+        for argument, source in zip(evaluator.arguments, (times, states, commands), strict=False):
+            argument.reshape(_CHUNK, -1)[:size] = source[at : at + size]
+        evaluator.evaluate()
+        found[at : at + size] = evaluator.results[0].reshape(_CHUNK, -1)[:size]
+    return Signal("cost", tuple(ocp.terms)), found
+
+
+def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int) -> ca.Function:
+    """Function (times, states, inputs, parameters) -> cost terms of `count` cycles."""
+    t, s = ca.MX.sym("t"), ca.MX.sym("s", ocp.state.size)
+    u, p = ca.MX.sym("u", ocp.input.size), ca.MX.sym("p", data_of.size1_in(1))
+    one = ca.Function("fpirhc_cost", [t, s, u, p], [ocp.stage_cost(s, u, data_of(t, p)[:, 0])[1]])
+    times, states = ca.MX.sym("t", 1, count), ca.MX.sym("s", ocp.state.size, count)
+    inputs = ca.MX.sym("u", ocp.input.size, count)
+    given = one.map(count)(times, states, inputs, ca.repmat(p, 1, count))
+    return ca.Function("fpirhc_costs", [times, states, inputs, p], [given])

@@ -1,0 +1,172 @@
+"""Runs a closed loop and logs every signal.
+
+The loop's one-cycle Function is accumulated over a chunk of cycles inside CasADi (compiled when a C compiler is found),
+so Python is entered once per chunk: to fill in disturbances and noise, to check that all signals are finite, to report
+progress.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller
+from fpirhc.describe import describe
+from fpirhc.simulation.loop import close_loop, start_memory
+from fpirhc.simulation.run import Run
+from fpirhc.simulation.run_signals import judgements
+from fpirhc.symbolic.block import Composite
+from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.layout import Layout
+from fpirhc.symbolic.native import native
+from fpirhc.task.problem import Problem
+
+CHUNK = 500  # cycles per call: long enough to hide Python, short enough for progress and Ctrl-C
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Simulator:
+    """A closed loop that was built once and runs many times; seeds and exact parameters are its data.
+
+    Not for threads, and not to be pickled: build one in each process.
+    """
+
+    problem: Problem
+    controller: Controller
+    loop: Composite
+    evaluator: Evaluator
+    compiled: bool
+    why_not_compiled: str
+
+    @property
+    def remembers(self) -> bool:
+        """Whether some solver inside keeps what it found for the next run (OSQP does): a run would depend on those before."""
+        return any(f.class_name() == "OsqpInterface" for f in self.loop.function.find_functions())
+
+    def run(
+        self, *, seed: int, name: str = "", variant: Problem | None = None, progress: Progress | None = None
+    ) -> Run:
+        """Run the loop once and return its signals.
+
+        Parameters: `variant` is the simulator's problem with other exact parameters (None: the problem itself); the rest as
+        in `simulate`.
+        """
+        problem = variant or self.problem
+        start = start_memory(self.loop, problem, self.controller)
+        log, stop = _run_chunks(problem, start, self.loop.trace, self.evaluator, seed, progress)
+        log.setflags(write=False)
+        step_limit = self.controller.adaptive.largest_step()
+        settings = {
+            "step_limit": step_limit if np.isfinite(step_limit) else None,
+            "controller": describe(self.controller),
+            "problem": describe(problem),
+            "backend": "compiled C" if self.compiled else "CasADi virtual machine",
+            "why not compiled": self.why_not_compiled,
+        }
+        title = name or type(self.controller).__name__
+        return Run("", title, seed, problem.period, self.loop.trace, log, stop, self.compiled, settings)
+
+
+def simulator(
+    problem: Problem, controller: Controller, *, compiled: bool = True, flags: Sequence[str] = ()
+) -> Simulator:
+    """Build the closed loop of problem and controller, in C when there is a compiler and `compiled` is set.
+
+    `flags` go to the compiler after its usual ones.
+    """
+    chosen = controller.resolved(problem)
+    loop = close_loop(problem, chosen)
+    chunked = loop.function.mapaccum(f"{loop.function.name()}_run", CHUNK)
+    backend = native(chunked, flags) if compiled else None
+    evaluator = Evaluator(backend.function if backend else chunked)
+    reason = backend.reason if backend else "not asked for"
+    return Simulator(problem, chosen, loop, evaluator, bool(backend and backend.compiled), reason)
+
+
+def simulate(
+    problem: Problem,
+    controller: Controller,
+    *,
+    seed: int,
+    name: str = "",
+    compiled: bool = True,
+    flags: Sequence[str] = (),
+    progress: Progress | None = None,
+) -> Run:
+    """Run the closed loop of problem and controller and return every signal, also those that judge the run.
+
+    Parameters: `seed` of the noise of disturbances and sensors; `name` of the controller in the results; `compiled`: use C
+    when there is a compiler, with `flags` after its usual ones; `progress` is called with (cycles done, cycles in all).
+
+    A signal that becomes NaN or infinite ends the run at that cycle; the finite part is kept and `Run.stop` says why.
+    """
+    ready = simulator(problem, controller, compiled=compiled, flags=flags)
+    run = ready.run(seed=seed, name=name or type(ready.controller).__name__, progress=progress)
+    found = judgements(problem, ready.controller, run.layout, run.log)
+    log = np.hstack([run.log, *(values for _, values in found)])
+    log.setflags(write=False)
+    return replace(run, layout=run.layout + Layout(tuple(signal for signal, _ in found)), log=log)
+
+
+def disturbance_table(problem: Problem, seed: int, cycles: int) -> np.ndarray:
+    """Return the disturbances of every cycle, shape (cycles, number of disturbances); each has its own stream."""
+    times = np.arange(cycles) * problem.period
+    streams = np.random.SeedSequence(seed).spawn(len(problem.disturbances))
+    columns = [
+        d.values(times, np.random.default_rng(stream))
+        for d, stream in zip(problem.disturbances.values(), streams, strict=True)
+    ]
+    return np.column_stack(columns) if columns else np.zeros((cycles, 0))
+
+
+def sensing_table(problem: Problem, seed: int, cycles: int) -> np.ndarray:
+    """Return the sensors' random series of every cycle, shape (cycles, number of series); each has its own stream."""
+    return problem.sensing.table(np.arange(cycles) * problem.period, seed)
+
+
+def _run_chunks(
+    problem: Problem, start: np.ndarray, trace: Layout, evaluator: Evaluator, seed: int, progress: Progress | None
+) -> tuple[np.ndarray, str | None]:
+    cycles = problem.cycles
+    padded = -(-cycles // CHUNK) * CHUNK
+    drawn = disturbance_table(problem, seed, padded), sensing_table(problem, seed, padded)
+    tables = [table for table in drawn if table.shape[1]]
+    log = np.empty((padded, trace.size))
+    evaluator.arguments[0][:] = start
+    for at in range(0, cycles, CHUNK):
+        for argument, table in zip(evaluator.arguments[1:], tables, strict=True):
+            argument.reshape(CHUNK, -1)[:] = table[at : at + CHUNK]
+        evaluator.redirect(1, log[at : at + CHUNK])
+        evaluator.evaluate()
+        rows = log[at : min(at + CHUNK, cycles)]
+        bad = _first_bad(rows)
+        if bad is not None:
+            row, column = bad
+            return log[: at + row].copy(), _why(trace, at + row, column, problem.period)
+        evaluator.arguments[0][:] = evaluator.results[0].reshape(CHUNK, start.size)[-1]
+        if progress:
+            progress(at + rows.shape[0], cycles)
+    return log[:cycles], None
+
+
+def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:
+    """Row and column of the first value that is not finite."""
+    # A sum is finite only if every summand is, and is found much faster; a sum that overflows is looked at closely.
+    with np.errstate(all="ignore"):
+        if np.isfinite(np.sum(rows)):
+            return None
+    finite = np.isfinite(rows)
+    if finite.all():
+        return None
+    row = int(np.argmin(finite.all(axis=1)))
+    return row, int(np.argmin(finite[row]))
+
+
+def _why(trace: Layout, cycle: int, column: int, period: float) -> str:
+    return (
+        f"signal '{trace.columns[column]}' is not finite at t = {cycle * period:g} s (cycle {cycle}); "
+        "the run keeps what came before"
+    )

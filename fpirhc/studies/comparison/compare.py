@@ -1,0 +1,257 @@
+"""Runs several controllers on one problem, pairs them, and says what adaptation bought."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from fpirhc.contraction import ContractionReport, Spectrum, assess_gain, identified_factor, spectrum_over_run
+from fpirhc.controllers.base import Controller, prepared
+from fpirhc.deformation.identity import Identity
+from fpirhc.describe import describe
+from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, nearest
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
+from fpirhc.simulation.metrics import Metrics, measure
+from fpirhc.simulation.run import Run
+from fpirhc.simulation.simulate import simulate
+from fpirhc.studies.comparison.optimality import Optimality, measure_optimality
+from fpirhc.studies.comparison.timing import CycleTime, measure_cycle
+from fpirhc.studies.comparison.verdict import verdict
+from fpirhc.summary import line, number, table
+from fpirhc.task.problem import Problem
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Contraction:
+    """Contraction of one adaptive controller: predicted from the symbols along the run, measured from the run."""
+
+    predicted: float
+    measured: float
+    report: ContractionReport
+    spectrum: Spectrum
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """One controller's share of a comparison; `pair` names the same controller without adaptation, if present."""
+
+    name: str
+    run: Run
+    metrics: Metrics
+    cycle: CycleTime | None
+    adaptive: bool
+    pair: str | None
+    contraction: Contraction | None
+    optimality: Optimality | None = None
+    notes: tuple[str, ...] = ()
+    lyapunov: LyapunovView | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What `compare` found: entries in order, skipped controllers with the reason, the verdict in sentences."""
+
+    problem: str
+    title: str
+    description: str
+    seed: int
+    measure_from: float
+    entries: tuple[Entry, ...]
+    skipped: Mapping[str, str]
+    verdict: tuple[str, ...]
+    command: str
+    versions: Mapping[str, str]
+    settings: Mapping[str, Any]
+    elapsed: float
+
+    def __repr__(self) -> str:
+        counts = f"{len(self.entries)} controllers" + (f", {len(self.skipped)} skipped" if self.skipped else "")
+        return line(self, self.problem, f"seed {self.seed}", counts, self.verdict[0])
+
+    def _repr_html_(self) -> str:
+        """Verdict and errors as a table, for notebooks."""
+        names = list(self.entries[0].metrics.rms_error) if self.entries else []
+        rows = [
+            (
+                e.name,
+                *(number(e.metrics.rms_error[n]) for n in names),
+                number(e.cycle.median) if e.cycle else "",
+                f"{100 * e.metrics.clipped_share:.3g} %",
+                f"ended early: {e.run.stop}" if e.run.stop else e.metrics.worst_status,
+            )
+            for e in self.entries
+        ]
+        head = ("controller", *(f"rms error {n}" for n in names), "cycle [us]", "clipped", "worst status")
+        return table(self.title, head, rows, self.verdict)
+
+    def __getitem__(self, name: str) -> Entry:
+        for entry in self.entries:
+            if entry.name == name:
+                return entry
+        raise InvalidName(
+            f"controller '{name}' is not in this comparison.{nearest(name, [e.name for e in self.entries])}"
+        )
+
+
+def select(task: Task, names: Sequence[str] | None) -> dict[str, Controller]:
+    """Return the named controllers of a task in the given order; all of them when no names are given.
+
+    Raises:
+        InvalidProblem: unknown names, with the nearest valid ones.
+    """
+    if not names:
+        return dict(task.controllers)
+    mistakes = Mistakes(f"problem '{task.name}'")
+    mistakes.unknown("controller", names, task.controllers)
+    mistakes.raise_if_any()
+    return {name: task.controllers[name] for name in names}
+
+
+def compare(
+    task: Task,
+    *,
+    seed: int,
+    controllers: Sequence[str] | None = None,
+    compiled: bool = True,
+    command: str = "",
+    progress: Progress | None = None,
+) -> Comparison:
+    """Run the task's controllers with the same disturbances and return what they achieved.
+
+    A controller that cannot serve the problem is skipped with its reason. Ctrl-C keeps what is finished.
+
+    Raises:
+        InvalidProblem: unknown controllers, or deformations with a gain of the wrong sign.
+    """
+    begin = time.perf_counter()
+    check_gains(task, select(task, controllers))
+    chosen, skipped = select(task, controllers), {}
+    entries: list[Entry] = []
+    for name, controller in chosen.items():
+        try:
+            entries.append(_entry(task, chosen, name, controller, seed, compiled, progress))
+        except FpirhcError as error:
+            skipped[name] = str(error)
+        except KeyboardInterrupt:
+            waiting = list(chosen)[len(entries) + len(skipped) :]
+            skipped |= dict.fromkeys(waiting, "interrupted before it finished")
+            break
+    return Comparison(
+        problem=task.name,
+        title=task.title,
+        description=task.description,
+        seed=seed,
+        measure_from=task.problem.measure_from,
+        entries=tuple(entries),
+        skipped=skipped,
+        verdict=verdict(entries, skipped, task.headline),
+        command=command,
+        versions=versions(),
+        settings=describe(task.problem),
+        elapsed=time.perf_counter() - begin,
+    )
+
+
+def check_gains(task: Task, chosen: Mapping[str, Controller]) -> None:
+    """A gain of the wrong sign is a mistake in the file, not a result: it is refused before anything runs."""
+    mistakes = Mistakes(f"problem '{task.name}'")
+    for name, controller in chosen.items():
+        try:
+            prepared(task.problem, controller)
+        except NotContractive as error:
+            mistakes.add(f"controller '{name}': {error}")
+        except FpirhcError:
+            continue  # said later, as the reason why the controller is skipped
+    mistakes.raise_if_any()
+
+
+def versions() -> dict[str, str]:
+    """Versions of fpirhc and of what its numbers depend on."""
+    import platform
+
+    found = {name: version(name) for name in ("fpirhc", "casadi", "numpy", "scipy")}
+    return {**found, "python": platform.python_version(), "machine": platform.machine()}
+
+
+def _entry(
+    task: Task,
+    chosen: Mapping[str, Controller],
+    name: str,
+    controller: Controller,
+    seed: int,
+    compiled: bool,
+    progress: Progress | None,
+) -> Entry:
+    problem = task.problem
+    resolved = controller.resolved(problem)
+
+    def report(done: int, total: int) -> None:
+        if progress:
+            progress(name, done, total)
+
+    report(0, problem.cycles)
+    run = simulate(problem, resolved, seed=seed, name=name, compiled=compiled, progress=report)
+    run = replace(run, problem=task.name)
+    adaptive = not isinstance(resolved.adaptive, Identity)
+    view = lyapunov_view(problem, resolved, run)
+    return Entry(
+        name=name,
+        run=run,
+        metrics=measure(problem, run),
+        cycle=measure_cycle(problem, resolved, run, compiled=compiled),
+        adaptive=adaptive,
+        pair=_pair(chosen, name) if adaptive else None,
+        contraction=measure_contraction(problem, resolved, run) if adaptive else None,
+        optimality=measure_optimality(problem, resolved, run, compiled=compiled),
+        notes=(*_notes(controller, resolved), *resolved.notes(problem), *([view.text] if view else [])),
+        lyapunov=view,
+    )
+
+
+def _pair(chosen: Mapping[str, Controller], name: str) -> str | None:
+    """The controller with the same settings and no adaptation."""
+    wanted = _without_adaptation(describe(chosen[name]))
+    for other, controller in chosen.items():
+        if isinstance(controller.adaptive, Identity) and describe(controller) == wanted:
+            return other
+    return None
+
+
+def _without_adaptation(settings: Any) -> Any:
+    if isinstance(settings, list):
+        return [_without_adaptation(v) for v in settings]
+    if not isinstance(settings, dict):
+        return settings
+    identity = describe(Identity())
+    return {k: identity if k == "deformation" else _without_adaptation(v) for k, v in settings.items()}
+
+
+def measure_contraction(problem: Problem, controller: Controller, run: Run) -> Contraction | None:
+    """Predicted along the run and measured from it; None when the run is too short, or the response not the plant's own."""
+    if run.cycles < 10 or controller.response(problem) is not None:
+        return None
+    deformation = controller.adaptive
+    rows = np.unique(np.linspace(1, run.cycles - 1, 200).astype(int))
+    spectrum = spectrum_over_run(
+        problem.plant, run["state"][rows], run["deformed"][rows], approximate=controller.parameters(problem.plant)
+    )
+    report = assess_gain(deformation, spectrum)
+    # What the plant did, where the controller was given something later or noisier.
+    realised = run["plant_realised" if "plant_realised" in run.layout else "realised"]
+    measured = identified_factor(run["deformed"], realised, deformation.effective_gain())
+    return Contraction(report.predicted, measured, report, spectrum)
+
+
+def _notes(asked: Controller, resolved: Controller) -> tuple[str, ...]:
+    if describe(asked) == describe(resolved):
+        return ()
+    scale = getattr(resolved.adaptive, "scale", None)
+    return (f"scale S = {scale:g} was chosen automatically",)

@@ -1,0 +1,103 @@
+"""How good the plans of a run were: their cost against the converged optimum of the same horizon."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller, prepared
+from fpirhc.controllers.receding_horizon import RecedingHorizon
+from fpirhc.controllers.replanning import FromPlan
+from fpirhc.controllers.wrappers.exact_model import ExactModel
+from fpirhc.controllers.wrappers.predicted import Predicted
+from fpirhc.errors import FpirhcError
+from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
+from fpirhc.optimisers.fixed_point import FixedPoint
+from fpirhc.simulation.run import Run
+from fpirhc.status import Status
+from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.native import native
+from fpirhc.task.problem import Problem, cycles_per_stage
+
+SAMPLES = 25  # plans of a run that are solved again
+_ACCURATE = 1e-8  # of the input's range
+
+
+@dataclass(frozen=True)
+class Optimality:
+    """Relative excess (V - V*) / |V*| of sampled plans over the converged optimum: median and worst; how many were compared."""
+
+    median: float
+    worst: float
+    plans: int
+
+
+def planner(controller: Controller) -> RecedingHorizon | None:
+    """The receding-horizon controller inside, if there is one."""
+    inner = controller.controller if isinstance(controller, ExactModel) else controller
+    return inner if isinstance(inner, RecedingHorizon) else None
+
+
+def measure_optimality(
+    problem: Problem, controller: Controller, run: Run, *, compiled: bool = True
+) -> Optimality | None:
+    """Return the excess cost of sampled plans; None where plans do not start from the measured state, or none was solved.
+
+    A negative number is another local optimum that the controller found and the solve from rest did not.
+    """
+    chosen = planner(prepared(problem, controller))
+    if chosen is None or isinstance(chosen.replanning, FromPlan) or problem.horizon is None or run.cycles < 2:
+        return None
+    cost = chosen.cost or problem.cost
+    assert cost is not None
+    ocp = transcribe(problem.plant, problem.reference, problem.horizon, cost, problem.limits)
+    try:
+        solve = _Solver(ocp, compiled)
+    except FpirhcError:
+        return None
+    data_of = stage_data(problem.plant, problem.reference, problem.horizon, cost)
+    stride = cycles_per_stage(problem.horizon, problem.period)
+    planned = np.arange(stride, run.cycles, stride)
+    rows = planned[np.unique(np.linspace(0, planned.size - 1, SAMPLES).astype(int))] if planned.size else planned
+    parameters, excess = controller.parameters(problem.plant), []
+    for row in rows:
+        correction = run["command_shift"][row - 1]
+        first = ocp.start(run["state"][row], run["command"][row - 1]).full().ravel()
+        data = np.asarray(data_of(run.time[row], parameters).full())
+        best = solve(first, data, ocp.input_lower - correction, ocp.input_upper - correction)
+        told = run["solve.cost"][row]
+        if best is not None and run["status"][row] <= Status.NOT_CONVERGED:
+            excess.append((told - best) / max(abs(best), 1e-12))
+    return Optimality(float(np.median(excess)), float(np.max(excess)), len(excess)) if excess else None
+
+
+class _Solver:
+    """Solves one horizon after another from rest to high accuracy."""
+
+    def __init__(self, ocp: OptimalControl, compiled: bool) -> None:
+        reach = ocp.input_upper - ocp.input_lower
+        scale = float(np.where(np.isfinite(reach), reach, 1.0).max())
+        optimiser = FixedPoint(iterations=1, tolerance=_ACCURATE * scale)
+        optimiser.check(ocp)
+        function = optimiser.converging(ocp)
+        self._evaluator = Evaluator(native(function).function if compiled else function)
+        self._start = optimiser.memory(ocp).start()
+
+    def __call__(self, first: np.ndarray, data: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> float | None:
+        memory = self._start
+        for _ in range(20):
+            _, told, memory = self._evaluator(first, data.T, lower, upper, memory)
+            if told[4] == Status.OK:
+                return float(told[0])
+        return None
+
+
+def with_optimiser(controller: Controller, optimiser: object) -> Controller | None:
+    """The same controller with another optimiser; None when it has none."""
+    if isinstance(controller, ExactModel | Predicted):
+        inner = with_optimiser(controller.controller, optimiser)
+        return None if inner is None else replace(controller, controller=inner)
+    if isinstance(controller, RecedingHorizon):
+        return replace(controller, optimiser=optimiser)  # type: ignore[arg-type]
+    return None

@@ -1,0 +1,1 @@
+"""Many drawn plants, paired between controllers."""

@@ -1,0 +1,126 @@
+"""Runs single scenarios of a problem; what is costly is built once and used for all of them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from typing import Any
+
+from fpirhc.describe import describe
+from fpirhc.errors import FpirhcError
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.simulation.metrics import measure
+from fpirhc.simulation.simulate import Simulator, simulator
+from fpirhc.studies.scenarios.draws import Scenario, check_percent, draw, with_exact
+from fpirhc.studies.scenarios.score import outcome, ranges, relative_error
+from fpirhc.task.problem import Problem
+
+FORMAT = 1  # of records
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What, apart from the task, decides every number of a scenario.
+
+    Parameters: `seed` and `use` of the scenarios, `percent` of the exact parameters' draws, `compiled`: whether C is used.
+    """
+
+    seed: int
+    use: int
+    percent: float
+    compiled: bool
+
+
+def fingerprint(task: Task, conditions: Conditions) -> dict[str, Any]:
+    """Return the facts on which results depend; results with other facts are never put beside these."""
+    settings = json.dumps([describe(task.problem), describe(task.controllers)])
+    return {
+        "format": FORMAT,
+        "problem": task.name,
+        "problem file": _hash(task.path.read_bytes()),
+        "settings": _hash(settings.encode()),
+        **asdict(conditions),
+        **{name: version(name) for name in ("fpirhc", "casadi", "numpy")},
+        "machine": platform.machine(),
+    }
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+class Bench:
+    """Runs scenarios by number and controller.
+
+    Raises:
+        InvalidProblem, InvalidValue: draws that could leave the parameters' physical bounds.
+    """
+
+    def __init__(self, task: Task, conditions: Conditions) -> None:
+        check_percent(task.problem.plant, conditions.percent)
+        self._task, self._conditions = task, conditions
+        self._ranges = ranges(task.problem)
+        self._simulators: dict[str, Simulator | FpirhcError] = {}
+        self._drawn: tuple[int, Scenario, Problem] | None = None
+
+    def record(self, number: int, name: str) -> dict[str, Any]:
+        """Return what became of one controller in one scenario, as plain data; infinity becomes None.
+
+        A controller that cannot serve the problem gives {"controller": its name, "skipped": the reason}.
+        """
+        try:
+            ready = self._simulator(name)
+        except FpirhcError as error:
+            return {"controller": name, "skipped": str(error)}
+        scenario, variant = self._scenario(number)
+        run = ready.run(seed=scenario.seed, name=name, variant=variant)
+        metrics = measure(variant, run)
+        size = relative_error(metrics, self._ranges)
+        return {
+            "scenario": number,
+            "controller": name,
+            "mismatch": scenario.mismatch,
+            "outcome": outcome(run, size),
+            "error": _finite(size),
+            "rms_error": _finite(metrics.rms_error),
+            "max_error": _finite(metrics.max_error),
+            "effort": _finite(metrics.effort),
+            "clipped_share": _finite(metrics.clipped_share),
+            "lasted": run.cycles / variant.cycles,
+            "statuses": metrics.statuses,
+            "stop": run.stop,
+        }
+
+    def _scenario(self, number: int) -> tuple[Scenario, Problem]:
+        """The scenario and its problem; the last one is kept, because controllers take turns on it."""
+        if self._drawn is None or self._drawn[0] != number:
+            conditions, problem = self._conditions, self._task.problem
+            scenario = draw(
+                problem.plant, seed=conditions.seed, use=conditions.use, number=number, percent=conditions.percent
+            )
+            self._drawn = (number, scenario, with_exact(problem, scenario.exact))
+        return self._drawn[1:]
+
+    def _simulator(self, name: str) -> Simulator:
+        ready = self._simulators.get(name)
+        if ready is None or (isinstance(ready, Simulator) and ready.remembers):
+            ready = self._simulators[name] = self._built(name)
+        if isinstance(ready, FpirhcError):
+            raise ready
+        return ready
+
+    def _built(self, name: str) -> Simulator | FpirhcError:
+        try:
+            return simulator(self._task.problem, self._task.controllers[name], compiled=self._conditions.compiled)
+        except FpirhcError as error:
+            return error
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {k: _finite(v) for k, v in value.items()}
+    return value if abs(value) < float("inf") else None

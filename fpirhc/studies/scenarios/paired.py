@@ -1,0 +1,138 @@
+"""What many paired scenarios say about each controller: medians, paired differences, worst cases, failures."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fpirhc.studies.scenarios.bootstrap import ConfidenceInterval, median_interval, middle
+
+Record = Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """One controller over all scenarios; errors are relative (see `score`), infinite for runs that ended early.
+
+    Parameters:
+        errors, mismatch: by scenario, shape (n,). median, worst: of the errors; worst_scenario: its number.
+        rms_error: median rms error by coordinate.
+        outcomes: scenarios by outcome. statuses: cycles by status, over all scenarios.
+        difference: this error minus the baseline's in the same scenario; None for the baseline itself.
+        ratio: median of this error over the baseline's. better: scenarios in which this error is the smaller one.
+    """
+
+    name: str
+    errors: np.ndarray
+    mismatch: np.ndarray
+    median: float
+    worst: float
+    worst_scenario: int
+    rms_error: Mapping[str, float]
+    outcomes: Mapping[str, int]
+    statuses: Mapping[str, int]
+    difference: ConfidenceInterval | None
+    ratio: float
+    better: int
+
+    @property
+    def failures(self) -> int:
+        """Scenarios that ended early or diverged."""
+        return sum(n for outcome, n in self.outcomes.items() if outcome != "finished")
+
+
+def summarise(name: str, records: Sequence[Record], baseline: Sequence[Record] | None, seed: int) -> Summary:
+    """Return the summary of one controller's records against the baseline's of the same scenarios, in the same order."""
+    errors = errors_of(records)
+    before = errors if baseline is None else errors_of(baseline)
+    worst = int(np.argmax(errors))
+    return Summary(
+        name=name,
+        errors=errors,
+        mismatch=np.array([r["mismatch"] for r in records]),
+        median=float(middle(errors)),
+        worst=float(errors[worst]),
+        worst_scenario=int(records[worst]["scenario"]),
+        rms_error={c: float(middle(_numbers([r["rms_error"][c] for r in records]))) for c in records[0]["rms_error"]},
+        outcomes=dict(Counter(str(r["outcome"]) for r in records)),
+        statuses=dict(sum((Counter(r["statuses"]) for r in records), Counter())),
+        difference=None if baseline is None else median_interval(_differences(errors, before), seed),
+        ratio=float(middle(_ratios(errors, before))),
+        better=int(np.sum(errors < before)),
+    )
+
+
+def errors_of(records: Sequence[Record]) -> np.ndarray:
+    """Relative errors, infinite where a run ended early."""
+    return _numbers([r["error"] for r in records])
+
+
+def _numbers(values: Sequence[float | None]) -> np.ndarray:
+    return np.array([np.inf if v is None else v for v in values], dtype=float)
+
+
+def _differences(after: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Where both failed there is no difference."""
+    with np.errstate(invalid="ignore"):
+        found = after - before
+    return np.where(np.isnan(found), 0.0, found)
+
+
+def _ratios(after: np.ndarray, before: np.ndarray) -> np.ndarray:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        found = after / before
+    return np.where(np.isnan(found), 1.0, found)
+
+
+def verdict(summaries: Sequence[Summary], skipped: Mapping[str, str]) -> tuple[str, ...]:
+    """Return sentences: every controller against the baseline, failures, and what was not run."""
+    sentences = [_sentence(summaries[0], s) for s in summaries[1:]]
+    if len(summaries) == 1:
+        only = summaries[0]
+        sentences.append(
+            f"{only.name} has a median error of {percent(only.median)}; there is nothing to compare it with."
+        )
+    elif not summaries:
+        sentences.append("No controller could serve the problem, so nothing can be compared.")
+    sentences += [_failed(s) for s in summaries if s.failures]
+    if skipped:
+        sentences.append("Not run: " + "; ".join(f"{name} ({why})" for name, why in skipped.items()) + ".")
+    return tuple(sentences)
+
+
+def _sentence(baseline: Summary, one: Summary) -> str:
+    found = one.difference
+    assert found is not None
+    count = one.errors.size
+    numbers = (
+        f"median difference {signed(found.median)} of the reference's range, "
+        f"95 % interval {signed(found.low)} to {signed(found.high)}; smaller in {one.better} of {count} scenarios"
+    )
+    if found.high < 0:
+        return f"{one.name} has a smaller error than {baseline.name} ({numbers}; {one.ratio:.3g} times its error)."
+    if found.low > 0:
+        return f"{one.name} has a larger error than {baseline.name} ({numbers}; {one.ratio:.3g} times its error)."
+    return f"{one.name} and {baseline.name} show no clear difference ({numbers})."
+
+
+def _failed(one: Summary) -> str:
+    parts = [f"{n} {outcome}" for outcome, n in one.outcomes.items() if outcome != "finished"]
+    return f"{one.name} fails in {one.failures} of {one.errors.size} scenarios ({', '.join(parts)})."
+
+
+def percent(share: float) -> str:
+    """A share as text."""
+    return f"{100 * share:.3g} %" if np.isfinite(share) else "none (failed)"
+
+
+def signed(share: float) -> str:
+    """A difference of shares as text."""
+    return (
+        f"{100 * share:+.3g} %"
+        if np.isfinite(share)
+        else ("worse by a failure" if share > 0 else "better by a failure")
+    )

@@ -1,0 +1,167 @@
+"""Many controllers in many scenarios, each scenario the same for all of them; finished results are never lost or repeated."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from fpirhc.describe import describe
+from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.problem_files.settings import Values
+from fpirhc.studies.comparison.compare import check_gains, select, versions
+from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint
+from fpirhc.studies.scenarios.draws import COMPARING
+from fpirhc.studies.scenarios.ledger import Ledger
+from fpirhc.studies.scenarios.paired import Record, Summary, summarise, verdict
+from fpirhc.studies.scenarios.processes import Workers
+from fpirhc.studies.tuning.tuned_file import with_tuned
+
+LEDGER = "scenarios.jsonl"
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioComparison:
+    """What `compare_scenarios` found: summaries in the controllers' order, the baseline first; records by controller."""
+
+    problem: str
+    title: str
+    description: str
+    count: int
+    percent: float
+    seed: int
+    measure_from: float
+    units: Mapping[str, str]
+    summaries: tuple[Summary, ...]
+    records: Mapping[str, Sequence[Record]]
+    skipped: Mapping[str, str]
+    verdict: tuple[str, ...]
+    tuning: Mapping[str, str]
+    settings: Mapping[str, Any]
+    versions: Mapping[str, str]
+    command: str
+    elapsed: float
+
+    def __getitem__(self, name: str) -> Summary:
+        for summary in self.summaries:
+            if summary.name == name:
+                return summary
+        raise InvalidName(f"controller '{name}' is not here.{nearest(name, [s.name for s in self.summaries])}")
+
+
+def compare_scenarios(
+    task: Task,
+    *,
+    count: int,
+    percent: float,
+    seed: int,
+    folder: Path,
+    controllers: Sequence[str] | None = None,
+    baseline: str | None = None,
+    processes: int = 1,
+    tuned: Mapping[str, Values] | None = None,
+    tuning: Mapping[str, str] | None = None,
+    compiled: bool = True,
+    command: str = "",
+    progress: Progress | None = None,
+) -> ScenarioComparison:
+    """Run every controller in `count` scenarios and return paired statistics; what `folder` already holds is not run again.
+
+    Parameters:
+        count: of scenarios. percent: by how much exact parameters are drawn around the problem's. seed: of all draws.
+        folder: where finished scenarios are written, one by one.
+        baseline: the controller that the others are compared with (None: the first).
+        processes: 1 stays in this process; more need a task that is as its file says.
+        tuned: settings to change, by controller and path; tuning: sentences about where they come from.
+
+    Raises:
+        InvalidProblem: unknown controllers or settings, gains of the wrong sign, draws that could leave physical bounds.
+        OutputError: the folder cannot be written, or holds results of something else.
+        WorkerDied: processes die again and again.
+    """
+    begin = time.perf_counter()
+    for name, value in (("seeds", count), ("processes", processes)):
+        if value < 1:
+            raise InvalidValue(f"{name} {value}: expected at least 1")
+    if percent == 0 and not task.problem.disturbances:
+        raise InvalidValue(
+            "every scenario would be the same: the problem has no disturbances and no parameter is drawn; give --mismatch P"
+        )
+    task = with_tuned(task, tuned or {})
+    names = list(select(task, [*([baseline] if baseline else []), *(controllers or task.controllers)]))
+    check_gains(task, select(task, names))
+    conditions = Conditions(seed, COMPARING, float(percent), compiled)
+    bench, header = Bench(task, conditions), fingerprint(task, conditions)
+    opening = {"path": str(task.path.resolve()), "tuned": tuned or {}, "conditions": asdict(conditions)}
+    workers = Workers(__package__ + ".worker", opening, header, processes)
+    with Ledger(folder / LEDGER, header) as ledger:
+        records, skipped = _completed(ledger, bench, workers if processes > 1 else None, count, names, progress)
+    summaries = _summaries(records, seed)
+    return ScenarioComparison(
+        problem=task.name,
+        title=task.title,
+        description=task.description,
+        count=count,
+        percent=float(percent),
+        seed=seed,
+        measure_from=task.problem.measure_from,
+        units={c: task.problem.plant.coordinates[c] for c in task.problem.judged_names},
+        summaries=summaries,
+        records=records,
+        skipped=skipped,
+        verdict=verdict(summaries, skipped),
+        tuning={n: note for n, note in (tuning or {}).items() if n in names},
+        settings={"problem": describe(task.problem), **{n: describe(task.controllers[n]) for n in names}},
+        versions=versions(),
+        command=command,
+        elapsed=time.perf_counter() - begin,
+    )
+
+
+def _completed(
+    ledger: Ledger, bench: Bench, workers: Workers | None, count: int, names: Sequence[str], progress: Progress | None
+) -> tuple[dict[str, Sequence[Record]], dict[str, str]]:
+    """Run what the ledger does not hold; return records by controller in the scenarios' order, and who was skipped and why."""
+    found = {(r["scenario"], r["controller"]): r for r in ledger.records}
+    jobs = [(k, name) for k in range(count) for name in names if (k, name) not in found]
+    done = {name: sum((k, name) in found for k in range(count)) for name in names}
+    skipped: dict[str, str] = {}
+    # Closed whatever happens: the workers end with it.
+    with closing(_answers(bench, workers, jobs)) as answers:
+        for record in answers:
+            name = record["controller"]
+            if "skipped" in record:
+                skipped[name] = record["skipped"]
+            else:
+                ledger.append(record)
+                found[record["scenario"], name] = record
+            done[name] += 1
+            if progress:
+                progress(name, done[name], count)
+    return {n: [found[k, n] for k in range(count)] for n in names if n not in skipped}, skipped
+
+
+def _answers(bench: Bench, workers: Workers | None, jobs: Sequence[tuple[int, str]]) -> Generator[dict[str, Any]]:
+    """Records of the jobs as they come; without workers they are made here."""
+    if workers is None:
+        for number, name in jobs:
+            yield bench.record(number, name)
+        return
+    with workers:
+        for record in workers.answers(jobs, lambda job: bench.record(*job)):
+            if "error" in record and "scenario" not in record:
+                raise FpirhcError(record["error"])
+            yield record
+
+
+def _summaries(records: Mapping[str, Sequence[Record]], seed: int) -> tuple[Summary, ...]:
+    if not records:
+        return ()
+    first, *others = records
+    against = [(first, None), *((name, records[first]) for name in others)]
+    return tuple(summarise(name, records[name], before, seed) for name, before in against)

@@ -1,0 +1,58 @@
+"""A process that runs scenarios for another one: `python -m fpirhc.studies.scenarios.worker`, see `processes`.
+
+It is given the problem file and the conditions first and answers with the fingerprint; then jobs [scenario, controller],
+each answered by a record.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from typing import Any, TextIO
+
+from fpirhc.errors import FpirhcError
+from fpirhc.problem_files.problem_file import load_problem
+from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint
+from fpirhc.studies.tuning.tuned_file import with_tuned
+
+
+def main() -> None:
+    """Answer until the input ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the first one ends the others
+    answers = _private_output()
+    opening = json.loads(sys.stdin.readline())
+    try:
+        task = with_tuned(load_problem(opening["path"]), opening["tuned"])
+        conditions = Conditions(**opening["conditions"])
+        bench = Bench(task, conditions)
+        _answer(answers, fingerprint(task, conditions))
+    except FpirhcError as error:
+        _answer(answers, {"error": str(error)})
+        return
+    for line in sys.stdin:
+        number, name = json.loads(line)
+        try:
+            _answer(answers, bench.record(number, name))
+        except FpirhcError as error:
+            _answer(answers, {"error": f"scenario {number}, controller '{name}': {error}"})
+
+
+def _private_output() -> TextIO:
+    """The output, kept from everything else that prints: a problem file's words go to standard error."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    return answers
+
+
+def _answer(answers: TextIO, value: Any) -> None:
+    answers.write(json.dumps(value) + "\n")
+    answers.flush()
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except BrokenPipeError:  # the parent is gone, and with it every use of an answer
+        os._exit(1)

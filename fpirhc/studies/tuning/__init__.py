@@ -1,0 +1,1 @@
+"""Settings found by search, with the same budget for every controller."""

@@ -1,0 +1,220 @@
+"""Looks for better settings: every controller gets the same number of trials, the same scenarios and the same cost.
+
+The cost of a trial is the relative rms error (see `score`), the mean over the scenarios; what fails costs a finite penalty.
+The scenarios are of a use of their own: settings are never tuned on what they are compared on. Settings are proposed by
+Optuna's tree-structured Parzen estimator. Its random numbers are drawn afresh for every trial from (seed, number of the trial),
+so that a study that was killed and goes on finds what an undisturbed one finds.
+
+References:
+    J. Bergstra, R. Bardenet, Y. Bengio, B. Kégl, Algorithms for Hyper-Parameter Optimization, NIPS 2011.
+    T. Akiba, S. Sano, T. Yanase, T. Ohta, M. Koyama, Optuna: A Next-generation Hyperparameter Optimization Framework, KDD 2019.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.problem_files.settings import current_setting, is_whole, with_settings
+from fpirhc.problem_files.tuning_spans import TuningSpans
+from fpirhc.studies.comparison.compare import select
+from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint
+from fpirhc.studies.scenarios.draws import TUNING
+from fpirhc.studies.scenarios.ledger import Ledger
+from fpirhc.studies.tuning.tuned_file import as_python
+
+LEDGER = "trials.jsonl"
+PENALTY = 10.0  # relative error that no run can exceed; one that ended early costs up to twice as much, less if it lasted long
+_PRESENT = -1  # number of the trial of the settings as they are, which no budget counts
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class TunedController:
+    """One controller's settings by path, before and after, with their costs; failed: trials with a failure in some scenario."""
+
+    name: str
+    before: Mapping[str, float]
+    settings: Mapping[str, float]
+    cost_before: float
+    cost: float
+    failed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Tuning:
+    """What `tune` found; untouched: controllers without a search space."""
+
+    problem: str
+    trials: int
+    seed: int
+    conditions: str
+    entries: tuple[TunedController, ...]
+    untouched: tuple[str, ...]
+
+    def python(self) -> str:
+        """Lines that give a problem file's controllers what was found."""
+        notes = {e.name: f"cost {e.cost_before:.4g} before, {e.cost:.4g} after" for e in self.entries}
+        return as_python({e.name: e.settings for e in self.entries}, notes)
+
+    def facts(self) -> dict[str, Any]:
+        """Plain data for a file."""
+        controllers = {
+            e.name: {
+                "settings": dict(e.settings),
+                "before": dict(e.before),
+                "cost": e.cost,
+                "cost_before": e.cost_before,
+                "failed_trials": e.failed,
+            }
+            for e in self.entries
+        }
+        return {
+            "problem": self.problem,
+            "trials": self.trials,
+            "seed": self.seed,
+            "conditions": self.conditions,
+            "controllers": controllers,
+            "untouched": list(self.untouched),
+        }
+
+
+def tune(
+    task: Task,
+    *,
+    trials: int,
+    seed: int,
+    folder: Path,
+    controllers: Sequence[str] | None = None,
+    count: int = 1,
+    percent: float = 0.0,
+    compiled: bool = False,
+    progress: Progress | None = None,
+) -> Tuning:
+    """Try `trials` settings of every controller with a search space and return the best; what `folder` holds is not repeated.
+
+    Parameters:
+        trials: of every controller, in all. seed: of the proposals and of the scenarios.
+        folder: where finished trials are written, one by one. controllers: names (None: all that the task's tuning has).
+        count, percent: number of scenarios in a trial, and how far exact parameters are drawn.
+        compiled: other settings are other C code; compiling pays where the runs of a trial last longer than the compiler.
+
+    Raises:
+        InvalidProblem: no search space, or draws that could leave physical bounds. NotSupported: Optuna is not installed.
+        OutputError: the folder cannot be written, or holds results of something else.
+    """
+    optuna = _optuna()
+    names = _chosen(task, controllers)
+    for name, value in (("trials", trials), ("seeds", count)):
+        if value < 1:
+            raise InvalidValue(f"{name} {value}: expected at least 1")
+    conditions = Conditions(seed, TUNING, float(percent), compiled)
+    header = {**fingerprint(task, conditions), "scenarios": count, "optuna": optuna.__version__}
+    with Ledger(folder / LEDGER, header) as ledger:
+        entries = tuple(_tuned(optuna, task, n, conditions, count, trials, ledger, progress) for n in names)
+    said = f"{count} scenario{'s' if count > 1 else ''} within {percent:g} %"
+    untouched = tuple(n for n in task.controllers if n not in names)
+    return Tuning(task.name, trials, seed, said, entries, untouched)
+
+
+def _optuna() -> ModuleType:
+    try:
+        import optuna
+    except ImportError:
+        raise NotSupported("tuning needs Optuna, which is not installed: pip install 'fpirhc[tune]'") from None
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    return optuna
+
+
+def _chosen(task: Task, names: Sequence[str] | None) -> list[str]:
+    if not task.tuning:
+        first = next(iter(task.controllers))
+        raise InvalidProblem(
+            f"problem '{task.name}' says nothing of what may be tuned; add to its file, for example, "
+            f"tuning = {{{first!r}: {{'deformation.gain': fpirhc.LogSpan(-1.5, -0.05)}}}}"
+        )
+    chosen = list(select(task, names)) if names else list(task.tuning)
+    without = [n for n in chosen if not task.tuning.get(n)]
+    if without:
+        raise InvalidProblem(f"problem '{task.name}': its tuning has no search space for controller '{without[0]}'")
+    return chosen
+
+
+def _tuned(
+    optuna: ModuleType,
+    task: Task,
+    name: str,
+    conditions: Conditions,
+    count: int,
+    trials: int,
+    ledger: Ledger,
+    progress: Progress | None,
+) -> TunedController:
+    spans = task.tuning[name]
+    known = {r["trial"]: r for r in ledger.records if r["controller"] == name}
+    before = {path: current_setting(task.controllers[name], path) for path in spans}
+    study = optuna.create_study()
+    ranges = dict.fromkeys(spans, optuna.distributions.FloatDistribution(0.0, 1.0))
+    for number in range(_PRESENT, trials):
+        record = known.get(number)
+        if record is None:
+            shares = {} if number == _PRESENT else _proposal(optuna, study, ranges, conditions.seed, number)
+            settings = before if number == _PRESENT else _numbers(task, name, spans, shares)
+            record = {"controller": name, "trial": number, "shares": shares, "settings": settings}
+            record |= _judged(task, name, settings, conditions, count)
+            ledger.append(record)
+            known[number] = record
+        if number != _PRESENT:
+            told = optuna.trial.create_trial(params=record["shares"], distributions=ranges, value=record["cost"])
+            study.add_trial(told)
+        if progress:
+            progress(name, number + 1, trials)
+    tried = [known[n] for n in range(_PRESENT, trials)]
+    best = min(tried, key=lambda r: (r["cost"], r["trial"]))
+    failed = sum(bool(r["failures"]) for r in tried[1:])
+    return TunedController(name, before, best["settings"], tried[0]["cost"], best["cost"], failed)
+
+
+def _proposal(optuna: ModuleType, study: Any, ranges: Mapping[str, Any], seed: int, number: int) -> dict[str, float]:
+    """Shares of the spans that trial `number` is to try, given all trials before it."""
+    state = int(np.random.SeedSequence(seed, spawn_key=(TUNING, number)).generate_state(1)[0])
+    # A copy is asked, because a question that is not answered stays in the study as a trial that runs.
+    asked = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=state))
+    asked.add_trials(study.get_trials(deepcopy=False))
+    return dict(asked.ask(ranges).params)
+
+
+def _numbers(task: Task, name: str, spans: TuningSpans, shares: Mapping[str, float]) -> dict[str, float]:
+    found = {path: span.number(shares[path]) for path, span in spans.items()}
+    return {p: round(v) if is_whole(task.controllers[name], p) else v for p, v in found.items()}
+
+
+def _judged(
+    task: Task, name: str, settings: Mapping[str, float], conditions: Conditions, count: int
+) -> dict[str, float]:
+    """Cost of these settings, and in how many scenarios they fail; settings that are refused fail in all."""
+    try:
+        changed = with_settings(task.controllers[name], settings)
+        bench = Bench(replace(task, controllers={name: changed}), conditions)
+        records = [bench.record(k, name) for k in range(count)]
+    except (InvalidValue, InvalidProblem):
+        return {"cost": 2 * PENALTY, "failures": count}
+    costs = [_cost(record) for record in records]
+    return {"cost": math.fsum(costs) / count, "failures": sum(r.get("outcome") != "finished" for r in records)}
+
+
+def _cost(record: Mapping[str, Any]) -> float:
+    """Relative error, at most `PENALTY`; between one and two penalties for a run that ended early, and two for none."""
+    if "skipped" in record:
+        return 2 * PENALTY
+    if record["error"] is None:
+        return float(PENALTY * (2 - record["lasted"]))
+    return float(min(record["error"], PENALTY))

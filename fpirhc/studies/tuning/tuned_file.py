@@ -1,0 +1,100 @@
+"""The file in which `fpirhc tune` leaves what it found, and what a comparison says of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from fpirhc.errors import InvalidName, InvalidValue, Mistakes, OutputError, ProblemFileError
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.problem_files.settings import Values, with_settings
+from fpirhc.studies.comparison.compare import Comparison
+
+FORMAT = 1
+
+
+@dataclass(frozen=True, eq=False)
+class TunedSettings:
+    """TunedSettings settings by controller and path, and a sentence for every controller of the task."""
+
+    values: Mapping[str, Values]
+    notes: Mapping[str, str]
+
+
+def read_tuned(path: str | Path, task: Task) -> TunedSettings:
+    """Read the file that `fpirhc tune` wrote for this problem.
+
+    Raises:
+        OutputError: it cannot be read. ProblemFileError: it is of another problem, or no such file.
+    """
+    try:
+        facts = json.loads(Path(path).read_text(encoding="utf-8"))
+        if facts["format"] != FORMAT:
+            raise ProblemFileError(f"'{path}' has format {facts['format']}, this version reads {FORMAT}")
+        if facts["problem"] != task.name:
+            raise ProblemFileError(f"'{path}' is of problem '{facts['problem']}', not of '{task.name}'")
+        values = {name: dict(entry["settings"]) for name, entry in facts["controllers"].items()}
+        how = f"{facts['trials']} trials, seed {facts['seed']}, {facts['conditions']}"
+        notes = {
+            name: f"tuned ({how}): {', '.join(f'{p} = {v:g}' for p, v in entry['settings'].items())}; "
+            f"cost {entry['cost_before']:.4g} before, {entry['cost']:.4g} after"
+            for name, entry in facts["controllers"].items()
+        }
+    except OSError as error:
+        raise OutputError(f"cannot read '{path}': {error.strerror}") from None
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise ProblemFileError(f"'{path}' is not a file that 'fpirhc tune' wrote") from None
+    rest = {name: "not tuned: settings of the problem file" for name in task.controllers if name not in notes}
+    return TunedSettings(values, {**notes, **rest})
+
+
+def noted(comparison: Comparison, notes: Mapping[str, str]) -> Comparison:
+    """Return the comparison with a note on every controller that `notes` names."""
+    told = {e.name: (*e.notes, notes[e.name]) if e.name in notes else e.notes for e in comparison.entries}
+    return replace(comparison, entries=tuple(replace(e, notes=told[e.name]) for e in comparison.entries))
+
+
+def with_tuned(task: Task, tuned: Mapping[str, Values]) -> Task:
+    """Return the task with these settings of these controllers changed.
+
+    Raises:
+        InvalidProblem: unknown controllers or settings.
+    """
+    mistakes = Mistakes(f"tuned settings of problem '{task.name}'")
+    mistakes.unknown("controller", tuned, task.controllers)
+    changed = dict(task.controllers)
+    for name, values in tuned.items():
+        if name in changed:
+            try:
+                changed[name] = with_settings(changed[name], values)
+            except (InvalidName, InvalidValue) as error:
+                mistakes.add(f"controller '{name}': {error}")
+    mistakes.raise_if_any()
+    return replace(task, controllers=changed)
+
+
+def as_python(tuned: Mapping[str, Values], notes: Mapping[str, str]) -> str:
+    """Return the lines that give a problem file's controllers these settings; `notes` stand behind them."""
+    lines = []
+    for name, values in tuned.items():
+        inside = ", ".join(f"{path!r}: {value!r}" for path, value in values.items())
+        note = f"  # {notes[name]}" if name in notes else ""
+        lines.append(f"controllers[{name!r}] = fp.with_settings(controllers[{name!r}], {{{inside}}}){note}")
+    return "\n".join(lines)
+
+
+def write_tuned(facts: Mapping[str, Any], path: Path) -> None:
+    """Write what was found, atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    part = path.with_suffix(".part")
+    try:
+        part.write_text(json.dumps({"format": FORMAT, **facts}, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise OutputError(f"cannot write '{path}': {error.strerror}") from None

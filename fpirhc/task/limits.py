@@ -1,0 +1,97 @@
+"""Limits of inputs, states, rates and paths by name; whatever is not named is free."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from fpirhc.errors import Mistakes
+from fpirhc.plant.plant import Plant
+
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class PathConstraint:
+    """A limit on any expression of a stage.
+
+    Parameters:
+        expression: function of a View (view.state.q1, view.input.Q1, view.parameters.m1, ...) that returns one scalar.
+        lower, upper: the interval; infinite where free. unit: of the expression.
+    """
+
+    expression: Callable[[Any], Any]
+    lower: float = -math.inf
+    upper: float = math.inf
+    unit: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """Intervals (lower, upper): of inputs by name, and of states by name (q1, q1', ...); limits of rates and of paths.
+
+    Input limits are kept by the plant's actuator (clipping). All others bind an optimiser's plan.
+
+    Parameters:
+        inputs, states: intervals by name.
+        rates: intervals of the change of inputs from stage to stage, per second, by the input's name.
+        paths: named limits on expressions of state and input in stages 0 ... N-1.
+        soft: weights, in cost per second and unit squared, of limits that may be violated at that price; by the name of a state
+            or path, or by the name of an input for its rate. The price stands in the cost as the term 'soft NAME'.
+    """
+
+    inputs: Mapping[str, Interval] = field(default_factory=dict)
+    states: Mapping[str, Interval] = field(default_factory=dict)
+    rates: Mapping[str, Interval] = field(default_factory=dict)
+    paths: Mapping[str, PathConstraint] = field(default_factory=dict)
+    soft: Mapping[str, float] = field(default_factory=dict)
+
+    def check(self, plant: Plant) -> None:
+        """Raise if a name is unknown or an interval is empty.
+
+        Raises:
+            InvalidProblem: all mistakes together.
+        """
+        mistakes = Mistakes("limits")
+        mistakes.unknown("input", self.inputs, plant.inputs)
+        mistakes.unknown("state", self.states, plant.state.elements)
+        mistakes.unknown("rates: input", self.rates, plant.inputs)
+        mistakes.unknown("soft: limit of", self.soft, [*self.states, *self.paths, *self.rates])
+        for name, interval in [*self.inputs.items(), *self.states.items(), *self.rates.items()]:
+            _check_interval(name, interval, mistakes)
+        for name, path in self.paths.items():
+            if name in plant.state.elements or name in plant.inputs:
+                mistakes.add(f"paths: '{name}' is already the name of a state or input; choose another")
+            if not isinstance(path, PathConstraint):
+                mistakes.add(f"paths: '{name}' must be a PathConstraint(expression, lower, upper), got {path!r}")
+            else:
+                _check_interval(name, (path.lower, path.upper), mistakes)
+        for name, weight in self.soft.items():
+            if not isinstance(weight, int | float) or not 0 < weight < math.inf:
+                mistakes.add(f"soft: the weight of '{name}' must be a positive number, got {weight!r}")
+        mistakes.raise_if_any()
+
+    def input_bounds(self, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bound of every input, shape (nu,) each; infinite where free."""
+        return _bounds(self.inputs, plant.input.elements)
+
+    def state_bounds(self, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bound of every state, shape (nx,) each; infinite where free."""
+        return _bounds(self.states, plant.state.elements)
+
+
+def _check_interval(name: str, interval: Any, mistakes: Mistakes) -> None:
+    if not isinstance(interval, Sequence) or len(interval) != 2:
+        mistakes.add(f"'{name}' needs two numbers (lower, upper), got {interval!r}")
+    elif any(math.isnan(v) for v in interval) or interval[0] > interval[1]:
+        mistakes.add(f"'{name}' has lower {interval[0]} above upper {interval[1]}; swap them")
+
+
+def _bounds(intervals: Mapping[str, Interval], names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    free = (-math.inf, math.inf)
+    pairs = np.array([intervals.get(n, free) for n in names], dtype=float).reshape(-1, 2)
+    return pairs[:, 0], pairs[:, 1]

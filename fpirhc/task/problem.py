@@ -1,0 +1,176 @@
+"""A problem: what is to be controlled, along which motion, within which limits, for how long."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
+from fpirhc.horizon.cost import Cost
+from fpirhc.horizon.problem import Horizon
+from fpirhc.plant.integrators import Integrator, RungeKutta4
+from fpirhc.plant.plant import Plant
+from fpirhc.sensing.sensing import Sensing
+from fpirhc.task.dead_time import DeadTime
+from fpirhc.task.disturbance import Disturbance
+from fpirhc.task.limits import Limits
+from fpirhc.task.reference import Reference
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """One control task.
+
+    Parameters:
+        plant: the system, with approximate and exact parameters.
+        reference: the nominal motion of every coordinate.
+        start: first value of every coordinate by name; derivatives (q1', ...) not named start at zero.
+        period: control cycle, s. duration: length of a run, s.
+        limits: of inputs and states. disturbances: by name of the input or coordinate they add to.
+        horizon, cost: what a receding-horizon controller looks ahead with.
+        dead_time: of inputs and measurement; what a controller believes of it is the controller's.
+        sensing: what the controller is given of the plant; ideal unless something else is given.
+        integrator: how the simulated plant moves within a cycle.
+        measure_from: metrics are taken from this time on, s (the transient before it is left out).
+        judged: coordinates whose errors are logged and measured; None: the plant's controlled ones.
+
+    Raises:
+        InvalidProblem: all mistakes together.
+    """
+
+    plant: Plant
+    reference: Reference
+    start: Mapping[str, float]
+    period: float
+    duration: float
+    limits: Limits = field(default_factory=Limits)
+    disturbances: Mapping[str, Disturbance] = field(default_factory=dict)
+    dead_time: DeadTime = field(default_factory=DeadTime)
+    sensing: Sensing = field(default_factory=Sensing)
+    horizon: Horizon | None = None
+    cost: Cost | None = None
+    integrator: Integrator = field(default_factory=RungeKutta4)
+    measure_from: float = 0.0
+    judged: Sequence[str] | None = None
+
+    def __post_init__(self) -> None:
+        mistakes = Mistakes("problem")
+        _check_times(self, mistakes)
+        _check_start(self, mistakes)
+        plant = self.plant
+        mistakes.unknown("judged: coordinate", self.judged or (), plant.coordinates)
+        mistakes.unknown("disturbances: input or coordinate", self.disturbances, [*plant.inputs, *plant.coordinates])
+        checks = (
+            lambda: self.limits.check(plant),
+            lambda: self.reference.function(plant),
+            lambda: self.dead_time.check(plant, self.period),
+            lambda: self.sensing.check(plant),
+        )
+        for check in checks:
+            try:
+                check()
+            except FpirhcError as error:
+                mistakes.add(str(error))
+        mistakes.raise_if_any()
+        _check_inverse(self, mistakes)
+        mistakes.raise_if_any()
+
+    @property
+    def cycles(self) -> int:
+        """Number of control cycles in a run."""
+        return round(self.duration / self.period)
+
+    @cached_property
+    def judged_names(self) -> tuple[str, ...]:
+        """Coordinates whose errors are logged and measured."""
+        return self.plant.controlled_names if self.judged is None else tuple(self.judged)
+
+    @cached_property
+    def start_state(self) -> np.ndarray:
+        """First state, shape (nx,)."""
+        return np.array([float(self.start.get(e, 0.0)) for e in self.plant.state.elements])
+
+    @property
+    def response_delay(self) -> float:
+        """Cycles from a request to its estimated response, beyond the one of every loop: `Paired(map, cycles=...)`.
+
+        Dead time and estimator together; of several inputs or coordinates the slowest.
+        """
+        waiting = max(self.dead_time.inputs.values(), default=0.0) + self.dead_time.measurement
+        return waiting / self.period + self.sensing.delay(self.plant, self.period)
+
+    @property
+    def warm_up_cycles(self) -> int:
+        """Number of the first cycle whose realised response may be used; before it nothing is deformed."""
+        return self.sensing.blind(self.plant, self.dead_time.measurement / self.period)
+
+
+def _check_times(problem: Problem, mistakes: Mistakes) -> None:
+    for name in ("period", "duration"):
+        value = getattr(problem, name)
+        if not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
+            mistakes.add(f"{name} must be a positive number of seconds, got {value!r}")
+            return
+    if problem.duration < problem.period:
+        mistakes.add(f"duration {problem.duration} s is shorter than one period of {problem.period} s")
+    if not 0 <= problem.measure_from < problem.duration:
+        mistakes.add(f"measure_from must lie in [0, {problem.duration}), got {problem.measure_from}")
+    if problem.horizon is not None:
+        try:
+            cycles_per_stage(problem.horizon, problem.period)
+        except InvalidValue as error:
+            mistakes.add(str(error))
+
+
+def cycles_per_stage(horizon: Horizon, period: float) -> int:
+    """Return how many control cycles one stage of the horizon lasts.
+
+    Raises:
+        InvalidValue: the period does not divide the horizon step.
+    """
+    ratio = horizon.step / period
+    if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-6 * ratio:
+        whole = max(1, round(ratio))
+        raise InvalidValue(
+            f"period {period:g} s does not divide the horizon step {horizon.step:g} s; "
+            f"use a step of {whole * period:g} s or a period of {horizon.step / whole:g} s"
+        )
+    return round(ratio)
+
+
+def _check_start(problem: Problem, mistakes: Mistakes) -> None:
+    plant = problem.plant
+    mistakes.unknown("start: state", problem.start, plant.state.elements)
+    for c in plant.names:
+        if c not in problem.start:
+            mistakes.add(f"start: coordinate '{c}' has no first value; add '{c}': ...")
+    for name, value in problem.start.items():
+        if not isinstance(value, int | float) or not math.isfinite(value):
+            mistakes.add(f"start: '{name}' must be a finite number, got {value!r}")
+
+
+def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
+    """The model's response must be finite at the start and solvable there for the inputs."""
+    plant = problem.plant
+    if plant.controlled is None and len(plant.inputs) != len(plant.coordinates):
+        return
+    x, u, p = plant._symbols()
+    response = plant.controlled_response_function(x, u, p)
+    gain_of = ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response])
+    state = ", ".join(f"{e} = {v:g}" for e, v in zip(plant.state.elements, problem.start_state, strict=True))
+    for which, values in (("approximate", plant.approximate), ("exact", plant.exact)):
+        gain, free = (np.asarray(m.full()) for m in gain_of(problem.start_state, np.zeros(len(plant.inputs)), values))
+        if not np.all(np.isfinite(free)):
+            name = plant.controlled_names[int(np.argmin(np.isfinite(free).ravel()))]
+            mistakes.add(f"the response of '{name}' ({which} parameters) is not finite at the start ({state})")
+        elif plant.affine and np.linalg.matrix_rank(gain) < gain.shape[0]:
+            weakest = plant.input.elements[int(np.argmin(np.linalg.norm(gain, axis=0)))]
+            mistakes.add(
+                f"the response ({which} parameters) is not invertible at the start ({state}): input '{weakest}' has no "
+                "independent effect there; start elsewhere, or give Plant(inverse=...)"
+            )

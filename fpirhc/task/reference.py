@@ -1,0 +1,131 @@
+"""References: the nominal motion and its derivatives, as a function of time.
+
+Every reference gives one Function t -> (nominal state, nominal response): the coordinates with all derivatives that the
+plant's state has, and the highest derivative of each. Derivatives are found by automatic differentiation.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.layout import Expression
+
+
+class Reference(ABC):
+    """Contract: the nominal motion of every coordinate."""
+
+    @property
+    def opaque(self) -> bool:
+        """Whether the reference holds operations that scalar expressions cannot (a table's look-up)."""
+        return False
+
+    @abstractmethod
+    def coordinates(self, t: Expression) -> Mapping[str, Expression]:
+        """Return {coordinate: expression of t}."""
+
+    def function(self, plant: Plant) -> ca.Function:
+        """Function t -> (nominal state (nx), nominal response (n)).
+
+        Raises:
+            InvalidProblem: a coordinate is missing, unknown, or not a scalar.
+        """
+        kind: Any = ca.MX if self.opaque else ca.SX
+        t = kind.sym("t")
+        given = {name: kind(value) for name, value in self.coordinates(t).items()}
+        _check(plant, given)
+        derivatives = {c: _differentiate(given[c], t, r) for c, r in zip(plant.names, plant.orders, strict=True)}
+        state = [derivatives[e.rstrip("'")][e.count("'")] for e in plant.state.elements]
+        response = [derivatives[c][r] for c, r in zip(plant.names, plant.orders, strict=True)]
+        results = [ca.densify(ca.vertcat(*state)), ca.densify(ca.vertcat(*response))]
+        return ca.Function("fpirhc_reference", [t], results, ["t"], ["state", "response"])
+
+    def derivatives(self, coordinate: str, order: int) -> ca.Function:
+        """Function t -> the coordinate's nominal value and its derivatives up to `order`, shape (order + 1,)."""
+        kind: Any = ca.MX if self.opaque else ca.SX
+        t = kind.sym("t")
+        values = _differentiate(kind(self.coordinates(t)[coordinate]), t, order)
+        return ca.Function("fpirhc_ladder", [t], [ca.densify(ca.vertcat(*values))])
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory(Reference):
+    """A nominal motion given as expressions of time: Trajectory(lambda t: {"q1": ca.sin(2 * t)})."""
+
+    motion: Callable[[Expression], Mapping[str, Expression]]
+
+    def coordinates(self, t: Expression) -> Mapping[str, Expression]:
+        """Return {coordinate: expression of t}."""
+        return self.motion(t)
+
+
+@dataclass(frozen=True, eq=False)
+class Table(Reference):
+    """A nominal motion given by samples, joined by splines; held constant outside the table.
+
+    Parameters:
+        times: increasing sample times, shape (m,), s.
+        values: coordinate -> samples, shape (m,).
+        degree: degree of the splines; derivatives are continuous up to degree - 1.
+
+    Raises:
+        InvalidValue: times not increasing or values not finite. InvalidShape: lengths differ or too few samples.
+    """
+
+    times: Sequence[float]
+    values: Mapping[str, Sequence[float]]
+    degree: int = 5
+
+    def __post_init__(self) -> None:
+        times = np.asarray(self.times, dtype=float)
+        if times.ndim != 1 or times.size < self.degree + 1:
+            raise InvalidShape(f"a table of degree {self.degree} needs at least {self.degree + 1} times")
+        if not np.all(np.isfinite(times)) or np.any(np.diff(times) <= 0):
+            raise InvalidValue("the times of a table must be finite and increasing")
+        for name, samples in self.values.items():
+            column = np.asarray(samples, dtype=float)
+            if column.shape != times.shape:
+                raise InvalidShape(f"table '{name}' has shape {column.shape}, expected {times.shape} as its times")
+            if not np.all(np.isfinite(column)):
+                raise InvalidValue(f"table '{name}' holds values that are not finite")
+
+    @property
+    def opaque(self) -> bool:
+        """A table is looked up, which scalar expressions cannot."""
+        return True
+
+    def coordinates(self, t: Expression) -> Mapping[str, Expression]:
+        """Return {coordinate: spline of t}."""
+        return {name: self._spline(name, np.asarray(v, dtype=float), t) for name, v in self.values.items()}
+
+    def _spline(self, name: str, samples: np.ndarray, t: Expression) -> Expression:
+        times = np.asarray(self.times, dtype=float)
+        spline = ca.interpolant(f"fpirhc_table_{name}", "bspline", [times], samples, {"degree": [self.degree]})
+        # A choice, not a clamped argument: fmin and fmax have half a derivative at the table's own first and last time.
+        held = ca.if_else(t < times[0], spline(times[0]), spline(times[-1]))
+        return ca.if_else(ca.logic_or(t < times[0], t > times[-1]), held, spline(t))
+
+
+def _differentiate(value: Expression, t: Expression, order: int) -> list[Expression]:
+    derivatives = [value]
+    for _ in range(order):
+        derivatives.append(ca.jacobian(derivatives[-1], t))
+    return derivatives
+
+
+def _check(plant: Plant, given: Mapping[str, Expression]) -> None:
+    mistakes = Mistakes("reference")
+    mistakes.unknown("coordinate", given, plant.coordinates)
+    for c in plant.names:
+        if c not in given:
+            mistakes.add(f"coordinate '{c}' has no nominal motion; add '{c}' to the reference")
+        elif given[c].numel() != 1:
+            mistakes.add(f"coordinate '{c}' must be one scalar, got shape {given[c].shape}")
+    mistakes.raise_if_any()
