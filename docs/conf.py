@@ -8,6 +8,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+import make_api
+
+make_api.PAGE.write_text(make_api.page(), encoding="utf-8")
+
 project = "fpirhc"
 author = "The fpirhc authors"
 release = importlib.metadata.version("fpirhc")

@@ -1,4 +1,4 @@
-"""Writes the API page from the public names: python docs/make_api.py"""
+"""Writes the API page from the public names and the members that are found: python docs/make_api.py"""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import fpirhc as fp
+from fpirhc.members import FAMILIES, member_classes
 
 PAGE = Path(__file__).resolve().parent / "api.rst"
 STUB = Path(fp.__file__).with_suffix(".pyi")
@@ -42,6 +43,9 @@ def by_section() -> dict[str, list[str]]:
     text = re.sub(r"\(\s*([^)]*?),?\s*\)", lambda m: " ".join(m.group(1).split()), STUB.read_text(encoding="utf-8"))
     for module, names in re.findall(r"^from \.(\w+)[\w.]* import (.+)$", text, re.MULTILINE):
         found[homes[module]] += [name.strip() for name in names.split(",") if name.strip()]
+    for family, kind in FAMILIES.items():
+        section = found[homes[kind.packages[0].split(".")[1]]]
+        section += [c.__name__ for c in member_classes(family) if c.__name__ not in section]
     return found
 
 

@@ -1,6 +1,7 @@
 """Adaptive receding-horizon control by fixed-point iteration, on CasADi.
 
 The public names stand in `__init__.pyi`; each is imported when it is first used, so that `fpirhc --help` need not load CasADi.
+A member of a family that does not stand there yet is found by the name of its file (see `fpirhc.members`).
 """
 
 from importlib.metadata import version as _version
@@ -12,8 +13,12 @@ _import, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> object:
-    if name not in __all__:
-        from fpirhc.errors import InvalidName, nearest
+    if name in __all__:
+        return _import(name)
+    from fpirhc.errors import InvalidName, nearest
+    from fpirhc.members import public_member
 
+    member = None if name.startswith("_") else public_member(name)
+    if member is None:
         raise InvalidName(f"fpirhc has no name '{name}'.{nearest(name, __all__)}")
-    return _import(name)
+    return member

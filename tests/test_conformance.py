@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-import inspect
 import math
-import pkgutil
 import random
 from dataclasses import dataclass, field, replace
-from types import ModuleType
 from typing import Any
 
 import casadi as ca
@@ -27,6 +23,7 @@ import fpirhc.tracking
 from fpirhc.conformance.laws import within
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import InvalidProblem, InvalidValue
+from fpirhc.members import FAMILIES, Example, examples, member_classes
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.problem_files.problem_file import shipped_problems
 from fpirhc.symbolic.block import Block, Delay
@@ -37,16 +34,6 @@ FINE = 1e-6  # tolerance of the optimisers, N
 TRACKING = fp.Exponential(rate=8.0)
 SIGMOID = fp.Sigmoid(gain=-0.5, scale=50.0)
 PLANNER = fp.FixedPoint(iterations=2, tolerance=1e-3)
-
-
-def members(package: ModuleType, family: type) -> set[type]:
-    """Concrete classes of a family in a package, as `tests/test_deformation.py` finds the maps."""
-    found: set[type] = set()
-    for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-        for _, member in inspect.getmembers(importlib.import_module(module.name), inspect.isclass):
-            if issubclass(member, family) and not inspect.isabstract(member):
-                found.add(member)
-    return found
 
 
 def named(values: Any) -> list[str]:
@@ -66,13 +53,7 @@ def promised(t: np.ndarray, order: int) -> np.ndarray:
     return np.exp(-2 * t) * sum((2 * t) ** k / math.factorial(k) for k in range(order))
 
 
-TRACKINGS: tuple[Tracking, ...] = (
-    fp.Exponential(rate=6.0),
-    fp.Exponential(rate=6.0, bumpless=False),
-    fp.Exponential(rate=2.0, integral=False),
-    fp.Fractional(rate=4.0, order=0.8, memory=2.0),
-    fp.Fractional(rate=4.0, order=1.2, memory=2.0),
-)
+TRACKINGS = examples("tracking laws")
 
 
 @pytest.mark.parametrize("tracking", TRACKINGS, ids=named(TRACKINGS))
@@ -86,9 +67,11 @@ def test_exponential_decays_as_it_promises():
     fp.check_tracking(fp.Exponential(rate=2.0, integral=False), seed=2, duration=6.0, decay=promised)
 
 
-def test_every_tracking_law_is_tested():
-    """A new file must join the tuple above."""
-    assert members(fpirhc.tracking, Tracking) == {type(t) for t in TRACKINGS}
+def test_every_member_has_examples():
+    """A new file carries values for the laws, or they would go unchecked."""
+    for family in FAMILIES:
+        inner = examples(family)[0]
+        assert set(member_classes(family)) == {type(on_problem(e)[0]) for e in examples(family, inner)}, family
 
 
 @dataclass(frozen=True)
@@ -182,17 +165,9 @@ def test_a_decay_that_is_not_the_promised_one_is_caught():
 # Optimisers
 
 
-OPTIMISERS: tuple[Optimiser, ...] = (
-    fp.FixedPoint(iterations=20, tolerance=FINE),
-    fp.FixedPoint(iterations=1, tolerance=FINE),
-    fp.ReducedGradient(iterations=200, tolerance=FINE),
-    fp.GradientFixedPoint(iterations=100, tolerance=FINE),
-    fp.FullSpaceFixedPoint(iterations=300, tolerance=FINE, scaled=True, acceleration=fp.Anderson(8)),
-    fp.Ipopt(tolerance=FINE),
-    fp.Fatrop(tolerance=FINE),
-    fp.SequentialQuadratic(tolerance=FINE),
-    fp.SequentialQuadratic(tolerance=FINE, quadratic=fp.Osqp()),
-)
+OPTIMISERS = examples("optimisers")
+SETTLED = fp.FixedPoint(iterations=20, tolerance=FINE)
+SINGLE = fp.FixedPoint(iterations=1, tolerance=FINE)
 
 
 @pytest.mark.parametrize("optimiser", OPTIMISERS, ids=named(OPTIMISERS))
@@ -201,18 +176,13 @@ def test_optimiser_laws(optimiser):
     fp.check_optimiser(optimiser, tolerance=FINE, seed=1)
 
 
-def test_every_optimiser_is_tested():
-    """A new file must join the tuple above."""
-    assert members(fpirhc.optimisers, Optimiser) == {type(o) for o in OPTIMISERS}
-
-
 @dataclass(frozen=True)
 class Dishonest(Optimiser):
     """A fixed-point optimiser that changes what it is given or what it answers."""
 
     change: str
     settings: list | None = None
-    within: Optimiser = OPTIMISERS[0]
+    within: Optimiser = SETTLED
 
     def memory(self, ocp):
         """As the contract says, but for the change."""
@@ -262,7 +232,7 @@ class Dishonest(Optimiser):
         (Dishonest("off"), optimiser_laws.linear_plan_is_riccati),
         (Dishonest("cost"), optimiser_laws.plan_is_stationary),
         (Dishonest("always OK", within=fp.FixedPoint(iterations=1, tolerance=1e-9)), optimiser_laws.plan_is_stationary),
-        (Dishonest("one step OK", within=OPTIMISERS[1]), optimiser_laws.status_is_honest),
+        (Dishonest("one step OK", within=SINGLE), optimiser_laws.status_is_honest),
         (Dishonest("ignores bounds"), optimiser_laws.bounds_of_inputs_are_kept),
         (Dishonest("own bounds"), optimiser_laws.bounds_of_a_call_count),
         (Dishonest("never feasible"), optimiser_laws.infeasible_is_told),
@@ -280,65 +250,39 @@ def test_wrong_optimisers_are_caught(wrong, law):
 
 def test_the_tolerance_must_tell_a_solution():
     with pytest.raises(InvalidValue, match="up to 1e-3"):
-        fp.check_optimiser(OPTIMISERS[0], tolerance=0.1, seed=1)
+        fp.check_optimiser(SETTLED, tolerance=0.1, seed=1)
 
 
 # Controllers
 
 
-def slots() -> tuple[Controller, fp.Problem]:
-    task = fp.load_problem("mass_spring_slots")
-    return task.controllers["slots"], task.problem
-
-
-def late() -> fp.Problem:
-    """The default problem with a command that arrives two cycles late."""
-    return replace(controller_laws.two_masses(), dead_time=fp.DeadTime(inputs={"Fa": 0.01, "Fb": 0.01}))
-
-
-def shipped(problem: str, name: str, duration: float, **changes: Any) -> tuple[Controller, fp.Problem]:
-    """A shipped controller, for a shorter time."""
-    task = fp.load_problem(problem)
-    return task.controllers[name], replace(task.problem, duration=duration, measure_from=0.0, **changes)
-
-
-KALMAN = fp.DisturbanceKalman({"a": 1.0, "b": 1.0}, dict.fromkeys(("a", "b", "a'", "b'"), 1e-3))
-AWAY = {"q1": 0.3, "q2": 0.3}
-RIVALS = (
-    "PID",
-    "sliding mode",
-    "acceleration feedback",
-    "acceleration rate",
-    "force MRAC",
-    "backstepping MRAC",
-    "Lyapunov MRAC",
+COMPUTED_TORQUE = examples("controllers")[0]
+CONTROLLERS = (
+    *examples("controllers", COMPUTED_TORQUE),
+    *(fp.Estimating(COMPUTED_TORQUE, estimator) for estimator in examples("estimators")),
 )
-CONTROLLERS: dict[str, tuple[Controller, fp.Problem | None]] = {
-    "CTC": (fp.ComputedTorque(TRACKING), None),
-    "CTC+FPI": (fp.ComputedTorque(TRACKING, SIGMOID), None),
-    "RHC+FPI": (fp.RecedingHorizon(PLANNER, SIGMOID), None),
-    "informed": (fp.ExactModel(fp.ComputedTorque(TRACKING)), None),
-    "predicted": (fp.Predicted(fp.ComputedTorque(TRACKING), inputs=0.01), late()),
-    "slots": slots(),
-    "estimating": (fp.Estimating(fp.ComputedTorque(TRACKING), KALMAN), None),
-    **{name: shipped("mrac_pendulum", name, 3.0) for name in RIVALS},
-    "AID": shipped("planar_arm", "AID", 2.0, start=AWAY),
-    "Slotine-Li": shipped("planar_arm", "Slotine-Li", 2.0, start=AWAY),
-}
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
-def test_controller_laws(name):
+def on_problem(example: Any) -> tuple[Controller, fp.Problem | None]:
+    """A controller and the problem that it is tried on, None for that of the laws."""
+    one = example if isinstance(example, Example) else Example(example)
+    if not one.problem:
+        return one.value, replace(controller_laws.two_masses(), **one.changes) if one.changes else None
+    task = fp.load_problem(one.problem)
+    return one.value or task.controllers[one.controller], replace(task.problem, **one.changes)
+
+
+def name_of(example: Any) -> str:
+    one = example if isinstance(example, Example) else Example(example)
+    return one.controller or type(one.value).__name__
+
+
+@pytest.mark.parametrize("example", CONTROLLERS, ids=name_of)
+def test_controller_laws(example):
     """Limits, bad measurements, and one command however it is computed; C is compared where it compiles quickly."""
-    controller, problem = CONTROLLERS[name]
-    # Without a model nothing is known of a reference that moves.
-    left = 0.25 if name == "PID" else 0.05
-    fp.check_controller(controller, problem=problem, seed=1, left=left, compiled=name == "CTC+FPI")
-
-
-def test_every_controller_is_tested():
-    """A new file must join the table above."""
-    assert members(fpirhc.controllers, Controller) == {type(c) for c, _ in CONTROLLERS.values()}
+    controller, problem = on_problem(example)
+    left = getattr(example, "left", None) or 0.05
+    fp.check_controller(controller, problem=problem, seed=1, left=left, compiled=example is CONTROLLERS[1])
 
 
 class Counter(ca.Callback):

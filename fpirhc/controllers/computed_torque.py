@@ -11,9 +11,11 @@ from fpirhc.controllers.automatic_scale import scaled_for_reference
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block, rename
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
+from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
+from fpirhc.tracking.exponential import Exponential
 
 
 @dataclass(frozen=True)
@@ -51,3 +53,9 @@ class ComputedTorque(Controller):
             self.tracking.update(plant, problem.period),
         ]
         return blocks, [*delays, *self.tracking.delays(plant)]
+
+
+EXAMPLES = (
+    ComputedTorque(Exponential(rate=8.0)),
+    ComputedTorque(Exponential(rate=8.0), Sigmoid(gain=-0.5, scale=50.0)),
+)

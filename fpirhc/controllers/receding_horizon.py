@@ -25,10 +25,12 @@ from fpirhc.controllers.on_failure import HoldPlan, OnFailure
 from fpirhc.controllers.replanning import FromMeasurement, Replanning
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
+from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidProblem
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
 from fpirhc.optimisers.base import Optimiser
+from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, every
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -179,3 +181,6 @@ def _correction_block(problem: Problem, deformation: Deformation) -> Block:
         return {"command_shift": s.command - inverse(s.state, s.desired, s.parameters)}
 
     return Block("correction", reads, Layout((like(plant.input, "command_shift"),)), step, opaque=plant.inverse_opaque)
+
+
+EXAMPLES = (RecedingHorizon(FixedPoint(iterations=2, tolerance=1e-3), Sigmoid(gain=-0.5, scale=50.0)),)

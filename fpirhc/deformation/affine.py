@@ -53,3 +53,6 @@ class Affine(Deformation):
     def with_effective_gain(self, gain: float) -> Self:
         """Return the map with A_c = -2 a."""
         return replace(self, gain=-2.0 * gain)
+
+
+EXAMPLES = (Affine(gain=-0.5),)

@@ -46,3 +46,6 @@ class Identity(Deformation):
         raise NotSupported(
             f"Identity() has no gain, so it cannot take {gain!r}; use Sigmoid(gain=...), the usual choice"
         )
+
+
+EXAMPLES = (Identity(),)

@@ -67,3 +67,6 @@ class RFPT(Deformation):
     def with_effective_gain(self, gain: float) -> Self:
         """Return the map with A_c = -a / (K_c B_c)."""
         return replace(self, gain=-gain / (self.offset * self.sign))
+
+
+EXAMPLES = (RFPT(offset=1e5, sign=-1, gain=5e-6), RFPT(offset=-1e4, sign=1, gain=4e-5))

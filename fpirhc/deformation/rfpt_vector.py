@@ -72,3 +72,6 @@ class RFPTVector(Deformation):
     def with_effective_gain(self, gain: float) -> Self:
         """Return the map with A_c = -a / (K_c B_c)."""
         return replace(self, gain=-gain / (self.offset * self.sign))
+
+
+EXAMPLES = (RFPTVector(offset=1e5, sign=-1, gain=5e-6),)

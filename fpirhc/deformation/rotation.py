@@ -112,3 +112,6 @@ def _turned(
     along_unit = ca.dot(unit[0], vector[0]) + unit[1] * vector[1]
     along_chord = ca.dot(chord[0], vector[0]) + chord[1] * vector[1]
     return unit[0] * along_chord - chord[0] * along_unit, unit[1] * along_chord - chord[1] * along_unit
+
+
+EXAMPLES = (Rotation(fraction=0.4, radius=1e3), Rotation(fraction=0.4, radius=1.0))

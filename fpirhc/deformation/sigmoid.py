@@ -151,3 +151,11 @@ class Sigmoid(Deformation):
                 "with S above the largest change of the desired response in one cycle"
             )
         return self.scale
+
+
+EXAMPLES = (
+    Sigmoid(gain=-0.5, scale=1.0),
+    Sigmoid(gain=-1.5, shift=0.0, scale=20.0),
+    Sigmoid(gain=0.5, shift=-0.3, scale=1.0),
+    Sigmoid(gain=0.5, shift=0.3, scale=1.0),
+)

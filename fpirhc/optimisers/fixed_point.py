@@ -320,3 +320,7 @@ class FixedPoint(Optimiser):
         # A remembered plan under which a well-posed problem overflows is given up, so that the next call can succeed.
         kept = ca.if_else(finite, found, ca.if_else(posed, ca.MX.zeros(found.shape), memory))
         return [anchor.inputs, ca.vertcat(told, 0, iterations, status), kept]
+
+
+EXAMPLES = (FixedPoint(iterations=20, tolerance=1e-6), FixedPoint(iterations=1, tolerance=1e-6))
+CHOICES = {"fixed-point": ("FPI", lambda tolerance: FixedPoint(iterations=1, tolerance=tolerance))}

@@ -144,3 +144,6 @@ def _scaling(ocp: OptimalControl, scaled: bool) -> tuple[np.ndarray, float]:
         factors /= np.sqrt(np.where(size > 0, size, 1.0))
     largest = float(np.abs(np.linalg.eigvalsh(factors[:, None] * hessian * factors)).max())
     return factors, largest
+
+
+EXAMPLES = (FullSpaceFixedPoint(iterations=300, tolerance=1e-6, scaled=True, acceleration=Anderson(8)),)

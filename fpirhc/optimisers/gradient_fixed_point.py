@@ -132,3 +132,6 @@ def _scale(ocp: OptimalControl) -> ca.DM:
 
 def _steepest(ocp: OptimalControl) -> float:
     return steepest_curvature(ocp.along, 1 / (ocp.step * ocp.curvature))
+
+
+EXAMPLES = (GradientFixedPoint(iterations=100, tolerance=1e-6),)

@@ -326,3 +326,21 @@ class SequentialQuadratic(_MultipleShooting):
 def _usable(multipliers: Expression) -> Expression:
     """Forget multipliers that are not finite or absurdly large: they would poison a warm start."""
     return ca.if_else(ca.fabs(multipliers) <= _LARGEST_MULTIPLIER, multipliers, 0)
+
+
+EXAMPLES = (
+    Ipopt(tolerance=1e-6),
+    Fatrop(tolerance=1e-6),
+    SequentialQuadratic(tolerance=1e-6),
+    SequentialQuadratic(tolerance=1e-6, quadratic=Osqp()),
+)
+CHOICES = {
+    "ipopt": ("IPOPT", lambda tolerance: Ipopt(tolerance=tolerance)),
+    "fatrop": ("fatrop", lambda tolerance: Fatrop(tolerance=tolerance)),
+    "qrqp": ("SQP qrqp", lambda tolerance: SequentialQuadratic(tolerance=tolerance)),
+    "osqp": ("SQP OSQP", lambda tolerance: SequentialQuadratic(tolerance=tolerance, quadratic=Osqp())),
+    "osqp-rti": (
+        "OSQP, one iteration",
+        lambda tolerance: SequentialQuadratic(tolerance=tolerance, quadratic=Osqp(), iterations=1),
+    ),
+}

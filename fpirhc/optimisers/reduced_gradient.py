@@ -182,3 +182,9 @@ def _spectral_length(move: ca.MX, scale: ca.DM, change: ca.MX, before: ca.MX) ->
     usable = ca.logic_and(curvature > _TINY, size > _TINY)
     length = size / ca.if_else(usable, curvature, 1)
     return ca.if_else(usable, ca.fmin(ca.fmax(length, _SHORTEST), _LONGEST), before)
+
+
+EXAMPLES = (ReducedGradient(iterations=200, tolerance=1e-6),)
+CHOICES = {
+    "reduced-gradient": ("reduced gradient", lambda tolerance: ReducedGradient(iterations=50, tolerance=tolerance))
+}

@@ -46,3 +46,6 @@ class Measured(DerivativeEstimator):
         """One: in the first cycle nothing was asked yet."""
         del order
         return 1
+
+
+EXAMPLES = (Measured(),)

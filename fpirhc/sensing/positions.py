@@ -172,3 +172,6 @@ class SavitzkyGolay(_Finite):
         """(window - 1) / 2 - 1 / 2."""
         del order, period
         return (self.window - 1) / 2 - 0.5
+
+
+EXAMPLES = (PositionDifference(), SavitzkyGolay(window=11, degree=4))

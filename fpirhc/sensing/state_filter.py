@@ -124,3 +124,6 @@ class StateVariableFilter(DerivativeEstimator):
             names += [f"{name}@{j + 1}" for j in range(order)]
             values += [float(place - speed * (period + (j + late) / self.bandwidth)) for j in range(order)]
         return Signal(kind, tuple(names), start=tuple(values))
+
+
+EXAMPLES = (StateVariableFilter(bandwidth=100.0),)

@@ -127,3 +127,6 @@ def _difference_block(plant: Plant, period: float, start: Array, seen: Signal, p
         return {**found, "realised": response, "estimate_smooth_next": response, "estimate_cycles_next": counted}
 
     return Block("estimate", Layout((seen,)), Layout((plant.state, realised)), step, Layout(memory))
+
+
+EXAMPLES = (VelocityDifference(), LowPassDifference(time_constant=0.01))

@@ -12,7 +12,7 @@ from fpirhc.horizon.problem import stage_data, transcribe
 from fpirhc.optimisers.certificate import Certificate, certify
 from fpirhc.optimisers.plan import Plan, solve
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.studies.comparison.optimiser_choices import OPTIMISERS
+from fpirhc.studies.comparison.optimiser_choices import optimiser_choices
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +34,10 @@ def solve_first(task: Task, names: Sequence[str], tolerance: float) -> list[Solv
     problem = task.problem
     if problem.horizon is None or problem.cost is None:
         raise InvalidProblem(f"problem '{task.name}' has no horizon or no cost; give Problem(horizon=..., cost=...)")
-    unknown = [n for n in names if n != "all" and n not in OPTIMISERS]
+    choices = optimiser_choices()
+    unknown = [n for n in names if n != "all" and n not in choices]
     if unknown:
-        raise InvalidName(f"optimiser '{unknown[0]}' is unknown.{nearest(unknown[0], [*OPTIMISERS, 'all'])}")
+        raise InvalidName(f"optimiser '{unknown[0]}' is unknown.{nearest(unknown[0], [*choices, 'all'])}")
     plant = problem.plant
     ocp = transcribe(plant, problem.reference, problem.horizon, problem.cost, problem.limits)
     data = np.asarray(
@@ -44,8 +45,8 @@ def solve_first(task: Task, names: Sequence[str], tolerance: float) -> list[Solv
     )
     first = np.asarray(ocp.start(problem.start_state, np.zeros(plant.input.size)).full()).ravel()
     solved = []
-    for name in OPTIMISERS if "all" in names else dict.fromkeys(names):
-        label, build = OPTIMISERS[name]
+    for name in choices if "all" in names else dict.fromkeys(names):
+        label, build = choices[name]
         plan = solve(ocp, build(tolerance), first, data)
         solved.append(Solved(label, plan, None if plan.overflow() else certify(plan)))
     return solved

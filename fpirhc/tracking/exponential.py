@@ -93,3 +93,6 @@ class Exponential(Tracking):
             return chain[0] * 0
         first, *others = self.gains(len(chain))
         return -sum(g * e for g, e in zip(others, chain, strict=True)) / first
+
+
+EXAMPLES = (Exponential(rate=6.0), Exponential(rate=6.0, bumpless=False), Exponential(rate=2.0, integral=False))

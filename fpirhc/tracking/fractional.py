@@ -155,3 +155,6 @@ def _pushed(queue: Expression, newest: Expression) -> Expression:
     """The queue with a newest entry and without its oldest."""
     # Not an empty slice: CasADi's [:0] of one entry is that entry.
     return ca.vertcat(newest, queue[:-1]) if queue.numel() > 1 else newest
+
+
+EXAMPLES = (Fractional(rate=4.0, order=0.8, memory=2.0), Fractional(rate=4.0, order=1.2, memory=2.0))

@@ -27,6 +27,7 @@ from fpirhc.controllers.base import FINITE, Controller, commanding_blocks, inver
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
+from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
@@ -102,3 +103,10 @@ class AccelerationFeedback(Controller):
 
         reads = (plant.response_signal("desired"), plant.response_signal("realised"), scalar("warm_up"))
         return Block("feedback", Layout(reads), Layout((plant.response_signal("_deformed_unclipped"),)), step, memory)
+
+
+EXAMPLES = (
+    Example(
+        problem="mrac_pendulum", controller="acceleration feedback", changes={"duration": 3.0, "measure_from": 0.0}
+    ),
+)

@@ -16,6 +16,7 @@ from fpirhc.controllers.rivals.learned_parameters import Learning, equation_func
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.learning.rules.base import Pair, Rule
+from fpirhc.members import Example
 from fpirhc.plant.regressor import Combination
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Expression
@@ -111,3 +112,12 @@ class AdaptiveInverseDynamics(Controller):
         companion = np.vstack([np.eye(size)[1:], -np.array(gains)])
         weights = np.diag([self.tracking.rate ** (2.0 * (size - 1 - k)) for k in range(size)])
         return np.asarray(solve_continuous_lyapunov(companion.T, -weights)[-1])
+
+
+EXAMPLES = (
+    Example(
+        problem="planar_arm",
+        controller="AID",
+        changes={"duration": 2.0, "measure_from": 0.0, "start": {"q1": 0.3, "q2": 0.3}},
+    ),
+)

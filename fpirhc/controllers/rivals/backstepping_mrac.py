@@ -27,6 +27,7 @@ from fpirhc.controllers.base import Controller, closing_blocks, like, reference_
 from fpirhc.controllers.rivals.reference_model import model_block
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Expression, Layout, vector
@@ -110,3 +111,8 @@ class BacksteppingMRAC(Controller):
 
         reads = Layout((plant.state, like(plant.state, "model"), plant.response_signal("nominal")))
         return Block("nested", reads, Layout((vector("nested", names), plant.response_signal("desired"))), step)
+
+
+EXAMPLES = (
+    Example(problem="mrac_pendulum", controller="backstepping MRAC", changes={"duration": 3.0, "measure_from": 0.0}),
+)

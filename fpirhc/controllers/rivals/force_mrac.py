@@ -28,6 +28,7 @@ from fpirhc.controllers.automatic_scale import scaled_for_command
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block, rename
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import Mistakes
+from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Expression, Layout, scalar
@@ -120,3 +121,6 @@ class ForceMRAC(Controller):
         shown = [scalar(name) for name in self.deformation.shown()]
         writes = Layout((*forces, plant.response_signal("_deformed_unclipped"), *shown))
         return Block("force", Layout(reads), writes, step, memory, opaque=plant.inverse_opaque)
+
+
+EXAMPLES = (Example(problem="mrac_pendulum", controller="force MRAC", changes={"duration": 3.0, "measure_from": 0.0}),)

@@ -36,6 +36,7 @@ from fpirhc.controllers.rivals.reference_model import companion, decay_gains, mo
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -191,3 +192,8 @@ def _sign(problem: Problem) -> int:
     matrix = np.asarray(effect(problem.start_state, [0] * len(plant.inputs), plant.approximate).full())
     values = np.linalg.eigvalsh(matrix + matrix.T)
     return 1 if values.min() > 0 else -1 if values.max() < 0 else 0
+
+
+EXAMPLES = (
+    Example(problem="mrac_pendulum", controller="Lyapunov MRAC", changes={"duration": 3.0, "measure_from": 0.0}),
+)

@@ -26,6 +26,7 @@ from fpirhc.controllers.base import Controller, commanding_blocks, like, referen
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import Mistakes
+from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
@@ -137,3 +138,8 @@ class PID(Controller):
             plant.response_signal("_deformed_unclipped"),
         )
         return Block("pid", Layout(reads), Layout(writes), step)
+
+
+EXAMPLES = (
+    Example(problem="mrac_pendulum", controller="PID", changes={"duration": 3.0, "measure_from": 0.0}, left=0.25),
+)

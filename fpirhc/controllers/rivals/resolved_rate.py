@@ -36,6 +36,7 @@ from fpirhc.controllers.base import Controller, commanding_blocks, invert_block,
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
+from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
@@ -150,3 +151,8 @@ def _increment_block(problem: Problem) -> Block:
     reads = (plant.state, like(plant.input, "_command_before"), plant.parameter, *map(plant.response_signal, names))
     writes = Layout((plant.response_signal("_deformed_unclipped"),))
     return Block("increment", Layout((*reads, scalar("warm_up"))), writes, step)
+
+
+EXAMPLES = (
+    Example(problem="mrac_pendulum", controller="acceleration rate", changes={"duration": 3.0, "measure_from": 0.0}),
+)

@@ -25,6 +25,7 @@ from fpirhc.controllers.base import Controller, closing_blocks, like, reference_
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Expression, Layout, vector
@@ -105,3 +106,8 @@ class SlidingMode(Controller):
         reads = Layout((plant.state, like(plant.state, "reference"), plant.response_signal("nominal")))
         writes = Layout((vector("surface", plant.controlled_names, units), plant.response_signal("desired")))
         return Block("surface", reads, writes, step)
+
+
+EXAMPLES = (
+    Example(problem="mrac_pendulum", controller="sliding mode", changes={"duration": 3.0, "measure_from": 0.0}),
+)

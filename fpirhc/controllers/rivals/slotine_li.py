@@ -16,6 +16,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
 from fpirhc.learning.rules.base import Pair, Rule
+from fpirhc.members import Example
 from fpirhc.plant.regressor import Combination, Regressor
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
@@ -174,3 +175,12 @@ def _rates(problem: Problem, name: str) -> Signal:
     """A signal of velocities."""
     plant = problem.plant
     return vector(name, plant.names, [f"{plant.coordinates[c]}/s" for c in plant.names])
+
+
+EXAMPLES = (
+    Example(
+        problem="planar_arm",
+        controller="Slotine-Li",
+        changes={"duration": 2.0, "measure_from": 0.0, "start": {"q1": 0.3, "q2": 0.3}},
+    ),
+)

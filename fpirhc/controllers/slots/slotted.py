@@ -47,6 +47,7 @@ from fpirhc.controllers.slots.slot_modes import linear_modes
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import FpirhcError, InvalidValue, Mistakes, NotContractive
+from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import scalar
 from fpirhc.task.problem import Problem
@@ -213,3 +214,6 @@ def _check_gain(problem: Problem, one: Channel) -> None:
     report = assess_gain(one.slot.deformation, Spectrum(np.array([exact / one.start_gain])))
     if not report.contractive:
         raise NotContractive(f"slot '{one.slot.coordinate}': {report.text}")
+
+
+EXAMPLES = (Example(problem="mass_spring_slots", controller="slots"),)

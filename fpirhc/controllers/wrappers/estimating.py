@@ -20,6 +20,7 @@ from fpirhc.controllers.base import FINITE, Controller, compose_controller, embe
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotSupported
 from fpirhc.learning.estimators.base import Estimator, Seen
+from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -125,3 +126,9 @@ def _estimate_block(
 
     reads = Layout((plant.state, plant.response_signal("realised"), plant.parameter, acted))
     return Block("estimate", reads, Layout((believed, estimate)), step, own, opaque=True)
+
+
+def examples(inner: Controller) -> tuple[Controller, ...]:
+    """Values for the laws, around any controller."""
+    noise = dict.fromkeys(("a", "b", "a'", "b'"), 1e-3)
+    return (Estimating(inner, DisturbanceKalman({"a": 1.0, "b": 1.0}, noise)),)

@@ -53,3 +53,8 @@ def _told(problem: Problem) -> Problem:
     """The problem as one sees it who knows the plant: what is prepared before a run has the exact parameters too."""
     exact = {name: replace(p, approximate=p.exact) for name, p in problem.plant.parameters.items()}
     return replace(problem, plant=replace(problem.plant, parameters=exact))
+
+
+def examples(inner: Controller) -> tuple[Controller, ...]:
+    """Values for the laws, around any controller."""
+    return (ExactModel(inner),)

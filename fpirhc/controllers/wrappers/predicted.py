@@ -24,11 +24,12 @@ import numpy as np
 from fpirhc.controllers.base import Controller, Response, compose_controller, embedded, like
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.members import Example
 from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.task.dead_time import MOST
+from fpirhc.task.dead_time import MOST, DeadTime
 from fpirhc.task.problem import Problem
 
 
@@ -247,3 +248,9 @@ def _residual(plant: Plant, time: float, period: float) -> ca.Function:
     seen[list(plant.controlled_indices)] = f - plant.controlled_response_function(x, u, p)
     share = 1 - float(np.exp(-period / time))
     return ca.Function("fpirhc_residual", [old, x, u, f, p], [old + share * (seen - old)])
+
+
+def examples(inner: Controller) -> tuple[Example, ...]:
+    """Values for the laws, around any controller: the command arrives two cycles late."""
+    late = DeadTime(inputs={"Fa": 0.01, "Fb": 0.01})
+    return (Example(Predicted(inner, inputs=0.01), changes={"dead_time": late}),)

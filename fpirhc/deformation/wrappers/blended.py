@@ -151,3 +151,8 @@ class Blended(Wrapper):
             smallest_gain=self.smallest_gain * share,
             largest_gain=self.largest_gain * share,
         )
+
+
+def examples(inner: Deformation) -> tuple[Deformation, ...]:
+    """Values for the laws, around any map."""
+    return (Blended(inner, smallest_gain=0.5 * inner.effective_gain(), largest_gain=1.5 * inner.effective_gain()),)

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.deformation.wrappers.forgetting import forget, growing_in_a_row
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -76,3 +77,8 @@ class Damped(Wrapper):
             "damper_error": error,
         }
         return ca.if_else(factor < 1, request + factor * (wanted - request), wanted), {**own, **following}
+
+
+def examples(inner: Deformation) -> tuple[Deformation, ...]:
+    """Values for the laws, around any map."""
+    return (Damped(inner),)

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -150,3 +151,8 @@ class Increment(_Queued):
         deformed = self._mean(requests - wishes, desired.numel(), self.uncertainty)
         wanted, following = self.map.step(asked + deformed, response, asked, memory)
         return desired + (wanted - asked), following
+
+
+def examples(inner: Deformation) -> tuple[Deformation, ...]:
+    """Values for the laws, around any map."""
+    return (Paired(inner, cycles=3), Increment(inner, cycles=2.5))

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -53,3 +54,8 @@ class Filtered(Wrapper):
         error = self.pole * memory["filter_error"] + (1 - self.pole) * (response - desired)
         wanted, following = self.map.step(request, desired + error, desired, inner)
         return wanted, {"filter_error": error, **following}
+
+
+def examples(inner: Deformation) -> tuple[Deformation, ...]:
+    """Values for the laws, around any map."""
+    return (Filtered(inner, pole=0.5),)

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.deformation.base import smooth_norm
+from fpirhc.deformation.base import Deformation, smooth_norm
 from fpirhc.deformation.wrappers.base import Wrapper, of_map, start_of_map
 from fpirhc.deformation.wrappers.forgetting import forget
 from fpirhc.errors import InvalidValue
@@ -143,3 +143,8 @@ class Guarded(Wrapper):
 
 def _finite(value: Expression) -> Expression:
     return ca.mmin(ca.fabs(value) <= _FINITE)
+
+
+def examples(inner: Deformation) -> tuple[Deformation, ...]:
+    """Values for the laws, around any map."""
+    return (Guarded(inner, largest_deformation=1e12),)

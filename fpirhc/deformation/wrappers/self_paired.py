@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.deformation.wrappers.delay_estimate import SIGNALS, estimate_memory, estimated
 from fpirhc.errors import InvalidValue
@@ -129,3 +130,8 @@ class SelfPaired(Wrapper):
 def _check_most(owner: str, most: int) -> None:
     if not 1 <= most <= MOST:
         raise InvalidValue(f"{owner}(most={most!r}): expected a longest dead time between 1 and {MOST} cycles")
+
+
+def examples(inner: Deformation) -> tuple[Deformation, ...]:
+    """Values for the laws, around any map."""
+    return (SelfPaired(inner, most=5), DelayWatched(inner, most=5))

@@ -20,6 +20,7 @@ from typing import Self
 
 import casadi as ca
 
+from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.deformation.wrappers.forgetting import forget, growing_in_a_row
 from fpirhc.errors import InvalidValue
@@ -104,3 +105,8 @@ class Tuned(Wrapper):
             map=self.map.with_effective_gain(gain),
             largest_gain=self.largest_gain * gain / self.map.effective_gain(),
         )
+
+
+def examples(inner: Deformation) -> tuple[Deformation, ...]:
+    """Values for the laws, around any map."""
+    return (Tuned(inner, largest_gain=1.2 * inner.effective_gain()),)

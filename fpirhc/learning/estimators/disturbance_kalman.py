@@ -187,3 +187,6 @@ def _operating_point(problem: Problem) -> tuple[ca.DM, ca.DM, np.ndarray]:
         return state, ca.DM.zeros(len(plant.inputs)), plant.approximate
     needed = plant.inverse_function(state, response[list(plant.controlled_indices)], plant.approximate)
     return state, needed, plant.approximate
+
+
+EXAMPLES = (DisturbanceKalman({"a": 1.0, "b": 1.0}, dict.fromkeys(("a", "b", "a'", "b'"), 1e-3)),)

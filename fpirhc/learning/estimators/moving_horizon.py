@@ -175,3 +175,6 @@ def _absorb_function(size: int, factor: float) -> ca.Function:
     moved = prior + ca.solve(ca.densify(joined), slopes + square @ (z - prior))
     found = [ca.if_else(valid > 0.5, moved, prior), ca.if_else(valid > 0.5, ca.vec(joined), information)]
     return ca.Function("fpirhc_absorb", [prior, information, z, squares, slopes, valid], [ca.densify(v) for v in found])
+
+
+EXAMPLES = (MovingHorizon({"m": Uncertain(0.5, 3.0, 0.5)}, noise={"a": 0.1, "b": 0.1}, window=5, time=1.0),)

@@ -110,3 +110,6 @@ def _estimate(names: tuple[str, ...]) -> Signal:
 def _covariance(size: int) -> Signal:
     entries = tuple(f"{i},{j}" for j in range(size) for i in range(size))
     return Signal("least_squares_covariance", entries, start=tuple(np.eye(size).ravel()))
+
+
+EXAMPLES = (RecursiveLeastSquares({"m": Uncertain(0.5, 3.0, 0.5)}, noise={"a": 0.1, "b": 0.1}, time=1.0),)

@@ -55,3 +55,6 @@ class LyapunovRule(Rule):
         matrix, along = evidence.gradient()
         gains = ca.DM([self.gains[name] for name in bounds])
         return (1 - evidence.clipped) * period * gains * ca.mtimes(matrix.T, along)
+
+
+EXAMPLES = (LyapunovRule({"m": 1e2}),)

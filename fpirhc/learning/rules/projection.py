@@ -71,3 +71,6 @@ class Projection(Rule):
         size = ca.sqrt(ca.sumsqr(error) + _FLOOR**2)
         share = self.gain * ca.fmax(size - self.dead_zone, 0) / size
         return share * ca.mtimes(spread.T, ca.solve(square, error))
+
+
+EXAMPLES = (Projection(gain=0.02), Projection(gain=0.5, dead_zone=0.1))

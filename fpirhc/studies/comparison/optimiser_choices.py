@@ -7,25 +7,21 @@ from dataclasses import replace
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import InvalidName, InvalidProblem, nearest
+from fpirhc.members import member_modules
 from fpirhc.optimisers.base import Optimiser
-from fpirhc.optimisers.fixed_point import FixedPoint
-from fpirhc.optimisers.nlp import Fatrop, Ipopt, Osqp, SequentialQuadratic
-from fpirhc.optimisers.reduced_gradient import ReducedGradient
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.studies.comparison.optimality import planner, with_optimiser
 
-OPTIMISERS: dict[str, tuple[str, Callable[[float], Optimiser]]] = {
-    "fixed-point": ("FPI", lambda tolerance: FixedPoint(iterations=1, tolerance=tolerance)),
-    "reduced-gradient": ("reduced gradient", lambda tolerance: ReducedGradient(iterations=50, tolerance=tolerance)),
-    "ipopt": ("IPOPT", lambda tolerance: Ipopt(tolerance=tolerance)),
-    "fatrop": ("fatrop", lambda tolerance: Fatrop(tolerance=tolerance)),
-    "qrqp": ("SQP qrqp", lambda tolerance: SequentialQuadratic(tolerance=tolerance)),
-    "osqp": ("SQP OSQP", lambda tolerance: SequentialQuadratic(tolerance=tolerance, quadratic=Osqp())),
-    "osqp-rti": (
-        "OSQP, one iteration",
-        lambda tolerance: SequentialQuadratic(tolerance=tolerance, quadratic=Osqp(), iterations=1),
-    ),
-}
+
+def optimiser_choices() -> dict[str, tuple[str, Callable[[float], Optimiser]]]:
+    """Every optimiser that the command line knows: name -> (label, function of the tolerance).
+
+    A member's module offers them as `CHOICES`.
+    """
+    choices: dict[str, tuple[str, Callable[[float], Optimiser]]] = {}
+    for module in member_modules("optimisers"):
+        choices |= getattr(module, "CHOICES", {})
+    return choices
 
 
 def with_optimisers(task: Task, names: Sequence[str], controllers: Sequence[str] | None) -> Task:
@@ -34,10 +30,11 @@ def with_optimisers(task: Task, names: Sequence[str], controllers: Sequence[str]
     Raises:
         InvalidName: an unknown optimiser. InvalidProblem: no receding-horizon controller to vary.
     """
-    unknown = [n for n in names if n != "all" and n not in OPTIMISERS]
+    choices = optimiser_choices()
+    unknown = [n for n in names if n != "all" and n not in choices]
     if unknown:
-        raise InvalidName(f"optimiser '{unknown[0]}' is unknown.{nearest(unknown[0], [*OPTIMISERS, 'all'])}")
-    chosen = list(OPTIMISERS) if "all" in names else list(dict.fromkeys(names))
+        raise InvalidName(f"optimiser '{unknown[0]}' is unknown.{nearest(unknown[0], [*choices, 'all'])}")
+    chosen = list(choices) if "all" in names else list(dict.fromkeys(names))
     sources = list(controllers or task.headline or task.controllers)
     varied: dict[str, Controller] = {}
     for name in sources:
@@ -46,7 +43,7 @@ def with_optimisers(task: Task, names: Sequence[str], controllers: Sequence[str]
             continue
         tolerance = float(getattr(found.optimiser, "tolerance", 1e-3))
         for key in chosen:
-            label, build = OPTIMISERS[key]
+            label, build = choices[key]
             controller = with_optimiser(task.controllers[name], build(tolerance))
             assert controller is not None
             varied[f"{name} ({label})"] = controller
