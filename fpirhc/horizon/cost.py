@@ -136,7 +136,7 @@ class Quadratic(Cost):
         mistakes.raise_if_any()
 
     def stage(self, view: View) -> dict[str, Expression]:
-        """Return the terms 'states', and 'effort', 'correction', 'rate' where weighed."""
+        """Return the terms 'states', and 'effort', 'deviation', 'rate' where weighed."""
         terms = {"states": _squares(self.states, view.state, view.reference)}
         if self.effort:
             terms["effort"] = sum(w * view.input[n] ** 2 for n, w in self.effort.items())

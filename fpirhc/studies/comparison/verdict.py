@@ -112,7 +112,7 @@ def _effort_cause(entry: Entry) -> str:
         return ""
     return (
         "Its cost weighs the absolute effort, so the optimum of the wrong model trades tracking against a wrong effort and "
-        "adaptation realises that plan faithfully: weigh the correction to the model's feedforward, or the input's rate."
+        "adaptation realises that plan faithfully: weigh the deviation from the model's feedforward, or the input's rate."
     )
 
 
