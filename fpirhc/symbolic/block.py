@@ -183,8 +183,10 @@ def _branches(block: Block, held: Layout) -> tuple[ca.Function, ca.Function]:
 def _call(block: Block, known: dict[str, Expression], following: dict[str, Expression]) -> None:
     taken = [_lookup(f"block '{block.name}'", s, s.name, known) for s in block.reads.signals]
     given = block.function(*taken, *(known[m] for m in block.memory.names))
-    values = given if isinstance(given, tuple) else (given,)
-    results = dict(zip([key for _, key in block._results()], values, strict=True))
+    keys = [key for _, key in block._results()]
+    # A Function returns a tuple of several results, one bare result, and None for none.
+    values = given if isinstance(given, tuple) else (given,) * len(keys)
+    results = dict(zip(keys, values, strict=True))
     for name in block.writes.names:
         if name in known:
             raise InvalidName(f"block '{block.name}' writes '{name}', which is already written")

@@ -4,7 +4,7 @@
 
 Offset-free receding-horizon control is RecedingHorizon with DisturbanceKalman; adaptive receding-horizon control in the
 sense of certainty equivalence is RecedingHorizon with RecursiveLeastSquares or MovingHorizon. They are what an engineer
-would use instead of a deformation, or with one. The parameter_change is used where the controller evaluates its model: in the
+would use instead of a deformation, or with one. The change is used where the controller evaluates its model: in the
 inverse every cycle, in a receding horizon whenever it plans.
 """
 

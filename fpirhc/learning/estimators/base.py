@@ -1,4 +1,4 @@
-"""The contract of estimators: a parameter_change of the model's parameters from what was commanded and measured.
+"""The contract of estimators: a change of the model's parameters from what was commanded and measured.
 
 At t_k an estimator sees the state, and the response that the plant gave just before t_k to the command held since t_{k-1}.
 It returns what is to be added to the parameters that it learns; everything else about the model stays as it was given. A
@@ -21,7 +21,7 @@ class Seen:
     """What an estimator is shown in a cycle.
 
     `command` acted until now and caused `response` at `state`; `parameters` are those that the model was given, before any
-    parameter_change; `valid` is 0 in the first cycle, when nothing has been commanded yet, and 1 from then on.
+    change of the estimator; `valid` is 0 in the first cycle, when nothing has been commanded yet, and 1 from then on.
     """
 
     state: Expression
@@ -55,4 +55,4 @@ class Estimator(ABC):
 
     @abstractmethod
     def step(self, problem: Problem) -> Correct:
-        """Function (seen, memory) -> (parameter_change of the learned parameters, memory one cycle later)."""
+        """Function (seen, memory) -> (change of the learned parameters, memory one cycle later)."""
