@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
@@ -19,7 +18,8 @@ from fpirhc.plant.plant import Plant
 from fpirhc.simulation.simulate import simulate
 from fpirhc.symbolic.block import Block, Composite, compose
 from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.expression import Signals, kind
+from fpirhc.symbolic.layout import Expression, Layout, Named, Signal, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Trajectory
 from fpirhc.tracking.base import Tracking
@@ -124,7 +124,7 @@ class _Trial:
 def _ideal(orders: tuple[int, ...]) -> Plant:
     names = [f"y{k}" for k in range(len(orders))]
 
-    def response(*given: Any) -> dict[str, Expression]:
+    def response(*given: Named) -> dict[str, Expression]:
         return {name: given[-2][f"u{k}"] for k, name in enumerate(names)}
 
     arguments = [*(f"d{k}" for k in range(max(orders))), "u", "p"]
@@ -164,15 +164,15 @@ def _reads_only(block: Block, allowed: set[str], what: str) -> None:
 
 def _writes_what_it_declares(block: Block, what: str) -> None:
     read: set[str] = set()
-    kind: Any = ca.MX if block.opaque else ca.SX
-    symbols = {s.name: kind.sym(s.name, s.size) for s in [*block.reads.signals, *block.memory.signals]}
+    matrix = kind(block.opaque)
+    symbols = {s.name: matrix.sym(s.name, s.size) for s in [*block.reads.signals, *block.memory.signals]}
 
-    class Reading:
+    class Reading(Signals):
         def __getattr__(self, name: str) -> Expression:
             read.add(name)
-            return symbols.get(name, kind(0))
+            return symbols.get(name, matrix(0))
 
-    given = set(block.step(Reading()))
+    given = set(block.step(Reading({})))
     unknown = sorted(read - set(symbols))
     hold(not unknown, f"the step of {what} reads {unknown}, which the block does not declare")
     expected = {*block.writes.names, *(f"{m}_next" for m in block.memory.names)}

@@ -6,16 +6,16 @@ import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
 from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.expression import kind
 
-Array = npt.NDArray[Any]
+Array: TypeAlias = np.ndarray
 
 LARGEST_SAMPLE = 2000  # cycles of a run whose eigenvalues are computed; longer runs are thinned evenly
 _NO_SIGN = 1e-9  # real parts below this share of the largest eigenvalue have no sign
@@ -64,11 +64,11 @@ def response_jacobian(plant: Plant) -> ca.Function:
     Raises:
         NotInvertible: the inputs and the controlled coordinates differ in number.
     """
-    kind: Any = ca.MX if plant.inverse_opaque else ca.SX
-    x = kind.sym("x", plant.state.size)
-    r = kind.sym("r", len(plant.controlled_names))
-    exact = kind.sym("exact", plant.parameter.size if plant.parameters else 0)
-    believed = kind.sym("approximate", exact.numel())
+    matrix = kind(plant.inverse_opaque)
+    x = matrix.sym("x", plant.state.size)
+    r = matrix.sym("r", len(plant.controlled_names))
+    exact = matrix.sym("exact", plant.parameter.size if plant.parameters else 0)
+    believed = matrix.sym("approximate", exact.numel())
     realised = plant.controlled_response_function(x, plant.inverse_function(x, r, believed), exact)
     jacobian = ca.densify(ca.jacobian(realised, r))
     names = ["state", "deformed", "exact", "approximate"]

@@ -15,7 +15,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -26,6 +25,7 @@ from fpirhc.errors import NotSupported
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.task.problem import Problem
 
@@ -112,7 +112,7 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
     """A composed step as one block; `feeds` renames what it reads."""
     reads = tuple(feeds.get(s.name, s) for s in composite.reads.signals)
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         memory = composite.memory.join({m: getattr(s, m) for m in composite.memory.names})
         following, trace, *_ = composite.function(memory, *(getattr(s, r.name) for r in reads))
         kept = {f"{m}_next": v for m, v in composite.memory.split(following).items()}
@@ -128,7 +128,7 @@ def reference_block(problem: Problem) -> Block:
     chosen = list(plant.controlled_indices)
     places = [plant.state.elements.index(c) for c in problem.judged_names]
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         state, response = function(s.time)
         return {"reference": state, "_reference_response": response[chosen], "error": state[places] - s.state[places]}
 
@@ -174,7 +174,7 @@ def commanding_blocks(problem: Problem, judged: Sequence[Signal] = ()) -> tuple[
 def _warm_up_block(blind: int) -> Block:
     """Block that counts the cycles of a run up to `blind`, after which the response may be used."""
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         return {"_warm_up_now": ca.fmin(s.warm_up + 1, blind)}
 
     return Block("running", Layout((scalar("warm_up"),)), Layout((scalar("_warm_up_now"),)), step)
@@ -193,7 +193,7 @@ def deform_block(plant: Plant, deformation: Deformation, blind: int = 1) -> Bloc
         scalar("warm_up"),
     )
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         remembered = {m: getattr(s, m) for m in memory.names}
         deformed, following = deformation.step(s._deformed_last, s.realised, s.desired, remembered)
         valid = s.warm_up > blind - 0.5
@@ -210,7 +210,7 @@ def invert_block(plant: Plant) -> Block:
     reads = Layout((plant.state, plant.response_signal("_deformed_unclipped"), plant.parameter))
     inverse = plant.inverse_function
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         return {"command_unclipped": inverse(s.state, s._deformed_unclipped, s.parameters)}
 
     return Block("invert", reads, Layout((like(plant.input, "command_unclipped"),)), step, opaque=plant.inverse_opaque)
@@ -230,7 +230,7 @@ def _limit_block(problem: Problem) -> Block:
     )
     writes = (plant.input, plant.response_signal("deformed"), scalar("clipped"), scalar("_held"))
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         # Finiteness is asked before the clamp: fmin and fmax turn NaN into a full-scale command.
         finite = ca.mmin(ca.fabs(s.command_unclipped) <= FINITE)
         safe = ca.if_else(finite, s.command_unclipped, s._command_before)
@@ -272,7 +272,7 @@ def clip(u: Expression, lower: np.ndarray, upper: np.ndarray) -> Expression:
 def _judge_block(judged: Sequence[Signal]) -> Block:
     reads = Layout((scalar("_held"), *judged))
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         worst: Expression = s._held * int(Status.NON_FINITE)
         for signal in judged:
             worst = ca.fmax(worst, getattr(s, signal.name))

@@ -14,7 +14,6 @@ The first plan is prepared before the run, for the problem's start, so that one 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -33,6 +32,7 @@ from fpirhc.optimisers.base import Optimiser
 from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, every
+from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem, cycles_per_stage
 
@@ -108,7 +108,7 @@ def _due_block(cycles: int) -> Block:
     """Block that says whether a new plan is due in this cycle."""
     count = scalar("plan_count")
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         following = s.plan_count + 1
         return {"_due": s.plan_count < 0.5, "plan_count_next": ca.if_else(following > cycles - 0.5, 0, following)}
 
@@ -133,12 +133,12 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     )
     writes = (like(plant.input, "planned"), Signal("solve", _SOLVE), scalar("_solve_status"))
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Value]:
         data = data_of(s.time, s.parameters)
         first = ocp.start(s._plan_state, s._command_before)
         lower, upper = ocp.input_lower - s._command_shift_last, ocp.input_upper - s._command_shift_last
-        before = memory.join({m: getattr(s, m) for m in memory.names})
-        remembered = ca.if_else(s.plan_begun > 0.5, optimiser.shifted(ocp, before), before)
+        before = graph(memory.join({m: getattr(s, m) for m in memory.names}))
+        remembered = expression(ca.if_else(graph(s.plan_begun) > 0.5, optimiser.shifted(ocp, before), before))
         inputs, diagnostics, following = solve(first, data, lower, upper, remembered)
         status = diagnostics[_SOLVE.index("status")]
         failed = status > int(Status.NOT_CONVERGED) + 0.5
@@ -175,7 +175,7 @@ def _correction_block(problem: Problem, deformation: Deformation) -> Block:
     inverse = plant.inverse_function
     reads = Layout((plant.state, plant.response_signal("desired"), plant.input, plant.parameter))
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         if isinstance(deformation, Identity):
             return {"command_shift": 0 * s.command}
         return {"command_shift": s.command - inverse(s.state, s.desired, s.parameters)}

@@ -17,7 +17,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 
@@ -25,6 +24,7 @@ from fpirhc.controllers.base import like
 from fpirhc.plant.integrators import runge_kutta_4
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
@@ -52,7 +52,7 @@ class FromMeasurement(Replanning):
         reads = Layout((plant.state, like(plant.input, "planned"), plant.parameter))
         writes = Layout((plant.response_signal("nominal"), plant.response_signal("desired")))
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             planned = response(s.state, s.planned, s.parameters)
             return {"nominal": planned, "desired": planned}
 
@@ -68,7 +68,7 @@ class FromMeasurementTracked(Replanning):
     def parts(self, problem: Problem) -> Parts:
         """Blocks of this choice."""
 
-        def start(s: Any) -> dict[str, Expression]:
+        def start(s: Signals) -> dict[str, Expression]:
             fresh = ca.logic_or(s.warm_up < 0.5, s._due > 0.5)
             return {"_plan_state": s.state, "_target": ca.if_else(fresh, s.state, s._target_before)}
 
@@ -84,14 +84,14 @@ class FromPlan(Replanning):
     def parts(self, problem: Problem) -> Parts:
         """Blocks of this choice."""
 
-        def start(s: Any) -> dict[str, Expression]:
+        def start(s: Signals) -> dict[str, Expression]:
             target = ca.if_else(s.warm_up < 0.5, s.state, s._target_before)
             return {"_plan_state": target, "_target": target}
 
         return _tracked(problem, self.tracking, start)
 
 
-def _tracked(problem: Problem, tracking: Tracking, start: Callable[[Any], dict[str, Expression]]) -> Parts:
+def _tracked(problem: Problem, tracking: Tracking, start: Callable[[Signals], dict[str, Expression]]) -> Parts:
     plant = problem.plant
     begin = _choose("plan_state", plant, start, ["_plan_state", "_target"])
     delay = Delay(like(plant.state, "_target_before"), "target")
@@ -99,7 +99,7 @@ def _tracked(problem: Problem, tracking: Tracking, start: Callable[[Any], dict[s
     return [begin], after, [tracking.update(plant, problem.period)], [delay, *tracking.delays(plant)]
 
 
-def _choose(name: str, plant: Plant, step: Callable[[Any], dict[str, Expression]], writes: list[str]) -> Block:
+def _choose(name: str, plant: Plant, step: Callable[[Signals], dict[str, Expression]], writes: list[str]) -> Block:
     reads = [plant.state]
     if len(writes) > 1:
         reads += [scalar("warm_up"), scalar("_due"), like(plant.state, "_target_before")]
@@ -112,7 +112,7 @@ def _propagate(plant: Plant, period: float) -> Block:
     writes = Layout((plant.response_signal("nominal"), like(plant.state, "target")))
     response, rate = plant.controlled_response_function, plant.derivative_function
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         following = runge_kutta_4(lambda x: rate(x, s.planned, s.parameters), s._target, period)
         return {"nominal": response(s._target, s.planned, s.parameters), "target": following}
 

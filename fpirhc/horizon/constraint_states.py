@@ -14,6 +14,7 @@ import numpy as np
 
 from fpirhc.horizon.cost import View
 from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.expression import Value, expression
 from fpirhc.symbolic.layout import Expression
 from fpirhc.task.limits import Limits
 
@@ -44,7 +45,7 @@ def rates(limits: Limits, plant: Plant, view: View, step: float) -> list[Constra
 def paths(limits: Limits, view: View) -> list[ConstraintState]:
     """Expressions of state and input of stages 0 ... N-1 that are to stay in an interval."""
     return [
-        ConstraintState(name, path.unit, path.expression(view), path.lower, path.upper)
+        ConstraintState(name, path.unit, expression(path.expression(view)), path.lower, path.upper)
         for name, path in limits.paths.items()
     ]
 
@@ -97,6 +98,6 @@ def _entry(name: str, plant: Plant) -> str:
 
 
 def _violation(value: Expression, lower: float, upper: float) -> Expression:
-    above = ca.fmax(value - upper, 0) if math.isfinite(upper) else 0
-    below = ca.fmax(lower - value, 0) if math.isfinite(lower) else 0
-    return above + below
+    above: Value = ca.fmax(value - upper, 0) if math.isfinite(upper) else 0
+    below: Value = ca.fmax(lower - value, 0) if math.isfinite(lower) else 0
+    return expression(above + below)

@@ -17,6 +17,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes
 from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Named
 
 
@@ -139,7 +140,7 @@ class Quadratic(Cost):
         """Return the terms 'states', and 'effort', 'deviation', 'rate' where weighed."""
         terms = {"states": _squares(self.states, view.state, view.reference)}
         if self.effort:
-            terms["effort"] = sum(w * view.input[n] ** 2 for n, w in self.effort.items())
+            terms["effort"] = total(w * view.input[n] ** 2 for n, w in self.effort.items())
         if self.deviation:
             terms["deviation"] = _squares(self.deviation, view.input, view.feedforward)
         if self.rate:

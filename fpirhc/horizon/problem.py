@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -31,6 +30,7 @@ from fpirhc.horizon.cost import Cost, Linearisation, View
 from fpirhc.horizon.reference_expansion import ReferenceExpansion, expand_along, input_curvature
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Expression, Layout, Named, Signal, scalar
 from fpirhc.task.limits import Limits
 from fpirhc.task.reference import Reference
@@ -143,7 +143,7 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
     state = _stage_state(plant, keeps_input, binding)
     s = ca.vertcat(x, before, ca.SX.sym("z", len(binding)))
     following = ca.vertcat(moved, *([u] if keeps_input else []), *(w.expression for w in binding))
-    stacked: Any = ca.vertcat(*terms.values())
+    stacked = ca.vertcat(*terms.values())
     column = horizon.step * stacked
     lower, upper = hard_state_bounds(limits, plant)
     dynamics = ca.Function("fpirhc_dynamics", [s, u, theta], [ca.densify(following)])
@@ -176,13 +176,13 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
 
 def stage_data(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost) -> ca.Function:
     """Function (time, parameters) -> data of all stages, shape (ntheta, N + 1)."""
-    kind: Any = ca.MX if reference.opaque or plant.inverse_opaque else ca.SX
-    t, p = kind.sym("t"), kind.sym("p", plant.parameter.size)
+    matrix = kind(reference.opaque or plant.inverse_opaque)
+    t, p = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
     state, response = reference.function(plant)(t)
     if cost.uses_feedforward:
         needed = plant.inverse_function(state, response[list(plant.controlled_indices)], p)
     else:
-        needed = kind.zeros(plant.input.size)
+        needed = matrix.zeros(plant.input.size)
     one = ca.Function("fpirhc_stage_data", [t, p], [ca.densify(ca.vertcat(t, state, needed, p))])
     start, parameters = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
     nodes = horizon.stages + 1
@@ -265,7 +265,7 @@ def _linearise(plant: Plant, reference: Reference, horizon: Horizon, advance: ca
     return Linearisation(np.asarray(a.full()), np.asarray(b.full()), horizon.step)
 
 
-def _scalar_terms(given: Any) -> dict[str, Expression]:
+def _scalar_terms(given: Mapping[str, Expression]) -> dict[str, Expression]:
     """Terms as scalar expressions, or all that is wrong with them."""
     mistakes = Mistakes("cost")
     if not isinstance(given, Mapping) or not given:
@@ -283,7 +283,7 @@ def _nodes(
     plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, extra: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States (the plant's, `extra` input and written entries), inputs and data along the reference from t = 0."""
-    table: Any = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
+    table = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
     data = np.asarray(table.full())
     layout = data_layout(plant, horizon)
     given = {name: data[layout.slice(name)] for name in ("reference", "feedforward")}

@@ -15,12 +15,11 @@ Programming, IEEE ICRA 2014.
 
 from __future__ import annotations
 
-from typing import Any
-
 import casadi as ca
 import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
+from fpirhc.symbolic.expression import kind
 
 _SCALAR_CODE = 1000  # multiplications of one stage up to which scalar code beats matrix calls
 PIVOT = 1e-12  # relative size below which a pivot is replaced: the direction then still descends
@@ -49,15 +48,14 @@ def backward_sweep(ocp: OptimalControl, damping: float) -> ca.Function:
     return ca.Function("fpirhc_riccati", [*stacked, value, slope], results, names, ["v", "K"])
 
 
-def _reverse(stacked: Any, width: int, stages: int) -> Any:
+def _reverse(stacked: ca.MX, width: int, stages: int) -> ca.MX:
     return ca.horzcat(*reversed(ca.horzsplit(stacked, width))) if stages > 1 else stacked
 
 
 def _stage(ocp: OptimalControl, damping: float) -> ca.Function:
     """Function (P, p, A, B, l_s, l_u, Q, S, R, u, lower, upper) -> (P, p, v, K)."""
     ns, nu = ocp.state.size, ocp.input.size
-    kind: Any = ca.SX if ns * ns * (ns + nu) <= _SCALAR_CODE else ca.MX
-    sym = kind.sym
+    sym = kind(opaque=ns * ns * (ns + nu) > _SCALAR_CODE).sym
     value, slope = sym("P", ns, ns), sym("p", ns)
     a, b, by_state, by_input = sym("A", ns, ns), sym("B", ns, nu), sym("ls", ns), sym("lu", nu)
     q, s, r = sym("Q", ns, ns), sym("S", nu, ns), sym("R", nu, nu)

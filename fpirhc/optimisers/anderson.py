@@ -13,14 +13,12 @@ References: D. G. Anderson, J. ACM 12(4), 1965; H. F. Walker, P. Ni, SIAM J. Num
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 
 from fpirhc.errors import InvalidValue
 from fpirhc.horizon.riccati import solve_free
 from fpirhc.optimisers.base import FINITE
-from fpirhc.symbolic.layout import Expression
 
 _RIDGE = 1e-12  # of the normal equations with columns of length one
 _GROWTH = 2.0  # growth of |F| after which the memory is dropped
@@ -42,10 +40,10 @@ class Anderson:
 
 
 def iterated(
-    function: ca.Function, start: Expression, given: list[ca.MX], iterations: int, acceleration: Anderson | None
-) -> Expression:
+    function: ca.Function, start: ca.MX, given: list[ca.MX], iterations: int, acceleration: Anderson | None
+) -> ca.MX:
     """Return x after `iterations` of x <- function(x, *given), a column."""
-    x: Any = ca.vec(start)
+    x = ca.vec(start)
     if acceleration is None:
         for _ in range(iterations):
             x = function(x, *given)

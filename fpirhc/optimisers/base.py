@@ -22,7 +22,8 @@ from fpirhc.errors import InvalidValue
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient, rollout
 from fpirhc.status import Status
-from fpirhc.symbolic.layout import Expression, Layout
+from fpirhc.symbolic.expression import Matrix
+from fpirhc.symbolic.layout import Layout
 
 FINITE = 1e300  # |v| <= FINITE is false for NaN and infinity
 FEASIBLE = 1e-4  # largest violation of a state bound that still counts as kept
@@ -45,7 +46,7 @@ class Optimiser(ABC):
         """What is kept for the next call: at least the plan, in `plan_inputs`."""
 
     @abstractmethod
-    def shifted(self, ocp: OptimalControl, memory: Expression) -> Expression:
+    def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         """The memory for a horizon that starts one stage later."""
 
     @abstractmethod
@@ -77,38 +78,36 @@ def require_settings(owner: str, iterations: int, tolerance: float) -> None:
         raise InvalidValue(f"{owner} needs a positive tolerance, got {tolerance}")
 
 
-def shift(columns: Expression) -> Expression:
+def shift(columns: ca.MX) -> ca.MX:
     """Drop the first stage and repeat the last: the warm start of the next call."""
     return columns if columns.shape[1] == 1 else ca.horzcat(columns[:, 1:], columns[:, -1])
 
 
-def clip(columns: Expression, lower: Expression, upper: Expression) -> Expression:
+def clip(columns: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
     """Clip every stage's input to its box."""
     stages = columns.shape[1]
     return ca.fmin(ca.fmax(columns, ca.repmat(lower, 1, stages)), ca.repmat(upper, 1, stages))
 
 
-def is_finite(value: Expression) -> Expression:
+def is_finite(value: Matrix) -> Matrix:
     """1 when every entry is finite, 0 otherwise (NaN included, which fmax and fmin would hide)."""
     return ca.mmin(ca.fabs(ca.vec(value)) <= FINITE)
 
 
-def largest(value: Expression) -> Expression:
+def largest(value: ca.MX) -> ca.MX:
     """Largest absolute entry."""
     return ca.norm_inf(ca.vec(value))
 
 
-def stationarity(
-    ocp: OptimalControl, inputs: Expression, gradient: Expression, lower: Expression, upper: Expression
-) -> Expression:
+def stationarity(ocp: OptimalControl, inputs: ca.MX, gradient: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
     """Return the projected residual of a plan (see the module's docstring)."""
     scale = ca.repmat(ca.DM(1 / (ocp.step * ocp.curvature)), 1, ocp.stages)
     return largest(inputs - clip(inputs - scale * gradient, lower, upper))
 
 
-def state_violation(ocp: OptimalControl, states: Expression) -> Expression:
+def state_violation(ocp: OptimalControl, states: ca.MX) -> ca.MX:
     """Largest violation of a state bound by s_1 ... s_N; zero without bounds."""
-    worst: Expression = ca.MX(0)
+    worst: ca.MX = ca.MX(0)
     for k in range(ocp.state.size):
         row = states[k, 1:]
         if ocp.state_lower[k] > -FINITE:
@@ -134,7 +133,7 @@ def judge(ocp: OptimalControl) -> ca.Function:
     return ca.Function("fpirhc_judge", [inputs, s0, data, lower, upper, multipliers], results)
 
 
-def _valid_multipliers(ocp: OptimalControl, states: Expression, multipliers: Expression) -> Expression:
+def _valid_multipliers(ocp: OptimalControl, states: ca.MX, multipliers: ca.MX) -> ca.MX:
     """Keep what can be a multiplier: positive at the upper bound, negative at the lower one, zero elsewhere."""
     rows = []
     for k in range(ocp.state.size):
@@ -147,19 +146,19 @@ def _valid_multipliers(ocp: OptimalControl, states: Expression, multipliers: Exp
     return ca.vertcat(*rows)
 
 
-def sane(s0: Expression, data: Expression, lower: Expression, upper: Expression) -> Expression:
+def sane(s0: ca.MX, data: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
     """1 when a problem can be posed: finite first state and data, and a box that is not empty; 0 otherwise (NaN included)."""
     ordered = ca.logic_and(ca.mmin(lower <= upper), ca.logic_and(ca.mmin(lower <= FINITE), ca.mmin(upper >= -FINITE)))
     return ca.logic_and(is_finite(ca.vertcat(s0, ca.vec(data))), ordered)
 
 
-def remembered_plan(column: Expression, size: int, lower: Expression, upper: Expression) -> Expression:
+def remembered_plan(column: ca.MX, size: int, lower: ca.MX, upper: ca.MX) -> ca.MX:
     """The remembered plan (size, N) inside its box; a poisoned memory is forgotten, for zero inputs."""
     usable = ca.if_else(is_finite(column), column, 0)
     return clip(ca.reshape(usable, size, column.numel() // size), lower, upper)
 
 
-def status_of(finite: Expression, residual: Expression, violation: Expression, tolerance: float) -> Expression:
+def status_of(finite: Matrix, residual: Matrix, violation: Matrix | float, tolerance: float) -> Matrix:
     """Return the status number of a plan."""
     converged = ca.if_else(residual <= tolerance, int(Status.OK), int(Status.NOT_CONVERGED))
     feasible = ca.if_else(violation <= FEASIBLE, converged, int(Status.INFEASIBLE))

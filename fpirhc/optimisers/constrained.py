@@ -8,7 +8,6 @@ one away. An open-loop solve repeats calls until the plan is stationary and insi
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import casadi as ca
 
@@ -17,7 +16,7 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.base import FINITE, is_finite, judge, sane, shift, state_violation, status_of
 from fpirhc.status import Status
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 MULTIPLIERS = "plan_state_multipliers"
 _RHO, _VIOLATION = "plan_penalty", "plan_violation"
@@ -33,12 +32,12 @@ def with_multipliers(ocp: OptimalControl, inner: Layout) -> Layout:
     return inner + Layout((multipliers, scalar(_RHO), scalar(_VIOLATION)))
 
 
-def shifted_multipliers(ocp: OptimalControl, kept: Mapping[str, Expression]) -> dict[str, Expression]:
+def shifted_multipliers(ocp: OptimalControl, kept: Mapping[str, ca.MX]) -> dict[str, ca.MX]:
     """What belongs to the multipliers, one stage later: rho relaxes, and the last violation says nothing any more."""
     return {
         MULTIPLIERS: ca.vec(shift(ca.reshape(kept[MULTIPLIERS], len(bounded_states(ocp)), ocp.stages))),
         _RHO: kept[_RHO] / _RAISE,
-        _VIOLATION: 0,
+        _VIOLATION: ca.MX(0),
     }
 
 
@@ -46,7 +45,7 @@ def constrained_step(
     ocp: OptimalControl,
     build: Callable[[OptimalControl], ca.Function],
     inner: Layout,
-    prepare: Callable[[dict[str, Expression], Expression], dict[str, Expression]],
+    prepare: Callable[[dict[str, ca.MX], ca.MX], dict[str, ca.MX]],
     updates: int,
     tolerance: float,
     feasible: float,
@@ -61,15 +60,14 @@ def constrained_step(
     lower, upper, memory = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu), ca.MX.sym("memory", layout.size)
     kept = layout.split(memory)
     usable = ca.if_else(ca.fabs(kept[MULTIPLIERS]) <= FINITE, kept[MULTIPLIERS], 0)
-    found: Expression = ca.reshape(usable, rows, n)
+    found: ca.MX = ca.reshape(usable, rows, n)
     rho = 1 + ca.if_else(ca.fabs(kept[_RHO]) <= _LARGEST, ca.fabs(kept[_RHO]), 0)
-    worst: Expression = ca.if_else(ca.fabs(kept[_VIOLATION]) <= FINITE, kept[_VIOLATION], 0)
+    worst: ca.MX = ca.if_else(ca.fabs(kept[_VIOLATION]) <= FINITE, kept[_VIOLATION], 0)
     given, iterations = {name: kept[name] for name in inner.names}, ca.MX(0)
     for _ in range(updates):
         before = found
         extended = ca.vertcat(data, ca.repmat(rho, 1, n + 1), ca.horzcat(ca.MX.zeros(rows, 1), before))
-        result: Any = work(s0, extended, lower, upper, inner.join(prepare(given, rho)))
-        plan, told, after = result
+        plan, told, after = work(s0, extended, lower, upper, inner.join(prepare(given, rho)))
         given, states = inner.split(after), rollout(ocp)(s0, plan, data)[0]
         fresh, left = update(states, rho, before), state_violation(ocp, states)
         settled = told[1] <= 10 * tolerance + _NEARLY * ca.norm_inf(ca.vec(plan))

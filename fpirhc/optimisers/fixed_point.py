@@ -73,7 +73,7 @@ from fpirhc.optimisers.search import (
 )
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, with_driver
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 _DIGITS = 1e-15  # relative rounding of a number
 MOST = 100  # iterations of one converging call
@@ -147,7 +147,7 @@ class FixedPoint(Optimiser):
         )
         return with_multipliers(ocp, own) if ocp.bounds_states else own
 
-    def shifted(self, ocp: OptimalControl, memory: Expression) -> Expression:
+    def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         """The memory one stage later; the last stage, which is repeated, has no feedback."""
         kept = self.memory(ocp).split(memory)
         ns, nu, n = ocp.state.size, ocp.input.size, ocp.stages
@@ -193,7 +193,7 @@ class FixedPoint(Optimiser):
     ) -> ca.Function:
         moved = augmented(ocp)
 
-        def prepare(memory: dict[str, Expression], steeper: Expression) -> dict[str, Expression]:
+        def prepare(memory: dict[str, ca.MX], steeper: ca.MX) -> dict[str, ca.MX]:
             # A call starts with twice the remembered gamma.
             return {**memory, "plan_gamma": 0.5 * first_gamma(moved) / steeper}
 
@@ -297,8 +297,8 @@ class FixedPoint(Optimiser):
         )
 
     def _finish(
-        self, ocp: OptimalControl, given: Given, memory: ca.MX, anchor: Anchor, iterations: Expression | int
-    ) -> list[Expression]:
+        self, ocp: OptimalControl, given: Given, memory: ca.MX, anchor: Anchor, iterations: ca.MX | int
+    ) -> list[ca.MX]:
         posed, evaluated = sane(*given), anchor.value < UNTRIED
         finite = ca.logic_and(posed, evaluated)
         residual = stationarity(ocp, anchor.inputs, anchor.slope, given.lower, given.upper)

@@ -28,7 +28,8 @@ from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.anderson import Anderson, iterated
 from fpirhc.optimisers.base import Optimiser, is_finite, judge, require_settings, sane, shift, status_of
 from fpirhc.status import Status
-from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.expression import expression, graph
+from fpirhc.symbolic.layout import Layout, Signal
 
 _SAFE = 0.95
 _BALANCING = 20  # passes of Ruiz's equilibration
@@ -83,7 +84,7 @@ class FullSpaceFixedPoint(Optimiser):
         plan = tuple(f"{i}@{k}" for k in range(n) for i in ocp.input.elements)
         return Layout((Signal("plan_states", states), Signal("plan_inputs", plan), Signal("plan_multipliers", states)))
 
-    def shifted(self, ocp: OptimalControl, memory: Expression) -> Expression:
+    def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         """Everything one stage later."""
         rows = {"plan_states": ocp.state.size, "plan_inputs": ocp.input.size, "plan_multipliers": ocp.state.size}
         kept = self.memory(ocp).split(memory)
@@ -129,8 +130,9 @@ class FullSpaceFixedPoint(Optimiser):
         slope = scale * ca.vertcat(*(ca.vec(v) for v in auxiliary_gradient(ocp)(*shaped, s0, data)))
         response = ca.jtimes(slope, column, slope, True)
         chosen = Affine(gain=-2 * _SAFE / largest**2) if self.map is None else self.map
-        following, _ = chosen.step(column, response, ca.MX.zeros(column.numel()), {})
-        return ca.Function("fpirhc_transformed_auxiliary", [column, s0, data], [following])
+        request, error, none = (expression(v) for v in (column, response, ca.MX.zeros(column.numel())))
+        following, _ = chosen.step(request, error, none, {})
+        return ca.Function("fpirhc_transformed_auxiliary", [column, s0, data], [graph(following)])
 
 
 def _scaling(ocp: OptimalControl, scaled: bool) -> tuple[np.ndarray, float]:

@@ -36,7 +36,8 @@ from fpirhc.optimisers.base import (
     status_of,
 )
 from fpirhc.status import Status
-from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.expression import expression, graph
+from fpirhc.symbolic.layout import Layout, Signal
 
 _SAFE = 0.95  # share of the largest gain, for the map that is chosen automatically
 
@@ -85,7 +86,7 @@ class GradientFixedPoint(Optimiser):
             (Signal("plan_inputs", tuple(f"{i}@{k}" for k in range(ocp.stages) for i in ocp.input.elements)),)
         )
 
-    def shifted(self, ocp: OptimalControl, memory: Expression) -> Expression:
+    def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         """The plan one stage later."""
         return ca.vec(shift(ca.reshape(memory, ocp.input.size, ocp.stages)))
 
@@ -121,8 +122,9 @@ class GradientFixedPoint(Optimiser):
         inputs = ca.reshape(column, nu, n)
         slope = reduced_gradient(ocp)(s0, inputs, data, ca.MX.zeros(ocp.state.size, n))[1]
         response = ca.vec(ca.repmat(ca.DM(_scale(ocp)), 1, n) * slope)
-        following, _ = self._map(ocp).step(column, response, ca.MX.zeros(nu * n), {})
-        clipped = ca.vec(clip(ca.reshape(following, nu, n), lower, upper))
+        request, error, none = (expression(v) for v in (column, response, ca.MX.zeros(nu * n)))
+        following, _ = self._map(ocp).step(request, error, none, {})
+        clipped = ca.vec(clip(ca.reshape(graph(following), nu, n), lower, upper))
         return ca.Function("fpirhc_transformed_plan", [column, s0, data, lower, upper], [clipped])
 
 

@@ -6,8 +6,6 @@ M < 0 only at a lower one: a non-negative least-squares problem.
 
 from __future__ import annotations
 
-from typing import Any
-
 import casadi as ca
 import numpy as np
 
@@ -19,7 +17,7 @@ _AT_BOUND = 1e-6  # relative distance within which an input counts as at its bou
 
 
 def fit_multipliers(
-    ocp: OptimalControl, inputs: np.ndarray, state: np.ndarray, data: Any, bounds: tuple[np.ndarray, np.ndarray]
+    ocp: OptimalControl, inputs: np.ndarray, state: np.ndarray, data: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
     """Return M (ns, N) with the sign of the bound it belongs to; zero where no state is at a bound."""
     none = np.zeros((ocp.state.size, ocp.stages))

@@ -11,8 +11,9 @@ References: J. A. E. Andersson et al., CasADi, Math. Program. Comput. 11, 2019.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TypeAlias
 
 import casadi as ca
 
@@ -42,9 +43,10 @@ from fpirhc.optimisers.shooting import (
     stage_bounds,
 )
 from fpirhc.status import Status
-from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.layout import Layout, Signal
 
-Options = dict[str, Any]
+Setting: TypeAlias = "bool | int | float | str | Sequence[bool] | ca.Function | Mapping[str, Setting]"
+Options: TypeAlias = Mapping[str, Setting]
 _QUIET: Options = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
 _LARGEST_MULTIPLIER = 1e12
 
@@ -154,7 +156,7 @@ class _MultipleShooting(Optimiser):
             )
         )
 
-    def shifted(self, ocp: OptimalControl, memory: Expression) -> Expression:
+    def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         """The plan and the multipliers one stage later."""
         kept = self.memory(ocp).split(memory)
         moved = {
@@ -323,7 +325,7 @@ class SequentialQuadratic(_MultipleShooting):
         }
 
 
-def _usable(multipliers: Expression) -> Expression:
+def _usable(multipliers: ca.MX) -> ca.MX:
     """Forget multipliers that are not finite or absurdly large: they would poison a warm start."""
     return ca.if_else(ca.fabs(multipliers) <= _LARGEST_MULTIPLIER, multipliers, 0)
 

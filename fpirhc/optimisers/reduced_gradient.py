@@ -33,7 +33,7 @@ from fpirhc.optimisers.base import (
     status_of,
 )
 from fpirhc.status import Status
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 _HISTORY = 5  # values that the non-monotone line search compares with
 _DECREASE = 1e-4
@@ -77,7 +77,7 @@ class ReducedGradient(Optimiser):
         plan = Signal("plan_inputs", tuple(f"{i}@{k}" for k in range(ocp.stages) for i in ocp.input.elements))
         return Layout((plan, scalar("plan_step_length", start=0.0)))
 
-    def shifted(self, ocp: OptimalControl, memory: Expression) -> Expression:
+    def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         """The plan one stage later, and the same step length."""
         plan = ca.reshape(memory[:-1], ocp.input.size, ocp.stages)
         return ca.vertcat(ca.vec(shift(plan)), memory[-1])
@@ -106,8 +106,8 @@ class ReducedGradient(Optimiser):
         self,
         ocp: OptimalControl,
         arguments: tuple[ca.MX, ...],
-        start: Expression,
-        survives: Expression,
+        start: ca.MX,
+        survives: ca.MX,
         best: ca.MX,
         length: ca.MX,
     ) -> ca.Function:
@@ -166,7 +166,7 @@ def _part(ocp: OptimalControl, state: ca.MX, k: int) -> ca.MX:
     return state[ends[k] : ends[k + 1]]
 
 
-def _choose(condition: Expression, yes: Expression, no: Expression) -> Expression:
+def _choose(condition: ca.MX, yes: ca.MX, no: ca.MX) -> ca.MX:
     """Entry-wise choice that keeps NaN of the branch not taken out of the result."""
     return ca.if_else(condition, yes, no)
 

@@ -15,7 +15,6 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.reference_expansion import steepest_curvature
 from fpirhc.horizon.riccati import backward_sweep
 from fpirhc.optimisers.base import clip, is_finite
-from fpirhc.symbolic.layout import Expression
 
 SHARE = 0.95  # gamma L, and the share of the guaranteed decrease that is asked for
 ARMIJO = 1e-2  # share of the first-order decrease that is asked of a short step
@@ -39,30 +38,30 @@ class Given(NamedTuple):
 class Anchor(NamedTuple):
     """The best plan so far, where to go from it, and how boldly."""
 
-    inputs: Expression  # U (nu, N)
-    states: Expression  # X (ns, N)
-    move: Expression  # v (nu, N)
-    gains: Expression  # K (nu, ns N)
-    plain: Expression  # T (nu, N)
-    slope: Expression  # g (nu, N)
-    value: Expression  # V
-    envelope: Expression  # phi
-    step: Expression  # tau; below SHORTEST the next plan is T
-    gamma: Expression
-    resume: Expression  # tau that follows the evaluation of a remembered plan
+    inputs: ca.MX  # U (nu, N)
+    states: ca.MX  # X (ns, N)
+    move: ca.MX  # v (nu, N)
+    gains: ca.MX  # K (nu, ns N)
+    plain: ca.MX  # T (nu, N)
+    slope: ca.MX  # g (nu, N)
+    value: ca.MX  # V
+    envelope: ca.MX  # phi
+    step: ca.MX  # tau; below SHORTEST the next plan is T
+    gamma: ca.MX
+    resume: ca.MX  # tau that follows the evaluation of a remembered plan
 
 
 class Expanded(NamedTuple):
     """A plan that was tried, expanded."""
 
-    inputs: Expression
-    states: Expression  # (ns, N + 1)
-    a: Expression
-    b: Expression
-    by_state: Expression
-    by_input: Expression
-    costates: Expression  # (ns, N), of s_1 ... s_N
-    accepted: Expression
+    inputs: ca.MX
+    states: ca.MX  # (ns, N + 1)
+    a: ca.MX
+    b: ca.MX
+    by_state: ca.MX
+    by_input: ca.MX
+    costates: ca.MX  # (ns, N), of s_1 ... s_N
+    accepted: ca.MX
 
 
 def first_gamma(ocp: OptimalControl) -> float:
@@ -175,10 +174,10 @@ def _judgement(ocp: OptimalControl) -> ca.Function:
     old = Anchor(*(ca.MX.sym(name, *shape) for name, shape in zip(Anchor._fields, shapes, strict=True)))
     scale = ca.repmat(ca.DM(1 / (ocp.step * ocp.curvature)), 1, n)
 
-    def plain_step(u: Expression, g: Expression, gamma: Expression) -> Expression:
+    def plain_step(u: ca.MX, g: ca.MX, gamma: ca.MX) -> ca.MX:
         return clip(u - gamma * scale * g, lower, upper)
 
-    def size(difference: Expression) -> Expression:
+    def size(difference: ca.MX) -> ca.MX:
         return ca.dot(difference, difference / scale)
 
     plain = plain_step(inputs, slope, old.gamma)
@@ -222,6 +221,6 @@ def _stage_shapes(ns: int, nu: int) -> tuple[tuple[int, int], ...]:
     return (ns, ns), (ns, nu), (ns, 1), (nu, 1)
 
 
-def _turned(stacked: Expression, stages: int) -> Expression:
+def _turned(stacked: ca.MX, stages: int) -> ca.MX:
     """The blocks of the stages in reverse order."""
     return ca.horzcat(*reversed(ca.horzsplit(stacked, stacked.shape[1] // stages))) if stages > 1 else stacked

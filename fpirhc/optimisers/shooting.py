@@ -5,13 +5,11 @@ variables    w = (s_0, u_0, s_1, ..., u_{N-1}, s_N),    constraints  s_{i+1} - F
 
 from __future__ import annotations
 
-from typing import Any
-
 import casadi as ca
+import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.base import shift
-from fpirhc.symbolic.layout import Expression
 
 
 def program_values(ocp: OptimalControl) -> ca.Function:
@@ -27,20 +25,20 @@ def sizes(ocp: OptimalControl) -> tuple[int, int]:
     return ocp.stages * (ocp.state.size + ocp.input.size) + ocp.state.size, ocp.stages * ocp.state.size
 
 
-def interleave(states: Expression, inputs: Expression) -> Expression:
+def interleave(states: ca.MX, inputs: ca.MX) -> ca.MX:
     """(ns, N + 1), (nu, N) -> column (s_0, u_0, s_1, ..., s_N)."""
     n = inputs.shape[1]
     return ca.vertcat(ca.vec(ca.vertcat(states[:, :n], inputs)), states[:, n])
 
 
-def separate(ocp: OptimalControl, column: Expression) -> tuple[Expression, Expression]:
+def separate(ocp: OptimalControl, column: ca.MX) -> tuple[ca.MX, ca.MX]:
     """Inverse of `interleave`."""
     ns, nu, n = ocp.state.size, ocp.input.size, ocp.stages
     stages = ca.reshape(column[: n * (ns + nu)], ns + nu, n)
     return ca.horzcat(stages[:ns, :], column[n * (ns + nu) :]), stages[ns:, :]
 
 
-def stage_bounds(ocp: OptimalControl, s0: ca.MX, bound: Any) -> ca.MX:
+def stage_bounds(ocp: OptimalControl, s0: ca.MX, bound: np.ndarray) -> ca.MX:
     """Bounds of s_0 ... s_N: the first state is given."""
     return ca.horzcat(s0, ca.repmat(ca.DM(bound), 1, ocp.stages))
 
@@ -51,9 +49,9 @@ def shift_variables(ocp: OptimalControl, column: ca.MX) -> ca.MX:
     return interleave(shift(states), shift(inputs))
 
 
-def shift_dynamics(ocp: OptimalControl, column: ca.MX) -> Expression:
+def shift_dynamics(ocp: OptimalControl, column: ca.MX) -> ca.MX:
     """Multipliers of the dynamics one stage later."""
-    stages: Expression = ca.reshape(column, ocp.state.size, ocp.stages)
+    stages: ca.MX = ca.reshape(column, ocp.state.size, ocp.stages)
     return ca.vec(shift(stages))
 
 

@@ -44,7 +44,7 @@ def progress_bars() -> Iterator[Report]:
 
 def announce_backend(comparison: Comparison) -> None:
     """Say on standard error when loops ran without compiled C, and why."""
-    reasons = {e.run.settings["why not compiled"] for e in comparison.entries if not e.run.compiled}
+    reasons = {str(e.run.settings["why not compiled"]) for e in comparison.entries if not e.run.compiled}
     for reason in sorted(reasons):
         print(f"fpirhc: some loops ran in CasADi's virtual machine, more slowly ({reason})", file=sys.stderr)
 

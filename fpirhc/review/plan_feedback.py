@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -24,6 +23,7 @@ from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stag
 from fpirhc.horizon.problem import Horizon, stage_data, transcribe
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem import Problem
@@ -41,7 +41,7 @@ class PlanFeedback(Tracking):
         reads = (plant.state, target, plant.response_signal("nominal"), plant.parameter)
         nx, nu = plant.state.size, plant.input.size
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             deviation = s.state - s._target
             gains = ca.reshape(s.parameters[plant.parameter.size - nu * nx :], nx, nu).T
             planned = ca.mtimes(gains, deviation)

@@ -18,16 +18,15 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.layout import Expression, Signal
 
-Array = npt.NDArray[Any]
+Array: TypeAlias = np.ndarray
 
 
 class DerivativeEstimator(ABC):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, response_names
 from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 
@@ -26,7 +26,7 @@ class Measured(DerivativeEstimator):
         del period, start
         realised = plant.response_signal("realised")
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             both = getattr(s, seen.name)
             return {"state": both[: plant.state.size], "realised": both[plant.state.size :]}
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -19,6 +18,7 @@ from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, backward_difference, combine, spline_weights
 from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 LONGEST = 1001  # samples: what is remembered is static
@@ -54,7 +54,7 @@ class _Finite(DerivativeEstimator):
         queue = _queue(plant, period, start, [row.shape[1] - 1 for row in rows])
         realised = plant.response_signal("realised")
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             newest, past, at = getattr(s, seen.name), s.estimate_past, 0
             known: dict[str, Expression] = {}
             kept: list[Expression] = []

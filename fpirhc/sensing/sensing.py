@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -26,6 +25,7 @@ from fpirhc.sensing.base import Array, DerivativeEstimator, response_names
 from fpirhc.sensing.measured import Measured
 from fpirhc.sensing.sensor import Sensor
 from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
 from fpirhc.task.dead_time import delay_block
 
@@ -129,7 +129,7 @@ class Sensing:
         starts = [float(first[measured.elements.index(n)]) for n in lossy]
         memory = (Signal("sensor_last", tuple(lossy), start=tuple(starts)),) if lossy else ()
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             both = ca.vertcat(getattr(s, true[0].name), getattr(s, true[1].name))
             seen = {n: both[every.index(n)] for n in measured.elements}
             for name, sensor in self.sensors.items():

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -21,6 +20,7 @@ from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, spline_weights
 from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 _TAIL = 1e-16  # of a low-pass: what the weights leave out
@@ -79,7 +79,7 @@ class StateVariableFilter(DerivativeEstimator):
         keep, new = self._coefficients(period)
         memory = tuple(self._memory(plant, period, start, kind) for kind in ("filter_stages", "filter_inputs"))
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             positions, at = getattr(s, seen.name), 0
             known: dict[str, Expression] = {}
             stages: list[Expression] = []
@@ -110,9 +110,9 @@ class StateVariableFilter(DerivativeEstimator):
         double = 2 / period
         return (double - self.bandwidth) / (double + self.bandwidth), self.bandwidth / (double + self.bandwidth)
 
-    def _derivative(self, chain: list[Any], order: int, degree: int) -> Any:
+    def _derivative(self, chain: list[Expression], order: int, degree: int) -> Expression:
         terms = ((-1.0) ** i * math.comb(degree, i) * chain[order - degree + i] for i in range(degree + 1))
-        return self.bandwidth**degree * sum(terms)
+        return self.bandwidth**degree * total(terms)
 
     def _memory(self, plant: Plant, period: float, start: Array, kind: str) -> Signal:
         """The stages, or what came into them, one cycle before the first; stage j is late by j / w."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -20,6 +19,7 @@ from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator
 from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 _TAIL = 1e-9  # share of the low-pass's weights that is left out
@@ -115,7 +115,7 @@ def _difference_block(plant: Plant, period: float, start: Array, seen: Signal, p
     realised, smooth = plant.response_signal("realised"), Signal("estimate_smooth", plant.controlled_names)
     memory = (before, smooth, scalar("estimate_cycles")) if pole else (before,)
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         state = getattr(s, seen.name)
         newest = state[places]
         response = (newest - s.estimate_before) / period

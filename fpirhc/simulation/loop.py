@@ -7,7 +7,6 @@ held since t_{k-1}; the controller turns them into a command; the plant moves on
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller, Response, error_signal, like, prepared
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
+from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.dead_time import delay_block
 from fpirhc.task.problem import Problem
@@ -79,7 +79,7 @@ def _forcing(plant: Plant, name: str) -> Signal:
 def _clock_block(period: float) -> Block:
     """Time from a counter: no rounding error grows in a long run."""
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         return {"time": s.cycle * period, "cycle_next": s.cycle + 1}
 
     return Block("clock", Layout(), Layout((scalar("time", "s"),)), step, Layout((scalar("cycle"),)))
@@ -121,7 +121,7 @@ def _truth_block(problem: Problem, state: Signal) -> Block:
     places = [plant.state.elements.index(c) for c in problem.judged_names]
     writes = Layout((error_signal(problem, "true_error"),))
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         return {"true_error": (function(s.time)[0] - getattr(s, state.name))[places]}
 
     return Block("truth", Layout((scalar("time", "s"), state)), writes, step, opaque=problem.reference.opaque)
@@ -148,7 +148,7 @@ def _sense_block(plant: Plant, state: Signal, response: Response) -> Block:
         like(plant.parameter, "_exact"),
     )
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         found = response.function(s._state_before, s._acting_before, s._exact, s._forcing_before)
         return {state.name: s._state_before, response.signal.name: found}
 
@@ -176,8 +176,8 @@ def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Si
     reads = (state, arriving, like(plant.parameter, "_exact"), *disturbed)
     writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
 
-    def step(s: Any) -> dict[str, Expression]:
-        u, w = getattr(s, arriving.name), ca.DM.zeros(len(plant.names))
+    def step(s: Signals) -> dict[str, Expression]:
+        u, w = getattr(s, arriving.name), expression(ca.DM.zeros(len(plant.names)))
         if disturbed:
             added = dict(zip(problem.disturbances, ca.vertsplit(s.disturbance), strict=True))
             u = u + ca.vertcat(*(added.get(name, 0) for name in plant.inputs))

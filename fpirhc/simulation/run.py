@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 import numpy as np
@@ -43,7 +43,7 @@ class Run:
     log: np.ndarray
     stop: str | None
     compiled: bool
-    settings: Mapping[str, Any]
+    settings: Mapping[str, object]
 
     def __repr__(self) -> str:
         return line(self, f"{self.problem or 'problem'}, {self.controller}", *self._facts())

@@ -12,15 +12,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from types import SimpleNamespace
-from typing import Any
 
 import casadi as ca
 
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.expression import Expression, Signals, Value, kind
+from fpirhc.symbolic.layout import Layout, Signal, scalar
 
-Step = Callable[[Any], Mapping[str, Expression]]
+Step = Callable[[Signals], Mapping[str, Value]]
 PREFIX = "fpirhc_"  # keeps generated C names away from those of libc
 
 
@@ -47,15 +46,15 @@ class Block:
         Raises:
             InvalidName: the step forgot a signal. InvalidShape: a signal has the wrong size.
         """
-        kind: Any = ca.MX if self.opaque else ca.SX
+        matrix = kind(self.opaque)
         taken = [*self.reads.signals, *self.memory.signals]
-        symbols = {s.name: kind.sym(s.name, s.size) for s in taken}
-        given = self.step(SimpleNamespace(**symbols))
+        symbols = {s.name: matrix.sym(s.name, s.size) for s in taken}
+        given = self.step(Signals(symbols))
         results = []
         for signal, key in self._results():
             if key not in given:
                 raise InvalidName(f"block '{self.name}' does not give '{key}'.{nearest(key, given)}")
-            value = kind(given[key])
+            value = matrix(given[key])
             if value.numel() != signal.size:
                 raise InvalidShape(
                     f"block '{self.name}' gives '{key}' with {value.numel()} entries, expected {signal.size}"
@@ -110,8 +109,8 @@ def compose(
     memory = Layout(tuple(d.now for d in delays) + tuple(s for b in blocks for s in b.memory.signals))
     inputs = {s.name: ca.MX.sym(s.name, s.size) for s in reads.signals}
     remembered = ca.MX.sym("memory", memory.size)
-    known: dict[str, Expression] = {**memory.split(remembered), **inputs}
-    following: dict[str, Expression] = {}
+    known: dict[str, ca.MX] = {**memory.split(remembered), **inputs}
+    following: dict[str, ca.MX] = {}
     for block in blocks:
         _call(block, known, following)
     trace = Layout(tuple(s for b in blocks for s in b.writes.signals if not s.name.startswith("_")))
@@ -146,7 +145,7 @@ def every(block: Block, cycles: int) -> Block:
     own = Layout((phase, *held.signals)) + block.memory
     run, hold = _branches(block, held)
 
-    def step(signals: Any) -> dict[str, Expression]:
+    def step(signals: Signals) -> dict[str, Expression]:
         taken = [getattr(signals, n) for n in (*held.names, *block.reads.names, *block.memory.names)]
         choice = ca.Function.if_else(f"{PREFIX}{block.name}_every", run, hold)
         due = getattr(signals, phase.name) < 0.5
@@ -180,7 +179,7 @@ def _branches(block: Block, held: Layout) -> tuple[ca.Function, ca.Function]:
     return run, hold
 
 
-def _call(block: Block, known: dict[str, Expression], following: dict[str, Expression]) -> None:
+def _call(block: Block, known: dict[str, ca.MX], following: dict[str, ca.MX]) -> None:
     taken = [_lookup(f"block '{block.name}'", s, s.name, known) for s in block.reads.signals]
     given = block.function(*taken, *(known[m] for m in block.memory.names))
     keys = [key for _, key in block._results()]
@@ -201,7 +200,7 @@ def _scalar_code(function: ca.Function) -> ca.Function:
     return ca.Function(function.name(), inputs, shared, function.name_in(), function.name_out())
 
 
-def _lookup(reader: str, signal: Signal, source: str, known: Mapping[str, Expression]) -> Expression:
+def _lookup(reader: str, signal: Signal, source: str, known: Mapping[str, ca.MX]) -> ca.MX:
     if source not in known:
         raise InvalidName(f"{reader} reads '{source}', which no earlier block writes.{nearest(source, known)}")
     found = known[source]

@@ -11,12 +11,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NoReturn
+from typing import NoReturn, Protocol, cast
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 
 from fpirhc.errors import InvalidShape, InvalidValue
+
+
+class _Buffer(Protocol):
+    """What CasADi's FunctionBuffer takes from Python; its stub has the arguments of C++."""
+
+    def set_arg(self, k: int, memory: memoryview) -> None: ...
+    def set_res(self, k: int, memory: memoryview) -> None: ...
+    def ret(self) -> int: ...
 
 
 class Evaluator:
@@ -25,8 +34,7 @@ class Evaluator:
     def __init__(self, function: ca.Function) -> None:
         """Allocate the arrays and bind them; sparse arguments and results become dense."""
         self.function = _dense(function)
-        self._buffer: Any
-        self._buffer, handle = self.function.buffer()
+        self._buffer, handle = cast(tuple[_Buffer, Callable[[], object]], self.function.buffer())
         self.arguments = tuple(_array(self.function.size_in(k)) for k in range(self.function.n_in()))
         self.results = tuple(_array(self.function.size_out(k)) for k in range(self.function.n_out()))
         for k, array in enumerate(self.arguments):
@@ -34,10 +42,10 @@ class Evaluator:
         for k, array in enumerate(self.results):
             self._buffer.set_res(k, array.data)
         self._redirected: dict[int, np.ndarray] = {}
-        evaluate: Any = partial(handle)
+        self.evaluate: Callable[[], object] = partial(handle)
         # The handle alone points into memory that the buffer and the arrays own: it must keep them alive.
-        evaluate.owners = (self._buffer, self.arguments, self.results, self._redirected)
-        self.evaluate: Callable[[], Any] = evaluate
+        owners = (self._buffer, self.arguments, self.results, self._redirected)
+        vars(self.evaluate)["owners"] = owners
 
     def redirect(self, k: int, array: np.ndarray) -> None:
         """Write result `k` into `array` from now on, such as a slice of a log, and no longer into `results[k]`.
@@ -59,7 +67,7 @@ class Evaluator:
         """
         return bool(self._buffer.ret() != 0)
 
-    def __call__(self, *values: Any) -> tuple[np.ndarray, ...]:
+    def __call__(self, *values: npt.ArrayLike) -> tuple[np.ndarray, ...]:
         """Evaluate with these arguments and return copies of the results.
 
         Raises:
@@ -86,7 +94,7 @@ class Evaluator:
         """
         raise TypeError("an Evaluator cannot be copied or pickled; build one from its Function in each process")
 
-    def _checked(self, k: int, value: Any) -> np.ndarray:
+    def _checked(self, k: int, value: npt.ArrayLike) -> np.ndarray:
         array, name = self.arguments[k], self.function.name_in(k)
         try:
             given = np.asarray(value, dtype=float)

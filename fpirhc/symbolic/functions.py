@@ -9,7 +9,7 @@ from fpirhc.symbolic.layout import Expression
 SMOOTHING = 1e-6  # in the unit of the argument: where the power is rounded off around zero
 
 
-def signed_power(d: Expression, exponent: Expression) -> Expression:
+def signed_power(d: Expression, exponent: Expression | float) -> Expression:
     """Return sign(d) |d|^exponent, rounded off within 1e-6 of zero so that its derivatives stay finite.
 
     Computed as d (d^2 + 1e-12)^((exponent - 1)/2).

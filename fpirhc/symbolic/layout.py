@@ -10,14 +10,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
+from fpirhc.symbolic.expression import Expression, Matrix, column
 
-Expression = Any  # a CasADi SX, MX or DM column; CasADi's own stubs do not name their union
+__all__ = ["Expression", "Layout", "Named", "Signal", "scalar", "vector"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +161,7 @@ class Layout:
         parts = {s.name: tuple(map(float, values[self.slice(s.name)])) for s in self.signals}
         return Layout(tuple(replace(s, start=parts[s.name]) for s in self.signals))
 
-    def pack(self, values: Mapping[str, Any]) -> np.ndarray:
+    def pack(self, values: Mapping[str, npt.ArrayLike]) -> np.ndarray:
         """Numbers by name -> flat vector; signals not named take their start value.
 
         Raises:
@@ -185,13 +186,13 @@ class Layout:
             raise InvalidShape(f"expected {self.size} entries, got {flat.shape[-1]}")
         return {name: flat[..., place] for name, place in self._slices.items()}
 
-    def split(self, flat: Expression) -> dict[str, Expression]:
+    def split(self, flat: Matrix) -> dict[str, Matrix]:
         """CasADi column -> expressions by name."""
         if not self.signals:
             return {}
         ends = [0, *(place.stop for place in self._slices.values())]
         return dict(zip(self.names, ca.vertsplit(flat, ends), strict=True))
 
-    def join(self, expressions: Mapping[str, Expression]) -> Expression:
+    def join(self, expressions: Mapping[str, Matrix]) -> Matrix:
         """CasADi expressions by name -> column, in the layout's order."""
-        return ca.vertcat(*(expressions[name] for name in self.names)) if self.signals else ca.DM(0, 1)
+        return column([expressions[name] for name in self.names])

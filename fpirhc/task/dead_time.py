@@ -13,13 +13,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import casadi as ca
 
 from fpirhc.errors import Mistakes
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 MOST = 1000  # cycles
@@ -78,7 +78,7 @@ def delay_block(name: str, source: Signal, target: Signal, cycles: Sequence[floa
     for n in lengths:
         ends.append(ends[-1] + n)
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         now, queue = getattr(s, source.name), getattr(s, queues.name)
         seen, kept = [], []
         for k, (delay, n) in enumerate(zip(cycles, lengths, strict=True)):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from fpirhc.errors import Mistakes
 from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.expression import Value
 
 Interval = tuple[float, float]
 
@@ -24,7 +24,7 @@ class PathConstraint:
         lower, upper: the interval; infinite where free. unit: of the expression.
     """
 
-    expression: Callable[[Any], Any]
+    expression: Callable[..., Value]
     lower: float = -math.inf
     upper: float = math.inf
     unit: str = ""
@@ -84,7 +84,7 @@ class Limits:
         return _bounds(self.states, plant.state.elements)
 
 
-def _check_interval(name: str, interval: Any, mistakes: Mistakes) -> None:
+def _check_interval(name: str, interval: object, mistakes: Mistakes) -> None:
     if not isinstance(interval, Sequence) or len(interval) != 2:
         mistakes.add(f"'{name}' needs two numbers (lower, upper), got {interval!r}")
     elif any(math.isnan(v) for v in interval) or interval[0] > interval[1]:

@@ -9,13 +9,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
 from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Expression
 
 
@@ -37,9 +37,9 @@ class Reference(ABC):
         Raises:
             InvalidProblem: a coordinate is missing, unknown, or not a scalar.
         """
-        kind: Any = ca.MX if self.opaque else ca.SX
-        t = kind.sym("t")
-        given = {name: kind(value) for name, value in self.coordinates(t).items()}
+        matrix = kind(self.opaque)
+        t = matrix.sym("t")
+        given = {name: matrix(value) for name, value in self.coordinates(t).items()}
         _check(plant, given)
         derivatives = {c: _differentiate(given[c], t, r) for c, r in zip(plant.names, plant.orders, strict=True)}
         state = [derivatives[e.rstrip("'")][e.count("'")] for e in plant.state.elements]
@@ -49,9 +49,9 @@ class Reference(ABC):
 
     def derivatives(self, coordinate: str, order: int) -> ca.Function:
         """Function t -> the coordinate's nominal value and its derivatives up to `order`, shape (order + 1,)."""
-        kind: Any = ca.MX if self.opaque else ca.SX
-        t = kind.sym("t")
-        values = _differentiate(kind(self.coordinates(t)[coordinate]), t, order)
+        matrix = kind(self.opaque)
+        t = matrix.sym("t")
+        values = _differentiate(matrix(self.coordinates(t)[coordinate]), t, order)
         return ca.Function("fpirhc_ladder", [t], [ca.densify(ca.vertcat(*values))])
 
 

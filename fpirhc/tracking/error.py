@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import casadi as ca
 
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 
 
@@ -15,7 +14,7 @@ def integral_update(plant: Plant, period: float) -> Block:
     """Block that integrates the error, except while the command is clipped."""
     reads = (error_signal(plant), scalar("clipped"), integral_signal(plant, "_integral_used"))
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         return {"integral": s._integral_used + period * ca.if_else(s.clipped, 0, s._target_error)}
 
     return Block("tracking_update", Layout(reads), Layout((integral_signal(plant, "integral"),)), step)

@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 
 from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.tracking.base import Tracking
 from fpirhc.tracking.error import error_chains, error_signal, integral_delay, integral_signal, integral_update
@@ -63,7 +63,7 @@ class Exponential(Tracking):
         )
         writes = (error_signal(plant), plant.response_signal("desired"), integral_signal(plant, "_integral_used"))
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             errors = error_chains(plant, s._target - s.state)
             begin = ca.vertcat(*(self._first_integral(chain) for chain in errors))
             used = ca.if_else(s.warm_up > 0.5, s._integral_before, begin)
@@ -86,13 +86,13 @@ class Exponential(Tracking):
 
     def _feedback(self, integral: Expression, chain: list[Expression]) -> Expression:
         terms = [integral, *chain] if self.integral else chain
-        return sum(g * e for g, e in zip(self.gains(len(chain)), terms, strict=True))
+        return total(g * e for g, e in zip(self.gains(len(chain)), terms, strict=True))
 
     def _first_integral(self, chain: list[Expression]) -> Expression:
         if not (self.integral and self.bumpless):
             return chain[0] * 0
         first, *others = self.gains(len(chain))
-        return -sum(g * e for g, e in zip(others, chain, strict=True)) / first
+        return -total(g * e for g, e in zip(others, chain, strict=True)) / first
 
 
 EXAMPLES = (Exponential(rate=6.0), Exponential(rate=6.0, bumpless=False), Exponential(rate=2.0, integral=False))

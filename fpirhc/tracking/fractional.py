@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -33,6 +32,7 @@ import numpy as np
 from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.tracking.base import Tracking
 from fpirhc.tracking.error import error_chains, error_signal, integral_delay, integral_signal, integral_update
@@ -112,7 +112,7 @@ class Fractional(Tracking):
         writes = (error_signal(plant), plant.response_signal("desired"), integral_signal(plant, "_integral_used"))
         weights, stiffness = ca.DM(self.weights(cycles)), (self.rate * period) ** self.order
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             errors = error_chains(plant, s._target - s.state)
             running = s.warm_up > 0.5
             used = ca.if_else(running, s._integral_before, 0)

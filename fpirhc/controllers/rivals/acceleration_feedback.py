@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 
@@ -29,6 +28,7 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
@@ -93,7 +93,7 @@ class AccelerationFeedback(Controller):
         plant, pole, blind = problem.plant, self.pole(problem.period), problem.warm_up_cycles
         memory = Layout((plant.response_signal("filtered_error"),))
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             error = pole * s.filtered_error + (1 - pole) * (s.realised - s.desired)
             # A measurement that is not finite must not stay in the filter.
             running = s.warm_up > blind - 0.5

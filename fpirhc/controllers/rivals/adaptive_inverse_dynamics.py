@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -19,6 +18,7 @@ from fpirhc.learning.rules.base import Pair, Rule
 from fpirhc.members import Example
 from fpirhc.plant.regressor import Combination
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.error import error_chains, integral_signal
@@ -94,7 +94,7 @@ class AdaptiveInverseDynamics(Controller):
         plant, learning = problem.plant, self._learning
         equation, weights = equation_function(learning.regressor(problem)), self.lyapunov_row()
 
-        def gradient(s: Any, estimate: Expression) -> Pair:
+        def gradient(s: Signals, estimate: Expression) -> Pair:
             matrix, _ = equation(s.state, s.realised, s._command_before, estimate, s.parameters)
             chains = error_chains(plant, s._target - s.state)
             if self.tracking.integral:

@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -30,6 +29,7 @@ from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, vector
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.error import error_chains
@@ -103,7 +103,7 @@ class BacksteppingMRAC(Controller):
         rows = self.nested()
         names = tuple(f"{c}_{i + 1}" for c in plant.controlled_names for i in range(len(self.rates)))
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             chains = [ca.vertcat(*chain) for chain in error_chains(plant, s.model - s.state)]
             nested = [ca.mtimes(ca.DM(rows[:-1, :-1]), chain) for chain in chains]
             feedback = [ca.dot(ca.DM(rows[-1, :-1]), chain) for chain in chains]

@@ -19,7 +19,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -31,6 +30,7 @@ from fpirhc.errors import Mistakes
 from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
@@ -97,7 +97,7 @@ class ForceMRAC(Controller):
         memory = self.deformation.memory(plant.input.elements)
         inverse, response = plant.inverse_function, plant.controlled_response_function
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             remembered = {m: getattr(s, m) for m in memory.names}
             running = s.warm_up > blind - 0.5
             desired = inverse(s.state, s.desired, s.parameters)

@@ -10,10 +10,8 @@ which is the deformation's r - q'' with r what the model now takes the last comm
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import SimpleNamespace
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -23,6 +21,7 @@ from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.learning.rules.base import Bounds, Evidence, Pair, Rule
 from fpirhc.plant.regressor import Combination, Regressor
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals, Value, pair
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 
@@ -73,7 +72,9 @@ class Learning:
         if inverts or self.rule.reads_response:
             _check_definite(self.bounds, coefficients)
 
-    def block(self, problem: Problem, given: Sequence[Signal], gradient: Callable[[Any, Expression], Pair]) -> Block:
+    def block(
+        self, problem: Problem, given: Sequence[Signal], gradient: Callable[[Signals, Expression], Pair]
+    ) -> Block:
         """Block (what every controller reads, what was issued, `given`) -> (estimate, _believed).
 
         Parameters: `gradient` returns (G, w) from the signals and the estimate; `_believed` are the parameters of
@@ -95,12 +96,12 @@ class Learning:
             *given,
         )
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             running = s.warm_up > 0.5
             old = ca.if_else(running, s.learned, clip(regressor.theta_function(s.parameters), lower, upper))
             evidence = Evidence(
                 lambda: gradient(s, old),
-                lambda: equation(s.state, s.realised, s._command_before, old, s.parameters),
+                lambda: pair(equation(s.state, s.realised, s._command_before, old, s.parameters)),
                 s._clipped_before,
             )
             moved = old + self.rule.change(evidence, self.bounds, problem.period)
@@ -122,8 +123,8 @@ def fed(block: Block, name: str, source: Signal) -> Block:
         return block
     reads = tuple(source if s.name == name else s for s in block.reads.signals)
 
-    def step(s: Any) -> Any:
-        return block.step(SimpleNamespace(**{**vars(s), name: getattr(s, source.name)}))
+    def step(s: Signals) -> Mapping[str, Value]:
+        return block.step(Signals({**vars(s), name: getattr(s, source.name)}))
 
     return Block(block.name, Layout(reads), block.writes, step, block.memory, block.opaque)
 

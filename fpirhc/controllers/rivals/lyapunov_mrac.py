@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -39,6 +38,7 @@ from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.error import error_chains
@@ -116,7 +116,7 @@ class LyapunovMRAC(Controller):
         def pull(row: np.ndarray, chain: list[Expression]) -> Expression:
             return sum(w * rate ** (len(chain) - 1 - j) * e for j, (w, e) in enumerate(zip(row, chain, strict=True)))
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             errors = error_chains(plant, s.reference - s.state)
             feedback = [ca.dot(ca.DM(list(decay_gains(rate, len(c)))), ca.vertcat(*c)) for c in errors]
             wanted = s._reference_response + ca.vertcat(*feedback)
@@ -150,7 +150,7 @@ class LyapunovMRAC(Controller):
     def _adapt_block(self, plant: Plant, period: float, sign: int) -> Block:
         """Block that steps the gains, except while the command is clipped."""
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             rule = sign * self.adaptation * ca.vec(ca.mtimes(s._pull, s._regressor.T))
             change = rule - self.leakage * (s._gains_used - s._gains_first)
             return {"gains": s._gains_used + period * ca.if_else(s.clipped, 0, change)}

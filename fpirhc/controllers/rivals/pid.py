@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import casadi as ca
 
@@ -28,6 +27,7 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.errors import Mistakes
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.error import error_chains, error_signal, integral_delay, integral_signal, integral_update
@@ -114,7 +114,7 @@ class PID(Controller):
         orders = [plant.orders[k] for k in plant.controlled_indices]
         gains = [self.gains(n, order) for n, order in zip(plant.controlled_names, orders, strict=True)]
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             errors = error_chains(plant, s.reference - s.state)
             direct = [
                 sum(g * e for g, e in zip(k[1:], chain, strict=True)) for k, chain in zip(gains, errors, strict=True)

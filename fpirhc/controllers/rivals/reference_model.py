@@ -10,7 +10,6 @@ The deviation is carried by its exact solution over one period, so the model has
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -19,6 +18,7 @@ from scipy.linalg import expm
 from fpirhc.controllers.base import like
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.tracking.error import error_chains
 
@@ -46,7 +46,7 @@ def model_block(plant: Plant, rate: float, period: float) -> Block:
     memory = Layout((Signal("model_deviation", tuple(e for chain in chains for e in chain)),))
     ends = np.cumsum([0, *(len(chain) for chain in chains)]).tolist()
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         first = ca.vertcat(*(e for chain in error_chains(plant, s.reference - s.state) for e in chain))
         deviation = ca.vertsplit(ca.if_else(s.warm_up > 0.5, s.model_deviation, first), ends)
         spread = dict(zip(memory.signals[0].elements, ca.vertsplit(ca.vertcat(*deviation)), strict=True))

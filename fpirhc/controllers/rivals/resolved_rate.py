@@ -28,7 +28,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 
@@ -38,6 +37,7 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.error import error_chains
@@ -89,7 +89,7 @@ class ResolvedAccelerationRate(Controller):
         """Block (state, realised, reference now and one cycle later) -> (desired, its change in this cycle)."""
         plant, period, blind = problem.plant, problem.period, problem.warm_up_cycles
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             errors = error_chains(plant, s.reference - s.state)
             change, first = [], []
             for k, chain in enumerate(errors):
@@ -113,7 +113,7 @@ def _following_block(problem: Problem) -> Block:
     plant, function = problem.plant, problem.reference.function(problem.plant)
     chosen = list(plant.controlled_indices)
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         later = function(s.time + problem.period)[1][chosen]
         return {"nominal": s._reference_response, "_nominal_following": later}
 
@@ -142,7 +142,7 @@ def _increment_block(problem: Problem) -> Block:
     drift = ca.jtimes(response, x, ca.vertcat(*moving))
     model = ca.Function("fpirhc_drifting", [x, u, p, measured], [response, drift])
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         now, drifting = model(s.state, s._command_before, s.parameters, s.realised)
         wanted = now + s._change - period * drifting
         return {"_deformed_unclipped": ca.if_else(s.warm_up > blind - 0.5, wanted, s.desired)}

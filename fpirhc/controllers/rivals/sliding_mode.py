@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 
@@ -28,6 +27,7 @@ from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, vector
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.error import error_chains
@@ -92,7 +92,7 @@ class SlidingMode(Controller):
         """Block (state, reference, nominal) -> (S, desired)."""
         units = [f"{plant.response_units[k]} s" for k in plant.controlled_indices]
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             surfaces, drifts = [], []
             for chain in error_chains(plant, s.reference - s.state):
                 degree = len(chain) - 1

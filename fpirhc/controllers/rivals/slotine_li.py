@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import casadi as ca
 
@@ -19,6 +18,7 @@ from fpirhc.learning.rules.base import Pair, Rule
 from fpirhc.members import Example
 from fpirhc.plant.regressor import Combination, Regressor
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
 from fpirhc.task.problem import Problem
 
@@ -112,7 +112,7 @@ class SlotineLi(Controller):
         slope = plant.response_signal("_velocity_slope" if self._deforms else "desired")
         writes = (_rates(problem, "sliding"), _rates(problem, "_velocity"), slope, plant.response_signal("nominal"))
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             error = s.reference - s.state
             velocity = s.reference[moving] + self.rate * error[at]
             return {
@@ -127,7 +127,7 @@ class SlotineLi(Controller):
     def _learn_block(self, problem: Problem, regressor: Regressor) -> Block:
         slope = problem.plant.response_signal("_velocity_slope" if self._deforms else "desired")
 
-        def gradient(s: Any, estimate: Expression) -> Pair:
+        def gradient(s: Signals, estimate: Expression) -> Pair:
             del estimate
             matrix, _ = regressor.split_function(s.state, s._velocity, getattr(s, slope.name), s.parameters)
             return matrix, s.sliding
@@ -141,7 +141,7 @@ class SlotineLi(Controller):
         slope = plant.response_signal("_velocity_slope")
         reads = (plant.state, plant.parameter, regressor.signal, _rates(problem, "sliding"), slope)
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             mass = regressor.mass_function(s.state, s.estimate, s.parameters)
             pull = ca.mtimes(regressor.coriolis_function(s.state, s.estimate, s.parameters), s.sliding)
             return {"desired": s._velocity_slope + ca.solve(mass, pull + damping * s.sliding)}
@@ -161,7 +161,7 @@ class SlotineLi(Controller):
             slope,
         )
 
-        def step(s: Any) -> dict[str, Expression]:
+        def step(s: Signals) -> dict[str, Expression]:
             matrix, rest = regressor.split_function(s.state, s._velocity, s._deformed_unclipped, s.parameters)
             return {"command_unclipped": ca.mtimes(matrix, s.estimate) + rest + damping * s.sliding}
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeGuard
+from typing import TypeGuard
 
 import casadi as ca
 import numpy as np
@@ -23,11 +23,12 @@ from fpirhc.controllers.slots.slot import Channel
 from fpirhc.controllers.slots.slot_modes import linear_modes
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 
 _NEVER = -1e300  # score of a slot that may not be chosen
-Scores = Callable[[Any], list[Expression]]
+Scores = Callable[[Signals], list[Expression]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +66,7 @@ class ByError(Schedule):
         weights = [self.weights[c.slot.coordinate] for c in channels]
         places = [problem.judged_names.index(c.slot.coordinate) for c in channels]
 
-        def score(s: Any) -> list[Expression]:
+        def score(s: Signals) -> list[Expression]:
             return [w * ca.fabs(s.error[k]) for w, k in zip(weights, places, strict=True)]
 
         return _chosen(problem, channels, score, self.dwell, self.hysteresis)
@@ -117,7 +118,7 @@ class ByLookAhead(Schedule):
         moved = [(scipy.linalg.expm(m.generator * self.dwell) @ m.start(m))[:n, :n] for m in modes]
         forms = [phi.T @ weight @ phi for phi in moved]
 
-        def score(s: Any) -> list[Expression]:
+        def score(s: Signals) -> list[Expression]:
             away = s.state - s.reference
             return [-ca.bilin(ca.DM(form), away, away) for form in forms]
 
@@ -149,7 +150,7 @@ def _chosen(problem: Problem, channels: Sequence[Channel], score: Scores, dwell:
     )
     shortest = round(dwell / problem.period)
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         scores = [ca.if_else(s._admissible[k] > 0.5, v, _NEVER) for k, v in enumerate(score(s))]
         best, slot, active = scores[0], ca.SX(0), scores[0]
         for k, value in enumerate(scores[1:], 1):

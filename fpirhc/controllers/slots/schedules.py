@@ -13,13 +13,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 
 from fpirhc.controllers.slots.slot import Channel
 from fpirhc.errors import Mistakes
 from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
 
@@ -163,7 +163,7 @@ def _timed(problem: Problem, channels: Sequence[Channel], starts: Sequence[tuple
     numbers = {c.slot.coordinate: c.number for c in channels}
     order = [numbers[name] for name, _ in starts]
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         cycle = ca.floor(s.time / problem.period + 0.5)
         phase = ca.fmod(cycle, cycles) if math.isfinite(cycles) else cycle
         slot = ca.SX(order[0])

@@ -9,7 +9,6 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -23,7 +22,8 @@ from fpirhc.errors import InvalidProblem, NotInvertible, NotSupported
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.relative_order import OutputChain, output_chain
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.layout import Expression, Layout, Named, Signal
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -116,7 +116,7 @@ def _check_deformation(deformation: Deformation) -> None:
 def _light_plant(plant: Plant, chain: OutputChain) -> Plant:
     """The plant y^(r) = u that has the chain as its state; only its signals are used."""
 
-    def response(*given: Any) -> dict[str, Expression]:
+    def response(*given: Named) -> dict[str, Expression]:
         return {chain.coordinate: given[-2].vector}
 
     names = [f"d{k}" for k in range(chain.order)] + ["u", "p"]
@@ -140,7 +140,7 @@ def for_channel(block: Block, one: Channel, shared: Set[str], names: Mapping[str
     own = [renamed(s) for s in block.memory.signals]
     reads_begun = [] if not own or begun.name in [s.name for s in reads] else [begun]
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         kept = [ca.if_else(getattr(s, begun.name) > 0.5, getattr(s, m.name), ca.DM(m.start_vector())) for m in own]
         given = block.function(*(getattr(s, r.name) for r in reads), *kept)
         values = given if isinstance(given, tuple) else (given,)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import casadi as ca
 
@@ -23,6 +22,7 @@ from fpirhc.controllers.base import FINITE, clip, error_signal, like
 from fpirhc.controllers.slots.slot import Channel
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.expression import Signals, Value, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 
@@ -37,7 +37,7 @@ def reference_block(problem: Problem) -> Block:
     plant, function = problem.plant, problem.reference.function(problem.plant)
     places = [plant.state.elements.index(c) for c in problem.judged_names]
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         reference = function(s.time)[0]
         return {"reference": reference, "error": reference[places] - s.state[places]}
 
@@ -53,7 +53,7 @@ def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
     place = plant.input.elements.index(chain.input)
     smallest = smallest_gain * abs(one.start_gain)
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         nominal = derivatives(s.time)
         others = ca.vertcat(*(0 if k == place else s._command_before[k] for k in range(plant.input.size)))
         gain = chain.gain(s.state, others, s.parameters)
@@ -84,7 +84,7 @@ def admissible_block(channels: Sequence[Channel]) -> Block:
     return Block("admissible", reads, Layout((writes,)), lambda s: {"_admissible": _column(s, channels, "good")})
 
 
-def _column(s: Any, channels: Sequence[Channel], name: str) -> Expression:
+def _column(s: Signals, channels: Sequence[Channel], name: str) -> Expression:
     return ca.vertcat(*(getattr(s, c.wire(name)) for c in channels))
 
 
@@ -92,7 +92,7 @@ def switch_block(channels: Sequence[Channel]) -> Block:
     """Block -> per slot whether it is active, and whether it was in the last cycle too; cycles since it began."""
     reads = Layout((scalar("slot"), scalar("_slot_before"), scalar("_age_before"), scalar("warm_up")))
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         goes_on = ca.logic_and(s.warm_up > 0.5, s.slot == s._slot_before)
         found = {"_age": ca.if_else(goes_on, s._age_before + 1, 0)}
         for one in channels:
@@ -111,7 +111,7 @@ def join_block(problem: Problem, channels: Sequence[Channel], one: Channel, blen
     place = problem.plant.input.elements.index(one.chain.input)
     names = ("law", "free", "gain", "active", "warm_up")
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         law, free, gain, active, goes_on = (getattr(s, one.wire(name)) for name in names)
         running, realised = s.warm_up > 0.5, s.realised[one.number]
         switched = ca.logic_and(ca.logic_and(active, running), ca.logic_not(goes_on))
@@ -159,7 +159,7 @@ def command_block(problem: Problem, channels: Sequence[Channel]) -> Block:
     lower, upper = problem.limits.input_bounds(plant)
     places = [plant.input.elements.index(c.chain.input) for c in channels]
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Value]:
         per_slot = {name: _column(s, channels, name) for name in _OF_A_SLOT}
         active, free, gain = per_slot["active"], per_slot["free"], per_slot["gain"]
         wanted = ca.if_else(per_slot["blanked"], per_slot["desired"] + per_slot["kept"], per_slot["deformed_unclipped"])
@@ -197,12 +197,12 @@ def command_block(problem: Problem, channels: Sequence[Channel]) -> Block:
     return Block("command", Layout((*reads, like(plant.input, "_command_before"))), Layout(writes), step)
 
 
-def _pick(active: Expression, values: Expression, otherwise: Expression = 0) -> Expression:
+def _pick(active: Expression, values: Expression, otherwise: Value = 0) -> Expression:
     """The value of the active slot; no sum, in which a value that is not finite would spoil the others."""
     found = otherwise
     for k in range(values.numel()):
         found = ca.if_else(active[k] > 0.5, values[k], found)
-    return found
+    return expression(found)
 
 
 def _finite(value: Expression) -> Expression:
@@ -213,7 +213,7 @@ def _finite(value: Expression) -> Expression:
 def judge_block() -> Block:
     """Block that says whether the command was held: because it was not finite, or because the gain is too small."""
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         return {"status": ca.fmax(s._held * int(Status.NON_FINITE), s.slot_held * int(Status.HELD))}
 
     return Block("judge", Layout((scalar("_held"), scalar("slot_held"))), Layout((scalar("status"),)), step)

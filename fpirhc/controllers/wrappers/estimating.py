@@ -11,7 +11,6 @@ inverse every cycle, in a receding horizon whenever it plans.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -23,7 +22,8 @@ from fpirhc.learning.estimators.base import Estimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.expression import Signals, Value
+from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 
 
@@ -105,7 +105,7 @@ def _estimate_block(
     correct = estimator.step(modelled)
     own = memory + Layout((like(estimate, "estimate_change"), scalar("estimate_begun")))
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Value]:
         given = ca.vertcat(s.parameters[:count], ca.DM(model.approximate[count:]))
         before = {m: getattr(s, m) for m in memory.names}
         seen = Seen(s.state, s._acted, s.realised, given, s.estimate_begun)

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -28,6 +27,7 @@ from fpirhc.members import Example
 from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.dead_time import MOST, DeadTime
 from fpirhc.task.problem import Problem
@@ -225,10 +225,10 @@ def _predict_block(
     reads = (scalar("time", "s"), plant.state, *seen, plant.parameter, before)
     own = (queue, residual) if corrected else (queue,)
 
-    def step(s: Any) -> dict[str, Expression]:
+    def step(s: Signals) -> dict[str, Expression]:
         kept = ca.vertcat(s._sent_before, s.sent[: size * cycles])
         following = {"sent_next": kept}
-        error = ca.MX.zeros(len(plant.names))
+        error = expression(ca.MX.zeros(len(plant.names)))
         if corrected:
             error = corrected(s.residual, s.state, kept[size * cycles :], s.realised, s.parameters)
             following["residual_next"] = error

@@ -10,6 +10,7 @@ from typing import Self
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation
+from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.layout import Expression
 
 
@@ -54,4 +55,4 @@ def of_map(wrapper: Wrapper, memory: Mapping[str, Expression], size: int) -> dic
 def start_of_map(wrapper: Wrapper, size: int) -> dict[str, Expression]:
     """What the map remembers at the start."""
     own = wrapper.map.memory(tuple(f"q{k}" for k in range(size)))
-    return own.split(ca.DM(own.start()))
+    return own.split(expression(ca.DM(own.start())))

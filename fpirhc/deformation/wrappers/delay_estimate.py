@@ -18,6 +18,7 @@ from collections.abc import Mapping
 
 import casadi as ca
 
+from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 _MEAN = 0.05  # share of a new value in the running means
@@ -65,10 +66,10 @@ def estimated(
 def _peak(weights: Expression, most: int) -> tuple[Expression, Expression]:
     """Place of the largest weight by size, and the sum of squares within one cycle of it."""
     sizes: list[Expression] = [w * w for w in ca.vertsplit(weights)]
-    place, largest, near = 0 * sizes[0], sizes[0], sum(sizes[:2])
+    place, largest, near = 0 * sizes[0], sizes[0], total(sizes[:2])
     for k in range(1, most + 1):
         above = sizes[k] > largest
         place = ca.if_else(above, k, place)
-        near = ca.if_else(above, sum(sizes[k - 1 : k + 2]), near)
+        near = ca.if_else(above, total(sizes[k - 1 : k + 2]), near)
         largest = ca.fmax(sizes[k], largest)
     return place, near

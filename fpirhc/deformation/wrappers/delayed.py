@@ -27,6 +27,7 @@ import casadi as ca
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.errors import InvalidValue
+from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 MOST = 1000  # cycles of dead time: what is remembered is static
@@ -116,7 +117,7 @@ class _Queued(Wrapper):
 
     def _mean(self, queue: Expression, size: int, width: int) -> Expression:
         """What was pushed `cycles` ago, a weighted mean over its neighbours within `width`."""
-        return sum(share * queue[size * k : size * (k + 1)] for k, share in self._shares(width).items())
+        return total(share * queue[size * k : size * (k + 1)] for k, share in self._shares(width).items())
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import casadi as ca
 
@@ -49,7 +48,7 @@ def disturbance_name(coordinate: str) -> str:
 
 
 def _response(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping[str, Expression]]:
-    def response(*given: Any) -> Mapping[str, Expression]:
+    def response(*given: Named) -> Mapping[str, Expression]:
         *before, p = given
         found = plant.response(*before, _own(plant, p))
         return {c: v + p[disturbance_name(c)] if c in coordinates else v for c, v in found.items()}
@@ -61,7 +60,7 @@ def _response(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping
 def _inverse(
     plant: Plant, inverse: Callable[..., Mapping[str, Expression]], coordinates: Sequence[str]
 ) -> Callable[..., Mapping[str, Expression]]:
-    def undisturbed(*given: Any) -> Mapping[str, Expression]:
+    def undisturbed(*given: Named) -> Mapping[str, Expression]:
         *before, r, p = given
         entries = [r[c] - p[disturbance_name(c)] if c in coordinates else r[c] for c in plant.controlled_names]
         return inverse(*before, Named(plant.controlled_names, ca.vertcat(*entries), "coordinate"), _own(plant, p))

@@ -95,7 +95,8 @@ def _gain_cause(entry: Entry) -> str:
 
 def _slew_cause(plain: Entry, adaptive: Entry) -> str:
     """The step limit is judged by what the same controller asks for without adaptation, before anything diverges."""
-    limit = adaptive.run.settings["step_limit"]
+    settings: Any = adaptive.run.settings
+    limit = settings["step_limit"]
     if limit is None or plain.run.cycles < MANY_CYCLES:
         return ""
     largest = float(np.linalg.norm(np.diff(plain.run["desired"], axis=0), axis=1).max())
@@ -117,9 +118,10 @@ def _effort_cause(entry: Entry) -> str:
 
 
 def _own_cost_weighs_effort(entry: Entry) -> bool:
-    controller = entry.run.settings["controller"]
+    settings: Any = entry.run.settings
+    controller = settings["controller"]
     plans = "optimiser" in controller or "optimiser" in controller.get("controller", {})
-    return plans and not controller.get("cost") and _weighs_effort({"cost": entry.run.settings["problem"]["cost"]})
+    return plans and not controller.get("cost") and _weighs_effort({"cost": settings["problem"]["cost"]})
 
 
 def _weighs_effort(settings: Any) -> bool:

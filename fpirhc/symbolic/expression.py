@@ -1,0 +1,63 @@
+"""The types that steps are written in, on top of CasADi's stubs.
+
+CasADi has two kinds of symbolic matrices with the same operations: SX (scalar code) and MX (calls of Functions). Its stubs
+give them no common type, and the union of both has no sum, because SX and MX never mix. A step is written once and built
+with either kind. The type checker therefore reads every `Expression` as SX; what is always a graph of calls (the
+optimisers) is typed as MX. This module is the only place where one kind passes for the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TypeAlias, TypeVar, cast
+
+import casadi as ca
+
+from fpirhc.errors import nearest
+
+Expression: TypeAlias = ca.SX  # a CasADi SX, MX or DM
+Value: TypeAlias = ca.SX | ca.DM | float  # what a step may write: numbers become expressions
+Matrix = TypeVar("Matrix", ca.SX, ca.MX, ca.DM)  # of functions whose result is of the same kind as their argument
+
+
+class Signals:
+    """The signals that a step reads and remembers, by attribute: `s.desired` is a CasADi column."""
+
+    def __init__(self, symbols: Mapping[str, Expression]) -> None:
+        """Take the symbol of every signal by name."""
+        vars(self).update(symbols)
+
+    def __getattr__(self, name: str) -> Expression:
+        raise AttributeError(f"the step neither reads nor remembers '{name}'.{nearest(name, vars(self))}")
+
+
+def expression(value: ca.SX | ca.MX | ca.DM | float) -> Expression:
+    """Return `value` itself; the type checker reads it as an Expression."""
+    return cast(Expression, value)
+
+
+def graph(value: Expression) -> ca.MX:
+    """Return `value` itself, an expression of an opaque block; the type checker reads it as the MX that it is."""
+    return cast(ca.MX, value)
+
+
+def kind(opaque: bool) -> type[Expression]:
+    """The kind of symbols to build with: MX for operations that scalar expressions cannot hold, else SX."""
+    return cast(type[Expression], ca.MX) if opaque else ca.SX
+
+
+def column(parts: Sequence[Matrix]) -> Matrix:
+    """Return the parts in one column; without parts an empty column of numbers, which mixes with every kind."""
+    empty: object = ca.DM(0, 1)
+    return ca.vertcat(*parts) if parts else cast(Matrix, empty)
+
+
+def total(terms: Iterable[Expression]) -> Expression:
+    """Return the sum of the terms; the number 0 where there are none."""
+    return cast(Expression, sum(terms))
+
+
+def pair(results: Expression) -> tuple[Expression, Expression]:
+    """Return the two results of a call; CasADi's stub knows calls with one result only."""
+    first, second = results
+    return first, second
