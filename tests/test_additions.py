@@ -1,0 +1,169 @@
+"""A package of somebody else adds one member of each kind, one file each, and everything works with them.
+
+The members are the examples of the pages in docs/extending: what a reader pastes into a file. Nothing of fpirhc is edited.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = {
+    "clipped": ("map", "EXAMPLES = (Clipped(gain=0.3, limit=5.0),)"),
+    "poles": ("tracking", "EXAMPLES = (Poles(rate=2.0),)"),
+    "projected_gradient": (
+        "optimiser",
+        "EXAMPLES = (ProjectedGradient(iterations=100, tolerance=1e-6),)\n"
+        'CHOICES = {"projected-gradient": ("projected gradient", lambda t: ProjectedGradient(30, t))}',
+    ),
+    "gradient": ("estimator", 'EXAMPLES = (Gradient("m", gain=0.02, largest=0.6),)'),
+    "saturated": ("controller", "EXAMPLES = (Saturated(6.0, 20.0),)"),
+}
+MEMBERS = {
+    "deformations": "Clipped",
+    "tracking laws": "Poles",
+    "optimisers": "ProjectedGradient",
+    "estimators": "Gradient",
+    "controllers": "Saturated",
+}
+# Two wrappers in each other, neither of them known to fpirhc: a controller whose user wants to name it.
+NAMED = '''
+"""A controller under another name."""
+from dataclasses import dataclass
+
+from fpirhc.controllers.wrappers.base import ControllerWrapper
+
+
+@dataclass(frozen=True)
+class Named(ControllerWrapper):
+    """The inner controller, unchanged."""
+
+    controller: object
+    title: str
+
+
+def examples(inner):
+    return (Named(inner, "one"),)
+'''
+PROBLEM = '''
+"""Two masses served by members from abroad."""
+from dataclasses import replace
+
+import fpirhc as fp
+from abroad.clipped import Clipped
+from abroad.gradient import Gradient
+from abroad.named import Named
+from abroad.poles import Poles
+from abroad.saturated import Saturated
+
+task = fp.load_problem("two_mass")
+problem = replace(task.problem, duration=1.0, measure_from=0.5)
+planned = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-2))
+controllers = {
+    "poles": fp.ComputedTorque(Poles(rate=6.0)),
+    "poles+clipped": fp.ComputedTorque(Poles(rate=6.0), Clipped(gain=0.2, limit=5.0)),
+    "saturated+FPI": Saturated(6.0, 20.0, fp.Sigmoid(gain=-0.5)),
+    "learner": fp.Estimating(fp.ComputedTorque(Poles(rate=6.0)), Gradient("m1", gain=0.02, largest=0.6)),
+    "RHC": Named(Named(planned, "inside"), "outside"),
+}
+headline = ("poles", "poles+clipped")
+'''
+
+
+@pytest.fixture(scope="module")
+def abroad(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the package `abroad`, installed as a distribution with an entry point, and a problem that uses it."""
+    folder = tmp_path_factory.mktemp("site")
+    package = folder / "abroad"
+    package.mkdir()
+    (package / "__init__.py").write_text('"""Members from abroad."""\n')
+    (package / "named.py").write_text(NAMED)
+    for module, (page, examples) in PAGES.items():
+        text = (ROOT / "docs" / "extending" / f"{page}.md").read_text(encoding="utf-8")
+        [code, *_] = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+        definition = code.partition("\ntask = ")[0]
+        (package / f"{module}.py").write_text(f'"""From the page {page}."""\n{definition}\n\n{examples}\n')
+    facts = folder / "abroad-1.0.dist-info"
+    facts.mkdir()
+    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: abroad\nVersion: 1.0\n")
+    (facts / "entry_points.txt").write_text("[fpirhc.members]\nabroad = abroad\n")
+    (folder / "masses.py").write_text(PROBLEM)
+    return folder
+
+
+def run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """A command in a process of its own, with the package on the path."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)]), "COLUMNS": "200"}
+    return subprocess.run(
+        [sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def test_members_from_abroad_are_found(abroad: Path) -> None:
+    """Every family lists the new member beside the shipped ones, with its examples."""
+    script = (
+        "import json; from fpirhc.members import FAMILIES, member_classes, examples;"
+        "print(json.dumps({f: [c.__name__ for c in member_classes(f)] for f in FAMILIES}))"
+    )
+    answer = run(abroad, "-c", script)
+    assert answer.returncode == 0, answer.stderr
+    families = json.loads(answer.stdout)
+    for family, name in MEMBERS.items():
+        assert name in families[family]
+    assert "Named" in families["controllers"]
+
+
+def test_members_from_abroad_keep_the_laws(abroad: Path) -> None:
+    """The conformance laws find them and try their examples like the shipped ones."""
+    script = (
+        "import fpirhc as fp; from fpirhc.members import examples\n"
+        "mine = lambda f: [e for e in examples(f) if type(e).__module__.startswith('abroad')]\n"
+        "[fp.check_deformation(m, seed=1) for m in mine('deformations')]\n"
+        "[fp.check_tracking(m, seed=1, period=2e-3, duration=6.0) for m in mine('tracking laws')]\n"
+        "[fp.check_optimiser(m, tolerance=1e-6, seed=1) for m in mine('optimisers')]\n"
+        "print(sum(len(mine(f)) for f in ('deformations', 'tracking laws', 'optimisers', 'estimators', 'controllers')))"
+    )
+    answer = run(abroad, "-c", script)
+    assert (answer.returncode, answer.stdout.strip()) == (0, "5"), answer.stderr
+
+
+def test_review_speaks_of_members_from_abroad(abroad: Path) -> None:
+    """Every controller gets answers, none is a stranger."""
+    answer = run(abroad, "-m", "fpirhc", "review", "masses.py", "--json")
+    assert answer.returncode in (0, 1), answer.stderr
+    told = json.loads(answer.stdout)["controllers"]
+    assert set(told) == {"poles", "poles+clipped", "saturated+FPI", "learner", "RHC"}
+    texts = json.dumps(told)
+    assert "does not have" not in texts
+    [verdict] = [a for a in told["poles+clipped"] if a["question"] == "Does the deformation converge?"]
+    assert verdict["verdict"] == "yes"
+
+
+def test_compare_runs_members_from_abroad(abroad: Path) -> None:
+    """The table has them all, the plan's metrics reach through two wrappers, and the optimiser is a choice."""
+    answer = run(abroad, "-m", "fpirhc", "compare", "masses.py", "--json", "--no-compile")
+    assert answer.returncode == 0, answer.stderr
+    told = json.loads(answer.stdout)
+    assert set(told["controllers"]) == {"poles", "poles+clipped", "saturated+FPI", "learner", "RHC"}
+    assert told["controllers"]["RHC"]["optimality"]["plans"] > 0
+    assert told["controllers"]["poles+clipped"]["rms_error"]["q1"] < 0.5 * told["controllers"]["poles"]["rms_error"]["q1"]
+    words = ("compare", "masses.py", "--controllers", "RHC", "--optimisers", "projected-gradient", "--json", "--no-compile")
+    varied = run(abroad, "-m", "fpirhc", *words)
+    assert varied.returncode == 0, varied.stderr
+    assert list(json.loads(varied.stdout)["controllers"]) == ["RHC (projected gradient)"]
+
+
+def test_check_measures_members_from_abroad(abroad: Path) -> None:
+    """A baseline is written and checked, with the plan metrics of the wrapped controller."""
+    written = run(abroad, "-m", "fpirhc", "accept", "masses.py", "--reason", "first numbers")
+    assert written.returncode == 0, written.stderr
+    [baseline] = (abroad / "baselines").glob("*.json")
+    assert "plans" in baseline.read_text()
+    assert run(abroad, "-m", "fpirhc", "check", "masses.py").returncode == 0
