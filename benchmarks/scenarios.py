@@ -36,7 +36,7 @@ def command(
             "fpirhc",
             "compare",
             name,
-            "--seeds",
+            "--scenarios",
             f"{count}",
             "--mismatch",
             "10",

@@ -1,6 +1,6 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
-from .baselines.check import bless, check_baseline
+from .baselines.check import accept, bless, check_baseline
 from .conformance import check_controller, check_deformation, check_optimiser, check_plant, check_tracking
 from .contraction import assess_gain, check_gain, delayed_limit, response_jacobian, spectrum_over_box, spectrum_over_run
 from .controllers.computed_torque import ComputedTorque
@@ -206,6 +206,7 @@ __all__ = [
     "Tuning",
     "Uncertain",
     "VelocityDifference",
+    "accept",
     "assess_gain",
     "bless",
     "certify",

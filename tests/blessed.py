@@ -61,10 +61,10 @@ controllers = {"CTC": fp.ComputedTorque(fp.Exponential(rate=6.0))}
 
 def write_problems(folder: Path) -> None:
     """Write both problems and their baselines, measured in the virtual machine."""
-    from fpirhc.baselines.check import bless
+    from fpirhc.baselines.check import accept
     from fpirhc.problem_files.problem_file import load_problem
 
     for name, text in (("line", LINE), ("noisy", NOISY)):
         path = folder / f"{name}.py"
         path.write_text(text)
-        bless(load_problem(str(path)), "first", baselines=folder / "baselines", compiled=False, working=folder)
+        accept(load_problem(str(path)), "first", baselines=folder / "baselines", compiled=False, working=folder)

@@ -235,14 +235,3 @@ def test_numpy_check_leaves_warnings_as_they_were():
         warnings.simplefilter("always")
         traps.numpy_on_symbols()
     assert not caught
-
-
-@pytest.mark.parametrize("command", ["new", "doctor"])
-def test_help_has_examples(command, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main([command, "--help"])
-    assert stop.value.code == 0
-    printed = capsys.readouterr().out
-    assert "examples:" in printed
-    assert f"fpirhc {command}" in printed
-    assert "xit codes: 0" in printed

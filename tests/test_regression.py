@@ -157,12 +157,12 @@ def test_stale_settings_are_named(folder, capsys):
     assert "first" in printed
 
 
-def test_bless_replaces_a_baseline_and_keeps_the_reason(folder, capsys):
+def test_accept_replaces_a_baseline_and_keeps_the_reason(folder, capsys):
     """After it the check holds again; the widths of the bands are told."""
     text = (folder / "noisy.py").read_text()
     (folder / "noisy.py").write_text(text.replace("rate=6.0", "rate=7.0"))
     assert main(["check", "noisy.py", "--no-compile"]) == 6
-    assert main(["bless", "noisy.py", "--reason", " faster\n tracking", "--no-compile"]) == 0
+    assert main(["accept", "noisy.py", "--reason", " faster\n tracking", "--no-compile"]) == 0
     assert read_baseline(folder / "baselines" / "noisy.json").reason == "faster tracking"
     assert main(["check", "noisy.py", "--no-compile"]) == 0
     assert "± " in capsys.readouterr().out
@@ -238,11 +238,11 @@ def test_a_baseline_that_is_no_text_or_no_file(folder, capsys):
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["bless", "line.py", "--reason", "  "], 2, "needs a reason"),
-        (["bless", "line.py", "--reason", "x", "--seeds", "1"], 2, "at least 2"),
-        (["bless", "lin.py", "--reason", "x"], 2, "no file at 'lin.py'"),
-        (["bless", "line.py", "--reason", "x", "--baselines", "../elsewhere"], 3, "outside of the project"),
-        (["bless", "two_mass", "--reason", "x"], 3, "outside of the project"),
+        (["accept", "line.py", "--reason", "  "], 2, "needs a reason"),
+        (["accept", "line.py", "--reason", "x", "--seeds", "1"], 2, "at least 2"),
+        (["accept", "lin.py", "--reason", "x"], 2, "no file at 'lin.py'"),
+        (["accept", "line.py", "--reason", "x", "--baselines", "../elsewhere"], 3, "outside of the project"),
+        (["accept", "two_mass", "--reason", "x"], 3, "outside of the project"),
         (["check", "--junit", "line.py"], 3, "is not overwritten"),
         (["check", "--markdown", "baselines/line.json"], 3, "is not overwritten"),
         (["check", "--junit", "nowhere/a.xml"], 3, "no folder 'nowhere'"),
@@ -265,7 +265,7 @@ def test_links_out_of_the_project_are_not_followed(folder, capsys):
     (folder / "baselines").rename(outside)
     (folder / "baselines").symlink_to(outside, target_is_directory=True)
     before = (outside / "noisy.json").read_bytes()
-    assert main(["bless", "noisy.py", "--reason", "x", "--no-compile"]) == 3
+    assert main(["accept", "noisy.py", "--reason", "x", "--no-compile"]) == 3
     assert "outside of the project" in capsys.readouterr().err
     assert (outside / "noisy.json").read_bytes() == before
 
@@ -363,7 +363,7 @@ def test_hostile_names_from_file_to_report(tmp_path, monkeypatch, capsys):
     controller = '"; touch pwned; <img src=x onerror=alert(1)>\\x1b[2J\\n::error::x'
     text = NOISY.replace('{"CTC"', f"{{'{controller}'")
     Path(f"{stem}.py").write_text(text)
-    assert main(["bless", f"{stem}.py", "--reason", "<i>why</i>", "--no-compile"]) == 0
+    assert main(["accept", f"{stem}.py", "--reason", "<i>why</i>", "--no-compile"]) == 0
     Path(f"{stem}.py").write_text(text.replace("fp.Noise(2.0)", "fp.Noise(20.0)"))
     assert main(["check", "--no-compile", "--junit", "a.xml", "--markdown", "a.md"]) == 6
     printed = capsys.readouterr().out
@@ -407,7 +407,7 @@ def test_pytest_plugin(pytester, blessed):
     missing = run("-k", "RHC")
     missing.assert_outcomes(failed=1, deselected=2)
     missing.stdout.fnmatch_lines(["*there is no baseline 'line.json'*"])
-    run("--fpirhc-bless", "first", "-n", "2").assert_outcomes(passed=3)
+    run("--fpirhc-accept", "first", "-n", "2").assert_outcomes(passed=3)
     file = pytester.path / "baselines" / "line.json"
     first = read_baseline(file)
     assert list(first.controllers) == ["CTC", "CTC+FPI", "RHC+FPI"], "in this order, whichever worker was first"
@@ -419,7 +419,7 @@ def test_pytest_plugin(pytester, blessed):
     changed = run()
     changed.assert_outcomes(passed=2, failed=1)
     changed.stdout.fnmatch_lines(["*rms_error.y was *: worse", "*tracking.rate was 6.0, is 9.0*"])
-    run("--fpirhc-bless", "faster", "-k", "line and not FPI").assert_outcomes(passed=1, deselected=2)
+    run("--fpirhc-accept", "faster", "-k", "line and not FPI").assert_outcomes(passed=1, deselected=2)
     second = read_baseline(file)
     assert second.reason == "faster"
     assert second.controllers["CTC"] != first.controllers["CTC"]
@@ -427,7 +427,7 @@ def test_pytest_plugin(pytester, blessed):
     run().assert_outcomes(passed=3)
     # A changed problem cannot be blessed for one of its controllers alone.
     path.write_text(LINE.replace("period=1e-3", "period=2e-3"))
-    refused = run("--fpirhc-bless", "slower", "-k", "line and not FPI")
+    refused = run("--fpirhc-accept", "slower", "-k", "line and not FPI")
     assert refused.ret == pytest.ExitCode.TESTS_FAILED
     refused.stdout.fnmatch_lines(["*were not measured; its baseline is left as it is*"])
     assert read_baseline(file) == second
@@ -436,6 +436,6 @@ def test_pytest_plugin(pytester, blessed):
 def test_pytest_plugin_wants_a_reason(pytester):
     """An empty one is refused before anything runs."""
     pytester.makepyfile(test_line=TEST)
-    result = pytester.runpytest_subprocess("--fpirhc-bless", " ")
+    result = pytester.runpytest_subprocess("--fpirhc-accept", " ")
     assert result.ret == pytest.ExitCode.USAGE_ERROR
     result.stderr.fnmatch_lines(["*needs a reason*"])

@@ -352,7 +352,7 @@ def test_a_controller_that_does_not_fit_is_skipped_with_its_reason(task, tmp_pat
     assert [s.name for s in found.summaries] == ["CTC", "CTC+FPI", "CTC exact"]
 
 
-ARGUMENTS = ["compare", "line.py", "--seeds", "4", "--mismatch", "20", "--no-compile"]
+ARGUMENTS = ["compare", "line.py", "--scenarios", "4", "--mismatch", "20", "--no-compile"]
 
 
 def test_command_line_journey(task, capsys):
@@ -366,7 +366,7 @@ def test_command_line_journey(task, capsys):
     assert "CTC+FPI has a smaller error than CTC" in page
     assert Path("out/mismatch.png").stat().st_size > 10_000
     before = lines_of(Path("out"))
-    assert main([*ARGUMENTS, "--seeds", "5", "--out", "out"]) == 0
+    assert main([*ARGUMENTS, "--scenarios", "5", "--out", "out"]) == 0
     assert "CTC+FPI" in capsys.readouterr().out
     assert lines_of(Path("out"))[: len(before)] == before
     Path("line.py").write_text(LINE.replace("rate=6.0", "rate=7.0"))
@@ -379,13 +379,13 @@ def test_command_line_journey(task, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--mismatch", "20"], "--mismatch needs --seeds N"),
-        (["--processes", "2"], "--processes needs --seeds N"),
-        (["--seeds", "3", "--mismatch", "60"], "parameter 'b'"),
-        (["--seeds", "0", "--mismatch", "10"], "seeds 0: expected at least 1"),
-        (["--seeds", "3", "--processes", "0"], "processes 0: expected at least 1"),
-        (["--seeds", "3", "--baseline", "CTC+FPY"], "Did you mean 'CTC+FPI'"),
-        (["--seeds", "3", "--optimisers", "all"], "cannot be combined"),
+        (["--mismatch", "20"], "--mismatch needs --scenarios N"),
+        (["--processes", "2"], "--processes needs --scenarios N"),
+        (["--scenarios", "3", "--mismatch", "60"], "parameter 'b'"),
+        (["--scenarios", "0", "--mismatch", "10"], "scenarios 0: expected at least 1"),
+        (["--scenarios", "3", "--processes", "0"], "processes 0: expected at least 1"),
+        (["--scenarios", "3", "--baseline", "CTC+FPY"], "Did you mean 'CTC+FPI'"),
+        (["--scenarios", "3", "--optimisers", "all"], "cannot be combined"),
     ],
 )
 def test_bad_arguments(options, message, task, capsys):
@@ -442,7 +442,7 @@ def test_thirty_random_kills(task, tmp_path):
     """Parents and workers, at any moment; no scenario is lost, none is doubled, and all numbers are those of a calm run."""
     moments, kills, count = random.Random(0), 0, 60
     while True:
-        command = [sys.executable, "-m", "fpirhc", "compare", "line.py", "--seeds", str(count), "--mismatch", "20"]
+        command = [sys.executable, "-m", "fpirhc", "compare", "line.py", "--scenarios", str(count), "--mismatch", "20"]
         command += ["--seed", "5", "--no-compile", "--processes", "2", "--out", "killed"]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         while kills < 30:

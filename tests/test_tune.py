@@ -202,7 +202,7 @@ def test_command_line_journey(task, capsys):
     page = Path("c/report.html").read_text()
     assert "tuned (6 trials, seed 0" in page
     assert "not tuned: settings of the problem file" in page
-    assert main([*command, "--seeds", "3", "--mismatch", "10", "--controllers", "CTC", "CTC+FPI"]) == 0
+    assert main([*command, "--scenarios", "3", "--mismatch", "10", "--controllers", "CTC", "CTC+FPI"]) == 0
     assert "tuned (6 trials, seed 0" in Path("c/report.html").read_text()
 
 

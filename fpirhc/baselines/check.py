@@ -1,11 +1,13 @@
-"""`check` compares a problem with its baseline; `bless` measures a new one and writes it."""
+"""`check` compares a problem with its baseline; `accept` measures a new one and writes it."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from fpirhc.baselines.bands import Expected, expected
 from fpirhc.baselines.baseline import Baseline, to_text
@@ -141,7 +143,7 @@ def write_baseline(task: Task, baseline: Baseline, baselines: Path | None, worki
     return path
 
 
-def bless(
+def accept(
     task: Task,
     reason: str,
     *,
@@ -171,3 +173,9 @@ def bless(
     )
     baseline = compose_baseline(task, found, reason, seed=seed, seeds=seeds, compiled=compiled)
     return baseline, write_baseline(task, baseline, baselines, project)
+
+
+def bless(task: Task, reason: str, **settings: Any) -> tuple[Baseline, Path]:
+    """Return what `accept` returns: the earlier name, which goes with the next version."""
+    warnings.warn("fpirhc.bless is now fpirhc.accept", DeprecationWarning, stacklevel=2)
+    return accept(task, reason, **settings)

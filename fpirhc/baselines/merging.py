@@ -39,7 +39,7 @@ def _kept(before: Baseline, merged: Baseline) -> Baseline:
     ):
         raise BaselineError(
             f"problem '{before.problem}' changed, and {', '.join(others)} were not measured; its baseline is left as it "
-            "is: run the tests of all its controllers, or fpirhc bless"
+            "is: run the tests of all its controllers, or fpirhc accept"
         )
     return before
 

@@ -1,4 +1,4 @@
-"""Baselines in a test suite of one's own: the fixture `fpirhc_check` and the option `--fpirhc-bless REASON`.
+"""Baselines in a test suite of one's own: the fixture `fpirhc_check` and the option `--fpirhc-accept REASON`.
 
     def test_arm(fpirhc_check):
         fpirhc_check("problems/arm.py", "RHC+FPI")
@@ -19,13 +19,14 @@ if TYPE_CHECKING:
 
 _found = pytest.StashKey[list[tuple[str, str]]]()
 _told = pytest.StashKey[list[str]]()
-_OUTPUT = "fpirhc_blessed"
+_OUTPUT = "fpirhc_accepted"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options."""
     group = parser.getgroup("fpirhc", "baselines of control problems")
-    group.addoption("--fpirhc-bless", metavar="REASON", help="measure anew and write baselines, for this reason")
+    group.addoption("--fpirhc-accept", metavar="REASON", help="measure anew and write baselines, for this reason")
+    group.addoption("--fpirhc-bless", metavar="REASON", help="earlier name of --fpirhc-accept, for one version")
     group.addoption("--fpirhc-no-compile", action="store_true", help="run loops in CasADi's virtual machine")
 
 
@@ -33,9 +34,14 @@ def pytest_configure(config: pytest.Config) -> None:
     """Refuse an empty reason at once."""
     config.stash[_found] = []
     config.stash[_told] = []
-    reason = config.getoption("--fpirhc-bless")
+    if config.option.fpirhc_bless is not None:
+        config.stash[_told].append(
+            "the option --fpirhc-bless is now --fpirhc-accept; the old name goes with the next version"
+        )
+        config.option.fpirhc_accept = config.option.fpirhc_bless
+    reason = config.getoption("--fpirhc-accept")
     if reason is not None and not reason.strip():
-        raise pytest.UsageError("--fpirhc-bless needs a reason: say why the new numbers are right")
+        raise pytest.UsageError("--fpirhc-accept needs a reason: say why the new numbers are right")
 
 
 @pytest.fixture
@@ -56,7 +62,7 @@ def fpirhc_check(request: pytest.FixtureRequest) -> Callable[..., Judgement | No
         task = load_problem(str(path if path.is_file() else problem))
         names = None if controller is None else [controller]
         compiled = not config.getoption("--fpirhc-no-compile")
-        if config.getoption("--fpirhc-bless") is not None:
+        if config.getoption("--fpirhc-accept") is not None:
             _measure(config, task, names, compiled)
             return None
         judgement = check_baseline(task, controllers=names, compiled=compiled)
@@ -75,7 +81,7 @@ def _measure(config: pytest.Config, task: Any, names: list[str] | None, compiled
     from fpirhc.studies.comparison.compare import select
 
     found = measure_expected(task, list(select(task, names)), compiled=compiled)
-    baseline = compose_baseline(task, found, config.getoption("--fpirhc-bless"), compiled=compiled)
+    baseline = compose_baseline(task, found, config.getoption("--fpirhc-accept"), compiled=compiled)
     config.stash[_found].append((str(task.path.resolve()), to_text(baseline)))
 
 

@@ -26,14 +26,14 @@ def read_baseline(path: Path) -> Baseline:
     """
     try:
         if path.stat().st_size > _LARGEST:
-            raise BaselineError(f"'{path.name}' is larger than {_LARGEST / 1e6:.0f} MB and no baseline; {_BLESS}")
+            raise BaselineError(f"'{path.name}' is larger than {_LARGEST / 1e6:.0f} MB and no baseline; {_ACCEPT}")
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise BaselineError(f"there is no baseline '{path.name}'; {_BLESS}") from None
+        raise BaselineError(f"there is no baseline '{path.name}'; {_ACCEPT}") from None
     except OSError as error:
         raise BaselineError(f"'{path.name}' cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
-        raise BaselineError(f"'{path.name}' is no text ({error.reason}); restore it, or {_BLESS}") from None
+        raise BaselineError(f"'{path.name}' is no text ({error.reason}); restore it, or {_ACCEPT}") from None
     return read_text(text, path)
 
 
@@ -51,29 +51,29 @@ def read_text(text: str, path: Path) -> Baseline:
         )
     checksum = facts.pop("checksum", None)
     if found != FORMAT or checksum is None:
-        raise BaselineError(f"'{path.name}' is not a baseline of format {FORMAT}; {_BLESS}")
+        raise BaselineError(f"'{path.name}' is not a baseline of format {FORMAT}; {_ACCEPT}")
     if checksum != fingerprint(facts):
-        raise BaselineError(f"'{path.name}' was edited by hand, its checksum does not fit; restore it, or {_BLESS}")
+        raise BaselineError(f"'{path.name}' was edited by hand, its checksum does not fit; restore it, or {_ACCEPT}")
     try:
         baseline = _baseline(facts)
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         said = error if isinstance(error, BaselineError | InvalidName) else f"it lacks or misshapes {error}"
-        raise BaselineError(f"'{path.name}': {said}; {_BLESS}") from None
+        raise BaselineError(f"'{path.name}': {said}; {_ACCEPT}") from None
     if baseline.problem != path.stem:
-        raise BaselineError(f"'{path.name}' is the baseline of '{baseline.problem}', not of '{path.stem}'; {_BLESS}")
+        raise BaselineError(f"'{path.name}' is the baseline of '{baseline.problem}', not of '{path.stem}'; {_ACCEPT}")
     return baseline
 
 
-_BLESS = "measure it again with: fpirhc bless PROBLEM --reason ..."
+_ACCEPT = "measure it again with: fpirhc accept PROBLEM --reason ..."
 
 
 def _parsed(text: str, path: Path) -> dict[str, Any]:
     try:
         facts = json.loads(text, object_pairs_hook=_without_doubles, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
-        raise BaselineError(f"'{path.name}' is no complete JSON ({error}); restore it, or {_BLESS}") from None
+        raise BaselineError(f"'{path.name}' is no complete JSON ({error}); restore it, or {_ACCEPT}") from None
     if not isinstance(facts, dict):
-        raise BaselineError(f"'{path.name}' is no baseline: expected an object, got {type(facts).__name__}; {_BLESS}")
+        raise BaselineError(f"'{path.name}' is no baseline: expected an object, got {type(facts).__name__}; {_ACCEPT}")
     return facts
 
 

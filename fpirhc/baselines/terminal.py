@@ -36,7 +36,7 @@ def show_judgements(judgements: Sequence[Judgement], unchecked: Sequence[tuple[s
 
 
 def show_baseline(baseline: Baseline, path: str) -> None:
-    """Print what was blessed and how wide its bands are."""
+    """Print what was accepted and how wide its bands are."""
     console = Console()
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=Text(f"{clean(baseline.problem)}, baseline"))
     for head in ("controller", "metric", "value", "band", "made of"):

@@ -1,6 +1,6 @@
 """What a result may depend on without having changed: seed, rounding, and the steps of the simulated plant.
 
-`bless` measures every controller under all of these; the spread of the results is what bands are made of. C compiled at
+`accept` measures every controller under all of these; the spread of the results is what bands are made of. C compiled at
 two levels may agree to the last digit, which says nothing about another machine, so rounding is also tried directly: the first
 state and the exact parameters move by 1e-14 of themselves.
 """

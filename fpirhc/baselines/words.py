@@ -53,7 +53,7 @@ def remarks(judgement: Judgement) -> list[str]:
     if judgement.changed or any(text.startswith("stale") for text in judgement.unusable):
         said.append(
             f"baseline of {clean(judgement.date)}: {clean(judgement.reason)}. If the new numbers are right: "
-            "fpirhc bless PROBLEM --reason '...'"
+            "fpirhc accept PROBLEM --reason '...'"
         )
     return said
 

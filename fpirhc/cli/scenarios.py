@@ -1,36 +1,39 @@
-"""`fpirhc compare PROBLEM --seeds N --mismatch P`: paired scenarios."""
+"""Paired scenarios: the part of `fpirhc compare` that `--scenarios N` asks for."""
 
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
-from pathlib import Path
 
-from fpirhc.cli.common import output_folder
+from fpirhc.cli.exit_codes import ExitCode
+from fpirhc.cli.options import add_mismatch, add_processes, add_scenarios
+from fpirhc.cli.output import results_folder
 
-EXAMPLES = """examples of scenarios:
-  fpirhc compare two_mass --seeds 100 --mismatch 20                 exact parameters within 20 % of the problem's
-  fpirhc compare two_mass --seeds 400 --mismatch 20 --processes 2   goes on from the 100 that are there
-  fpirhc compare my_arm.py --seeds 50 --mismatch 30 --controllers RHC RHC+FPI --baseline RHC --out results/arm30
-
-Scenario k of a seed is the same for every controller, and whatever the number of seeds and processes. Every exact
-parameter is multiplied by a factor that is log-uniform between 1 - P and 1 + P. Finished scenarios are kept in
-scenarios.jsonl in the output folder; after an interruption or a crash the same command goes on from there. A folder
-that holds results of another problem, seed, mismatch or version is refused (exit code 3).
+EXAMPLES = (
+    ("fpirhc compare two_mass --scenarios 100 --mismatch 20", "exact parameters within 20 % of the problem's"),
+    ("fpirhc compare two_mass --scenarios 400 --mismatch 20 --processes 2", "goes on from the 100 that are there"),
+    (
+        "fpirhc compare my_arm.py --scenarios 50 --mismatch 30 --controllers RHC RHC+FPI --baseline RHC --out results/arm",
+        "two controllers, compared with the first",
+    ),
+)
+NOTES = """
+Scenario k of a seed is the same for every controller, whatever the number of scenarios and processes. Every exact parameter
+is multiplied by a factor of its own, log-uniform between 1 - PERCENT/100 and 1 + PERCENT/100. Finished scenarios are kept in
+scenarios.jsonl in the output folder; after an interruption or a crash the same command goes on from there. A folder that
+holds results of another problem, seed, mismatch or version is refused (exit code 3).
 """
 
 
-def add_options(command: argparse.ArgumentParser) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of scenarios to `compare`."""
-    group = command.add_argument_group("scenarios")
-    group.add_argument("--seeds", type=int, metavar="N", help="run every controller in N paired scenarios")
-    group.add_argument(
-        "--mismatch", type=float, metavar="P", help="draw exact parameters within P percent (default: 0)"
-    )
-    group.add_argument("--processes", type=int, default=1, metavar="K", help="worker processes (default: 1)")
-    group.add_argument(
-        "--baseline", metavar="NAME", help="controller that the others are compared with (default: the first)"
-    )
+    group = parser.add_argument_group("scenarios")
+    add_scenarios(group, None, "run every controller in N paired scenarios")
+    add_mismatch(group, None)
+    add_processes(group)
+    text = "controller that the others are compared with (default: the first)"
+    group.add_argument("--baseline", metavar="NAME", help=text)
 
 
 def check_options(options: argparse.Namespace) -> None:
@@ -41,17 +44,19 @@ def check_options(options: argparse.Namespace) -> None:
     """
     from fpirhc.errors import InvalidValue
 
-    if options.seeds is None:
-        given = [n for n in ("mismatch", "baseline") if getattr(options, n) is not None]
-        given += ["processes"] if options.processes != 1 else []
-        if given:
-            raise InvalidValue(f"--{given[0]} needs --seeds N, the number of scenarios")
+    if options.scenarios is None:
+        named = [n for n in ("mismatch", "baseline") if getattr(options, n) is not None]
+        named += ["processes"] if options.processes != 1 else []
+        if named:
+            raise InvalidValue(f"--{named[0]} needs --scenarios N, the number of scenarios")
     elif options.optimisers:
-        raise InvalidValue("--optimisers cannot be combined with --seeds; write the controllers into the problem file")
+        raise InvalidValue(
+            "--optimisers cannot be combined with --scenarios; write the controllers into the problem file"
+        )
 
 
-def run(options: argparse.Namespace) -> int:
-    """Run the scenarios, write report.html, mismatch.png and scenarios.jsonl, and print what was found."""
+def run(options: argparse.Namespace) -> ExitCode:
+    """Run the scenarios, write report.html, mismatch.png and scenarios.jsonl, and print the comparison."""
     from fpirhc.problem_files.problem_file import load_problem
     from fpirhc.report.figures import save_figure
     from fpirhc.report.scenarios import mismatch_figure, show_scenarios, write_scenarios
@@ -63,13 +68,12 @@ def run(options: argparse.Namespace) -> int:
     tuned = read_tuned(options.tuned, task) if options.tuned else None
     percent = options.mismatch or 0.0
     kind = "tuned_scenarios" if tuned else "scenarios"
-    default = Path("results") / task.name / f"{kind}_{percent:g}percent_seed{options.seed}"
-    folder = output_folder(Path(options.out) if options.out else default)
+    folder = results_folder(options.out, task.name, f"{kind}_{percent:g}percent_seed{options.seed}")
     try:
         with progress_bars() as progress:
-            found = compare_scenarios(
+            comparison = compare_scenarios(
                 task,
-                count=options.seeds,
+                count=options.scenarios,
                 percent=percent,
                 seed=options.seed,
                 folder=folder,
@@ -85,23 +89,21 @@ def run(options: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         print(f"fpirhc: what is finished is kept in {folder / LEDGER}; the same command goes on", file=sys.stderr)
         raise
-    write_scenarios(found, folder / "report.html")
-    if found.summaries:
-        save_figure(mismatch_figure(found), folder / "mismatch.png")
+    write_scenarios(comparison, folder / "report.html")
+    if comparison.summaries:
+        save_figure(mismatch_figure(comparison), folder / "mismatch.png")
     if options.json:
         from fpirhc.report.scenarios import scenarios_json
 
-        print(scenarios_json(found))
+        print(scenarios_json(comparison))
     else:
-        show_scenarios(found, folder / "report.html")
-    return 0 if found.summaries else 2
+        show_scenarios(comparison, folder / "report.html")
+    return ExitCode.FINISHED if comparison.summaries else ExitCode.BAD_INPUT
 
 
 def _command(options: argparse.Namespace) -> str:
     """The command that reproduces these scenarios."""
-    import shlex
-
-    words = ["fpirhc", "compare", options.problem, "--seeds", str(options.seeds), "--seed", str(options.seed)]
+    words = ["fpirhc", "compare", options.problem, "--scenarios", str(options.scenarios), "--seed", str(options.seed)]
     words += ["--mismatch", f"{options.mismatch or 0:g}"]
     for name in ("baseline", "tuned"):
         if getattr(options, name):

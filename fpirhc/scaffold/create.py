@@ -9,7 +9,7 @@ from importlib.machinery import PathFinder
 from importlib.resources import files
 from pathlib import Path
 
-from fpirhc.baselines.check import bless
+from fpirhc.baselines.check import accept
 from fpirhc.baselines.places import baseline_path
 from fpirhc.errors import InvalidName, OutputError
 from fpirhc.problem_files.problem_file import load_problem, shipped_problems
@@ -55,7 +55,7 @@ def create_problem(name: str, folder: Path) -> tuple[Path, ...]:
 def first_baseline(problem_file: Path) -> Path:
     """Measure what later runs of a new problem are compared with, and return where it is."""
     task = load_problem(str(problem_file))
-    _, path = bless(task, "first numbers of a new problem", working=problem_file.parent)
+    _, path = accept(task, "first numbers of a new problem", working=problem_file.parent)
     return path
 
 

@@ -85,7 +85,7 @@ def compare_scenarios(
         WorkerDied: processes die again and again.
     """
     begin = time.perf_counter()
-    for name, value in (("seeds", count), ("processes", processes)):
+    for name, value in (("scenarios", count), ("processes", processes)):
         if value < 1:
             raise InvalidValue(f"{name} {value}: expected at least 1")
     if percent == 0 and not task.problem.disturbances:

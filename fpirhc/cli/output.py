@@ -1,8 +1,17 @@
-"""What commands share."""
+"""Where a command writes its results."""
 
 from __future__ import annotations
 
 from pathlib import Path
+
+
+def results_folder(wanted: str | None, *default: str) -> Path:
+    """Return the folder for results, `results/DEFAULT...` when none is wanted, made before anything runs.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    return output_folder(Path(wanted) if wanted else Path("results", *default))
 
 
 def output_folder(folder: Path) -> Path:

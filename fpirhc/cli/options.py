@@ -1,0 +1,93 @@
+"""Options that several commands share: one name, one meaning, one text."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+Parser = argparse.ArgumentParser | argparse._ArgumentGroup
+
+
+def add_problem(parser: Parser) -> None:
+    """PROBLEM."""
+    parser.add_argument("problem", metavar="PROBLEM", help="name of a shipped problem, or path of a problem file")
+
+
+def add_out(parser: Parser, default: str = "results/PROBLEM") -> None:
+    """--out FOLDER."""
+    parser.add_argument("--out", metavar="FOLDER", help=f"folder for the results (default: {default})")
+
+
+def add_controllers(parser: Parser, default: str = "all") -> None:
+    """--controllers NAME ..."""
+    parser.add_argument("--controllers", nargs="+", metavar="NAME", help=f"only these controllers (default: {default})")
+
+
+def add_optimisers(parser: Parser) -> None:
+    """--optimisers NAME ...; the names are those that the study knows."""
+    from fpirhc.studies.comparison.optimiser_choices import OPTIMISERS
+
+    names = f"{', '.join(OPTIMISERS)}, or all"
+    parser.add_argument("--optimisers", nargs="+", metavar="NAME", help=names)
+
+
+def add_seed(parser: Parser, use: str) -> None:
+    """--seed K."""
+    parser.add_argument("--seed", type=int, default=0, metavar="K", help=f"seed of {use} (default: 0)")
+
+
+def add_mismatch(parser: Parser, default: float | None = 0.0) -> None:
+    """--mismatch PERCENT, with the same meaning wherever it stands; see `fpirhc.plant.mismatch`."""
+    text = "every exact parameter lies within PERCENT %% of its value in the problem file (default: 0)"
+    parser.add_argument("--mismatch", type=float, default=default, metavar="PERCENT", help=text)
+
+
+def add_scenarios(parser: Parser, default: int | None, text: str) -> None:
+    """--scenarios N, formerly --seeds."""
+    parser.add_argument("--scenarios", type=int, default=default, metavar="N", help=text)
+    parser.add_argument("--seeds", action=Former, type=int, dest="scenarios", new="--scenarios")
+
+
+def add_baselines(parser: Parser) -> None:
+    """--baselines FOLDER."""
+    text = "folder of the baselines (default: baselines beside the problem)"
+    parser.add_argument("--baselines", type=Path, metavar="FOLDER", help=text)
+
+
+def add_processes(parser: Parser) -> None:
+    """--processes N."""
+    parser.add_argument("--processes", type=int, default=1, metavar="N", help="number of processes (default: 1)")
+
+
+def add_no_compile(parser: Parser) -> None:
+    """--no-compile."""
+    text = "run loops in CasADi's virtual machine even where there is a C compiler"
+    parser.add_argument("--no-compile", action="store_true", help=text)
+
+
+def add_json(parser: Parser, instead: str) -> None:
+    """--json."""
+    parser.add_argument("--json", action="store_true", help=f"print one JSON object instead of {instead}")
+
+
+class Former(argparse.Action):
+    """An option under its earlier name: accepted for one version with a notice, and not shown in help."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, new: str, **settings: Any) -> None:
+        super().__init__(option_strings, dest, default=argparse.SUPPRESS, help=argparse.SUPPRESS, **settings)
+        self.new = new
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,  # noqa: ARG002 -- argparse gives it to every action
+        namespace: argparse.Namespace,
+        values: Any,
+        option: str | None = None,
+    ) -> None:
+        """Store the value where the new option does."""
+        notice = f"fpirhc: the option {option} is now {self.new}; the old name goes with the next version"
+        print(notice, file=sys.stderr)
+        setattr(namespace, self.dest, values)

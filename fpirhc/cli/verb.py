@@ -1,0 +1,65 @@
+"""The contract of a command: a value that names it, explains it, adds its options and runs it."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from fpirhc.cli.exit_codes import OF_EVERY_VERB, ExitCode, table
+
+
+@dataclass(frozen=True)
+class Verb:
+    """One command of the command line.
+
+    Parameters:
+        name: word after `fpirhc`. summary: one line for `fpirhc --help`.
+        add: adds arguments and options to a parser; it may import what the choices are discovered in.
+        run: does the work with the options and returns an exit code; heavy libraries are imported here.
+        codes: exit codes that this command returns, in its own words; `OF_EVERY_VERB` need not be repeated.
+        examples: pairs of a command line and a remark; the first one also stands in `fpirhc --help`.
+        notes: paragraphs below the examples. former: earlier names, accepted for one version with a notice.
+    """
+
+    name: str
+    summary: str
+    add: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], ExitCode]
+    examples: tuple[tuple[str, str], ...]
+    codes: Mapping[ExitCode, str] = field(default_factory=dict)
+    notes: str = ""
+    former: tuple[str, ...] = ()
+
+    @property
+    def exit_codes(self) -> dict[ExitCode, str]:
+        """Every exit code that the command can return, in order, with its meaning."""
+        known = {**OF_EVERY_VERB, **self.codes}
+        return {code: known[code] for code in sorted(known)}
+
+    def parser(self) -> argparse.ArgumentParser:
+        """Return the parser of the command's own options, with examples and exit codes below them."""
+        notes = f"\n{self.notes.strip()}\n" if self.notes else ""
+        parser = argparse.ArgumentParser(
+            prog=f"fpirhc {self.name}",
+            description=f"{self.summary[0].upper()}{self.summary[1:]}.",
+            epilog=f"examples:\n{aligned(self.examples)}\n{notes}\nexit codes:\n{table(self.exit_codes)}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        self.add(parser)
+        return parser
+
+
+def aligned(examples: tuple[tuple[str, str], ...]) -> str:
+    """Return examples one per line, the remarks below each other; a remark that finds no room has a line of its own."""
+    room = max((len(line) for line, _ in examples if len(line) <= _WIDEST), default=0)
+    lines = []
+    for line, remark in examples:
+        if len(line) <= room:
+            lines.append(f"  {line:{room}s}   {remark}".rstrip())
+        else:
+            lines += [f"  {line}", f"  {'':{room}s}   {remark}".rstrip()]
+    return "\n".join(lines)
+
+
+_WIDEST = 52  # characters of an example with its remark on the same line

@@ -1,0 +1,96 @@
+"""`fpirhc check [PROBLEM ...]`: fresh results against the committed baselines."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fpirhc.cli.exit_codes import ExitCode
+from fpirhc.cli.options import add_baselines, add_no_compile, add_processes
+from fpirhc.cli.verb import Verb
+
+if TYPE_CHECKING:
+    from fpirhc.baselines.judging import Judgement
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("problems", nargs="*", metavar="PROBLEM", help="names or files (default: all of this folder)")
+    parser.add_argument("--junit", type=Path, metavar="FILE", help="also write JUnit XML")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write Markdown, for a pull request")
+    text = "show every metric, not only those that changed and the rms errors"
+    parser.add_argument("--all", action="store_true", help=text)
+    add_baselines(parser)
+    add_processes(parser)
+    add_no_compile(parser)
+
+
+def _run(options: argparse.Namespace) -> ExitCode:
+    from fpirhc.baselines import junit, markdown
+    from fpirhc.baselines.places import problems_here, write_whole
+    from fpirhc.baselines.terminal import show_judgements
+    from fpirhc.baselines.words import check_replaceable
+
+    for path, mark in ((options.junit, junit.MARK), (options.markdown, markdown.MARK)):
+        if path:
+            check_replaceable(path, mark)
+    problems, unchecked = (options.problems, {}) if options.problems else problems_here(Path(), options.baselines)
+    judgements = _judgements(options, list(dict.fromkeys(map(str, problems))))
+    show_judgements(judgements, list(unchecked.items()), options.all)
+    if options.junit:
+        write_whole(junit.to_junit(judgements), options.junit, "report")
+    if options.markdown:
+        write_whole(markdown.to_markdown(judgements, list(unchecked.items())), options.markdown, "report")
+    return _code(judgements)
+
+
+def _judgements(options: argparse.Namespace, problems: Sequence[str]) -> list[Judgement]:
+    from fpirhc.baselines.check import check_file
+    from fpirhc.report.terminal import progress_bars
+
+    with progress_bars() as progress:
+        return [
+            check_file(
+                problem,
+                baselines=options.baselines,
+                compiled=not options.no_compile,
+                processes=options.processes,
+                progress=progress,
+            )
+            for problem in problems
+        ]
+
+
+def _code(judgements: Sequence[Judgement]) -> ExitCode:
+    """The first of 2, 6, 5 that one of the problems asks for."""
+    if any(j.broken for j in judgements):
+        return ExitCode.BAD_INPUT
+    if any(j.unusable or not j.rows for j in judgements):
+        return ExitCode.NO_BASELINE
+    return ExitCode.FINISHED if all(j.holds for j in judgements) else ExitCode.CHANGED
+
+
+VERB = Verb(
+    name="check",
+    summary="compare fresh results with the committed baselines",
+    add=_add,
+    run=_run,
+    codes={
+        ExitCode.FINISHED: "every metric holds",
+        ExitCode.BAD_INPUT: "bad input: an option, a problem that cannot be loaded, or nothing to check",
+        ExitCode.NOT_WRITABLE: ExitCode.NOT_WRITABLE.meaning,
+        ExitCode.CHANGED: ExitCode.CHANGED.meaning,
+        ExitCode.NO_BASELINE: ExitCode.NO_BASELINE.meaning,
+    },
+    examples=(
+        ("fpirhc check", "every problem of ./problems, or of this folder"),
+        ("fpirhc check my_arm.py two_mass", "these problems"),
+        ("fpirhc check --junit check.xml --markdown check.md", "for a pull request"),
+    ),
+    notes="""
+A baseline is baselines/NAME.json beside the problem file; commit it. Without names, a problem in the folder that has
+no baseline fails, unless baselines/unchecked.toml gives a reason, such as: chain_of_masses = "takes a minute".
+Of several problems, the exit code is the first of 2, 6 and 5 that applies to one of them.
+""",
+)

@@ -1,0 +1,47 @@
+"""`fpirhc new NAME`: the first files of a problem."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from fpirhc.cli.exit_codes import ExitCode
+from fpirhc.cli.verb import Verb
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", metavar="NAME", help="of the problem: letters, digits and underscores")
+    text = "folder for the files, which is made where it is missing (default: the current folder)"
+    parser.add_argument("--dir", metavar="FOLDER", default=".", help=text)
+
+
+def _run(options: argparse.Namespace) -> ExitCode:
+    import shlex
+
+    from fpirhc.scaffold.create import create_problem, first_baseline
+
+    problem, test = create_problem(options.name, Path(options.dir))
+    print(f"wrote {problem}\nwrote {test}")
+    print("measuring the baseline: every controller, with several seeds and ways of computing", flush=True)
+    print(f"wrote {first_baseline(problem)}")
+    print("next:")
+    print(f"  {shlex.join(['fpirhc', 'compare', str(problem)])}")
+    print(f"  {shlex.join(['python', '-m', 'pytest', str(test)])}")
+    print(f"  {shlex.join(['fpirhc', 'accept', str(problem), '--reason', '...'])}      when new numbers are right")
+    return ExitCode.FINISHED
+
+
+VERB = Verb(
+    name="new",
+    summary="write a problem file, its test and its baseline to start from",
+    add=_add,
+    run=_run,
+    codes={ExitCode.NOT_WRITABLE: "a file exists already, or the folder cannot be written"},
+    examples=(
+        ("fpirhc new my_arm", "my_arm.py, test_my_arm.py and baselines/my_arm.json"),
+        ("fpirhc new my_arm --dir arms", "the same files in the folder arms"),
+        ("fpirhc compare my_arm.py", "the next step"),
+        ('fpirhc accept my_arm.py --reason "..."', "when its new numbers are right"),
+    ),
+    notes="A file that exists already is never written to. After a change of my_arm.py run: python -m pytest test_my_arm.py",
+)

@@ -1,0 +1,112 @@
+"""`fpirhc tune PROBLEM`: better settings, found with the same budget and cost for every controller."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fpirhc.cli.exit_codes import ExitCode
+from fpirhc.cli.options import add_controllers, add_mismatch, add_out, add_problem, add_scenarios, add_seed
+from fpirhc.cli.output import results_folder
+from fpirhc.cli.verb import Verb
+
+if TYPE_CHECKING:
+    from fpirhc.studies.tuning.tune import Tuning
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
+    add_problem(parser)
+    add_out(parser, "results/PROBLEM/tuning_...")
+    add_controllers(parser, "all that the problem file lets be tuned")
+    text = "trials of every controller (default: 50)"
+    parser.add_argument("--trials", type=int, default=50, metavar="N", help=text)
+    add_seed(parser, "the proposals and scenarios")
+    add_scenarios(parser, 1, "scenarios in every trial (default: 1)")
+    add_mismatch(parser)
+    text = "compile every trial: pays where its runs last longer than the compiler"
+    parser.add_argument("--compile", action="store_true", help=text)
+
+
+def _run(options: argparse.Namespace) -> ExitCode:
+    from fpirhc.problem_files.problem_file import load_problem
+    from fpirhc.report.terminal import progress_bars
+    from fpirhc.studies.tuning.tune import LEDGER, tune
+    from fpirhc.studies.tuning.tuned_file import write_tuned
+
+    task = load_problem(options.problem)
+    name = f"tuning_{options.scenarios}x{options.mismatch:g}percent_seed{options.seed}"
+    folder = results_folder(options.out, task.name, name)
+    try:
+        with progress_bars() as progress:
+            tuning = tune(
+                task,
+                trials=options.trials,
+                seed=options.seed,
+                folder=folder,
+                controllers=options.controllers,
+                count=options.scenarios,
+                percent=options.mismatch,
+                compiled=options.compile,
+                progress=progress,
+            )
+    except KeyboardInterrupt:
+        print(f"fpirhc: what is finished is kept in {folder / LEDGER}; the same command goes on", file=sys.stderr)
+        raise
+    write_tuned(tuning.facts(), folder / "tuning.json")
+    _show(tuning, folder / "tuning.json")
+    return ExitCode.FINISHED
+
+
+def _show(tuning: Tuning, saved: Path) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    title = f"{tuning.problem}: {tuning.trials} trials each, seed {tuning.seed}, {tuning.conditions}"
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title)
+    table.add_column("controller, setting", no_wrap=True)
+    for head in ("before", "after", "failed"):
+        table.add_column(head, justify="right")
+    for entry in tuning.entries:
+        name = entry.name.replace("[", "\\[")
+        table.add_row(f"{name}: cost", f"{entry.cost_before:.4g}", f"{entry.cost:.4g}", str(entry.failed))
+        for path, value in entry.settings.items():
+            table.add_row(f"  {path}", f"{entry.before[path]:.4g}", f"{value:.4g}", "")
+    console.print(table)
+    if tuning.untouched:
+        console.print(f"not tuned: {', '.join(tuning.untouched)}", markup=False, highlight=False)
+    print(f"for the problem file, below its controllers:\n\n{tuning.python()}\n")
+    console.print(f"saved: {saved}", markup=False, highlight=False, soft_wrap=True)
+
+
+VERB = Verb(
+    name="tune",
+    summary="find better settings, with the same budget and cost for every controller",
+    add=_add,
+    run=_run,
+    codes={
+        ExitCode.BAD_INPUT: f"{ExitCode.BAD_INPUT.meaning}; or Optuna is missing",
+        ExitCode.NOT_WRITABLE: ExitCode.NOT_WRITABLE.meaning,
+        ExitCode.INTERRUPTED: "interrupted from the keyboard; the same command goes on",
+    },
+    examples=(
+        ("fpirhc tune two_mass", "50 trials of every controller that may be tuned"),
+        (
+            "fpirhc tune two_mass --trials 200 --scenarios 5 --mismatch 20",
+            "each trial in 5 scenarios; goes on from the trials that are there",
+        ),
+        (
+            "fpirhc compare two_mass --scenarios 100 --mismatch 20 --tuned results/two_mass/tuning_5x20percent_seed0/tuning.json",
+            "what the new settings are worth",
+        ),
+    ),
+    notes="""
+A problem file says what may be tuned, by dotted path:
+  tuning = {"RHC+FPI": {"deformation.gain": fp.LogSpan(-1.5, -0.05), "deformation.scale": fp.LogSpan(5, 500)}}
+The cost is the rms error divided by the reference's range, the mean over the scenarios; runs that fail cost 10 to 20.
+The scenarios of tuning are never those of a comparison.
+""",
+)
