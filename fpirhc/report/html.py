@@ -8,12 +8,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fpirhc.report.figures import BANDS, PALETTE, contraction_figure, lyapunov_figure, pair_figures
+from fpirhc.report.figures import contraction_figure, lyapunov_figure, pair_figures
 from fpirhc.report.page import asset as _asset
 from fpirhc.report.page import page, write_page
 from fpirhc.report.page import picture as _picture
 from fpirhc.report.page import text as _text
 from fpirhc.report.series import chart_data
+from fpirhc.simulation.drawing import BANDS, PALETTE
 
 if TYPE_CHECKING:
     from fpirhc.studies.comparison.compare import Comparison, Entry

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fpirhc.report.figures import PALETTE
 from fpirhc.report.page import page, picture, text, write_page
+from fpirhc.simulation.drawing import PALETTE
 from fpirhc.studies.scenarios.paired import Summary, percent, signed
 
 if TYPE_CHECKING:

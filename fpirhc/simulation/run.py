@@ -100,7 +100,7 @@ class Run:
 
     def plot(self) -> Figure:
         """Errors, commands and responses over time as a matplotlib Figure."""
-        from fpirhc.report.figures import run_figure
+        from fpirhc.simulation.run_figure import run_figure
 
         return run_figure(self)
 
