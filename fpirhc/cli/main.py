@@ -280,8 +280,6 @@ def _comparison_code(comparison: Comparison) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from dataclasses import replace
-
     from fpirhc.problem_files.problem_file import load_problem
     from fpirhc.report.figures import save_figure
     from fpirhc.report.terminal import progress_bars, show_run
@@ -300,7 +298,6 @@ def _run(options: argparse.Namespace) -> int:
             compiled=not options.no_compile,
             progress=_named(progress, options.controller),
         )
-    run = replace(run, problem=task.name)
     stem = "".join(c if c.isalnum() else "_" for c in options.controller)
     run.save(folder / f"{stem}.npz")
     save_figure(run.plot(), folder / f"{stem}.png")

@@ -12,7 +12,7 @@ import importlib.util
 import sys
 import traceback
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 
@@ -24,7 +24,7 @@ from fpirhc.task.problem import Problem
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A loaded problem file."""
+    """A loaded problem file; its problem has its name."""
 
     name: str
     path: Path
@@ -34,6 +34,10 @@ class Task:
     controllers: Mapping[str, Controller]
     headline: tuple[str, str] | None = None
     tuning: Mapping[str, TuningSpans] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.problem.name != self.name:
+            object.__setattr__(self, "problem", replace(self.problem, name=self.name))
 
 
 def shipped_folders() -> list[Path]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
@@ -199,7 +199,6 @@ def _entry(
 
     report(0, problem.cycles)
     run = simulate(problem, resolved, seed=seed, name=name, compiled=compiled, progress=report)
-    run = replace(run, problem=task.name)
     adaptive = not isinstance(resolved.adaptive, Identity)
     view = lyapunov_view(problem, resolved, run)
     return Entry(
@@ -244,9 +243,7 @@ def measure_contraction(problem: Problem, controller: Controller, run: Run) -> C
         problem.plant, run["state"][rows], run["deformed"][rows], approximate=controller.parameters(problem.plant)
     )
     report = assess_gain(deformation, spectrum)
-    # What the plant did, where the controller was given something later or noisier.
-    realised = run["plant_realised" if "plant_realised" in run.layout else "realised"]
-    measured = identified_factor(run["deformed"], realised, deformation.effective_gain())
+    measured = identified_factor(run["deformed"], run["plant_realised"], deformation.effective_gain())
     return Contraction(report.predicted, measured, report, spectrum)
 
 
