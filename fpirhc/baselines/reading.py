@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,13 @@ from fpirhc.baselines.measuring import FINISHED
 from fpirhc.baselines.settings import Settings, fingerprint
 from fpirhc.baselines.variants import SOURCES
 from fpirhc.errors import BaselineError, InvalidName
+from fpirhc.simulation import metrics as run_metrics
 
 _LARGEST = 20_000_000  # bytes; a baseline has some tens of thousands
 
 
-def read_baseline(path: Path) -> Baseline:
-    """Return the baseline in a file.
+def read_baseline(path: Path, metrics: Sequence[run_metrics.Metric] | None = None) -> Baseline:
+    """Return the baseline in a file; `metrics` that the problem's runs are measured by, None: names are not checked.
 
     Raises:
         BaselineError: it is missing, damaged, edited by hand, of a newer format, of another problem, or compares nothing.
@@ -34,10 +36,10 @@ def read_baseline(path: Path) -> Baseline:
         raise BaselineError(f"'{path.name}' cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise BaselineError(f"'{path.name}' is no text ({error.reason}); restore it, or {_BLESS}") from None
-    return read_text(text, path)
+    return read_text(text, path, metrics)
 
 
-def read_text(text: str, path: Path) -> Baseline:
+def read_text(text: str, path: Path, metrics: Sequence[run_metrics.Metric] | None = None) -> Baseline:
     """Return the baseline in a text that is, or will be, in the file at `path`.
 
     Raises:
@@ -56,6 +58,8 @@ def read_text(text: str, path: Path) -> Baseline:
         raise BaselineError(f"'{path.name}' was edited by hand, its checksum does not fit; restore it, or {_BLESS}")
     try:
         baseline = _baseline(facts)
+        for key in {key for one in baseline.controllers.values() for key in one.metrics} if metrics is not None else ():
+            family_of(key, metrics)
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         said = error if isinstance(error, BaselineError | InvalidName) else f"it lacks or misshapes {error}"
         raise BaselineError(f"'{path.name}': {said}; {_BLESS}") from None
@@ -118,7 +122,7 @@ def _baseline(facts: dict[str, Any]) -> Baseline:
 
 def _expected(name: str, facts: dict[str, Any]) -> Expected:
     outcomes = tuple(str(o) for o in facts["outcomes"])
-    metrics = {metric: _metric(f"{name}: {metric}", metric, one) for metric, one in facts["metrics"].items()}
+    metrics = {metric: _metric(f"{name}: {metric}", one) for metric, one in facts["metrics"].items()}
     skipped = {str(k): str(v) for k, v in facts["not_compared"].items()}
     if not outcomes:
         raise BaselineError(f"controller '{name}' has no outcome")
@@ -127,8 +131,7 @@ def _expected(name: str, facts: dict[str, Any]) -> Expected:
     return Expected(outcomes, metrics, skipped)
 
 
-def _metric(where: str, name: str, facts: dict[str, Any]) -> Metric:
-    family_of(name)
+def _metric(where: str, facts: dict[str, Any]) -> Metric:
     kind, value = facts["kind"], facts["value"]
     if kind not in KINDS:
         raise BaselineError(f"{where} has class '{kind}'; expected one of {', '.join(KINDS)}")

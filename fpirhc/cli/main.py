@@ -283,6 +283,7 @@ def _run(options: argparse.Namespace) -> int:
     from fpirhc.problem_files.problem_file import load_problem
     from fpirhc.report.figures import save_figure
     from fpirhc.report.terminal import progress_bars, show_run
+    from fpirhc.simulation.metrics import measure
     from fpirhc.simulation.simulate import simulate
     from fpirhc.studies.comparison.compare import select
 
@@ -301,7 +302,7 @@ def _run(options: argparse.Namespace) -> int:
     stem = "".join(c if c.isalnum() else "_" for c in options.controller)
     run.save(folder / f"{stem}.npz")
     save_figure(run.plot(), folder / f"{stem}.png")
-    show_run(task.problem, run, folder / f"{stem}.npz")
+    show_run(run, measure(task.problem, run, task.metrics), folder / f"{stem}.npz")
     return OK if run.stop is None else ENDED_EARLY
 
 

@@ -63,6 +63,8 @@ class Simulator:
         step_limit = self.controller.adaptive.largest_step()
         settings = {
             "step_limit": step_limit if np.isfinite(step_limit) else None,
+            "effective_gain": float(self.controller.adaptive.effective_gain()),
+            "parameters": [float(v) for v in self.controller.parameters(problem.plant)],
             "controller": describe(self.controller),
             "problem": describe(problem),
             "backend": "compiled C" if self.compiled else "CasADi virtual machine",

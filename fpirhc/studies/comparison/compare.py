@@ -18,6 +18,7 @@ from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, ne
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
 from fpirhc.simulation.metrics import Metrics, measure
+from fpirhc.simulation.metrics.columns import columns
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
 from fpirhc.studies.comparison.optimality import Optimality, measure_optimality
@@ -78,18 +79,17 @@ class Comparison:
 
     def _repr_html_(self) -> str:
         """Verdict and errors as a table, for notebooks."""
-        names = list(self.entries[0].metrics.rms_error) if self.entries else []
+        shown = columns([e.metrics for e in self.entries], headline=True)
         rows = [
             (
                 e.name,
-                *(number(e.metrics.rms_error[n]) for n in names),
+                *(c.text(c.number(e.metrics), missing="", none="none") for c in shown),
                 number(e.cycle.median) if e.cycle else "",
-                f"{100 * e.metrics.clipped_share:.3g} %",
                 f"ended early: {e.run.stop}" if e.run.stop else e.metrics.worst_status,
             )
             for e in self.entries
         ]
-        head = ("controller", *(f"rms error {n}" for n in names), "cycle [us]", "clipped", "worst status")
+        head = ("controller", *(c.heading for c in shown), "cycle [us]", "worst status")
         return table(self.title, head, rows, self.verdict)
 
     def __getitem__(self, name: str) -> Entry:
@@ -204,7 +204,7 @@ def _entry(
     return Entry(
         name=name,
         run=run,
-        metrics=measure(problem, run),
+        metrics=measure(problem, run, task.metrics),
         cycle=measure_cycle(problem, resolved, run, compiled=compiled),
         adaptive=adaptive,
         pair=_pair(chosen, name) if adaptive else None,
