@@ -77,7 +77,7 @@ def judge(
     rows: list[Row] = []
     for name in names:
         rows += _rows(name, baseline.controllers.get(name), fresh.get(name), metrics)
-    notes = [f"{name}: {one.why}" for name, one in fresh.items() if one.why]
+    notes = [f"{name}: {one.why}" for name, one in fresh.items() if one.why] + _old_names(baseline)
     return Judgement(
         baseline.problem,
         tuple(rows),
@@ -86,6 +86,13 @@ def judge(
         date=baseline.date,
         notes=tuple(notes),
     )
+
+
+def _old_names(baseline: Baseline) -> list[str]:
+    if not baseline.renamed:
+        return []
+    names = ", ".join(f"'{old}' is now '{new}'" for old, new in sorted(baseline.renamed.items()))
+    return [f"the baseline has names of an older version and is read with those of today: {names}"]
 
 
 def _stale(baseline: Baseline, settings: Settings, names: Sequence[str]) -> tuple[str, ...]:

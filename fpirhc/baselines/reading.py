@@ -12,6 +12,7 @@ from fpirhc.baselines.bands import Expected, Metric
 from fpirhc.baselines.baseline import FORMAT, Baseline, settings_hash
 from fpirhc.baselines.catalogue import BANDED, EXACT, KINDS, family_of
 from fpirhc.baselines.measuring import FINISHED
+from fpirhc.baselines.renamed import new_metrics, new_settings
 from fpirhc.baselines.settings import Settings, fingerprint
 from fpirhc.baselines.variants import SOURCES
 from fpirhc.errors import BaselineError, InvalidName
@@ -103,6 +104,10 @@ def _baseline(facts: dict[str, Any]) -> Baseline:
         raise BaselineError("it holds no controller and would compare nothing")
     if set(controllers) != set(settings.controllers):
         raise BaselineError("its controllers and their settings differ")
+    settings, renamed = new_settings(settings)
+    for name, one in controllers.items():
+        controllers[name], also = new_metrics(one)
+        renamed |= also
     for name in ("problem", "reason", "date"):
         if not isinstance(facts[name], str) or not facts[name].strip():
             raise BaselineError(f"it has no {name}")
@@ -117,6 +122,7 @@ def _baseline(facts: dict[str, Any]) -> Baseline:
         {str(k): [str(n) for n in v] for k, v in facts["varied"].items()},
         settings,
         controllers,
+        renamed,
     )
 
 
