@@ -77,7 +77,7 @@ from .sensing import (
     VelocityDifference,
 )
 from .simulation.lyapunov_view import LyapunovView, lyapunov_view
-from .simulation.metrics import Metrics, measure
+from .simulation.metrics import Metric, Metrics, measure
 from .simulation.run import Run, load_run
 from .simulation.simulate import simulate
 from .simulation.stepper import Stepper
@@ -154,6 +154,7 @@ __all__ = [
     "LyapunovRule",
     "LyapunovView",
     "Measured",
+    "Metric",
     "Metrics",
     "MovingHorizon",
     "Noise",

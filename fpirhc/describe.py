@@ -10,9 +10,12 @@ import numpy as np
 
 
 def describe(value: Any) -> Any:
-    """Return `value` as JSON-able data; a dataclass becomes {"is": its class, field: ...}, a function its name."""
+    """Return `value` as JSON-able data; a dataclass becomes {"is": its class, field: ...}, a function its name.
+
+    A dataclass field with the metadata {"setting": False} is left out: it names the value and changes nothing.
+    """
     if is_dataclass(value) and not isinstance(value, type):
-        facts = {f.name: describe(getattr(value, f.name)) for f in fields(value)}
+        facts = {f.name: describe(getattr(value, f.name)) for f in fields(value) if f.metadata.get("setting", True)}
         return {"is": type(value).__name__, **facts}
     if isinstance(value, Mapping):
         return {str(k): describe(v) for k, v in value.items()}

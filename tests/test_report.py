@@ -22,24 +22,27 @@ from fpirhc.studies.comparison.compare import compare
 HOSTILE = "<script>alert('x')</script> \"& </script>"
 
 
-@pytest.fixture(scope="module")
-def comparison():
-    """A pair, and a third controller that ends early."""
-    plant = linear(1.6, 1.0)
-    problem = fp.Problem(
-        plant=plant,
+def problem():
+    """A linear plant with a wrong model that follows a sine."""
+    return fp.Problem(
+        plant=linear(1.6, 1.0),
         reference=fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}),
         start={"y": 0.3},
         period=1e-3,
         duration=1.0,
         disturbances={"u": fp.Noise(0.01)},
     )
+
+
+@pytest.fixture(scope="module")
+def comparison():
+    """A pair of controllers with and without adaptation."""
     track = fp.Exponential(rate=6.0)
     controllers = {
         "plain": fp.ComputedTorque(track),
         HOSTILE: fp.ComputedTorque(track, fp.Sigmoid(gain=-0.5, scale=5.0)),
     }
-    return compare(Task("case", Path("case.py"), HOSTILE, HOSTILE, problem, controllers), seed=0, compiled=False)
+    return compare(Task("case", Path("case.py"), HOSTILE, HOSTILE, problem(), controllers), seed=0, compiled=False)
 
 
 def test_report_is_self_contained_and_small(comparison, tmp_path):
@@ -95,8 +98,7 @@ def test_run_that_ended_early_is_told_in_words(comparison):
     """Its numbers are 'none', its reason is in the table, and its lines stop."""
     entry = comparison["plain"]
     short = replace(entry.run, log=entry.run.log[:300], stop="signal 'x' is not finite at t = 0.3 s")
-    nan = dict.fromkeys(entry.metrics.rms_error, float("nan"))
-    ended = replace(entry, run=short, metrics=replace(entry.metrics, rms_error=nan, max_error=nan))
+    ended = replace(entry, run=short, metrics=fp.measure(problem(), short))
     page = render(replace(comparison, entries=(ended, *comparison.entries[1:])))
     assert "ended early: signal &#x27;x&#x27; is not finite" in page
     assert "<span class='none'>none</span>" in page

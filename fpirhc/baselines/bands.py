@@ -12,9 +12,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from fpirhc.baselines.catalogue import BANDED, EXACT, TIGHT, family_of
+from fpirhc.baselines.catalogue import BANDED, EXACT, TIGHT, Family, family_of
 from fpirhc.baselines.measuring import FINISHED, Measurement, Number
 from fpirhc.baselines.variants import NOMINAL, Variant
+from fpirhc.simulation import metrics as run_metrics
 
 FACTOR = 3.0
 RELATIVE = 1e-6  # also what 'tight' means
@@ -59,12 +60,17 @@ class Expected:
     not_compared: Mapping[str, str]
 
 
-def expected(variants: Sequence[Variant], results: Sequence[Measurement], period: float) -> Expected:
-    """Return what to expect from the results under every variant, the nominal one first."""
+def expected(
+    variants: Sequence[Variant],
+    results: Sequence[Measurement],
+    period: float,
+    metrics: Sequence[run_metrics.Metric] | None = None,
+) -> Expected:
+    """Return what to expect from the results under every variant, the nominal one first; `metrics` are the problem's."""
     outcomes = tuple(dict.fromkeys(r.outcome for r in results))
     if outcomes != (FINISHED,):
         return Expected(outcomes, {}, {})
-    metrics: dict[str, Metric] = {}
+    compared: dict[str, Metric] = {}
     not_compared: dict[str, str] = {}
     names = dict.fromkeys(name for r in results for name in r.numbers)
     for name in names:
@@ -72,16 +78,16 @@ def expected(variants: Sequence[Variant], results: Sequence[Measurement], period
         if found[0][0] != NOMINAL:
             not_compared[name] = "only some variants have it"
             continue
-        metric = _metric(name, found, _quantum(name, results[0], period))
+        family = family_of(name, metrics)
+        metric = _metric(family, found, _quantum(family, results[0], period))
         if metric is None:
             not_compared[name] = "some variants have a value and some have none, or words that differ"
         else:
-            metrics[name] = metric
-    return Expected(outcomes, metrics, not_compared)
+            compared[name] = metric
+    return Expected(outcomes, compared, not_compared)
 
 
-def _metric(name: str, found: Sequence[tuple[str, Number]], quantum: float) -> Metric | None:
-    family = family_of(name)
+def _metric(family: Family, found: Sequence[tuple[str, Number]], quantum: float) -> Metric | None:
     values = [value for _, value in found]
     if any(isinstance(v, str) for v in values):
         return Metric(EXACT, values[0], 0.0, {}) if len(set(values)) == 1 else None
@@ -115,12 +121,9 @@ def _spread(found: Sequence[tuple[str, float]]) -> dict[str, float]:
     return {source: width for source, width in widths.items() if width}
 
 
-def _quantum(name: str, nominal: Measurement, period: float) -> float:
+def _quantum(family: Family, nominal: Measurement, period: float) -> float:
     """The smallest step of a metric that counts cycles."""
-    first = name.partition(".")[0]
     cycles = nominal.numbers.get("cycles", 0)
-    if first == "settling":
-        return period
-    if first == "clipped_share" and isinstance(cycles, int | float) and cycles > 0:
-        return 1.0 / cycles
-    return 0.0
+    if family.step is None or not isinstance(cycles, int | float) or cycles < 1:
+        return 0.0
+    return family.step(period, int(cycles))

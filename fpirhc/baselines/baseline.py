@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from fpirhc.baselines.bands import Expected
@@ -26,6 +26,7 @@ class Baseline:
     """What is expected of a problem, why, and what it was measured with.
 
     reason: why this baseline was accepted. date: when, in UTC. seed: of the nominal run. varied: variants in words by source.
+    renamed: names of an older version that the file has, and what they are called now; no file that is written has any.
     """
 
     problem: str
@@ -36,6 +37,7 @@ class Baseline:
     varied: Mapping[str, Sequence[str]]
     settings: Settings
     controllers: Mapping[str, Expected]
+    renamed: Mapping[str, str] = field(default_factory=dict)
 
 
 def to_text(baseline: Baseline) -> str:

@@ -1,66 +1,64 @@
-"""The metrics that a baseline may hold, and how each is compared. There are three classes:
+"""The numbers that a baseline may hold, and how each is compared. There are three classes:
 
     exact   counts, statuses, sizes: equal or changed
     tight   optimal costs of open-loop plans: equal to 1e-6
     banded  what a closed loop achieved: inside a band that `bands` computes
 
-A class is the least that is asked for: `bands` widens it where the variants disagree.
+A class is the least that is asked for: `bands` widens it where the variants disagree. Metrics of a run say themselves how they
+are compared; numbers of the first horizon's open-loop plan stand here.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from fpirhc.errors import InvalidName, nearest
+from fpirhc.simulation.metrics import Metric, known_metrics
+from fpirhc.simulation.metrics.base import Better
 
-EXACT, TIGHT, BANDED = "exact", "tight", "banded"
+EXACT, TIGHT, BANDED, NOT_COMPARED = "exact", "tight", "banded", "not"
 KINDS = (EXACT, TIGHT, BANDED)
 
 
 @dataclass(frozen=True)
 class Family:
-    """How all metrics 'family.element' are compared.
+    """How all numbers 'family.element' are compared.
 
-    kind: the class, where the spread does not say otherwise. smaller_is_better: whether leaving the band downwards is an
-    improvement. finite: whether a finished run must have it. floor: differences of this size mean nothing, in its unit.
+    kind: the class, where the spread does not say otherwise. better: the direction in which leaving the band is an improvement.
+    finite: whether a finished run must have it. floor: differences of this size mean nothing, in its unit. step: see `Metric`.
     """
 
     kind: str
-    smaller_is_better: bool = False
+    better: Better = "neither"
     finite: bool = False
     floor: float = 1e-12
+    step: Callable[[float, int], float] | None = None
 
 
-FAMILIES = {
-    "rms_error": Family(BANDED, smaller_is_better=True, finite=True),
-    "max_error": Family(BANDED, smaller_is_better=True, finite=True),
-    "iae": Family(BANDED, smaller_is_better=True, finite=True),
-    "settling": Family(BANDED, smaller_is_better=True),
-    "effort": Family(BANDED, finite=True),
-    "clipped_share": Family(BANDED, finite=True),
-    "cost": Family(BANDED, smaller_is_better=True, finite=True),
-    "solve": Family(BANDED, smaller_is_better=True, finite=True),
-    "plans": Family(EXACT, finite=True),
-    "cycles": Family(EXACT, finite=True),
-    "status": Family(EXACT, finite=True),
-    # A difference of 1e-4 in a contraction factor means nothing: it is a fit, or a difference of eigenvalues from one.
-    "contraction": Family(BANDED, smaller_is_better=True, floor=1e-4),
+PLANS = {
     "plan.cost": Family(TIGHT, finite=True),
     "plan.stages": Family(EXACT, finite=True),
     "plan.iterations": Family(EXACT),
     "plan.status": Family(EXACT, finite=True),
-    "plan.factor": Family(BANDED, smaller_is_better=True, floor=1e-4),
+    # A difference of eigenvalues from one.
+    "plan.factor": Family(BANDED, better="smaller", floor=1e-4),
 }
 
 
-def family_of(metric: str) -> Family:
-    """Return the family of a metric.
+def family_of(key: str, metrics: Sequence[Metric] | None = None) -> Family:
+    """Return how a number is compared; `metrics` are the problem's, None: the shipped and the installed ones.
 
     Raises:
-        InvalidName: a metric that fpirhc does not know, with the nearest that it does.
+        InvalidName: a metric that neither fpirhc nor the problem knows, with the nearest that they do.
     """
-    first = metric.partition(".")[0]
-    name = metric if first == "plan" else first
-    if name not in FAMILIES:
-        raise InvalidName(f"metric '{metric}' is unknown.{nearest(name, FAMILIES)}")
-    return FAMILIES[name]
+    if key in PLANS:
+        return PLANS[key]
+    entries = {m.name: m for m in (known_metrics() if metrics is None else metrics)}
+    name = key
+    while name not in entries and "." in name:  # an element may have dots of its own
+        name = name.rpartition(".")[0]
+    if name not in entries:
+        raise InvalidName(f"metric '{key}' is unknown.{nearest(name, [*entries, *PLANS])}")
+    metric = entries[name]
+    return Family(metric.compared, metric.better, metric.finite, metric.floor, metric.step)

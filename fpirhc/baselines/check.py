@@ -41,12 +41,12 @@ def check_baseline(
     """
     chosen = list(select(task, controllers))
     try:
-        baseline = read_baseline(baseline_path(task.path, baselines))
+        baseline = read_baseline(baseline_path(task.path, baselines), task.metrics)
     except BaselineError as error:
         return Judgement(task.name, unusable=(str(error),))
     jobs = [Job(name, nominal(baseline.seed, compiled)) for name in chosen]
     results = measure_all(task, jobs, processes=processes, progress=progress)
-    judgement = judge(baseline, settings_of(task), dict(zip(chosen, results, strict=True)))
+    judgement = judge(baseline, settings_of(task), dict(zip(chosen, results, strict=True)), task.metrics)
     return judgement if judgement.holds else replace(judgement, notes=(*judgement.notes, *_other_versions(baseline)))
 
 
@@ -89,7 +89,7 @@ def measure_expected(
     results = measure_all(task, jobs, processes=processes, progress=progress)
     found, count = {}, len(chosen)
     for k, name in enumerate(controllers):
-        found[name] = expected(chosen, results[k * count : (k + 1) * count], task.problem.period)
+        found[name] = expected(chosen, results[k * count : (k + 1) * count], task.problem.period, task.metrics)
     return found
 
 

@@ -11,6 +11,7 @@ from fpirhc.baselines.baseline import Baseline
 from fpirhc.baselines.catalogue import EXACT, family_of
 from fpirhc.baselines.measuring import FINISHED, Measurement, Number
 from fpirhc.baselines.settings import Settings, differences
+from fpirhc.simulation import metrics as run_metrics
 
 HOLDS, BETTER, WORSE, CHANGED, GONE, NEW = "holds", "better", "worse", "changed", "gone", "new"
 OUTCOME = "outcome"
@@ -60,18 +61,23 @@ class Judgement:
         return bool(self.rows) and not (self.changed or self.unusable or self.broken)
 
 
-def judge(baseline: Baseline, settings: Settings, fresh: Mapping[str, Measurement]) -> Judgement:
+def judge(
+    baseline: Baseline,
+    settings: Settings,
+    fresh: Mapping[str, Measurement],
+    metrics: Sequence[run_metrics.Metric] | None = None,
+) -> Judgement:
     """Compare the fresh results of a problem with its baseline.
 
     Parameters: `settings` of the problem as it is now; `fresh` results under the nominal variant by controller: all of the
-    problem's, or those asked for.
+    problem's, or those asked for; `metrics` that the problem's runs are measured by.
     """
     whole = set(fresh) == set(settings.controllers)
     names = dict.fromkeys([*fresh, *(baseline.controllers if whole else ())])
     rows: list[Row] = []
     for name in names:
-        rows += _rows(name, baseline.controllers.get(name), fresh.get(name))
-    notes = [f"{name}: {one.why}" for name, one in fresh.items() if one.why]
+        rows += _rows(name, baseline.controllers.get(name), fresh.get(name), metrics)
+    notes = [f"{name}: {one.why}" for name, one in fresh.items() if one.why] + _old_names(baseline)
     return Judgement(
         baseline.problem,
         tuple(rows),
@@ -80,6 +86,13 @@ def judge(baseline: Baseline, settings: Settings, fresh: Mapping[str, Measuremen
         date=baseline.date,
         notes=tuple(notes),
     )
+
+
+def _old_names(baseline: Baseline) -> list[str]:
+    if not baseline.renamed:
+        return []
+    names = ", ".join(f"'{old}' is now '{new}'" for old, new in sorted(baseline.renamed.items()))
+    return [f"the baseline has names of an older version and is read with those of today: {names}"]
 
 
 def _stale(baseline: Baseline, settings: Settings, names: Sequence[str]) -> tuple[str, ...]:
@@ -91,7 +104,9 @@ def _stale(baseline: Baseline, settings: Settings, names: Sequence[str]) -> tupl
     return tuple(f"stale: {text}" for text in said)
 
 
-def _rows(name: str, expected: Expected | None, fresh: Measurement | None) -> list[Row]:
+def _rows(
+    name: str, expected: Expected | None, fresh: Measurement | None, metrics: Sequence[run_metrics.Metric] | None
+) -> list[Row]:
     if expected is None or fresh is None:
         old, new = (None, fresh.outcome) if fresh else (" or ".join(expected.outcomes) if expected else None, None)
         return [Row(name, OUTCOME, old, new, None, NEW if fresh else GONE)]
@@ -103,21 +118,27 @@ def _rows(name: str, expected: Expected | None, fresh: Measurement | None) -> li
         return rows
     for metric in dict.fromkeys([*expected.metrics, *fresh.numbers]):
         if metric in expected.metrics or metric not in expected.not_compared:
-            rows.append(_row(name, metric, expected.metrics.get(metric), fresh.numbers.get(metric)))
+            rows.append(_row(name, metric, expected.metrics.get(metric), fresh.numbers.get(metric), metrics))
     return rows
 
 
-def _row(controller: str, name: str, metric: Metric | None, found: Number | None) -> Row:
+def _row(
+    controller: str,
+    name: str,
+    metric: Metric | None,
+    found: Number | None,
+    metrics: Sequence[run_metrics.Metric] | None,
+) -> Row:
     if metric is None:
         return Row(controller, name, None, found, None, NEW)
     band = None if metric.kind == EXACT else metric.band
     if found is None:
         return Row(controller, name, metric.value, None, band, GONE)
     value = found if isinstance(found, str) or math.isfinite(found) else None
-    return Row(controller, name, metric.value, value, band, _verdict(name, metric, value))
+    return Row(controller, name, metric.value, value, band, _verdict(family_of(name, metrics).better, metric, value))
 
 
-def _verdict(name: str, metric: Metric, found: Number | None) -> str:
+def _verdict(better: run_metrics.Better, metric: Metric, found: Number | None) -> str:
     old = metric.value
     if not isinstance(old, int | float) or not isinstance(found, int | float):
         return HOLDS if type(old) is type(found) and old == found else CHANGED
@@ -126,6 +147,6 @@ def _verdict(name: str, metric: Metric, found: Number | None) -> str:
     # Asked as "inside", so that no comparison with a number that is not finite can hold.
     if abs(found - old) <= metric.band:
         return HOLDS
-    if not family_of(name).smaller_is_better:
+    if better == "neither":
         return CHANGED
-    return BETTER if found < old else WORSE
+    return BETTER if (found < old) == (better == "smaller") else WORSE

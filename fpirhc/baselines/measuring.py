@@ -11,19 +11,16 @@ from functools import cache
 
 import numpy as np
 
-from fpirhc.baselines.catalogue import family_of
+from fpirhc.baselines.catalogue import NOT_COMPARED, family_of
 from fpirhc.baselines.variants import Variant
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.wrappers.exact_model import ExactModel
 from fpirhc.controllers.wrappers.predicted import Predicted
-from fpirhc.deformation.identity import Identity
 from fpirhc.errors import FpirhcError
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.simulation.metrics import measure
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
-from fpirhc.status import Status
-from fpirhc.studies.comparison.compare import measure_contraction
 from fpirhc.studies.comparison.optimality import planner
 from fpirhc.studies.open_loop import solve_first
 from fpirhc.task.problem import Problem
@@ -97,9 +94,9 @@ def measure_job(task: Task, job: Job) -> Measurement:
         run = simulate(problem, chosen, seed=variant.seed, compiled=variant.compiled, flags=variant.flags)
         if run.stop is not None:
             return Measurement(DIVERGED, run.stop, {})
-        numbers = _numbers(problem, chosen, run)
+        numbers = _numbers(task, problem, run)
         for metric, value in numbers.items():
-            if family_of(metric).finite and isinstance(value, float) and not math.isfinite(value):
+            if family_of(metric, task.metrics).finite and isinstance(value, float) and not math.isfinite(value):
                 return Measurement(DIVERGED, f"{metric} is not finite", {})
         plan = first_plan(task, problem, chosen) if variant.plans else {}
     except FpirhcError as error:
@@ -107,21 +104,9 @@ def measure_job(task: Task, job: Job) -> Measurement:
     return Measurement(FINISHED, "", {**numbers, **plan})
 
 
-def _numbers(problem: Problem, controller: Controller, run: Run) -> dict[str, Number]:
-    metrics = measure(problem, run)
-    found: dict[str, Number] = {"cycles": run.cycles}
-    by_element = ("rms_error", "max_error", "iae", "settling", "effort", "cost")
-    for family in by_element:
-        found |= {f"{family}.{element}": value for element, value in getattr(metrics, family).items()}
-    found["clipped_share"] = metrics.clipped_share
-    found |= {f"status.{status.name}": metrics.statuses.get(status.name, 0) for status in Status}
-    if metrics.solve:
-        found |= {f"solve.{name}": metrics.solve[name] for name in ("median_iterations", "worst_iterations")}
-        found["plans"] = int(metrics.solve["plans"])
-    known = None if isinstance(controller.adaptive, Identity) else measure_contraction(problem, controller, run)
-    if known:
-        found |= {"contraction.predicted": known.predicted, "contraction.measured": known.measured}
-    return found
+def _numbers(task: Task, problem: Problem, run: Run) -> dict[str, Number]:
+    measured = measure(problem, run, task.metrics)
+    return {m.key(element): value for m, element, value in measured if m.compared != NOT_COMPARED}
 
 
 def first_plan(task: Task, problem: Problem, controller: Controller) -> dict[str, Number]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +12,17 @@ from fpirhc.baselines.bands import Expected, Metric
 from fpirhc.baselines.baseline import FORMAT, Baseline, settings_hash
 from fpirhc.baselines.catalogue import BANDED, EXACT, KINDS, family_of
 from fpirhc.baselines.measuring import FINISHED
+from fpirhc.baselines.renamed import new_metrics, new_settings
 from fpirhc.baselines.settings import Settings, fingerprint
 from fpirhc.baselines.variants import SOURCES
 from fpirhc.errors import BaselineError, InvalidName
+from fpirhc.simulation import metrics as run_metrics
 
 _LARGEST = 20_000_000  # bytes; a baseline has some tens of thousands
 
 
-def read_baseline(path: Path) -> Baseline:
-    """Return the baseline in a file.
+def read_baseline(path: Path, metrics: Sequence[run_metrics.Metric] | None = None) -> Baseline:
+    """Return the baseline in a file; `metrics` that the problem's runs are measured by, None: names are not checked.
 
     Raises:
         BaselineError: it is missing, damaged, edited by hand, of a newer format, of another problem, or compares nothing.
@@ -34,10 +37,10 @@ def read_baseline(path: Path) -> Baseline:
         raise BaselineError(f"'{path.name}' cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise BaselineError(f"'{path.name}' is no text ({error.reason}); restore it, or {_ACCEPT}") from None
-    return read_text(text, path)
+    return read_text(text, path, metrics)
 
 
-def read_text(text: str, path: Path) -> Baseline:
+def read_text(text: str, path: Path, metrics: Sequence[run_metrics.Metric] | None = None) -> Baseline:
     """Return the baseline in a text that is, or will be, in the file at `path`.
 
     Raises:
@@ -56,6 +59,8 @@ def read_text(text: str, path: Path) -> Baseline:
         raise BaselineError(f"'{path.name}' was edited by hand, its checksum does not fit; restore it, or {_ACCEPT}")
     try:
         baseline = _baseline(facts)
+        for key in {key for one in baseline.controllers.values() for key in one.metrics} if metrics is not None else ():
+            family_of(key, metrics)
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         said = error if isinstance(error, BaselineError | InvalidName) else f"it lacks or misshapes {error}"
         raise BaselineError(f"'{path.name}': {said}; {_ACCEPT}") from None
@@ -99,6 +104,10 @@ def _baseline(facts: dict[str, Any]) -> Baseline:
         raise BaselineError("it holds no controller and would compare nothing")
     if set(controllers) != set(settings.controllers):
         raise BaselineError("its controllers and their settings differ")
+    settings, renamed = new_settings(settings)
+    for name, one in controllers.items():
+        controllers[name], also = new_metrics(one)
+        renamed |= also
     for name in ("problem", "reason", "date"):
         if not isinstance(facts[name], str) or not facts[name].strip():
             raise BaselineError(f"it has no {name}")
@@ -113,12 +122,13 @@ def _baseline(facts: dict[str, Any]) -> Baseline:
         {str(k): [str(n) for n in v] for k, v in facts["varied"].items()},
         settings,
         controllers,
+        renamed,
     )
 
 
 def _expected(name: str, facts: dict[str, Any]) -> Expected:
     outcomes = tuple(str(o) for o in facts["outcomes"])
-    metrics = {metric: _metric(f"{name}: {metric}", metric, one) for metric, one in facts["metrics"].items()}
+    metrics = {metric: _metric(f"{name}: {metric}", one) for metric, one in facts["metrics"].items()}
     skipped = {str(k): str(v) for k, v in facts["not_compared"].items()}
     if not outcomes:
         raise BaselineError(f"controller '{name}' has no outcome")
@@ -127,8 +137,7 @@ def _expected(name: str, facts: dict[str, Any]) -> Expected:
     return Expected(outcomes, metrics, skipped)
 
 
-def _metric(where: str, name: str, facts: dict[str, Any]) -> Metric:
-    family_of(name)
+def _metric(where: str, facts: dict[str, Any]) -> Metric:
     kind, value = facts["kind"], facts["value"]
     if kind not in KINDS:
         raise BaselineError(f"{where} has class '{kind}'; expected one of {', '.join(KINDS)}")

@@ -28,9 +28,9 @@ def add_controllers(parser: Parser, default: str = "all") -> None:
 
 def add_optimisers(parser: Parser) -> None:
     """--optimisers NAME ...; the names are those that the study knows."""
-    from fpirhc.studies.comparison.optimiser_choices import OPTIMISERS
+    from fpirhc.studies.comparison.optimiser_choices import optimiser_choices
 
-    names = f"{', '.join(OPTIMISERS)}, or all"
+    names = f"{', '.join(optimiser_choices())}, or all"
     parser.add_argument("--optimisers", nargs="+", metavar="NAME", help=names)
 
 

@@ -124,7 +124,7 @@ def exact_model_tracks(trial: _Trial, generator: np.random.Generator) -> None:  
     problem = _exact(trial.problem)
     run = trial.simulated(problem)
     hold(run.stop is None, f"with the exact model the run ends early: {run.stop}")
-    errors = np.abs(run["true_error"] if "true_error" in run.layout else run["error"])
+    errors = np.abs(run["true_error"])
     first, late = float(errors[0].max()), errors[-run.cycles // 4 :].max(axis=0)
     hold(first > 0, "the problem starts on its reference, so nothing can be told; start elsewhere")
     for name, rest in zip(problem.judged_names, late, strict=True):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TypeAlias
 
 import casadi as ca
@@ -56,6 +56,7 @@ class Spectrum:
         return self.smallest_real > small or self.largest_real < -small
 
 
+@lru_cache(maxsize=16)  # a run is judged by it more than once
 def response_jacobian(plant: Plant) -> ca.Function:
     """Return Function (state, deformed, exact, approximate) -> J = df/dr of the controlled coordinates, n x n.
 

@@ -2,7 +2,8 @@
 
 A problem file defines `problem` (a Problem) and `controllers` ({name: Controller}); its docstring's first line is its
 title. Optional: `headline`, a pair (controller without adaptation, controller with) that the verdict is about; `tuning`,
-{controller: {path of a setting: Span or LogSpan}}, where `fpirhc tune` looks for better settings.
+{controller: {path of a setting: Span or LogSpan}}, where `fpirhc tune` looks for better settings; `metrics`, a sequence of
+`Metric`, which every table, file and baseline of the problem then has beside the shipped ones.
 """
 
 from __future__ import annotations
@@ -11,20 +12,21 @@ import ast
 import importlib.util
 import sys
 import traceback
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, Mistakes, ProblemFileError, nearest
 from fpirhc.problem_files.tuning_spans import TuningSpans, check_tuning
+from fpirhc.simulation.metrics import Metric, known_metrics, with_own_metrics
 from fpirhc.task.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A loaded problem file."""
+    """A loaded problem file; its problem has its name. metrics: all that its runs are measured by."""
 
     name: str
     path: Path
@@ -34,6 +36,11 @@ class Task:
     controllers: Mapping[str, Controller]
     headline: tuple[str, str] | None = None
     tuning: Mapping[str, TuningSpans] = field(default_factory=dict)
+    metrics: Sequence[Metric] = field(default_factory=known_metrics)
+
+    def __post_init__(self) -> None:
+        if self.problem.name != self.name:
+            object.__setattr__(self, "problem", replace(self.problem, name=self.name))
 
 
 def shipped_folders() -> list[Path]:
@@ -100,15 +107,18 @@ def load_problem(name_or_path: str) -> Task:
             mistakes.add(f"controllers['{name}'] must be a controller, got {type(controller).__name__}")
     headline = getattr(module, "headline", None)
     mistakes.unknown("headline: controller", headline or (), controllers)
-    tuning = getattr(module, "tuning", {})
+    tuning, own = getattr(module, "tuning", {}), getattr(module, "metrics", ())
+    if not isinstance(own, Sequence) or not all(isinstance(metric, Metric) for metric in own):
+        mistakes.add("metrics must be a sequence of fpirhc.Metric, metrics = (fpirhc.Metric(...),)")
     try:
         mistakes.raise_if_any()
         check_tuning(tuning, controllers)
+        metrics = with_own_metrics(own)
     except FpirhcError as error:
         raise ProblemFileError(str(error)) from None
     assert isinstance(problem, Problem)
     title, _, description = (module.__doc__ or path.stem).strip().partition("\n")
-    return Task(path.stem, path, title, description.strip(), problem, controllers, headline, tuning)
+    return Task(path.stem, path, title, description.strip(), problem, controllers, headline, tuning, metrics)
 
 
 def _import(path: Path) -> ModuleType:

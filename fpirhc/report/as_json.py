@@ -7,6 +7,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from fpirhc.simulation.metrics import Metrics
     from fpirhc.studies.comparison.compare import Comparison, Entry
 
 
@@ -25,15 +26,8 @@ def to_json(comparison: Comparison) -> str:
 
 def _entry(entry: Entry) -> dict[str, Any]:
     metrics, cycle = entry.metrics, entry.cycle
-    contraction = entry.contraction
     return {
-        "rms_error": dict(metrics.rms_error),
-        "max_error": dict(metrics.max_error),
-        "iae": dict(metrics.iae),
-        "settling": dict(metrics.settling),
-        "effort": dict(metrics.effort),
-        "clipped_share": metrics.clipped_share,
-        "cost": dict(metrics.cost),
+        **_numbers(metrics),
         "cycle_us": None
         if cycle is None
         else {
@@ -44,17 +38,28 @@ def _entry(entry: Entry) -> dict[str, Any]:
             "planning": cycle.planning,
         },
         "statuses": dict(metrics.statuses),
-        "solve": dict(metrics.solve),
         "optimality": None
         if entry.optimality is None
         else {"median": entry.optimality.median, "worst": entry.optimality.worst, "plans": entry.optimality.plans},
-        "contraction": None
-        if contraction is None
-        else {"predicted": contraction.predicted, "measured": contraction.measured},
         "notes": list(entry.notes),
         "stop": entry.run.stop,
         "compiled": entry.run.compiled,
     }
+
+
+def _numbers(metrics: Metrics) -> dict[str, Any]:
+    """Every metric by name, null or empty where the run has no such number; metrics of a group stand inside it."""
+    facts: dict[str, Any] = {}
+    for name, metric in metrics.entries.items():
+        numbers: Any = dict(metrics[name]) if metric.by else metrics[name].get("")
+        group, _, rest = name.partition(".")
+        if not rest:
+            facts[name] = numbers
+        elif numbers is not None:
+            facts[group] = {**(facts.get(group) or {}), rest: numbers}
+        else:
+            facts.setdefault(group, None)
+    return facts
 
 
 def _finite(value: Any) -> Any:

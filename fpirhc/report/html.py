@@ -8,12 +8,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fpirhc.report.figures import BANDS, PALETTE, contraction_figure, lyapunov_figure, pair_figures
+from fpirhc.report.figures import contraction_figure, lyapunov_figure, pair_figures
 from fpirhc.report.page import asset as _asset
 from fpirhc.report.page import page, write_page
 from fpirhc.report.page import picture as _picture
 from fpirhc.report.page import text as _text
 from fpirhc.report.series import chart_data
+from fpirhc.simulation.drawing import BANDS, PALETTE
+from fpirhc.simulation.metrics.columns import Column, columns
 
 if TYPE_CHECKING:
     from fpirhc.studies.comparison.compare import Comparison, Entry
@@ -26,6 +28,9 @@ _CAPTIONS = {
     "Second derivatives": "With adaptation the realised acceleration lies on the desired one, although the deformed request "
     "is far from both: the request is what the wrong model must be asked for.",
 }
+
+_MISSING, _NONE = "&ndash;", "<span class='none'>none</span>"
+_STUDIED = ("cycle median [us]", "p99", "max", "first", "plan median [us]", "cost above optimum: median", "worst")
 
 
 def write_report(comparison: Comparison, path: Path) -> None:
@@ -67,9 +72,9 @@ def _verdict(comparison: Comparison) -> str:
 
 def _number(value: float | None, digits: int = 3) -> str:
     if value is None:
-        return "&ndash;"
+        return _MISSING
     if math.isnan(value):
-        return "<span class='none'>none</span>"
+        return _NONE
     return f"{value:.{digits}g}"
 
 
@@ -77,61 +82,46 @@ def _table(comparison: Comparison) -> str:
     entries = comparison.entries
     if not entries:
         return "<section><p>No controller finished.</p></section>"
-    names = list(entries[0].metrics.rms_error)
-    inputs = list(entries[0].metrics.effort)
-    run = entries[0].run
-    heads = ["controller"]
-    heads += [f"rms error {c} [{run.unit(f'error.{c}')}]" for c in names]
-    heads += [f"max error {c} [{run.unit(f'error.{c}')}]" for c in names]
-    heads += [f"settled {c} [s]" for c in names]
-    heads += [f"rms {i} [{run.unit(f'command.{i}')}]" for i in inputs]
-    heads += ["clipped", "cost", "cycle median [us]", "p99", "max", "first", "contraction predicted", "measured"]
-    heads += ["plan median [us]", "iterations", "worst residual", "cost above optimum: median", "worst"]
-    heads += ["statuses (cycles)"]
-    best = {c: min((e.metrics.rms_error[c] for e in entries if e.run.stop is None), default=math.nan) for c in names}
-    rows = "".join(_row(e, names, inputs, best) for e in entries)
+    shown = columns([e.metrics for e in entries])
+    heads = ["controller", *(c.heading for c in shown), *_STUDIED, "statuses (cycles)"]
+    best = {c: c.best([c.number(e.metrics) for e in entries if e.run.stop is None]) for c in shown if c.metric.headline}
+    rows = "".join(_row(e, shown, best) for e in entries)
     skipped = "".join(
         f"<tr><th scope='row'>{_text(n)}</th><td class='words' colspan='{len(heads) - 1}'>not run: {_text(w)}</td></tr>"
         for n, w in comparison.skipped.items()
     )
-    columns = "".join(f"<th scope='col'>{_text(h)}</th>" for h in heads)
+    top = "".join(f"<th scope='col'>{_text(h)}</th>" for h in heads)
+    marked = " and ".join(
+        dict.fromkeys(c.metric.heading for c in shown if c.metric.headline and c.metric.better != "neither")
+    )
     caption = f"Errors, effort and cost from t = {comparison.measure_from:g} s on; seed {comparison.seed}."
     return (
-        f"<section><h2>Controllers</h2><p>{caption} The best rms error is marked.</p><div class='scroll'><table><thead><tr>"
-        f"{columns}</tr></thead><tbody>{rows}{skipped}</tbody></table></div></section>"
+        f"<section><h2>Controllers</h2><p>{caption} The best {_text(marked)} is marked.</p><div class='scroll'><table><thead><tr>"
+        f"{top}</tr></thead><tbody>{rows}{skipped}</tbody></table></div></section>"
     )
 
 
-def _row(entry: Entry, names: Sequence[str], inputs: Sequence[str], best: dict[str, float]) -> str:
-    metrics, cycle, contraction = entry.metrics, entry.cycle, entry.contraction
-    cells = [
-        f"<td class='{'best' if metrics.rms_error[c] == best[c] else ''}'>{_number(metrics.rms_error[c])}</td>"
-        for c in names
-    ]
-    plain = [metrics.max_error[c] for c in names] + [metrics.settling[c] for c in names]
-    plain += [metrics.effort[i] for i in inputs]
-    values = [_number(v) for v in plain]
-    values.append(f"{100 * metrics.clipped_share:.3g} %")
-    values.append(_number(metrics.cost.get("total")))
-    values += [_number(v) for v in ((cycle.median, cycle.p99, cycle.maximum, cycle.first) if cycle else (None,) * 4)]
-    values += [_number(v) for v in ((contraction.predicted, contraction.measured) if contraction else (None, None))]
-    values += [_number(cycle.planning if cycle and metrics.solve else None), _iterations(metrics.solve)]
-    values += [_number(metrics.solve.get("worst_stationarity"))]
-    excess = entry.optimality
-    values += [_number(v, 2) for v in ((excess.median, excess.worst) if excess else (None, None))]
-    cells += [f"<td>{v}</td>" for v in values]
-    words = ", ".join(f"{k.lower().replace('_', ' ')} {v}" for k, v in metrics.statuses.items())
+def _row(entry: Entry, shown: Sequence[Column], best: Mapping[Column, float | None]) -> str:
+    cells = ""
+    for column in shown:
+        value = column.number(entry.metrics)
+        mark = " class='best'" if value is not None and value == best.get(column) else ""
+        cells += f"<td{mark}>{column.text(value, missing=_MISSING, none=_NONE)}</td>"
+    cells += "".join(f"<td>{v}</td>" for v in _studied(entry))
+    words = ", ".join(f"{k.lower().replace('_', ' ')} {v}" for k, v in entry.metrics.statuses.items())
     if entry.run.stop:
         words = f"ended early: {entry.run.stop}"
     notes = "".join(f"<br><small>{_text(n)}</small>" for n in entry.notes)
-    return (
-        f"<tr><th scope='row'>{_text(entry.name)}{notes}</th>{''.join(cells)}<td class='words'>{_text(words)}</td></tr>"
-    )
+    return f"<tr><th scope='row'>{_text(entry.name)}{notes}</th>{cells}<td class='words'>{_text(words)}</td></tr>"
 
 
-def _iterations(solve: Mapping[str, float]) -> str:
-    known = solve.get("median_iterations", -1.0)
-    return _number(known if known >= 0 else None)
+def _studied(entry: Entry) -> list[str]:
+    """What was found beyond the run: times of a cycle, and the cost of plans above the optimum."""
+    cycle, excess = entry.cycle, entry.optimality
+    times = (cycle.median, cycle.p99, cycle.maximum, cycle.first) if cycle else (None,) * 4
+    planning = cycle.planning if cycle and entry.metrics.solve else None
+    gaps = (excess.median, excess.worst) if excess else (None, None)
+    return [*(_number(v) for v in (*times, planning)), *(_number(v, 2) for v in gaps)]
 
 
 def _charts(comparison: Comparison) -> str:

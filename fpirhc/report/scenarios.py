@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fpirhc.report.figures import PALETTE
 from fpirhc.report.page import page, picture, text, write_page
+from fpirhc.simulation.drawing import PALETTE
+from fpirhc.simulation.metrics.columns import Column
 from fpirhc.studies.scenarios.paired import Summary, percent, signed
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def _table(found: ScenarioComparison) -> str:
     columns = "".join(f"<th scope='col'>{text(h)}</th>" for h in heads)
     rows = ""
     for one in found.summaries:
-        cells = "".join(f"<td>{text(c)}</td>" for c in _cells(one))
+        cells = "".join(f"<td>{text(c)}</td>" for c in _cells(found, one))
         statuses = ", ".join(f"{n} {name}" for name, n in sorted(one.statuses.items()))
         rows += f"<tr><th scope='row'>{text(one.name)}</th>{cells}<td class='words'>{text(statuses)}</td></tr>"
     for name, why in found.skipped.items():
@@ -113,28 +114,33 @@ def _conditions(found: ScenarioComparison) -> str:
 
 
 def _heads(found: ScenarioComparison) -> list[str]:
-    units = [f"median rms {c} [{unit}]" for c, unit in found.units.items()]
-    return ["median error", "difference (95 %)", "ratio", "smaller in", *units, "worst", "in scenario", "failures"]
+    medians = [f"median {c.short}" for c in found.columns]
+    return ["median error", "difference (95 %)", "ratio", "smaller in", *medians, "worst", "in scenario", "failures"]
 
 
-def _cells(one: Summary) -> list[str]:
+def _cells(found: ScenarioComparison, one: Summary) -> list[str]:
     difference, ratio, better = "baseline", "", ""
     if one.difference is not None:
         d = one.difference
         difference = f"{signed(d.median)} ({signed(d.low)} to {signed(d.high)})"
         ratio, better = f"{one.ratio:.3g}", str(one.better)
     failures = ", ".join(f"{n} {outcome}" for outcome, n in one.outcomes.items() if outcome != "finished")
-    rms = [f"{v:.3g}" if np.isfinite(v) else "none" for v in one.rms_error.values()]
+    medians = [_median(c, one) for c in found.columns]
     return [
         percent(one.median),
         difference,
         ratio,
         better,
-        *rms,
+        *medians,
         percent(one.worst),
         str(one.worst_scenario),
         failures or "0",
     ]
+
+
+def _median(column: Column, one: Summary) -> str:
+    value = one.metrics.get(column.metric.name, {}).get(column.element)
+    return column.metric.text(value) if value is not None and np.isfinite(value) else "none"
 
 
 def _tuning(found: ScenarioComparison) -> str:
@@ -171,7 +177,7 @@ def show_scenarios(found: ScenarioComparison, report: Path) -> None:
     for head in ("median", "difference (95 %)", "ratio", "worst", "failed"):
         table.add_column(head, justify="right")
     for one in found.summaries:
-        cells = _cells(one)
+        cells = _cells(found, one)
         shown = [*cells[:3], percent(one.worst), str(one.failures)]
         table.add_row(one.name.replace("[", "\\["), *shown)
     console.print(table)
@@ -211,6 +217,7 @@ def _facts(one: Summary) -> dict[str, object]:
         "worst_error": _number(one.worst),
         "worst_scenario": one.worst_scenario,
         "rms_error": {c: _number(v) for c, v in one.rms_error.items()},
+        "metrics": {n: {e: _number(v) for e, v in numbers.items()} for n, numbers in one.metrics.items()},
         "outcomes": dict(one.outcomes),
         "statuses": dict(one.statuses),
         "errors": [_number(v) for v in one.errors],

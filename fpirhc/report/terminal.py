@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,16 +14,16 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 from rich.text import Text
 
-from fpirhc.simulation.metrics import measure
+from fpirhc.simulation.metrics.columns import Column, columns
 from fpirhc.status import Status
 from fpirhc.summary import printable
 
 if TYPE_CHECKING:
+    from fpirhc.simulation.metrics import Metrics
     from fpirhc.simulation.run import Run
     from fpirhc.studies.comparison.compare import Comparison, Entry
     from fpirhc.studies.comparison.compare import Progress as Report
     from fpirhc.studies.open_loop import Solved
-    from fpirhc.task.problem import Problem
 
 
 @contextmanager
@@ -66,13 +65,11 @@ def show(comparison: Comparison, report: Path) -> None:
     _say(console, f"report: {report}", wrap=False)
 
 
-def show_run(problem: Problem, run: Run, saved: Path) -> None:
+def show_run(run: Run, metrics: Metrics, saved: Path) -> None:
     """Print one run's metrics and where it is saved."""
-    console, metrics = Console(), measure(problem, run)
-    for name in metrics.rms_error:
-        unit = run.unit(f"error.{name}")
-        line = f"{name}: rms error {metrics.rms_error[name]:.4g} {unit}, max {metrics.max_error[name]:.4g} {unit}"
-        _say(console, line)
+    console = Console()
+    for column in columns([metrics]):
+        _say(console, f"{column.heading}: {column.text(column.number(metrics), missing='-', none='none')}")
     if run.stop:
         _say(console, f"ended early: {run.stop}")
     _say(console, f"saved: {saved}", wrap=False)
@@ -119,27 +116,22 @@ def _table(comparison: Comparison) -> Table:
         title=_literal(f"{comparison.problem}, from t = {comparison.measure_from:g} s, seed {comparison.seed}"),
     )
     table.add_column("controller", min_width=16)
-    first = comparison.entries[0] if comparison.entries else None
-    names = list(first.metrics.rms_error) if first else []
-    for name in names:
-        unit = first.run.unit(f"error.{name}") if first else ""
-        table.add_column(_literal(f"rms {name} [{unit}]"), justify="right")
-    for head in ("cycle us", "clipped", "factor"):
-        table.add_column(head, justify="right")
+    shown = columns([e.metrics for e in comparison.entries], headline=True)
+    for column in shown:
+        table.add_column(_literal(column.short), justify="right")
+    table.add_column("cycle us", justify="right")
     table.add_column("status", no_wrap=True)
     for entry in comparison.entries:
-        table.add_row(*_row(entry, names))
+        table.add_row(*_row(entry, shown))
     return table
 
 
-def _row(entry: Entry, names: list[str]) -> list[str | Text]:
-    metrics, cycle, contraction = entry.metrics, entry.cycle, entry.contraction
-    errors = [_number(metrics.rms_error[n]) for n in names]
-    times = [f"{cycle.median:.2g}"] if cycle else [""]
-    factor = f"{contraction.predicted:.3f}" if contraction else ""
+def _row(entry: Entry, shown: Sequence[Column]) -> list[str | Text]:
+    metrics, cycle = entry.metrics, entry.cycle
+    numbers = [_literal(c.text(c.number(metrics), missing="", none="-")) for c in shown]
     fine = metrics.statuses.get("OK", 0) / max(sum(metrics.statuses.values()), 1)
     status = "ended early" if entry.run.stop else "ok" if fine == 1 else f"ok {100 * fine:.3g} %"
-    return [_literal(entry.name), *errors, *times, f"{100 * metrics.clipped_share:.2g} %", factor, status]
+    return [_literal(entry.name), *numbers, f"{cycle.median:.2g}" if cycle else "", status]
 
 
 def _plans(comparison: Comparison) -> Table:
@@ -150,15 +142,13 @@ def _plans(comparison: Comparison) -> Table:
     for head in ("iter", "residual", "gap", "plan us", "p99 us", "max us", "first us"):
         table.add_column(head, justify="right")
     for entry in comparison.entries:
-        solve, cycle, excess = entry.metrics.solve, entry.cycle, entry.optimality
-        if not solve:
+        metrics, cycle, excess = entry.metrics, entry.cycle, entry.optimality
+        if not metrics.solve:
             continue
-        known = solve["median_iterations"]
         times = [_micro(v) for v in (cycle.planning, cycle.p99, cycle.maximum, cycle.first)] if cycle else [""] * 4
         table.add_row(
             _literal(entry.name),
-            f"{known:.0f}" if known >= 0 else "-",
-            f"{solve['median_stationarity']:.0e}",
+            *(metrics.text(f"solve.{name}") for name in ("median_iterations", "median_stationarity")),
             f"{excess.median:.0e}" if excess else "-",
             *times,
         )
@@ -176,7 +166,3 @@ def _say(console: Console, text: str, *, style: str = "", wrap: bool = True) -> 
 
 def _micro(value: float) -> str:
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
-
-
-def _number(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:.3g}"

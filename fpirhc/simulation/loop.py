@@ -89,7 +89,7 @@ def _sense_blocks(problem: Problem, asked: Response | None, *, predicts: bool) -
     """State and response as the controller gets them; where these are not the plant's own, also the true ones and error."""
     plant, behind = problem.plant, problem.dead_time.measurement / problem.period
     response = asked or _own_response(plant)
-    if not _hidden(problem):
+    if problem.sees_plant:
         sense = [_sense_block(plant, plant.state, response)]
         return [*sense, _truth_block(problem, plant.state)] if predicts or problem.dead_time.inputs else sense
     true_state, true_response = like(plant.state, "plant_state"), like(response.signal, "plant_realised")
@@ -108,11 +108,6 @@ def _sense_blocks(problem: Problem, asked: Response | None, *, predicts: bool) -
         delay_block("see_state", true_state, replace(plant.state, start=start), [behind] * plant.state.size),
         delay_block("see_response", true_response, seen, [behind] * seen.size),
     ]
-
-
-def _hidden(problem: Problem) -> bool:
-    """Whether the controller is given something else than the plant's own state and response."""
-    return bool(problem.dead_time.measurement) or not problem.sensing.ideal
 
 
 def _truth_block(problem: Problem, state: Signal) -> Block:
@@ -172,7 +167,7 @@ def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Si
     """The exact plant over one period with the arriving command held."""
     plant = problem.plant
     advance = problem.integrator.step(plant, problem.period)
-    state = like(plant.state, "plant_state") if _hidden(problem) else plant.state
+    state = plant.state if problem.sees_plant else like(plant.state, "plant_state")
     reads = (state, arriving, like(plant.parameter, "_exact"), *disturbed)
     writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
 

@@ -68,7 +68,7 @@ def lyapunov_view(problem: Problem, controller: Controller, run: Run) -> Lyapuno
     None too behind sensors or a late measurement: what the law knows is then not what the plant does.
     """
     law, since = exponential_law(controller), round(problem.measure_from / problem.period)
-    if law is None or "reference" not in run.layout or "plant_state" in run.layout or run.cycles < since + 2:
+    if law is None or "reference" not in run.layout or not problem.sees_plant or run.cycles < since + 2:
         return None
     surface, response_error = _signals(problem, law, run)
     return LyapunovView(surface, response_error, law.rate, since)

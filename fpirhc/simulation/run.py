@@ -12,6 +12,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from fpirhc.errors import InvalidName, OutputError, nearest
+from fpirhc.simulation.common_columns import with_common_columns
 from fpirhc.summary import line, number, table
 from fpirhc.symbolic.layout import Layout, Signal
 
@@ -27,8 +28,9 @@ class Run:
     """The log of one closed-loop run.
 
     Parameters:
-        problem, controller: their names. seed: what disturbances and noise were drawn with. period: s.
-        layout: the logged signals. log: shape (cycles, layout.size), read-only.
+        problem, controller: their names, '' for a problem without one. seed: of disturbances and noise. period: s.
+        layout: the logged signals. log: shape (cycles, layout.size), read-only. Every run has 'plant_state' and
+            'plant_realised', what the plant did, and 'true_error', the reference minus the plant's state at the same time.
         stop: why the run ended early, None when it did not.
         compiled: whether the loop ran as compiled C. settings: of problem and controller, as plain data.
 
@@ -100,7 +102,7 @@ class Run:
 
     def plot(self) -> Figure:
         """Errors, commands and responses over time as a matplotlib Figure."""
-        from fpirhc.report.figures import run_figure
+        from fpirhc.simulation.run_figure import run_figure
 
         return run_figure(self)
 
@@ -141,7 +143,8 @@ def load_run(path: str | Path) -> Run:
         raise OutputError(f"cannot read a run from '{path}': {error}") from None
     if facts.get("format") != FORMAT:
         raise OutputError(f"'{path}' has format {facts.get('format')}, this version reads {FORMAT}")
-    layout = Layout(tuple(Signal(n, tuple(e), tuple(u)) for n, e, u in facts["signals"]))
+    # A file of an older version lacks columns that follow from the others.
+    layout, log = with_common_columns(Layout(tuple(Signal(n, tuple(e), tuple(u)) for n, e, u in facts["signals"])), log)
     log.setflags(write=False)
     return Run(
         facts["problem"],

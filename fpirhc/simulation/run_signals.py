@@ -44,7 +44,7 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
     one_cycle = replace(problem.horizon, stages=1, step=problem.period, terminal=())
     ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits)
     data_of = stage_data(plant, problem.reference, one_cycle, problem.cost)
-    states = log[:, layout.slice("plant_state" if "plant_state" in layout else "state")]
+    states = log[:, layout.slice("plant_state")]
     commands = log[:, layout.slice("command")]
     states = np.asarray(ocp.start(states.T, np.vstack([commands[:1], commands[:-1]]).T).full()).T
     times = log[:, layout.slice("time")]

@@ -14,6 +14,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.describe import describe
+from fpirhc.simulation.common_columns import with_common_columns
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.run_signals import judgements
@@ -56,18 +57,21 @@ class Simulator:
         """
         problem = variant or self.problem
         start = start_memory(self.loop, problem, self.controller)
-        log, stop = _run_chunks(problem, start, self.loop.trace, self.evaluator, seed, progress)
+        logged, stop = _run_chunks(problem, start, self.loop.trace, self.evaluator, seed, progress)
+        layout, log = with_common_columns(self.loop.trace, logged)
         log.setflags(write=False)
         step_limit = self.controller.adaptive.largest_step()
         settings = {
             "step_limit": step_limit if np.isfinite(step_limit) else None,
+            "effective_gain": float(self.controller.adaptive.effective_gain()),
+            "parameters": [float(v) for v in self.controller.parameters(problem.plant)],
             "controller": describe(self.controller),
             "problem": describe(problem),
             "backend": "compiled C" if self.compiled else "CasADi virtual machine",
             "why not compiled": self.why_not_compiled,
         }
         title = name or type(self.controller).__name__
-        return Run("", title, seed, problem.period, self.loop.trace, log, stop, self.compiled, settings)
+        return Run(problem.name, title, seed, problem.period, layout, log, stop, self.compiled, settings)
 
 
 def simulator(

@@ -38,6 +38,7 @@ class Problem:
         integrator: how the simulated plant moves within a cycle.
         measure_from: metrics are taken from this time on, s (the transient before it is left out).
         judged: coordinates whose errors are logged and measured; None: the plant's controlled ones.
+        name: of the problem in results; a problem file gives its own name.
 
     Raises:
         InvalidProblem: all mistakes together.
@@ -57,6 +58,7 @@ class Problem:
     integrator: Integrator = field(default_factory=RungeKutta4)
     measure_from: float = 0.0
     judged: Sequence[str] | None = None
+    name: str = field(default="", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("problem")
@@ -89,6 +91,11 @@ class Problem:
     def judged_names(self) -> tuple[str, ...]:
         """Coordinates whose errors are logged and measured."""
         return self.plant.controlled_names if self.judged is None else tuple(self.judged)
+
+    @property
+    def sees_plant(self) -> bool:
+        """Whether a controller is given the plant's own state and response, at once and as they are."""
+        return not self.dead_time.measurement and self.sensing.ideal
 
     @cached_property
     def start_state(self) -> np.ndarray:

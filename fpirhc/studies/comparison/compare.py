@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
@@ -18,6 +18,7 @@ from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, ne
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
 from fpirhc.simulation.metrics import Metrics, measure
+from fpirhc.simulation.metrics.columns import columns
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
 from fpirhc.studies.comparison.optimality import Optimality, measure_optimality
@@ -78,18 +79,17 @@ class Comparison:
 
     def _repr_html_(self) -> str:
         """Verdict and errors as a table, for notebooks."""
-        names = list(self.entries[0].metrics.rms_error) if self.entries else []
+        shown = columns([e.metrics for e in self.entries], headline=True)
         rows = [
             (
                 e.name,
-                *(number(e.metrics.rms_error[n]) for n in names),
+                *(c.text(c.number(e.metrics), missing="", none="none") for c in shown),
                 number(e.cycle.median) if e.cycle else "",
-                f"{100 * e.metrics.clipped_share:.3g} %",
                 f"ended early: {e.run.stop}" if e.run.stop else e.metrics.worst_status,
             )
             for e in self.entries
         ]
-        head = ("controller", *(f"rms error {n}" for n in names), "cycle [us]", "clipped", "worst status")
+        head = ("controller", *(c.heading for c in shown), "cycle [us]", "worst status")
         return table(self.title, head, rows, self.verdict)
 
     def __getitem__(self, name: str) -> Entry:
@@ -199,13 +199,12 @@ def _entry(
 
     report(0, problem.cycles)
     run = simulate(problem, resolved, seed=seed, name=name, compiled=compiled, progress=report)
-    run = replace(run, problem=task.name)
     adaptive = not isinstance(resolved.adaptive, Identity)
     view = lyapunov_view(problem, resolved, run)
     return Entry(
         name=name,
         run=run,
-        metrics=measure(problem, run),
+        metrics=measure(problem, run, task.metrics),
         cycle=measure_cycle(problem, resolved, run, compiled=compiled),
         adaptive=adaptive,
         pair=_pair(chosen, name) if adaptive else None,
@@ -244,9 +243,7 @@ def measure_contraction(problem: Problem, controller: Controller, run: Run) -> C
         problem.plant, run["state"][rows], run["deformed"][rows], approximate=controller.parameters(problem.plant)
     )
     report = assess_gain(deformation, spectrum)
-    # What the plant did, where the controller was given something later or noisier.
-    realised = run["plant_realised" if "plant_realised" in run.layout else "realised"]
-    measured = identified_factor(run["deformed"], realised, deformation.effective_gain())
+    measured = identified_factor(run["deformed"], run["plant_realised"], deformation.effective_gain())
     return Contraction(report.predicted, measured, report, spectrum)
 
 

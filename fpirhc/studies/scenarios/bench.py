@@ -19,7 +19,7 @@ from fpirhc.studies.scenarios.draws import Scenario, check_percent, draw, with_e
 from fpirhc.studies.scenarios.score import outcome, ranges, relative_error
 from fpirhc.task.problem import Problem
 
-FORMAT = 1  # of records
+FORMAT = 2  # of records
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Bench:
         self._drawn: tuple[int, Scenario, Problem] | None = None
 
     def record(self, number: int, name: str) -> dict[str, Any]:
-        """Return what became of one controller in one scenario, as plain data; infinity becomes None.
+        """Return what became of one controller in one scenario, as plain data; a number that is not finite becomes None.
 
         A controller that cannot serve the problem gives {"controller": its name, "skipped": the reason}.
         """
@@ -78,7 +78,7 @@ class Bench:
             return {"controller": name, "skipped": str(error)}
         scenario, variant = self._scenario(number)
         run = ready.run(seed=scenario.seed, name=name, variant=variant)
-        metrics = measure(variant, run)
+        metrics = measure(variant, run, self._task.metrics)
         size = relative_error(metrics, self._ranges)
         return {
             "scenario": number,
@@ -86,12 +86,8 @@ class Bench:
             "mismatch": scenario.mismatch,
             "outcome": outcome(run, size),
             "error": _finite(size),
-            "rms_error": _finite(metrics.rms_error),
-            "max_error": _finite(metrics.max_error),
-            "effort": _finite(metrics.effort),
-            "clipped_share": _finite(metrics.clipped_share),
+            "metrics": _finite(metrics.values),
             "lasted": run.cycles / variant.cycles,
-            "statuses": metrics.statuses,
             "stop": run.stop,
         }
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from fpirhc.simulation.metrics import Metric, known_metrics
 from fpirhc.studies.scenarios.bootstrap import ConfidenceInterval, median_interval, middle
 
 Record = Mapping[str, Any]
@@ -20,7 +21,7 @@ class Summary:
 
     Parameters:
         errors, mismatch: by scenario, shape (n,). median, worst: of the errors; worst_scenario: its number.
-        rms_error: median rms error by coordinate.
+        metrics: median over the scenarios, by metric and element; a run without the number counts as worse than any other.
         outcomes: scenarios by outcome. statuses: cycles by status, over all scenarios.
         difference: this error minus the baseline's in the same scenario; None for the baseline itself.
         ratio: median of this error over the baseline's. better: scenarios in which this error is the smaller one.
@@ -32,7 +33,7 @@ class Summary:
     median: float
     worst: float
     worst_scenario: int
-    rms_error: Mapping[str, float]
+    metrics: Mapping[str, Mapping[str, float]]
     outcomes: Mapping[str, int]
     statuses: Mapping[str, int]
     difference: ConfidenceInterval | None
@@ -40,13 +41,27 @@ class Summary:
     better: int
 
     @property
+    def rms_error(self) -> Mapping[str, float]:
+        """Median rms error by coordinate."""
+        return self.metrics["rms_error"]
+
+    @property
     def failures(self) -> int:
         """Scenarios that ended early or diverged."""
         return sum(n for outcome, n in self.outcomes.items() if outcome != "finished")
 
 
-def summarise(name: str, records: Sequence[Record], baseline: Sequence[Record] | None, seed: int) -> Summary:
-    """Return the summary of one controller's records against the baseline's of the same scenarios, in the same order."""
+def summarise(
+    name: str,
+    records: Sequence[Record],
+    baseline: Sequence[Record] | None,
+    seed: int,
+    metrics: Sequence[Metric] | None = None,
+) -> Summary:
+    """Return the summary of one controller's records against the baseline's of the same scenarios, in the same order.
+
+    Parameters: `metrics` that the records were measured by; None: the shipped and the installed ones.
+    """
     errors = errors_of(records)
     before = errors if baseline is None else errors_of(baseline)
     worst = int(np.argmax(errors))
@@ -57,13 +72,25 @@ def summarise(name: str, records: Sequence[Record], baseline: Sequence[Record] |
         median=float(middle(errors)),
         worst=float(errors[worst]),
         worst_scenario=int(records[worst]["scenario"]),
-        rms_error={c: float(middle(_numbers([r["rms_error"][c] for r in records]))) for c in records[0]["rms_error"]},
+        metrics=_medians(records, known_metrics() if metrics is None else metrics),
         outcomes=dict(Counter(str(r["outcome"]) for r in records)),
-        statuses=dict(sum((Counter(r["statuses"]) for r in records), Counter())),
+        statuses=dict(sum((Counter(r["metrics"]["status"]) for r in records), Counter())),
         difference=None if baseline is None else median_interval(_differences(errors, before), seed),
         ratio=float(middle(_ratios(errors, before))),
         better=int(np.sum(errors < before)),
     )
+
+
+def _medians(records: Sequence[Record], metrics: Sequence[Metric]) -> dict[str, dict[str, float]]:
+    """Median of every number that some scenario has."""
+    medians: dict[str, dict[str, float]] = {}
+    for metric in metrics:
+        found = [r["metrics"].get(metric.name, {}) for r in records]
+        missing = -np.inf if metric.better == "larger" else np.inf
+        for element in dict.fromkeys(e for numbers in found for e in numbers):
+            values = _numbers([numbers.get(element) for numbers in found], missing)
+            medians.setdefault(metric.name, {})[element] = float(middle(values))
+    return medians
 
 
 def errors_of(records: Sequence[Record]) -> np.ndarray:
@@ -71,8 +98,8 @@ def errors_of(records: Sequence[Record]) -> np.ndarray:
     return _numbers([r["error"] for r in records])
 
 
-def _numbers(values: Sequence[float | None]) -> np.ndarray:
-    return np.array([np.inf if v is None else v for v in values], dtype=float)
+def _numbers(values: Sequence[float | None], missing: float = np.inf) -> np.ndarray:
+    return np.array([missing if v is None else v for v in values], dtype=float)
 
 
 def _differences(after: np.ndarray, before: np.ndarray) -> np.ndarray:

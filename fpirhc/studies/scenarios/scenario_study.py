@@ -13,6 +13,8 @@ from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import Values
+from fpirhc.simulation.metrics import Metric
+from fpirhc.simulation.metrics.columns import Column
 from fpirhc.studies.comparison.compare import check_gains, select, versions
 from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint
 from fpirhc.studies.scenarios.draws import COMPARING
@@ -27,7 +29,10 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class ScenarioComparison:
-    """What `compare_scenarios` found: summaries in the controllers' order, the baseline first; records by controller."""
+    """What `compare_scenarios` found: summaries in the controllers' order, the baseline first; records by controller.
+
+    columns: of the summaries' metrics, in a short table.
+    """
 
     problem: str
     title: str
@@ -36,7 +41,7 @@ class ScenarioComparison:
     percent: float
     seed: int
     measure_from: float
-    units: Mapping[str, str]
+    columns: Sequence[Column]
     summaries: tuple[Summary, ...]
     records: Mapping[str, Sequence[Record]]
     skipped: Mapping[str, str]
@@ -101,7 +106,7 @@ def compare_scenarios(
     workers = Workers(__package__ + ".worker", opening, header, processes)
     with Ledger(folder / LEDGER, header) as ledger:
         records, skipped = _completed(ledger, bench, workers if processes > 1 else None, count, names, progress)
-    summaries = _summaries(records, seed)
+    summaries = _summaries(records, seed, task.metrics)
     return ScenarioComparison(
         problem=task.name,
         title=task.title,
@@ -110,7 +115,7 @@ def compare_scenarios(
         percent=float(percent),
         seed=seed,
         measure_from=task.problem.measure_from,
-        units={c: task.problem.plant.coordinates[c] for c in task.problem.judged_names},
+        columns=_columns(task, summaries),
         summaries=summaries,
         records=records,
         skipped=skipped,
@@ -159,9 +164,18 @@ def _answers(bench: Bench, workers: Workers | None, jobs: Sequence[tuple[int, st
             yield record
 
 
-def _summaries(records: Mapping[str, Sequence[Record]], seed: int) -> tuple[Summary, ...]:
+def _summaries(records: Mapping[str, Sequence[Record]], seed: int, metrics: Sequence[Metric]) -> tuple[Summary, ...]:
     if not records:
         return ()
     first, *others = records
     against = [(first, None), *((name, records[first]) for name in others)]
-    return tuple(summarise(name, records[name], before, seed) for name, before in against)
+    return tuple(summarise(name, records[name], before, seed, metrics) for name, before in against)
+
+
+def _columns(task: Task, summaries: Sequence[Summary]) -> tuple[Column, ...]:
+    return tuple(
+        Column(metric, element, metric.unit_of(task.problem, element))
+        for metric in task.metrics
+        if metric.headline
+        for element in dict.fromkeys(e for one in summaries for e in one.metrics.get(metric.name, {}))
+    )

@@ -6,8 +6,6 @@ import io
 
 from matplotlib.figure import Figure
 
-from fpirhc.summary import printable
-
 
 class Drawing(Figure):
     """A matplotlib Figure that knows its picture."""
@@ -17,8 +15,3 @@ class Drawing(Figure):
         buffer = io.BytesIO()
         self.savefig(buffer, format="png", dpi=88)
         return buffer.getvalue()
-
-
-def plain(text: str) -> str:
-    """Return a name or unit as matplotlib shows it literally: a pair of dollar signs would be read as a formula."""
-    return printable(text).replace("$", r"\$")

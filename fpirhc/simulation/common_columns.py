@@ -1,0 +1,43 @@
+"""Columns that every run has, whatever the problem: what the plant did, and the error by which a run is judged.
+
+A loop computes them where the controller is given something else than the plant's own state and response. Everywhere else
+they follow from what was logged, so they are added after the run and cost nothing in the loop.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fpirhc.symbolic.layout import Layout, Signal
+
+_SAME = {"plant_state": "state", "plant_realised": "realised"}
+
+
+def with_common_columns(layout: Layout, log: np.ndarray) -> tuple[Layout, np.ndarray]:
+    """Return layout and log, shape (cycles, layout.size), with 'plant_state', 'plant_realised' and 'true_error'.
+
+    'true_error' is the reference minus the plant's state of the judged coordinates, at the same time.
+    """
+    added = [
+        (_renamed(layout[logged], name), log[:, layout.slice(logged)])
+        for name, logged in _SAME.items()
+        if name not in layout and logged in layout
+    ]
+    if "true_error" not in layout and "error" in layout:
+        added.append((_renamed(layout["error"], "true_error"), _true_error(layout, log)))
+    if not added:
+        return layout, log
+    return layout + Layout(tuple(signal for signal, _ in added)), np.hstack([log, *(values for _, values in added)])
+
+
+def _true_error(layout: Layout, log: np.ndarray) -> np.ndarray:
+    state = layout["plant_state" if "plant_state" in layout else "state"]
+    if "reference" not in layout:
+        return log[:, layout.slice("error")]  # a controller of a user's own that logs its error alone
+    places = [state.elements.index(name) for name in layout["error"].elements]
+    reference, reached = log[:, layout.slice("reference")], log[:, layout.slice(state.name)]
+    return np.asarray(reference[:, places] - reached[:, places])
+
+
+def _renamed(signal: Signal, name: str) -> Signal:
+    return Signal(name, signal.elements, signal.units)

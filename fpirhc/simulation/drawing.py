@@ -1,0 +1,87 @@
+"""What figures of runs share: colours, lines with units, time slots, responses."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fpirhc.summary import printable
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from fpirhc.simulation.run import Run
+
+PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5b4a9c", "#8c6d1f", "#7f7f7f", "#111111")
+BANDS = ("#7f7f7f", "#e69f00", "#56b4e9", "#cc79a7")  # of time slots, drawn pale
+_RESPONSES = {"nominal": "#009e73", "desired": "#0072b2", "deformed": "#e69f00", "realised": "#d55e00"}
+_POINTS = 2000  # drawn per line
+_TALL = 20  # times the usual size from which a panel's range is cut, so that one spike does not hide the rest
+
+
+def new_figure(width: float, height: float, title: str) -> Figure:
+    """Return an empty figure of this size in inches, with the title as literal text."""
+    from fpirhc.simulation.picture import Drawing
+
+    figure = Drawing(figsize=(width, height), layout="constrained")
+    if title:
+        figure.suptitle(literal(title), fontsize=11)
+    return figure
+
+
+def literal(text: str) -> str:
+    """Return a name or unit as matplotlib shows it literally: a pair of dollar signs would be read as a formula."""
+    return printable(text).replace("$", r"\$")
+
+
+def draw_bands(axis: Axes, run: Run) -> None:
+    """Time slots as shaded bands, named in the legend."""
+    named: set[int] = set()
+    for start, end, slot in run.spans():
+        name = run.layout["desired"].elements[slot]
+        axis.axvspan(
+            start,
+            end,
+            color=BANDS[slot % len(BANDS)],
+            alpha=0.12,
+            lw=0,
+            label=None if slot in named else f"slot {name}",
+        )
+        named.add(slot)
+
+
+def thinned(values: np.ndarray) -> np.ndarray:
+    """Return evenly chosen rows, few enough to draw."""
+    return values[:: max(1, values.shape[0] // _POINTS)]
+
+
+def draw_line(axis: Axes, run: Run, column: str, label: str, color: str, style: str = "-") -> None:
+    """Draw one column of a run over time; its unit stands in the legend."""
+    axis.plot(
+        thinned(run.time),
+        thinned(run[column]),
+        style,
+        color=color,
+        lw=1,
+        label=literal(f"{label} [{run.unit(column)}]"),
+    )
+    axis.grid(visible=True, alpha=0.25)
+
+
+def draw_legend(axis: Axes) -> None:
+    """Add a legend where something has a label."""
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(fontsize=7, loc="best", framealpha=0.8)
+
+
+def draw_responses(axis: Axes, run: Run, name: str) -> None:
+    """Draw the nominal, desired, deformed and realised response of one coordinate; a spike does not hide the rest."""
+    for signal, color in _RESPONSES.items():
+        style = ":" if signal == "realised" else "-"
+        draw_line(axis, run, f"{signal}.{name}", f"{name} {signal}", color, style)
+    values = np.abs(np.concatenate([run[f"{s}.{name}"] for s in _RESPONSES])) if run.cycles else np.zeros(1)
+    usual = float(np.quantile(values, 0.99))
+    if usual > 0 and values.max() > _TALL * usual:
+        axis.set_ylim(-3 * usual, 3 * usual)

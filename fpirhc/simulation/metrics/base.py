@@ -1,0 +1,123 @@
+"""The contract of metrics: one value says what a number is, how it is computed, shown and compared."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from numbers import Integral, Real
+from typing import Literal, get_args
+
+from fpirhc.errors import InvalidName, InvalidValue, nearest
+from fpirhc.simulation.run import Run
+from fpirhc.task.problem import Problem
+
+Better = Literal["smaller", "larger", "neither"]
+Compared = Literal["banded", "tight", "exact", "not"]
+Function = Callable[[Problem, Run], float | Mapping[str, float] | None]
+
+_NAME = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)?")
+
+
+def digits(value: float) -> str:
+    """Return a number in three digits."""
+    return f"{value:.3g}"
+
+
+def percent(value: float) -> str:
+    """Return a share in percent."""
+    return f"{100 * value:.3g} %"
+
+
+@dataclass(frozen=True, eq=False)
+class Metric:
+    """A number that sums up a run, or one number for every coordinate, input or term.
+
+        overshoot = Metric("overshoot", function, by="coordinate", unit=lambda problem, name: problem.plant.coordinates[name])
+
+    Parameters:
+        name: small letters, digits and '_'; one dot may put it in a group, 'solve.worst_iterations'.
+        function: (problem, run) -> a number, or a mapping with one number for every element where `by` is given; None where
+            the run has no such number. NaN says that the run did not reach it.
+        by: what the elements are ('coordinate', 'input', 'term', ...); None for one number.
+        unit: of every element: text, or a function (problem, element) -> text; the element of a single number is ''.
+        better: which direction is an improvement: 'smaller', 'larger' or 'neither'.
+        title, short: headings in a report and on a terminal; the name when not given. text: how a finite number is written.
+        headline: whether it stands in short tables; its best value is marked in the report.
+        report: whether it stands in the report's table. shown: the elements that do; None: all.
+        compared: how baselines compare it: 'banded' (inside a computed band), 'tight' (to 1e-6), 'exact', 'not'.
+        finite: whether a run that finished must have a finite number. floor: differences of this size mean nothing.
+        step: (period in s, number of cycles) -> the smallest step of a number that counts cycles.
+        order: place among the columns, smallest first.
+
+    Raises:
+        InvalidName: a name that cannot be a key. InvalidValue: an unknown direction or comparison.
+    """
+
+    name: str
+    function: Function
+    by: str | None = None
+    unit: str | Callable[[Problem, str], str] = "1"
+    better: Better = "smaller"
+    title: str = ""
+    short: str = ""
+    text: Callable[[float], str] = digits
+    headline: bool = False
+    report: bool = True
+    shown: tuple[str, ...] | None = None
+    compared: Compared = "banded"
+    finite: bool = False
+    floor: float = 1e-12
+    step: Callable[[float, int], float] | None = None
+    order: float = 100.0
+
+    def __post_init__(self) -> None:
+        if not _NAME.fullmatch(self.name):
+            raise InvalidName(
+                f"metric {self.name!r}: expected a name of small letters, digits and '_', such as 'rms_error' or "
+                "'solve.worst_iterations'"
+            )
+        for what, value, valid in (
+            ("better", self.better, get_args(Better)),
+            ("compared", self.compared, get_args(Compared)),
+        ):
+            if value not in valid:
+                raise InvalidValue(
+                    f"metric '{self.name}': {what} is {value!r}, expected one of {', '.join(valid)}.{nearest(value, valid)}"
+                )
+
+    @property
+    def heading(self) -> str:
+        """Heading in a report."""
+        return self.title or self.name.replace("_", " ").replace(".", " ")
+
+    def key(self, element: str) -> str:
+        """Name of one number in files: 'rms_error.q1', or the metric's name."""
+        return f"{self.name}.{element}" if element else self.name
+
+    def unit_of(self, problem: Problem, element: str) -> str:
+        """Unit of one element."""
+        return self.unit if isinstance(self.unit, str) else self.unit(problem, element)
+
+    def values(self, problem: Problem, run: Run) -> dict[str, float]:
+        """Return the numbers of a run by element, under '' where there is one only; empty where the run has none.
+
+        Raises:
+            InvalidValue: the function returned something else.
+        """
+        result = self.function(problem, run)
+        if result is None:
+            return {}
+        if isinstance(result, Mapping) != (self.by is not None):
+            wanted = "one number" if self.by is None else f"a mapping with a number for every {self.by}"
+            raise InvalidValue(f"metric '{self.name}': its function must return {wanted}, got {type(result).__name__}")
+        items = result.items() if isinstance(result, Mapping) else [("", result)]
+        return {str(element): self._number(value) for element, value in items}
+
+    def _number(self, value: object) -> float:
+        """A count stays whole, so that files show it as one."""
+        if isinstance(value, Integral):
+            return int(value)
+        if isinstance(value, Real):
+            return float(value)
+        raise InvalidValue(f"metric '{self.name}': expected numbers, got {type(value).__name__}")

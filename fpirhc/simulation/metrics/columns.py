@@ -1,0 +1,61 @@
+"""Metrics of several runs as columns of a table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from fpirhc.simulation.metrics.base import Metric
+from fpirhc.simulation.metrics.measuring import Metrics
+
+
+@dataclass(frozen=True)
+class Column:
+    """One number of every run: a metric, the element, and its unit."""
+
+    metric: Metric
+    element: str
+    unit: str
+
+    @property
+    def heading(self) -> str:
+        """Heading in a report: 'rms error q1 [m]'."""
+        return self._with_unit(self.metric.heading)
+
+    @property
+    def short(self) -> str:
+        """Heading on a terminal."""
+        return self._with_unit(self.metric.short or self.metric.heading)
+
+    def number(self, metrics: Metrics) -> float | None:
+        """The number of one run; None where the run has none, NaN where it did not reach it."""
+        return metrics[self.metric.name].get(self.element)
+
+    def text(self, value: float | None, *, missing: str, none: str) -> str:
+        """A number as text; `missing` for None, `none` for NaN."""
+        if value is None:
+            return missing
+        return none if math.isnan(value) else self.metric.text(value)
+
+    def best(self, values: Iterable[float | None]) -> float | None:
+        """The best number; None where no direction is better or there is no number."""
+        finite = [v for v in values if v is not None and math.isfinite(v)]
+        if not finite or self.metric.better == "neither":
+            return None
+        return min(finite) if self.metric.better == "smaller" else max(finite)
+
+    def _with_unit(self, heading: str) -> str:
+        named = f"{heading} {self.element}" if self.metric.by and self.metric.shown is None else heading
+        return named if self.unit in ("", "1") else f"{named} [{self.unit}]"
+
+
+def columns(runs: Sequence[Metrics], *, headline: bool = False) -> list[Column]:
+    """Return the columns that a report shows of these runs, or only those of short tables; numbers that no run has are left out."""
+    found: dict[tuple[str, str], Column] = {}
+    for metrics in runs:
+        for metric, element, _ in metrics:
+            wanted = metric.headline if headline else metric.report
+            if wanted and (metric.shown is None or element in metric.shown):
+                found.setdefault((metric.name, element), Column(metric, element, metrics.units[metric.name][element]))
+    return sorted(found.values(), key=lambda column: column.metric.order)

@@ -1,0 +1,122 @@
+"""Measures a run: the one place where metrics are computed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from fpirhc.errors import InvalidName, nearest
+from fpirhc.simulation.metrics.base import Metric
+from fpirhc.simulation.metrics.discovery import known_metrics
+from fpirhc.simulation.run import Run
+from fpirhc.status import Status
+from fpirhc.summary import line, number, table
+from fpirhc.task.problem import Problem
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """What a run achieved.
+
+        metrics["overshoot"]["q1"], metrics["clipped_share"][""], metrics.rms_error["q1"]
+
+    Parameters:
+        values: numbers by metric and element; a metric with one number has the element ''. A metric that the run does not have is
+            not there. units: the same for units. entries: the metrics that were asked for, by name.
+    """
+
+    values: Mapping[str, Mapping[str, float]]
+    units: Mapping[str, Mapping[str, str]]
+    entries: Mapping[str, Metric]
+
+    def __getitem__(self, name: str) -> Mapping[str, float]:
+        if name in self.entries:
+            return self.values.get(name, {})
+        raise InvalidName(f"metric '{name}' is unknown.{nearest(name, self.entries)}")
+
+    def __iter__(self) -> Iterator[tuple[Metric, str, float]]:
+        """Every number as (metric, element, number)."""
+        for name, numbers in self.values.items():
+            for element, value in numbers.items():
+                yield self.entries[name], element, value
+
+    def text(self, name: str, element: str = "") -> str:
+        """One number as its metric writes it."""
+        return self.entries[name].text(self[name][element])
+
+    @property
+    def rms_error(self) -> Mapping[str, float]:
+        """Rms error by coordinate."""
+        return self["rms_error"]
+
+    @property
+    def max_error(self) -> Mapping[str, float]:
+        """Largest error by coordinate."""
+        return self["max_error"]
+
+    @property
+    def iae(self) -> Mapping[str, float]:
+        """Integral of |error| by coordinate."""
+        return self["iae"]
+
+    @property
+    def settling(self) -> Mapping[str, float]:
+        """Settling time by coordinate, s; NaN: it never settled."""
+        return self["settling"]
+
+    @property
+    def effort(self) -> Mapping[str, float]:
+        """Rms command by input."""
+        return self["effort"]
+
+    @property
+    def clipped_share(self) -> float:
+        """Share of the cycles with a clipped command."""
+        return self["clipped_share"][""]
+
+    @property
+    def cost(self) -> Mapping[str, float]:
+        """Cost along the run by term, and 'total'; empty without a cost."""
+        return self["cost"]
+
+    @property
+    def solve(self) -> Mapping[str, float]:
+        """Median and worst iterations, stationarity and feasibility, and plans; empty without an optimiser."""
+        group = {n.partition(".")[2]: v[""] for n, v in self.values.items() if n.startswith("solve.")}
+        return {**group, "plans": self["plans"][""]} if group else {}
+
+    @property
+    def statuses(self) -> Mapping[str, int]:
+        """Cycles by status, those that occurred."""
+        return {name: int(count) for name, count in self["status"].items() if count}
+
+    @property
+    def worst_status(self) -> str:
+        """The worst status that occurred."""
+        return max((Status[name] for name in self.statuses), default=Status.OK).name
+
+    def __repr__(self) -> str:
+        facts = (
+            f"{metric.heading} {element} {metric.text(value)}" for metric, element, value in self if metric.headline
+        )
+        return line(self, *(" ".join(fact.split()) for fact in facts), f"worst {self.worst_status}")
+
+    def _repr_html_(self) -> str:
+        """All numbers as a table, for notebooks."""
+        rows = [(f"{m.heading} {element}".strip(), number(v), self.units[m.name][element]) for m, element, v in self]
+        return table("Metrics", ("metric", "value", "unit"), rows)
+
+
+def measure(problem: Problem, run: Run, metrics: Sequence[Metric] | None = None) -> Metrics:
+    """Return the metrics of a run; those of a task are `task.metrics`, None: the shipped and the installed ones.
+
+    Errors are reference minus the plant's state of the judged coordinates. Numbers are taken from `problem.measure_from` on
+    unless the metric says otherwise; a run that ended before has NaN errors.
+
+    Raises:
+        InvalidValue: a metric's function returned no numbers.
+    """
+    entries = known_metrics() if metrics is None else metrics
+    values = {m.name: numbers for m in entries if (numbers := m.values(problem, run))}
+    units = {m.name: {e: m.unit_of(problem, e) for e in values[m.name]} for m in entries if m.name in values}
+    return Metrics(values, units, {m.name: m for m in entries})

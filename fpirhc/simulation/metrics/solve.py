@@ -1,0 +1,61 @@
+"""How the optimiser did over the whole run; nothing where the controller has none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from fpirhc.simulation.metrics.base import Function, Metric
+from fpirhc.simulation.run import Run
+from fpirhc.task.problem import Problem
+
+
+def iterations(value: float) -> str:
+    """Return a number of iterations as text; an optimiser that does not tell it logs -1."""
+    return f"{value:.0f}" if value >= 0 else "-"
+
+
+def _over(column: str, summary: Callable[[np.ndarray], np.floating]) -> Function:
+    """Function of a metric that sums up one column of 'solve'."""
+
+    def function(problem: Problem, run: Run) -> float | None:  # noqa: ARG001 -- every metric is given the problem
+        return float(summary(run[f"solve.{column}"])) if "solve" in run.layout and run.cycles else None
+
+    return function
+
+
+def plans(problem: Problem, run: Run) -> int | None:  # noqa: ARG001 -- every metric is given the problem
+    """Number of different plans."""
+    if "solve" not in run.layout or not run.cycles:
+        return None
+    return int(np.unique(run["solve"], axis=0).shape[0])
+
+
+def residual(value: float) -> str:
+    """Return a residual by its power of ten."""
+    return f"{value:.0e}"
+
+
+METRICS = (
+    Metric(
+        "solve.median_iterations",
+        _over("iterations", np.median),
+        title="iterations",
+        text=iterations,
+        finite=True,
+        order=90,
+    ),
+    Metric("solve.worst_iterations", _over("iterations", np.max), text=iterations, report=False, finite=True, order=91),
+    Metric(
+        "solve.median_stationarity",
+        _over("stationarity", np.median),
+        text=residual,
+        report=False,
+        compared="not",
+        order=92,
+    ),
+    Metric("solve.worst_stationarity", _over("stationarity", np.max), title="worst residual", compared="not", order=93),
+    Metric("solve.worst_feasibility", _over("feasibility", np.max), report=False, compared="not", order=94),
+    Metric("plans", plans, better="neither", report=False, compared="exact", finite=True, order=95),
+)

@@ -1,0 +1,33 @@
+"""The figure of one run."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from fpirhc.simulation.drawing import PALETTE, draw_bands, draw_legend, draw_line, draw_responses, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from fpirhc.simulation.run import Run
+
+
+def run_figure(run: Run) -> Figure:
+    """Errors, positions, commands and responses of one run over time."""
+    figure = new_figure(10, 9, f"{run.controller}" + (f" ({run.stop})" if run.stop else ""))
+    names = run.layout["error"].elements
+    axes = figure.subplots(4, 1, sharex=True)
+    for k, name in enumerate(names):
+        draw_line(axes[0], run, f"error.{name}", name, PALETTE[k])
+        draw_line(axes[1], run, f"state.{name}", name, PALETTE[k])
+        draw_line(axes[1], run, f"reference.{name}", f"{name} reference", PALETTE[k], "--")
+    for k, name in enumerate(run.layout["command"].elements):
+        draw_line(axes[2], run, f"command.{name}", name, PALETTE[k])
+    first = run.layout["desired"].elements[0]
+    draw_responses(axes[3], run, first)
+    for axis, what in zip(axes, ("error", "position", "command", f"responses of {first}"), strict=True):
+        draw_bands(axis, run)
+        axis.set_ylabel(what)
+        draw_legend(axis)
+    axes[3].set_xlabel("time [s]")
+    return figure
