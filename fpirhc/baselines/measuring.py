@@ -14,9 +14,9 @@ import numpy as np
 from fpirhc.baselines.catalogue import family_of
 from fpirhc.baselines.variants import Variant
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.wrappers.exact_model import ExactModel
 from fpirhc.controllers.wrappers.predicted import Predicted
-from fpirhc.deformation.identity import Identity
 from fpirhc.errors import FpirhcError
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.simulation.metrics import measure
@@ -93,7 +93,7 @@ def measure_job(task: Task, job: Job) -> Measurement:
     variant, controller = job.variant, task.controllers[job.controller]
     problem = variant.applied(task.problem)
     try:
-        chosen = controller.resolved(problem)
+        chosen = resolved(problem, controller)
         run = simulate(problem, chosen, seed=variant.seed, compiled=variant.compiled, flags=variant.flags)
         if run.stop is not None:
             return Measurement(DIVERGED, run.stop, {})
@@ -118,7 +118,7 @@ def _numbers(problem: Problem, controller: Controller, run: Run) -> dict[str, Nu
     if metrics.solve:
         found |= {f"solve.{name}": metrics.solve[name] for name in ("median_iterations", "worst_iterations")}
         found["plans"] = int(metrics.solve["plans"])
-    known = None if isinstance(controller.adaptive, Identity) else measure_contraction(problem, controller, run)
+    known = measure_contraction(problem, controller, run) if controller.deformation.adapts else None
     if known:
         found |= {"contraction.predicted": known.predicted, "contraction.measured": known.measured}
     return found

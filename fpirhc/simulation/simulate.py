@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import resolved
 from fpirhc.describe import describe
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.run import Run
@@ -58,7 +59,7 @@ class Simulator:
         start = start_memory(self.loop, problem, self.controller)
         log, stop = _run_chunks(problem, start, self.loop.trace, self.evaluator, seed, progress)
         log.setflags(write=False)
-        step_limit = self.controller.adaptive.largest_step()
+        step_limit = self.controller.deformation.largest_step()
         settings = {
             "step_limit": step_limit if np.isfinite(step_limit) else None,
             "controller": describe(self.controller),
@@ -77,7 +78,7 @@ def simulator(
 
     `flags` go to the compiler after its usual ones.
     """
-    chosen = controller.resolved(problem)
+    chosen = resolved(problem, controller)
     loop = close_loop(problem, chosen)
     chunked = loop.function.mapaccum(f"{loop.function.name()}_run", CHUNK)
     backend = native(chunked, flags) if compiled else None

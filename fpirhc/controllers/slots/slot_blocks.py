@@ -143,7 +143,7 @@ _OF_A_SLOT = (
     "good",
     "nominal",
     "desired",
-    "deformed_wanted",
+    "deformed_unclipped",
     "blanked",
     "kept",
     "offset",
@@ -162,7 +162,7 @@ def command_block(problem: Problem, channels: Sequence[Channel]) -> Block:
     def step(s: Any) -> dict[str, Expression]:
         per_slot = {name: _column(s, channels, name) for name in _OF_A_SLOT}
         active, free, gain = per_slot["active"], per_slot["free"], per_slot["gain"]
-        wanted = ca.if_else(per_slot["blanked"], per_slot["desired"] + per_slot["kept"], per_slot["deformed_wanted"])
+        wanted = ca.if_else(per_slot["blanked"], per_slot["desired"] + per_slot["kept"], per_slot["deformed_unclipped"])
         requests = (wanted - free) / per_slot["divisor"]
         good = _pick(active, per_slot["good"]) > 0.5
         requested = [
