@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.controllers import base
+from fpirhc.controllers import contract
 
 PERIOD = 5e-3  # s
 DURATION = 8.0  # s; the reference rests from about 2.5 s on
@@ -142,7 +142,7 @@ def _deformation(random: np.random.Generator, largest: float, cycles: float):
 def dies_out(case: Case) -> bool:
     """Whether the simulated response error dies out; a gain of the wrong sign, refused otherwise, is run too."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(base, "check_gain_sign", lambda *_: None)
+        patch.setattr(contract, "check_gain_sign", lambda *_: None)
         run = fp.simulate(case.problem, case.controller, seed=0, compiled=False)
     if run.stop is not None:
         return False

@@ -12,6 +12,7 @@ from plants import chain, pendulum
 
 import fpirhc as fp
 from fpirhc.controllers.base import compose_controller
+from fpirhc.controllers.contract import resolved
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.learning.rules.base import Evidence
 from fpirhc.symbolic.native import native
@@ -364,7 +365,7 @@ def test_puma_learns_its_load():
 def test_compiled_as_interpreted(name):
     """Scalar code throughout; the same numbers to rounding."""
     problem = task(poor, 0.5)
-    step = compose_controller(problem, CONTROLLERS[name].resolved(problem))
+    step = compose_controller(problem, resolved(problem, CONTROLLERS[name]))
     assert not step.opaque
     backend = native(step.function)
     values = [problem.start_state, [0.3], problem.plant.approximate]

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from plants import chain, pendulum
 
 import fpirhc as fp
+from fpirhc.controllers.contract import resolved
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.horizon.problem import stage_data, transcribe
 from fpirhc.horizon.rollout import rollout
@@ -237,11 +238,11 @@ def test_stop_run_ends_with_the_reason():
 
 def test_scale_is_chosen_from_the_input_limits():
     """S covers a jump of the command from limit to limit; without limits it must be given."""
-    controller = fp.RecedingHorizon(GRADIENT, fp.Sigmoid(gain=-0.5)).resolved(TASK.problem)
+    controller = resolved(TASK.problem, fp.RecedingHorizon(GRADIENT, fp.Sigmoid(gain=-0.5)))
     jump = np.linalg.norm([600 / 1.5, 600 / 2.6])
     assert controller.deformation.largest_step() == pytest.approx(jump, rel=0.01)
     with pytest.raises(InvalidValue, match="input 'Q1' has no finite limits"):
-        fp.RecedingHorizon(GRADIENT, fp.Sigmoid(gain=-0.5)).resolved(replace(TASK.problem, limits=fp.Limits()))
+        resolved(replace(TASK.problem, limits=fp.Limits()), fp.RecedingHorizon(GRADIENT, fp.Sigmoid(gain=-0.5)))
 
 
 def test_chain_of_order_four_under_receding_horizon():

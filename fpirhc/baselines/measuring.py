@@ -14,6 +14,7 @@ import numpy as np
 from fpirhc.baselines.catalogue import NOT_COMPARED, family_of
 from fpirhc.baselines.variants import Variant
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.wrappers.exact_model import ExactModel
 from fpirhc.controllers.wrappers.predicted import Predicted
 from fpirhc.errors import FpirhcError
@@ -90,7 +91,7 @@ def measure_job(task: Task, job: Job) -> Measurement:
     variant, controller = job.variant, task.controllers[job.controller]
     problem = variant.applied(task.problem)
     try:
-        chosen = controller.resolved(problem)
+        chosen = resolved(problem, controller)
         run = simulate(problem, chosen, seed=variant.seed, compiled=variant.compiled, flags=variant.flags)
         if run.stop is not None:
             return Measurement(DIVERGED, run.stop, {})

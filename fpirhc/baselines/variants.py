@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fpirhc.plant.integrators import Cvodes, Integrator, RungeKutta4
 from fpirhc.simulation.simulate import disturbance_table, sensing_table
 from fpirhc.symbolic.native import find_compiler
 from fpirhc.task.problem import Problem
@@ -52,7 +51,7 @@ class Variant:
             start = {name: value * (1 + self.nudge) for name, value in problem.start.items()}
             return replace(problem, plant=replace(problem.plant, parameters=parameters), start=start)
         if self.finer > 1:
-            return replace(problem, integrator=_finer(problem.integrator, self.finer) or problem.integrator)
+            return replace(problem, integrator=problem.integrator.finer(self.finer) or problem.integrator)
         return problem
 
 
@@ -70,7 +69,7 @@ def variants(problem: Problem, *, seed: int, seeds: int, compiled: bool) -> list
         found.append(Variant(ROUNDING, "virtual machine", seed, False))
         found.append(Variant(ROUNDING, "compiled -O0", seed, True, flags=("-O0",)))
     found.append(Variant(ROUNDING, f"start and exact parameters moved by {_NUDGE:g}", seed, compiled, nudge=_NUDGE))
-    if _finer(problem.integrator, 2):
+    if problem.integrator.finer(2):
         found.append(Variant(INTEGRATOR, "twice the integrator steps", seed, compiled, finer=2))
     return found
 
@@ -85,11 +84,3 @@ def _is_random(problem: Problem) -> bool:
     return any(
         not np.array_equal(draw(problem, 0, problem.cycles), draw(problem, 1, problem.cycles)) for draw in tables
     )
-
-
-def _finer(integrator: Integrator, times: int) -> Integrator | None:
-    if isinstance(integrator, RungeKutta4):
-        return RungeKutta4(integrator.substeps * times)
-    if isinstance(integrator, Cvodes):
-        return Cvodes(integrator.tolerance / 10)
-    return None

@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
-from fpirhc.controllers.base import Controller, compose_controller, prepared
+from fpirhc.controllers.base import Controller, compose_controller
+from fpirhc.controllers.contract import checked, resolved
 from fpirhc.horizon.cost import Quadratic
 from fpirhc.horizon.problem import Horizon
 from fpirhc.plant.plant import Parameter, Plant
@@ -97,13 +98,13 @@ class _Trial:
     @cached_property
     def stepper(self) -> Stepper:
         """The controller alone, in CasADi's virtual machine."""
-        return Stepper(self.problem, prepared(self.problem, self.controller), compiled=False)
+        return Stepper(self.problem, checked(self.problem, self.controller), compiled=False)
 
 
 def frozen_value(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """A controller is a frozen value that can be hashed, copied and described."""
     is_a_frozen_value(trial.controller)
-    is_a_frozen_value(trial.controller.resolved(trial.problem))
+    is_a_frozen_value(resolved(trial.problem, trial.controller))
 
 
 def writes_a_command_and_a_status(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001

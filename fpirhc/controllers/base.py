@@ -1,4 +1,4 @@
-"""The contract of controllers, and the part of a control cycle that all of them share.
+"""The part of a control cycle that all controllers share; the contract itself is in `contract`.
 
 Every controller reads (time, state, realised, parameters) and ends in the same four blocks:
 
@@ -12,16 +12,15 @@ A command that is not finite never reaches the plant: the last command is held a
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.gain_check import check_gain_sign, check_response_delay
+from fpirhc.controllers.contract import Controller as Controller
+from fpirhc.controllers.contract import Response as Response
+from fpirhc.controllers.contract import checked
 from fpirhc.deformation.base import Deformation
-from fpirhc.errors import NotSupported
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
@@ -30,68 +29,6 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.task.problem import Problem
 
 FINITE = 1e300  # |v| <= FINITE is false for NaN and infinity, and CasADi does not simplify it away
-
-
-@dataclass(frozen=True, eq=False)
-class Response:
-    """A response that the plant answers with: the signal 'realised' and its Function (state, input, parameters, forcing)."""
-
-    signal: Signal
-    function: ca.Function
-
-
-class Controller(ABC):
-    """Contract: a frozen value that becomes blocks for a given problem."""
-
-    @property
-    @abstractmethod
-    def adaptive(self) -> Deformation:
-        """The deformation in use (Identity when there is none)."""
-
-    @abstractmethod
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks of one control cycle, from (time, state, realised, parameters) to 'command'."""
-
-    def parameters(self, plant: Plant) -> np.ndarray:
-        """Parameters that the controller believes: the approximate ones."""
-        return plant.approximate
-
-    def resolved(self, problem: Problem) -> Controller:  # noqa: ARG002
-        """Return the controller with every automatic setting replaced by its value for this problem."""
-        return self
-
-    def response(self, problem: Problem) -> Response | None:  # noqa: ARG002
-        """What the controller reads as 'realised', where that is not the response of the plant's controlled coordinates."""
-        return None
-
-    def notes(self, problem: Problem) -> tuple[str, ...]:  # noqa: ARG002
-        """Sentences about the controller on this problem for a reader of results."""
-        return ()
-
-    def check(self, problem: Problem) -> None:  # noqa: B027 -- most controllers fit every problem
-        """Raise if the controller cannot serve the problem."""
-
-
-def prepared(problem: Problem, controller: Controller) -> Controller:
-    """Return the controller with its automatic settings chosen, checked against the problem.
-
-    Raises:
-        NotContractive: a deformation with a gain of the wrong sign, or one that its estimator or filter makes
-            unstable. NotSupported: own responses behind sensors or dead time. And what the controller's own check raises.
-    """
-    chosen = controller.resolved(problem)
-    chosen.check(problem)
-    if chosen.response(problem) is not None:
-        late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
-        if late or not problem.sensing.ideal:
-            what = "dead time" if late else "sensing"
-            raise NotSupported(
-                f"{type(chosen).__name__} reads responses of its own, at once and as they are; leave {what} out of the problem"
-            )
-    else:
-        check_gain_sign(problem, chosen.adaptive)
-        check_response_delay(problem, chosen.adaptive)
-    return chosen
 
 
 def controller_reads(problem: Problem, controller: Controller) -> Layout:
@@ -103,9 +40,9 @@ def controller_reads(problem: Problem, controller: Controller) -> Layout:
 
 def compose_controller(problem: Problem, controller: Controller) -> Composite:
     """Return the controller as one step: (memory, time, state, realised, parameters) -> (memory, trace, command)."""
-    chosen = prepared(problem, controller)
-    blocks, delays = chosen.blocks(problem)
-    return compose("controller", controller_reads(problem, chosen), blocks, delays, outputs=("command",))
+    ready = checked(problem, controller)
+    blocks, delays = ready.blocks(problem)
+    return compose("controller", controller_reads(problem, ready), blocks, delays, outputs=("command",))
 
 
 def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block:

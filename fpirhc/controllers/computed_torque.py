@@ -5,9 +5,8 @@ q^Des = q^(r),N + feedback of the tracking law;   u = inverse model of the defor
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
-from fpirhc.controllers.automatic_scale import scaled_for_reference
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block, rename
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
@@ -29,15 +28,6 @@ class ComputedTorque(Controller):
 
     tracking: Tracking
     deformation: Deformation = field(default_factory=Identity)
-
-    @property
-    def adaptive(self) -> Deformation:
-        """The deformation in use."""
-        return self.deformation
-
-    def resolved(self, problem: Problem) -> ComputedTorque:
-        """Return the controller with the deformation's scale chosen."""
-        return replace(self, deformation=scaled_for_reference(self.deformation, problem))
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Blocks reference, tracking, deform, invert, limit, judge, tracking update."""

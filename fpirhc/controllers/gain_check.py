@@ -15,8 +15,6 @@ import numpy as np
 
 from fpirhc.contraction import Spectrum, assess_gain, delayed_limit, linear_limit, spectrum_over_run
 from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.wrappers.delayed import Increment, Paired
-from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import InvalidValue, NotContractive
 from fpirhc.task.problem import Problem
 
@@ -95,15 +93,8 @@ class _Form:
 
 
 def _form(deformation: Deformation) -> _Form:
-    pairing, pole = 0.0, 0.0
-    inner: Deformation | None = deformation
-    while inner is not None:
-        if isinstance(inner, Paired | Increment):
-            pairing = inner.cycles
-        if isinstance(inner, Filtered):
-            pole = inner.pole
-        inner = getattr(inner, "map", None)
-    return _Form(pairing, pole)
+    pairing = deformation.pairing
+    return _Form((pairing.cycles or 0.0) if pairing else 0.0, deformation.error_pole)
 
 
 def _late(weights: np.ndarray, cycles: float) -> np.ndarray:

@@ -18,8 +18,8 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.automatic_scale import scaled_for_plan
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
+from fpirhc.controllers.contract import Planner
 from fpirhc.controllers.on_failure import HoldPlan, OnFailure
 from fpirhc.controllers.replanning import FromMeasurement, Replanning
 from fpirhc.deformation.base import Deformation
@@ -58,13 +58,13 @@ class RecedingHorizon(Controller):
     cost: Cost | None = None
 
     @property
-    def adaptive(self) -> Deformation:
-        """The deformation in use."""
-        return self.deformation
+    def planner(self) -> Planner:
+        """Optimiser, cost, and where its plans start."""
+        return Planner(self.optimiser, self.cost, self.replanning.restarts, self.replanning.law)
 
-    def resolved(self, problem: Problem) -> RecedingHorizon:
-        """Return the controller with the deformation's scale chosen."""
-        return replace(self, deformation=scaled_for_plan(self.deformation, problem))
+    def with_optimiser(self, optimiser: Optimiser) -> RecedingHorizon:
+        """Return the controller with another optimiser."""
+        return replace(self, optimiser=optimiser)
 
     def check(self, problem: Problem) -> None:
         """Raise if the problem has no horizon or cost, or the optimiser cannot serve it.
@@ -176,7 +176,7 @@ def _correction_block(problem: Problem, deformation: Deformation) -> Block:
     reads = Layout((plant.state, plant.response_signal("desired"), plant.input, plant.parameter))
 
     def step(s: Signals) -> dict[str, Expression]:
-        if isinstance(deformation, Identity):
+        if not deformation.adapts:
             return {"command_shift": 0 * s.command}
         return {"command_shift": s.command - inverse(s.state, s.desired, s.parameters)}
 

@@ -35,6 +35,16 @@ Parts = tuple[list[Block], list[Block], list[Block], list[Delay]]
 class Replanning(ABC):
     """Contract: blocks before the plan (-> _plan_state), after it (-> nominal, desired), after the command; delays."""
 
+    @property
+    @abstractmethod
+    def restarts(self) -> bool:
+        """Whether every plan starts from the measured state."""
+
+    @property
+    @abstractmethod
+    def law(self) -> Tracking | None:
+        """The law that keeps the plant on the planned motion between plans; None: the plan's response is the desired one."""
+
     @abstractmethod
     def parts(self, problem: Problem) -> Parts:
         """Blocks before the plan, after the plan, and after the command is limited; what is remembered."""
@@ -43,6 +53,16 @@ class Replanning(ABC):
 @dataclass(frozen=True)
 class FromMeasurement(Replanning):
     """Plan from the measured state; the plan's first response is the desired one (no tracking law)."""
+
+    @property
+    def restarts(self) -> bool:
+        """They do."""
+        return True
+
+    @property
+    def law(self) -> None:
+        """None."""
+        return
 
     def parts(self, problem: Problem) -> Parts:
         """Blocks of this choice."""
@@ -65,6 +85,16 @@ class FromMeasurementTracked(Replanning):
 
     tracking: Tracking
 
+    @property
+    def restarts(self) -> bool:
+        """They do."""
+        return True
+
+    @property
+    def law(self) -> Tracking:
+        """The tracking law."""
+        return self.tracking
+
     def parts(self, problem: Problem) -> Parts:
         """Blocks of this choice."""
 
@@ -80,6 +110,16 @@ class FromPlan(Replanning):
     """Plan from the model's own state and track the planned motion."""
 
     tracking: Tracking
+
+    @property
+    def restarts(self) -> bool:
+        """They do not."""
+        return False
+
+    @property
+    def law(self) -> Tracking:
+        """The tracking law."""
+        return self.tracking
 
     def parts(self, problem: Problem) -> Parts:
         """Blocks of this choice."""

@@ -11,21 +11,109 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import ClassVar, Self
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import casadi as ca
 
-from fpirhc.errors import InvalidValue
+from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.symbolic.layout import Expression, Layout
 
 
-class Deformation(ABC):
-    """Contract: a map from (request, response, desired) to the next request.
+@dataclass(frozen=True)
+class Reach:
+    """The setting of a map, with its size, that requests and responses must stay far below, in units of the response."""
 
-    Concrete maps are frozen dataclasses. `fpirhc.conformance.check_deformation` tests that a map keeps this contract.
+    name: str
+    size: float
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """With which earlier request a response is paired: that of `cycles` cycles before the last one.
+
+    cycles: None where the map estimates it on line. uncertainty: by how many cycles it may be wrong.
+    """
+
+    cycles: float | None
+    uncertainty: int = 0
+
+
+@dataclass(frozen=True)
+class Demand:
+    """How much the desired response of a controller changes, for maps that choose a setting of theirs by it.
+
+    change: largest change in one cycle, in units of the response. sudden: whether that is a jump once in a while, which one
+    step has to cover; otherwise it goes on from cycle to cycle, and the map needs room beyond it.
+    """
+
+    change: float
+    sudden: bool
+
+
+class Deformation(ABC):
+    """Contract: a map from (request, response, desired) to the next request, and facts about it.
+
+    Concrete maps are frozen dataclasses. What a map around another one does not say otherwise is the fact of the inner map.
+    `fpirhc.conformance.check_deformation` tests that a map keeps this contract.
     """
 
     gain_name: ClassVar[str] = "gain"  # the field that the effective gain is proportional to
+
+    if TYPE_CHECKING:
+
+        @property
+        def inner(self) -> Deformation | None:
+            """The map that this one is around; None for a map that stands alone."""
+
+    else:
+        inner = None  # a plain attribute, so that a dataclass may have a field of this name
+
+    def around(self, inner: Deformation) -> Self:
+        """Return the same map around another inner one.
+
+        Raises:
+            NotSupported: no field holds the inner map; override `around`.
+        """
+        return with_inner(self, inner)
+
+    @property
+    def adapts(self) -> bool:
+        """Whether the response changes the request at all; False for no adaptation."""
+        return True if self.inner is None else self.inner.adapts
+
+    @property
+    def constant(self) -> bool:
+        """Whether the map keeps the gain and the pairing that it begins with.
+
+        Unless a map says otherwise it does where it remembers nothing itself.
+        """
+        own = self.memory(("q",)).names
+        return not own if self.inner is None else self.inner.constant and own == self.inner.memory(("q",)).names
+
+    @property
+    def reach(self) -> Reach | None:
+        """What bounds the requests for which the gains hold; None where nothing does."""
+        return None if self.inner is None else self.inner.reach
+
+    @property
+    def pairing(self) -> Pairing | None:
+        """Which earlier request a response is paired with; None: with the last one."""
+        return None if self.inner is None else self.inner.pairing
+
+    @property
+    def error_pole(self) -> float:
+        """Pole of a low-pass filter on the response error, from 0 (none) to below 1."""
+        return 0.0 if self.inner is None else self.inner.error_pole
+
+    @property
+    def automatic(self) -> tuple[str, ...]:
+        """Names of settings that are still to be chosen, see `suited`."""
+        return () if self.inner is None else self.inner.automatic
+
+    def suited(self, demand: Demand) -> Self:
+        """Return the map with its automatic settings chosen for how much the desired response changes."""
+        return self if self.inner is None else self.around(self.inner.suited(demand))
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """What the map remembers besides the pair (request, desired); nothing unless it says otherwise."""
@@ -61,6 +149,28 @@ class Deformation(ABC):
     @abstractmethod
     def with_effective_gain(self, gain: float) -> Self:
         """Return the same map with another effective gain."""
+
+
+def with_inner(wrapper: Any, inner: object) -> Any:
+    """Return a frozen dataclass with another value in the field that holds its `inner`.
+
+    Raises:
+        NotSupported: no field does.
+    """
+    held = wrapper.inner
+    names = [f.name for f in fields(wrapper) if getattr(wrapper, f.name) is held] if is_dataclass(type(wrapper)) else []
+    if not names or held is None:
+        raise NotSupported(
+            f"{type(wrapper).__name__} has no field that holds its `inner`, so nothing else can be put there; override around()"
+        )
+    return replace(wrapper, **{names[0]: inner})
+
+
+def innermost(deformation: Deformation) -> Deformation:
+    """The map inside all others."""
+    while deformation.inner is not None:
+        deformation = deformation.inner
+    return deformation
 
 
 def smooth_norm(column: Expression, floor: float) -> Expression:

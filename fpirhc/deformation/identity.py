@@ -18,6 +18,11 @@ class Identity(Deformation):
     It is the only map that does not iterate: its gains are zero and no response error is ever corrected.
     """
 
+    @property
+    def adapts(self) -> bool:
+        """It does not."""
+        return False
+
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:

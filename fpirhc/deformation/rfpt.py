@@ -8,7 +8,7 @@ from typing import Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, require_numbers
+from fpirhc.deformation.base import Deformation, Reach, require_numbers
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression
 
@@ -43,6 +43,11 @@ class RFPT(Deformation):
             raise InvalidValue(
                 f"RFPT(sign={self.sign!r}): expected -1 or 1; -1 for offset > 0 and a model of right sign"
             )
+
+    @property
+    def reach(self) -> Reach:
+        """The gains hold for |K_c| >> |r|."""
+        return Reach("offset", abs(self.offset))
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]

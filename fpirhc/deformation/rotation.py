@@ -20,7 +20,7 @@ from typing import ClassVar, Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, require_numbers
+from fpirhc.deformation.base import Deformation, Reach, require_numbers
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression
 
@@ -58,6 +58,11 @@ class Rotation(Deformation):
         require_numbers("Rotation", {"fraction": self.fraction, "radius": self.radius})
         if self.radius < 0:
             raise InvalidValue(f"Rotation(radius={self.radius!r}): expected a positive number in units of the response")
+
+    @property
+    def reach(self) -> Reach:
+        """R is several times the longest vector."""
+        return Reach("radius", self.radius)
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]

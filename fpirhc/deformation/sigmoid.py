@@ -16,7 +16,7 @@ from typing import Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, require_numbers, smooth_norm
+from fpirhc.deformation.base import Deformation, Demand, require_numbers, smooth_norm
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression
 
@@ -64,6 +64,18 @@ class Sigmoid(Deformation):
     def with_scale(self, scale: float) -> Self:
         """Return the same map with scale S."""
         return replace(self, scale=scale)
+
+    @property
+    def automatic(self) -> tuple[str, ...]:
+        """The scale, unless it is given."""
+        return ("scale",) if self.scale is None else ()
+
+    def suited(self, demand: Demand) -> Self:
+        """Return the map with a scale S whose largest step covers a jump, or of twice a change that goes on; at least 1."""
+        if self.scale is not None:
+            return self
+        scale = demand.change / self.with_scale(1.0).largest_step() if demand.sudden else 2 * demand.change
+        return self.with_scale(float(f"{max(1.0, scale):.3g}"))
 
     @cached_property
     def _tanh_fixed_point(self) -> float:

@@ -25,6 +25,10 @@ class Integrator(ABC):
         """Whether the step holds operations that scalar expressions cannot."""
         return False
 
+    def finer(self, times: int) -> Integrator | None:  # noqa: ARG002
+        """The same method with about that many times the work; None where it has no such setting."""
+        return None
+
     @abstractmethod
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period` seconds."""
@@ -39,6 +43,10 @@ class RungeKutta4(Integrator):
     def __post_init__(self) -> None:
         if self.substeps < 1:
             raise InvalidValue(f"RungeKutta4 needs at least 1 sub-step, got {self.substeps}")
+
+    def finer(self, times: int) -> RungeKutta4:
+        """With that many times the sub-steps."""
+        return RungeKutta4(self.substeps * times)
 
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period` seconds."""
@@ -73,6 +81,10 @@ class Cvodes(Integrator):
     def opaque(self) -> bool:
         """CVODES is called, not written out."""
         return True
+
+    def finer(self, times: int) -> Cvodes:  # noqa: ARG002
+        """With a tenth of the tolerance."""
+        return Cvodes(self.tolerance / 10)
 
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period` seconds."""

@@ -38,7 +38,7 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
     worst = float(loops.radii.max())
     found = f"the slowest mode of the linear loop changes by {worst:.6g} per cycle"
     numbers = {"radius": worst, "smallest_radius": float(loops.radii.min())}
-    deformation = controller.adaptive
+    deformation = controller.deformation
     if not constant(deformation):
         change = f"{type(deformation).__name__} changes its map on line; the factor is that of its start."
         return Answer(QUESTION, Verdict.UNKNOWN, found, change, numbers)
@@ -80,7 +80,7 @@ def _mend(loops: Loops) -> str:
 
 def _steep(grid: ReviewGrid, controller: Controller) -> list[str]:
     """Whether the steepest secant of the map leaves its limit near the reference."""
-    deformation = controller.adaptive
+    deformation = controller.deformation
     believed = controller.parameters(grid.problem.plant)
     eigenvalues = eigenvalues_near(grid, believed, grid.draws[:1], near=True).ravel()
     if not eigenvalues.size:

@@ -165,7 +165,7 @@ def loop_matrices(problem: Problem, controller: Controller) -> LoopMatrices:
 
 
 def _linear_problem(problem: Problem, controller: Controller) -> Problem:
-    plant = linear_plant(problem.plant, -1.0 if controller.adaptive.effective_gain() < 0 else 1.0)
+    plant = linear_plant(problem.plant, -1.0 if controller.deformation.effective_gain() < 0 else 1.0)
     integrator = RungeKutta4() if problem.integrator.opaque else problem.integrator
     return Problem(
         plant=plant,

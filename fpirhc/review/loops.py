@@ -129,7 +129,7 @@ def without_deformation(controller: Controller) -> Controller:
     """Return the controller with Identity() for its deformation."""
     if isinstance(controller, Predicted):
         return replace(controller, controller=without_deformation(controller.controller))
-    if isinstance(controller.adaptive, Identity):
+    if not controller.deformation.adapts:
         return controller
     if isinstance(controller, ComputedTorque):
         return replace(controller, deformation=Identity())

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.slots.slotted import Slotted
 from fpirhc.controllers.wrappers.exact_model import ExactModel
-from fpirhc.deformation.identity import Identity
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.review.answer import Answer, Review, Verdict
 from fpirhc.review.commands import commands_inside
@@ -62,7 +62,7 @@ def predict(problem: Problem, controller: Controller) -> Answer:
     """
     grid = review_grid(problem, 0.0, 0)
     own = replace(grid, draws=grid.draws[:1])  # the box does not matter
-    chosen = controller.resolved(problem)
+    chosen = resolved(problem, controller)
     general = [well_posed(own), inverse_exists(own), commands_inside(own)]
     loops = loops_along(own, chosen)
     return converges(own, chosen, loops, _doubts([*general, *_speed_and_range(own, chosen, loops)]))
@@ -70,7 +70,7 @@ def predict(problem: Problem, controller: Controller) -> Answer:
 
 def _of(grid: ReviewGrid, controller: Controller, general: list[Answer]) -> tuple[Answer, ...]:
     try:
-        chosen = controller.resolved(grid.problem)
+        chosen = resolved(grid.problem, controller)
         chosen.check(grid.problem)
     except FpirhcError as error:
         return (Answer("Does the controller fit the problem?", Verdict.NO, str(error), "See the message."),)
@@ -79,12 +79,12 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer]) -> tupl
         return (schedule_stable(grid.problem, inside),)
     loops = loops_along(grid, chosen)
     outer = [rates_inside(grid, chosen, loops), zero_dynamics(zero_dynamics_rate(grid), is_planned(chosen), loops)]
-    inner = [] if isinstance(chosen.adaptive, Identity) else _of_map(grid, chosen, loops, general)
+    inner = [] if not chosen.deformation.adapts else _of_map(grid, chosen, loops, general)
     return (*inner, *outer, margins_enough(grid.problem, loops))
 
 
 def _of_map(grid: ReviewGrid, controller: Controller, loops: Loops, general: list[Answer]) -> list[Answer]:
-    deformation = controller.adaptive
+    deformation = controller.deformation
     believed = controller.parameters(grid.problem.plant)
     try:
         own, boxed = (spectrum_near(grid, believed, draws, near=False) for draws in (grid.draws[:1], grid.draws))
@@ -98,7 +98,7 @@ def _of_map(grid: ReviewGrid, controller: Controller, loops: Loops, general: lis
 
 
 def _speed_and_range(grid: ReviewGrid, controller: Controller, loops: Loops) -> list[Answer]:
-    deformation, believed = controller.adaptive, controller.parameters(grid.problem.plant)
+    deformation, believed = controller.deformation, controller.parameters(grid.problem.plant)
     ideal = loops.ideal if is_planned(controller) else None
     found = [slew_enough(grid, deformation, believed, ideal), range_enough(grid, deformation, believed)]
     return [a for a in found if a is not None]

@@ -15,7 +15,6 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.linear import LinearLoop
-from fpirhc.task.disturbance import Disturbance, Pulse, Sine, Step
 
 QUESTION = "Is the map fast enough for reference and disturbances?"
 _SPARE = 2.0  # how many times faster than the reference it should be
@@ -31,8 +30,8 @@ def slew_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray
     problem = grid.problem
     begun = 0.0 if ideal is None else _speed_after_start(grid, believed, ideal)
     speed = max(_speed(grid, believed), begun)
-    sudden = max((abs(_jump(d)) * _effect(grid, name) for name, d in problem.disturbances.items()), default=0.0)
-    steady = sum(_swing(d) * _effect(grid, name) for name, d in problem.disturbances.items())
+    sudden = max((d.jump * _effect(grid, name) for name, d in problem.disturbances.items()), default=0.0)
+    steady = sum(d.slew * _effect(grid, name) for name, d in problem.disturbances.items())
     needed, step = speed + steady, deformation.largest_step()
     numbers = {"needed": needed, "limit": step / problem.period, "jump": sudden}
     text = f"the request changes by up to {needed:.3g} per second"
@@ -77,17 +76,6 @@ def _speed_after_start(grid: ReviewGrid, believed: np.ndarray, ideal: LinearLoop
     gain = np.asarray(function(grid.states[0], np.nan_to_num(grid.commands[0, 0]), believed).full())
     changes = np.linalg.norm(np.diff(commands, axis=0) @ gain.T, axis=1)
     return float(changes.max() / grid.problem.period)
-
-
-def _jump(disturbance: Disturbance) -> float:
-    return disturbance.size if isinstance(disturbance, Step | Pulse) else 0.0
-
-
-def _swing(disturbance: Disturbance) -> float:
-    """How fast it changes, per second; noise is no motion that a map should follow."""
-    if not isinstance(disturbance, Sine):
-        return 0.0
-    return abs(2 * math.pi * disturbance.frequency * disturbance.amplitude)
 
 
 def _effect(grid: ReviewGrid, name: str) -> float:

@@ -32,6 +32,11 @@ Array: TypeAlias = np.ndarray
 class DerivativeEstimator(ABC):
     """Contract: a block from the measured quantities to the controller's 'state' and 'realised'."""
 
+    @property
+    def measures_all(self) -> bool:
+        """Whether state and response are measured as they are, so that nothing is estimated."""
+        return False
+
     @abstractmethod
     def measures(self, plant: Plant) -> tuple[str, ...]:
         """Names of the quantities that need a sensor: state elements, and highest derivatives of controlled coordinates."""

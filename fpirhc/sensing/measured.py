@@ -17,6 +17,11 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal
 class Measured(DerivativeEstimator):
     """State and response as the sensors show them: no delay."""
 
+    @property
+    def measures_all(self) -> bool:
+        """It does."""
+        return True
+
     def measures(self, plant: Plant) -> tuple[str, ...]:
         """The whole state and every controlled coordinate's highest derivative."""
         return plant.state.elements + response_names(plant)

@@ -49,7 +49,7 @@ class Sensing:
     @property
     def ideal(self) -> bool:
         """Whether the controller is given the true state and response."""
-        return not self.sensors and isinstance(self.estimator, Measured)
+        return not self.sensors and self.estimator.measures_all
 
     def check(self, plant: Plant) -> None:
         """Raise if a sensor's quantity is unknown or not measured, or the estimator cannot serve the plant.
@@ -81,7 +81,7 @@ class Sensing:
 
     def blind(self, plant: Plant, late: float) -> int:
         """Number of the first cycle whose response may be used, when samples arrive `late` cycles after they were taken."""
-        if isinstance(self.estimator, Measured):
+        if self.estimator.measures_all:
             return 1
         return math.ceil(late) + max(self.estimator.fills(plant.orders[k]) for k in plant.controlled_indices)
 

@@ -11,7 +11,8 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, Response, error_signal, like, prepared
+from fpirhc.controllers.base import Controller, Response, error_signal, like
+from fpirhc.controllers.contract import checked
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals, expression
@@ -26,15 +27,15 @@ def close_loop(problem: Problem, controller: Controller) -> Composite:
     Both parameter sets are part of the memory (constant), so that other values need no new Function. The disturbance
     input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples.
     """
-    chosen = prepared(problem, controller)
-    blocks, delays = chosen.blocks(problem)
+    ready = checked(problem, controller)
+    blocks, delays = ready.blocks(problem)
     disturbed = disturbance_signals(problem)
     seeing = _sense_blocks(
-        problem, chosen.response(problem), predicts="state_ahead" in [n for b in blocks for n in b.writes.names]
+        problem, ready.response(problem), predicts="state_ahead" in [n for b in blocks for n in b.writes.names]
     )
     around = [_clock_block(problem.period), *seeing, *blocks, *_actuate(problem, disturbed)]
     return compose(
-        "loop", Layout((*disturbed, *problem.sensing.drawn)), around, [*_plant_delays(problem, chosen), *delays]
+        "loop", Layout((*disturbed, *problem.sensing.drawn)), around, [*_plant_delays(problem, ready), *delays]
     )
 
 

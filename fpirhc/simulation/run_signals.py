@@ -23,7 +23,7 @@ def judgements(problem: Problem, controller: Controller, layout: Layout, log: np
     found = []
     if problem.cost is not None and problem.horizon is not None:
         found.append(_costs(problem, layout, log))
-    gain = controller.adaptive.effective_gain()
+    gain = controller.deformation.effective_gain()
     if gain != 0 and log.shape[0] and controller.response(problem) is None:
         plant = problem.plant
         states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import resolved
 from fpirhc.describe import describe
 from fpirhc.simulation.common_columns import with_common_columns
 from fpirhc.simulation.loop import close_loop, start_memory
@@ -60,10 +61,10 @@ class Simulator:
         logged, stop = _run_chunks(problem, start, self.loop.trace, self.evaluator, seed, progress)
         layout, log = with_common_columns(self.loop.trace, logged)
         log.setflags(write=False)
-        step_limit = self.controller.adaptive.largest_step()
+        step_limit = self.controller.deformation.largest_step()
         settings = {
             "step_limit": step_limit if np.isfinite(step_limit) else None,
-            "effective_gain": float(self.controller.adaptive.effective_gain()),
+            "effective_gain": float(self.controller.deformation.effective_gain()),
             "parameters": [float(v) for v in self.controller.parameters(problem.plant)],
             "controller": describe(self.controller),
             "problem": describe(problem),
@@ -81,7 +82,7 @@ def simulator(
 
     `flags` go to the compiler after its usual ones.
     """
-    chosen = controller.resolved(problem)
+    chosen = resolved(problem, controller)
     loop = close_loop(problem, chosen)
     chunked = loop.function.mapaccum(f"{loop.function.name()}_run", CHUNK)
     backend = native(chunked, flags) if compiled else None

@@ -20,7 +20,17 @@ from fpirhc.symbolic.layout import Expression
 
 
 class Disturbance(ABC):
-    """Contract: values at the given times."""
+    """Contract: values at the given times, and how suddenly and how fast they change, as far as that is known."""
+
+    @property
+    def jump(self) -> float:
+        """Size of its largest sudden change, in the unit of what it adds to; zero where it has none or it is not known."""
+        return 0.0
+
+    @property
+    def slew(self) -> float:
+        """How fast it changes otherwise, per second; zero where that is not known, and for noise, which is no motion to follow."""
+        return 0.0
 
     @abstractmethod
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -33,6 +43,11 @@ class Step(Disturbance):
 
     at: float
     size: float
+
+    @property
+    def jump(self) -> float:
+        """The size."""
+        return abs(self.size)
 
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:  # noqa: ARG002
         """Return the step's values."""
@@ -47,6 +62,11 @@ class Pulse(Disturbance):
     duration: float
     size: float
 
+    @property
+    def jump(self) -> float:
+        """The size."""
+        return abs(self.size)
+
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:  # noqa: ARG002
         """Return the pulse's values."""
         return np.where((times >= self.at) & (times < self.at + self.duration), self.size, 0.0)
@@ -59,6 +79,11 @@ class Sine(Disturbance):
     amplitude: float
     frequency: float
     phase: float = 0.0
+
+    @property
+    def slew(self) -> float:
+        """2 pi frequency amplitude."""
+        return abs(2 * math.pi * self.frequency * self.amplitude)
 
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:  # noqa: ARG002
         """Return the sine's values."""

@@ -21,7 +21,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.tracking.base import Tracking
+from fpirhc.tracking.base import Feedback, Tracking
 from fpirhc.tracking.error import error_chains, error_signal, integral_delay, integral_signal, integral_update
 
 
@@ -50,6 +50,15 @@ class Exponential(Tracking):
         """Gains of (e_int, e, e', ...) with the integral, of (e, e', ...) without; lowest derivative first."""
         degree = order + 1 if self.integral else order
         return tuple(math.comb(degree, s) * self.rate ** (degree - s) for s in range(degree))
+
+    @property
+    def speed(self) -> float:
+        """Lambda."""
+        return self.rate
+
+    def feedback(self, order: int) -> Feedback:
+        """Its gains for that order."""
+        return Feedback(self.gains(order), self.integral, self.bumpless, self.rate)
 
     def law(self, plant: Plant, period: float) -> Block:
         """Block (state, target, nominal, started, integral) -> (error to the target, desired, integral in use)."""

@@ -97,6 +97,11 @@ class Fractional(Tracking):
         """Gains of (e_int, e, e', ...) in S below its highest derivative, for relative order n."""
         return tuple(math.comb(order, s) * self.rate ** (order - s) for s in range(order))
 
+    @property
+    def speed(self) -> float:
+        """Lambda."""
+        return self.rate
+
     def law(self, plant: Plant, period: float) -> Block:
         """Block (state, target, nominal, started, integral) -> (error to the target, desired, integral in use)."""
         cycles, size = self.cycles(period), len(plant.controlled_names)

@@ -60,7 +60,7 @@ class AccelerationFeedback(Controller):
             )
 
     @property
-    def adaptive(self) -> Deformation:
+    def deformation(self) -> Deformation:
         """None: the request is not iterated."""
         return Identity()
 

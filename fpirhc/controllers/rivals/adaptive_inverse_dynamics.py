@@ -9,7 +9,6 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
-from fpirhc.controllers.automatic_scale import scaled_for_reference
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block, rename
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, fed, learning_delays
 from fpirhc.deformation.base import Deformation
@@ -57,13 +56,9 @@ class AdaptiveInverseDynamics(Controller):
     deformation: Deformation = field(default_factory=Identity)
 
     @property
-    def adaptive(self) -> Deformation:
-        """The deformation in use."""
-        return self.deformation
-
-    def resolved(self, problem: Problem) -> AdaptiveInverseDynamics:
-        """Return the controller with the deformation's scale chosen."""
-        return replace(self, deformation=scaled_for_reference(self.deformation, problem))
+    def learns(self) -> bool:
+        """It does."""
+        return True
 
     def check(self, problem: Problem) -> None:
         """Raise if plant, bounds or rule do not fit (see Learning.check)."""

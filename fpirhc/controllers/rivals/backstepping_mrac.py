@@ -16,12 +16,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.automatic_scale import scaled_for_reference
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
 from fpirhc.controllers.rivals.reference_model import model_block
 from fpirhc.deformation.base import Deformation
@@ -57,15 +56,6 @@ class BacksteppingMRAC(Controller):
             raise InvalidValue(
                 f"BacksteppingMRAC(model_rate={self.model_rate!r}, rates={self.rates!r}): expected positive numbers, 1/s"
             )
-
-    @property
-    def adaptive(self) -> Deformation:
-        """The deformation in use."""
-        return self.deformation
-
-    def resolved(self, problem: Problem) -> BacksteppingMRAC:
-        """Return the controller with the deformation's scale chosen."""
-        return replace(self, deformation=scaled_for_reference(self.deformation, problem))
 
     def check(self, problem: Problem) -> None:
         """Raise if the rates do not fit the relative orders.

@@ -18,14 +18,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.automatic_scale import scaled_for_command
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block, rename
-from fpirhc.deformation.base import Deformation
+from fpirhc.controllers.demands import command_demand
+from fpirhc.deformation.base import Deformation, Demand
 from fpirhc.errors import Mistakes
 from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
@@ -50,19 +50,13 @@ class ForceMRAC(Controller):
     deformation: Deformation
     model: Mapping[str, float] = field(default_factory=dict)
 
-    @property
-    def adaptive(self) -> Deformation:
-        """The deformation in use."""
-        return self.deformation
+    def demand(self, problem: Problem) -> Demand:
+        """Of the command that the reference model needs along the reference."""
+        return command_demand(problem, self.parameters(problem.plant))
 
     def parameters(self, plant: Plant) -> np.ndarray:
         """Parameters of the reference model."""
         return np.array([self.model.get(n, p.approximate) for n, p in plant.parameters.items()], dtype=float)
-
-    def resolved(self, problem: Problem) -> ForceMRAC:
-        """Return the controller with the deformation's scale chosen."""
-        values = self.parameters(problem.plant)
-        return replace(self, deformation=scaled_for_command(self.deformation, problem, values))
 
     def check(self, problem: Problem) -> None:
         """Raise if the reference model has parameters that the plant does not have, or values that are no numbers.

@@ -69,9 +69,14 @@ class LyapunovMRAC(Controller):
             raise InvalidValue(f"LyapunovMRAC(leakage={self.leakage!r}): expected 0 or more, 1/s")
 
     @property
-    def adaptive(self) -> Deformation:
+    def deformation(self) -> Deformation:
         """None: gains are adapted, no request is iterated."""
         return Identity()
+
+    @property
+    def learns(self) -> bool:
+        """It does."""
+        return True
 
     def weights(self, order: int) -> np.ndarray:
         """P of the scaled error z for one coordinate, shape (order, order)."""

@@ -50,7 +50,7 @@ class PID(Controller):
     bumpless: bool = True
 
     @property
-    def adaptive(self) -> Deformation:
+    def deformation(self) -> Deformation:
         """None: there is no model whose request could be deformed."""
         return Identity()
 

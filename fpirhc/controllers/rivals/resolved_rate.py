@@ -63,7 +63,7 @@ class ResolvedAccelerationRate(Controller):
             raise InvalidValue(f"ResolvedAccelerationRate(rate={self.rate!r}): expected a positive number, 1/s")
 
     @property
-    def adaptive(self) -> Deformation:
+    def deformation(self) -> Deformation:
         """None: no request is iterated."""
         return Identity()
 

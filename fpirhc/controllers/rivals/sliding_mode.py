@@ -57,7 +57,7 @@ class SlidingMode(Controller):
                 raise InvalidValue(f"SlidingMode({name}={value!r}): expected a positive number")
 
     @property
-    def adaptive(self) -> Deformation:
+    def deformation(self) -> Deformation:
         """None: the model is trusted up to the switching term."""
         return Identity()
 
@@ -79,7 +79,7 @@ class SlidingMode(Controller):
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Blocks reference, surface, deform, invert, limit, judge."""
         response = problem.plant.response_signal("_reference_response")
-        closing, delays = closing_blocks(problem, self.adaptive)
+        closing, delays = closing_blocks(problem, self.deformation)
         blocks = [
             reference_block(problem),
             rename("nominal", response, problem.plant.response_signal("nominal")),

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 
 import casadi as ca
 
-from fpirhc.controllers.automatic_scale import scaled_for_reference
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
 from fpirhc.controllers.rivals.learned_parameters import Learning, fed, learning_delays
 from fpirhc.deformation.base import Deformation
@@ -65,13 +64,9 @@ class SlotineLi(Controller):
                 raise InvalidValue(f"SlotineLi: '{name}' is {value!r}; expected a positive number")
 
     @property
-    def adaptive(self) -> Deformation:
-        """The deformation in use."""
-        return self.deformation
-
-    def resolved(self, problem: Problem) -> SlotineLi:
-        """Return the controller with the deformation's scale chosen."""
-        return replace(self, deformation=scaled_for_reference(self.deformation, problem))
+    def learns(self) -> bool:
+        """It does."""
+        return True
 
     def check(self, problem: Problem) -> None:
         """Raise if plant, damping, bounds or rule do not fit (see Learning.check)."""
@@ -98,7 +93,7 @@ class SlotineLi(Controller):
 
     @property
     def _deforms(self) -> bool:
-        return not isinstance(self.deformation, Identity)
+        return self.deformation.adapts
 
     @property
     def _learning(self) -> Learning:

@@ -15,9 +15,6 @@ import numpy as np
 
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
-from fpirhc.deformation.wrappers.base import Wrapper
-from fpirhc.deformation.wrappers.delayed import Increment, Paired
-from fpirhc.deformation.wrappers.self_paired import SelfPaired
 from fpirhc.errors import InvalidProblem, NotInvertible, NotSupported
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.relative_order import OutputChain, output_chain
@@ -49,7 +46,7 @@ class Slot:
     @property
     def adapts(self) -> bool:
         """Whether the slot has a deformation."""
-        return not isinstance(self.deformation, Identity)
+        return self.deformation.adapts
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,12 +100,12 @@ def channel(problem: Problem, slot: Slot, number: int) -> Channel:
 
 
 def _check_deformation(deformation: Deformation) -> None:
-    inner = deformation
-    while isinstance(inner, Wrapper) and not isinstance(inner, Paired | Increment | SelfPaired):
-        inner = inner.map
-    if isinstance(inner, Paired | Increment | SelfPaired):
+    if deformation.pairing is not None:
+        pairs = deformation
+        while pairs.inner is not None and pairs.inner.pairing is not None:
+            pairs = pairs.inner
         raise NotSupported(
-            f"{type(inner).__name__} keeps pairs of earlier cycles, which belong to another slot after a switch; "
+            f"{type(pairs).__name__} keeps pairs of earlier cycles, which belong to another slot after a switch; "
             "use the map itself"
         )
 

@@ -15,7 +15,6 @@ import numpy as np
 
 from fpirhc.controllers.slots.slot import Channel
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.exponential import Exponential
 
 _STILL = 1e-6  # size of a derivative, relative to its terms, that counts as zero
 
@@ -74,9 +73,9 @@ def linear_modes(
 
     Parameters: `parameters` of the plant, shape (np,); `blend` as in Slotted, s.
     """
-    other = [c.slot.coordinate for c in channels if not isinstance(c.slot.tracking, Exponential)]
+    other = [c.slot.coordinate for c in channels if c.slot.tracking.feedback(c.chain.order) is None]
     if other:
-        return [], f"the tracking law of slot '{other[0]}' is not Exponential, whose gains are known"
+        return [], f"the tracking law of slot '{other[0]}' is no feedback with constant gains, such as Exponential"
     found = _set_point(problem, parameters)
     if isinstance(found, str):
         return [], found
@@ -104,8 +103,8 @@ def _set_point(problem: Problem, parameters: np.ndarray) -> tuple[np.ndarray, np
 def _mode(
     problem: Problem, one: Channel, parameters: np.ndarray, blend: float, state: np.ndarray, command: np.ndarray
 ) -> Mode:
-    plant, law = problem.plant, one.slot.tracking
-    assert isinstance(law, Exponential)
+    plant, law = problem.plant, one.slot.tracking.feedback(one.chain.order)
+    assert law is not None
     x, u, p = plant._symbols()
     rate, calm = plant.derivative_function(x, u, p), ca.SX.zeros(len(plant.names))
     chosen = u[plant.input.elements.index(one.chain.input)]
@@ -113,7 +112,7 @@ def _mode(
     wanted = [(rate, x), (rate, chosen), (one.chain.states(x, p), x), (realised, x), (realised, chosen)]
     function = ca.Function("fpirhc_linear", [x, u, p], [ca.densify(ca.jacobian(f, v)) for f, v in wanted])
     a, b, chain, own, gain = (np.asarray(v.full()) for v in function(state, command, parameters))
-    n, gains = a.shape[0], np.array(law.gains(one.chain.order))
+    n, gains = a.shape[0], np.array(law.gains)
     integral, proportional = (gains[0], gains[1:]) if law.integral else (0.0, gains)
     feedback = proportional @ chain
     desired = np.concatenate([-feedback, [integral, 0.0]])

@@ -30,7 +30,7 @@ import numpy as np
 
 from fpirhc.contraction import Spectrum, assess_gain
 from fpirhc.controllers.base import Controller, Response, deform_block, like
-from fpirhc.controllers.slots.floquet import radius_of
+from fpirhc.controllers.slots.floquet import Floquet, radius_of
 from fpirhc.controllers.slots.schedules import Schedule
 from fpirhc.controllers.slots.slot import Channel, Slot, channel, delays_for_channel, for_channel
 from fpirhc.controllers.slots.slot_blocks import (
@@ -94,7 +94,7 @@ class Slotted(Controller):
             raise InvalidValue(f"Slotted(largest_growth={self.largest_growth!r}): expected a factor above 1")
 
     @property
-    def adaptive(self) -> Deformation:
+    def deformation(self) -> Deformation:
         """The first slot's deformation that iterates, or Identity."""
         return next((s.deformation for s in self.slots if s.adapts), Identity())
 
@@ -106,9 +106,17 @@ class Slotted(Controller):
         found = ca.vertcat(*(c.chain.response(x, u, p, w) for c in channels))
         return Response(by_slot(channels, "realised"), ca.Function("fpirhc_slots_realised", [x, u, p, w], [found]))
 
+    def demand(self, problem: Problem) -> None:
+        """None: every slot's deformation has its scale given."""
+        del problem
+
+    def floquet(self, problem: Problem) -> Floquet:
+        """Of the schedule, with ideal deformations and the plant's exact parameters."""
+        return radius_of(problem, self.channels(problem), self.schedule, self.blend)
+
     def notes(self, problem: Problem) -> tuple[str, ...]:
         """The Floquet radius of the schedule, and each slot's fastest divergence."""
-        found = radius_of(problem, self.channels(problem), self.schedule, self.blend)
+        found = self.floquet(problem)
         if found.radius is None:
             return (f"no Floquet radius: {found.reason}",)
         alone = ", ".join(

@@ -10,21 +10,22 @@ inverse every cycle, in a receding horizon whenever it plans.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import casadi as ca
-import numpy as np
 
 from fpirhc.controllers.base import FINITE, Controller, compose_controller, embedded, like
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotSupported
 from fpirhc.learning.estimators.base import Estimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
-from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.task.problem import Problem
+
+_BELIEVED = "_believed"
 
 
 @dataclass(frozen=True)
@@ -39,21 +40,33 @@ class Estimating(Controller):
     estimator: Estimator
 
     @property
-    def adaptive(self) -> Deformation:
-        """The wrapped controller's deformation."""
-        return self.controller.adaptive
+    def inner(self) -> Controller:
+        """The wrapped controller."""
+        return self.controller
 
-    def parameters(self, plant: Plant) -> np.ndarray:
-        """The wrapped controller's parameters, from which the estimate starts."""
-        return self.controller.parameters(plant)
-
-    def resolved(self, problem: Problem) -> Estimating:
-        """Return the wrapped controller resolved."""
-        return replace(self, controller=self.controller.resolved(self._modelled(problem)))
-
-    def notes(self, problem: Problem) -> tuple[str, ...]:
+    @property
+    def deformation(self) -> Deformation:
         """The wrapped controller's."""
-        return self.controller.notes(self._modelled(problem))
+        return self.controller.deformation
+
+    def inner_problem(self, problem: Problem) -> Problem:
+        """The problem with the estimator's model of the plant."""
+        model = self.estimator.model(problem.plant)
+        return problem if model is problem.plant else replace(problem, plant=model)
+
+    @property
+    def feeds(self) -> Mapping[str, str]:
+        """The wrapped controller reads the corrected parameters."""
+        return {"parameters": _BELIEVED, **self.controller.feeds}
+
+    @property
+    def learns(self) -> bool:
+        """It does."""
+        return True
+
+    def linear_around(self, inner: Controller) -> Controller:
+        """The wrapped one: near the reference the model is the one that it begins with."""
+        return inner
 
     def check(self, problem: Problem) -> None:
         """Raise what the wrapped controller and the estimator raise.
@@ -62,7 +75,7 @@ class Estimating(Controller):
             NotSupported: dead time, with which the response answers another command than the last; or a controller that
             reads a response of its own.
         """
-        modelled = self._modelled(problem)
+        modelled = self.inner_problem(problem)
         self.estimator.check(modelled)
         self.controller.check(modelled)
         if problem.dead_time.measurement or any(problem.dead_time.inputs.values()):
@@ -76,20 +89,15 @@ class Estimating(Controller):
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Blocks estimate, and the wrapped controller as one."""
-        modelled = self._modelled(problem)
+        modelled = self.inner_problem(problem)
         inner = compose_controller(modelled, self.controller)
-        believed = Signal("_believed", modelled.plant.parameter.elements, modelled.plant.parameter.units)
+        believed = Signal(_BELIEVED, modelled.plant.parameter.elements, modelled.plant.parameter.units)
         acted = like(problem.plant.input, "_acted")
         blocks = [
             _estimate_block(problem, modelled, self.estimator, believed, acted),
             embedded("controller", inner, {"parameters": believed}),
         ]
         return blocks, [Delay(acted, problem.plant.input.name)]
-
-    def _modelled(self, problem: Problem) -> Problem:
-        """The problem as the wrapped controller sees it."""
-        model = self.estimator.model(problem.plant)
-        return problem if model is problem.plant else replace(problem, plant=model)
 
 
 def _estimate_block(

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fpirhc.controllers.base import Controller, Response
+from fpirhc.controllers.base import Controller
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
@@ -20,39 +20,31 @@ class ExactModel(Controller):
     controller: Controller
 
     @property
-    def adaptive(self) -> Deformation:
-        """The wrapped controller's deformation."""
-        return self.controller.adaptive
+    def inner(self) -> Controller:
+        """The wrapped controller."""
+        return self.controller
+
+    @property
+    def deformation(self) -> Deformation:
+        """The wrapped controller's."""
+        return self.controller.deformation
+
+    def inner_problem(self, problem: Problem) -> Problem:
+        """The problem as one sees it who knows the plant: what is prepared before a run has the exact parameters too."""
+        exact = {name: replace(p, approximate=p.exact) for name, p in problem.plant.parameters.items()}
+        return replace(problem, plant=replace(problem.plant, parameters=exact))
+
+    def linear_around(self, inner: Controller) -> Controller:
+        """The wrapped one: what is believed is given beside."""
+        return inner
 
     def parameters(self, plant: Plant) -> np.ndarray:
         """The exact parameters."""
         return plant.exact
 
-    def resolved(self, problem: Problem) -> ExactModel:
-        """Return the wrapped controller resolved."""
-        return replace(self, controller=self.controller.resolved(_told(problem)))
-
-    def response(self, problem: Problem) -> Response | None:
-        """The wrapped controller's."""
-        return self.controller.response(_told(problem))
-
-    def notes(self, problem: Problem) -> tuple[str, ...]:
-        """The wrapped controller's."""
-        return self.controller.notes(_told(problem))
-
-    def check(self, problem: Problem) -> None:
-        """Raise what the wrapped controller raises."""
-        self.controller.check(_told(problem))
-
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Blocks of the wrapped controller."""
-        return self.controller.blocks(_told(problem))
-
-
-def _told(problem: Problem) -> Problem:
-    """The problem as one sees it who knows the plant: what is prepared before a run has the exact parameters too."""
-    exact = {name: replace(p, approximate=p.exact) for name, p in problem.plant.parameters.items()}
-    return replace(problem, plant=replace(problem.plant, parameters=exact))
+        return self.controller.blocks(self.inner_problem(problem))
 
 
 def examples(inner: Controller) -> tuple[Controller, ...]:

@@ -15,12 +15,13 @@ Two ways to predict, as values:
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, Response, compose_controller, embedded, like
+from fpirhc.controllers.base import Controller, compose_controller, embedded, like
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.members import Example
@@ -159,25 +160,19 @@ class Predicted(Controller):
                 raise InvalidValue(f"Predicted({name}={value!r}): expected a number of seconds of at least 0")
 
     @property
-    def adaptive(self) -> Deformation:
-        """The wrapped controller's deformation."""
-        return self.controller.adaptive
+    def inner(self) -> Controller:
+        """The wrapped controller."""
+        return self.controller
 
-    def parameters(self, plant: Plant) -> np.ndarray:
-        """The wrapped controller's parameters."""
-        return self.controller.parameters(plant)
-
-    def resolved(self, problem: Problem) -> Predicted:
-        """Return the wrapped controller resolved."""
-        return replace(self, controller=self.controller.resolved(problem))
-
-    def response(self, problem: Problem) -> Response | None:
+    @property
+    def deformation(self) -> Deformation:
         """The wrapped controller's."""
-        return self.controller.response(problem)
+        return self.controller.deformation
 
-    def notes(self, problem: Problem) -> tuple[str, ...]:
-        """The wrapped controller's."""
-        return self.controller.notes(problem)
+    @property
+    def feeds(self) -> Mapping[str, str]:
+        """The wrapped controller reads time and state ahead."""
+        return {"time": "time_ahead", "state": "state_ahead", **self.controller.feeds}
 
     def check(self, problem: Problem) -> None:
         """Raise what the wrapped controller raises, and if the plant or the dead time does not fit.

@@ -21,6 +21,11 @@ class Wrapper(Deformation, ABC):
     map: Deformation
 
     @property
+    def inner(self) -> Deformation:
+        """The map."""
+        return self.map
+
+    @property
     def gain(self) -> float:
         """The map's own gain."""
         return float(getattr(self.map, self.map.gain_name))

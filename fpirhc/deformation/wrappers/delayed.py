@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, Pairing
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.expression import total
@@ -59,6 +59,16 @@ class _Queued(Wrapper):
                 f"{type(self).__name__}(uncertainty={self.uncertainty!r}): expected whole cycles from 0 to the dead time of "
                 f"{self.cycles:g}"
             )
+
+    @property
+    def constant(self) -> bool:
+        """What it remembers are pairs; gain and pairing stay."""
+        return self.map.constant
+
+    @property
+    def pairing(self) -> Pairing:
+        """The dead time that it is given."""
+        return Pairing(self.cycles, self.uncertainty)
 
     @property
     def _length(self) -> int:

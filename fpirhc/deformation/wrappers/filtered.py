@@ -42,6 +42,16 @@ class Filtered(Wrapper):
                 f"Filtered(pole={self.pole!r}): expected a number from 0 to below 1; exp(-period / time constant) is one"
             )
 
+    @property
+    def constant(self) -> bool:
+        """What it remembers changes neither gain nor pairing."""
+        return self.map.constant
+
+    @property
+    def error_pole(self) -> float:
+        """The filter's."""
+        return self.pole
+
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """The filtered error, and the map's own memory."""
         return Layout((Signal("filter_error", elements),)) + self.map.memory(elements)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, Pairing
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.deformation.wrappers.delay_estimate import SIGNALS, estimate_memory, estimated
 from fpirhc.errors import InvalidValue
@@ -44,6 +44,11 @@ class DelayWatched(Wrapper):
 
     def __post_init__(self) -> None:
         _check_most(type(self).__name__, self.most)
+
+    @property
+    def constant(self) -> bool:
+        """What it remembers serves the estimate alone."""
+        return self.map.constant
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """The estimate's memory and the map's own."""
@@ -82,6 +87,11 @@ class SelfPaired(Wrapper):
         _check_most(type(self).__name__, self.most)
         if not 0 < self.confidence < 1:
             raise InvalidValue(f"SelfPaired(confidence={self.confidence!r}): expected a share between 0 and 1")
+
+    @property
+    def pairing(self) -> Pairing:
+        """Estimated on line."""
+        return Pairing(None)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """Past requests, what is believed and for how long the estimate has stood; the estimate's memory and the map's own."""

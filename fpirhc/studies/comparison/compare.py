@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from fpirhc.contraction import ContractionReport, Spectrum, assess_gain, identified_factor, spectrum_over_run
-from fpirhc.controllers.base import Controller, prepared
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import checked, resolved
 from fpirhc.deformation.identity import Identity
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, nearest
@@ -165,7 +166,7 @@ def check_gains(task: Task, chosen: Mapping[str, Controller]) -> None:
     mistakes = Mistakes(f"problem '{task.name}'")
     for name, controller in chosen.items():
         try:
-            prepared(task.problem, controller)
+            checked(task.problem, controller)
         except NotContractive as error:
             mistakes.add(f"controller '{name}': {error}")
         except FpirhcError:
@@ -191,26 +192,26 @@ def _entry(
     progress: Progress | None,
 ) -> Entry:
     problem = task.problem
-    resolved = controller.resolved(problem)
+    ready = resolved(problem, controller)
 
     def report(done: int, total: int) -> None:
         if progress:
             progress(name, done, total)
 
     report(0, problem.cycles)
-    run = simulate(problem, resolved, seed=seed, name=name, compiled=compiled, progress=report)
-    adaptive = not isinstance(resolved.adaptive, Identity)
-    view = lyapunov_view(problem, resolved, run)
+    run = simulate(problem, ready, seed=seed, name=name, compiled=compiled, progress=report)
+    adaptive = ready.deformation.adapts
+    view = lyapunov_view(problem, ready, run)
     return Entry(
         name=name,
         run=run,
         metrics=measure(problem, run, task.metrics),
-        cycle=measure_cycle(problem, resolved, run, compiled=compiled),
+        cycle=measure_cycle(problem, ready, run, compiled=compiled),
         adaptive=adaptive,
         pair=_pair(chosen, name) if adaptive else None,
-        contraction=measure_contraction(problem, resolved, run) if adaptive else None,
-        optimality=measure_optimality(problem, resolved, run, compiled=compiled),
-        notes=(*_notes(controller, resolved), *resolved.notes(problem), *([view.text] if view else [])),
+        contraction=measure_contraction(problem, ready, run) if adaptive else None,
+        optimality=measure_optimality(problem, ready, run, compiled=compiled),
+        notes=(*_notes(controller, ready), *ready.notes(problem), *([view.text] if view else [])),
         lyapunov=view,
     )
 
@@ -219,7 +220,7 @@ def _pair(chosen: Mapping[str, Controller], name: str) -> str | None:
     """The controller with the same settings and no adaptation."""
     wanted = _without_adaptation(describe(chosen[name]))
     for other, controller in chosen.items():
-        if isinstance(controller.adaptive, Identity) and describe(controller) == wanted:
+        if not controller.deformation.adapts and describe(controller) == wanted:
             return other
     return None
 
@@ -237,7 +238,7 @@ def measure_contraction(problem: Problem, controller: Controller, run: Run) -> C
     """Predicted along the run and measured from it; None when the run is too short, or the response not the plant's own."""
     if run.cycles < 10 or controller.response(problem) is not None:
         return None
-    deformation = controller.adaptive
+    deformation = controller.deformation
     rows = np.unique(np.linspace(1, run.cycles - 1, 200).astype(int))
     spectrum = spectrum_over_run(
         problem.plant, run["state"][rows], run["deformed"][rows], approximate=controller.parameters(problem.plant)
@@ -247,8 +248,8 @@ def measure_contraction(problem: Problem, controller: Controller, run: Run) -> C
     return Contraction(report.predicted, measured, report, spectrum)
 
 
-def _notes(asked: Controller, resolved: Controller) -> tuple[str, ...]:
-    if describe(asked) == describe(resolved):
+def _notes(asked: Controller, ready: Controller) -> tuple[str, ...]:
+    if describe(asked) == describe(ready):
         return ()
-    scale = getattr(resolved.adaptive, "scale", None)
+    scale = getattr(ready.deformation, "scale", None)
     return (f"scale S = {scale:g} was chosen automatically",)

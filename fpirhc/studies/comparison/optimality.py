@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fpirhc.controllers.base import Controller, prepared
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import checked
 from fpirhc.controllers.receding_horizon import RecedingHorizon
 from fpirhc.controllers.replanning import FromPlan
 from fpirhc.controllers.wrappers.exact_model import ExactModel
@@ -46,7 +47,7 @@ def measure_optimality(
 
     A negative number is another local optimum that the controller found and the solve from rest did not.
     """
-    chosen = planner(prepared(problem, controller))
+    chosen = planner(checked(problem, controller))
     if chosen is None or isinstance(chosen.replanning, FromPlan) or problem.horizon is None or run.cycles < 2:
         return None
     cost = chosen.cost or problem.cost

@@ -1,0 +1,209 @@
+"""The contract of controllers: blocks for a problem, and facts that reviews, studies and reports ask for.
+
+A controller that wraps another one tells it by `inner`. What it does not say otherwise is then the fact of the inner controller,
+on the problem that the inner one sees; so a wrapper of a wrapper is treated as what it is made of.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import TYPE_CHECKING, Any, Self
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.controllers.demands import plan_demand, reference_demand
+from fpirhc.controllers.gain_check import check_gain_sign, check_response_delay
+from fpirhc.deformation.base import Deformation, Demand, with_inner
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import NotSupported
+from fpirhc.horizon.cost import Cost
+from fpirhc.optimisers.base import Optimiser
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Signal
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.base import Tracking
+
+if TYPE_CHECKING:
+    from fpirhc.controllers.slots.floquet import Floquet
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """A response that the plant answers with: the signal 'realised' and its Function (state, input, parameters, forcing)."""
+
+    signal: Signal
+    function: ca.Function
+
+
+@dataclass(frozen=True)
+class Planner:
+    """What a controller plans with over the problem's horizon.
+
+    cost: of its own; None: the problem's. restarts: whether every plan starts from the measured state. tracking: the law that
+    keeps the plant on the planned motion between plans; None: the plan's first response is the desired one.
+    """
+
+    optimiser: Optimiser
+    cost: Cost | None
+    restarts: bool
+    tracking: Tracking | None
+
+
+class Controller(ABC):
+    """Contract: a frozen value that becomes blocks for a given problem.
+
+    Concrete controllers are frozen dataclasses. `fpirhc.conformance.check_controller` tests that a controller keeps this contract.
+    """
+
+    if TYPE_CHECKING:
+
+        @property
+        def deformation(self) -> Deformation:
+            """The deformation in use: a field or a property of every controller; Identity() when there is none."""
+
+        @property
+        def inner(self) -> Controller | None:
+            """The controller that this one wraps; None for one that stands alone."""
+
+    else:  # plain attributes, so that dataclasses may have fields of these names
+        deformation: Deformation
+        inner = None
+
+    @abstractmethod
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Blocks of one control cycle, from (time, state, realised, parameters) to 'command'."""
+
+    def around(self, inner: Controller) -> Self:
+        """Return the same wrapper around another controller.
+
+        Raises:
+            NotSupported: no field holds the inner controller; override `around`.
+        """
+        return with_inner(self, inner)
+
+    def inner_problem(self, problem: Problem) -> Problem:
+        """The problem that the inner controller sees."""
+        return problem
+
+    @property
+    def feeds(self) -> Mapping[str, str]:
+        """What the inner controller reads under other names: 'time', 'state', 'realised' or 'parameters' -> signal of a run."""
+        return {} if self.inner is None else self.inner.feeds
+
+    def linear_around(self, inner: Controller) -> Controller:
+        """What serves a linear plant as this wrapper does near the reference, `inner` serving it as the inner one does."""
+        return self.around(inner)
+
+    def parameters(self, plant: Plant) -> np.ndarray:
+        """Parameters that the controller believes: the approximate ones."""
+        return plant.approximate if self.inner is None else self.inner.parameters(plant)
+
+    @property
+    def learns(self) -> bool:
+        """Whether its model or its gains change on line, so that what is known of them before a run is how they begin."""
+        return False if self.inner is None else self.inner.learns
+
+    @property
+    def law(self) -> Tracking | None:
+        """The law by which it tracks the reference itself: its field `tracking`, if it has one."""
+        return getattr(self, "tracking", None) if self.inner is None else self.inner.law
+
+    @property
+    def planner(self) -> Planner | None:
+        """What it plans with; None for one that does not plan over a horizon."""
+        return None if self.inner is None else self.inner.planner
+
+    def with_optimiser(self, optimiser: Optimiser) -> Self:
+        """Return the controller with another optimiser in its planner.
+
+        Raises:
+            NotSupported: it does not plan, or not with an optimiser that can be replaced.
+        """
+        if self.inner is not None:
+            return self.around(self.inner.with_optimiser(optimiser))
+        raise NotSupported(f"{type(self).__name__} has no optimiser that can be replaced")
+
+    def with_deformation(self, deformation: Deformation) -> Self:
+        """Return the controller with another deformation.
+
+        Raises:
+            NotSupported: neither it nor an inner controller has a field `deformation`.
+        """
+        own: Any = self
+        if "deformation" in ([f.name for f in fields(own)] if is_dataclass(type(own)) else []):
+            return replace(own, deformation=deformation)
+        if self.inner is not None:
+            return self.around(self.inner.with_deformation(deformation))
+        raise NotSupported(f"{type(self).__name__} has no deformation that can be replaced")
+
+    def demand(self, problem: Problem) -> Demand | None:
+        """How much its desired response changes; None where it leaves the deformation's automatic settings open."""
+        if self.inner is not None:
+            return self.inner.demand(self.inner_problem(problem))
+        return reference_demand(problem) if self.planner is None else plan_demand(problem)
+
+    def response(self, problem: Problem) -> Response | None:
+        """What the controller reads as 'realised', where that is not the response of the plant's controlled coordinates."""
+        return None if self.inner is None else self.inner.response(self.inner_problem(problem))
+
+    def floquet(self, problem: Problem) -> Floquet | None:
+        """The stability of one period of a controller that switches; None for one that does not."""
+        return None if self.inner is None else self.inner.floquet(self.inner_problem(problem))
+
+    def notes(self, problem: Problem) -> tuple[str, ...]:
+        """Sentences about the controller on this problem for a reader of results."""
+        return () if self.inner is None else self.inner.notes(self.inner_problem(problem))
+
+    def check(self, problem: Problem) -> None:
+        """Raise if the controller cannot serve the problem."""
+        if self.inner is not None:
+            self.inner.check(self.inner_problem(problem))
+
+
+def resolved(problem: Problem, controller: Controller) -> Controller:
+    """Return the controller with every automatic setting replaced by its value for this problem.
+
+    Raises:
+        InvalidValue: a setting that cannot be chosen, with what to give.
+    """
+    if controller.inner is not None:
+        inner = resolved(controller.inner_problem(problem), controller.inner)
+        controller = controller if inner is controller.inner else controller.around(inner)
+    deformation = controller.deformation
+    demand = controller.demand(problem) if deformation.automatic else None
+    return controller if demand is None else controller.with_deformation(deformation.suited(demand))
+
+
+def checked(problem: Problem, controller: Controller) -> Controller:
+    """Return the resolved controller, checked against the problem.
+
+    Raises:
+        NotContractive: a deformation with a gain of the wrong sign, or one that its estimator or filter makes
+            unstable. NotSupported: own responses behind sensors or dead time. And what the controller's own check raises.
+    """
+    ready = resolved(problem, controller)
+    ready.check(problem)
+    if ready.response(problem) is None:
+        check_gain_sign(problem, ready.deformation)
+        check_response_delay(problem, ready.deformation)
+        return ready
+    late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
+    if late or not problem.sensing.ideal:
+        what = "dead time" if late else "sensing"
+        raise NotSupported(
+            f"{type(ready).__name__} reads responses of its own, at once and as they are; leave {what} out of the problem"
+        )
+    return ready
+
+
+def without_deformation(controller: Controller) -> Controller:
+    """Return the controller without adaptation.
+
+    Raises:
+        NotSupported: it has a deformation that cannot be left out.
+    """
+    return controller.with_deformation(Identity()) if controller.deformation.adapts else controller
