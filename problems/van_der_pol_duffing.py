@@ -15,8 +15,8 @@ the filter finds the disturbance in one cycle, and stays at 0.757 mm. Gains of t
 mm, but hundreds with 0.1, which trusts the first responses, far from linear in m. Moving horizon: noise of 0.1, 1, 10 gives
 0.32, 0.32, 1.0 mm.
 
-Tuned alike, `fpirhc tune van_der_pol_duffing --trials 25 --scenarios 3 --mismatch 20 --compile`, rms error divided by the range of
-the reference:
+Tuned alike, `fpirhc tune van_der_pol_duffing --trials 25 --scenarios 3 --mismatch 20 --compile`,
+rms error divided by the reference's range:
 offset-free 3.6e-4, RHC+FPI 1.2e-4 (gain -2.9), least squares 1.5e-4, moving horizon 1.4e-4.
 
 What the numbers do not say. The disturbance acts through the plan, ten times less often than the deformation: with a

@@ -20,10 +20,11 @@ from scipy import stats
 import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.errors import InvalidProblem, InvalidValue, OutputError, WorkerDied
+from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.studies.scenarios.bench import Bench, Conditions
 from fpirhc.studies.scenarios.bootstrap import median_interval, middle
-from fpirhc.studies.scenarios.draws import COMPARING, TUNING, check_percent, draw, mismatch_of, with_exact
+from fpirhc.studies.scenarios.draws import COMPARING, TUNING, draw, mismatch_of, with_exact
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.scenarios.paired import summarise, verdict
 from fpirhc.studies.scenarios.processes import DEATHS, Workers
@@ -114,12 +115,12 @@ def test_factors_are_log_uniform():
 
 def test_draws_that_could_leave_physical_bounds_are_refused(task):
     """The parameter is named, with how far it may be drawn: b = 1.6 may grow by one half to its bound of 2.4."""
-    check_percent(task.problem.plant, 49.9)
+    exact_ranges(task.problem.plant, 49.9)
     with pytest.raises(InvalidProblem, match=r"parameter 'b'.*at most 50 %"):
-        check_percent(task.problem.plant, 51.0)
+        exact_ranges(task.problem.plant, 51.0)
     for percent in (100.0, -1.0, math.nan):
         with pytest.raises(InvalidValue, match="at least 0 and below 100"):
-            check_percent(task.problem.plant, percent)
+            exact_ranges(task.problem.plant, percent)
 
 
 @pytest.mark.parametrize(

@@ -195,7 +195,7 @@ def scenarios_json(found: ScenarioComparison) -> str:
     """Return the comparison as JSON text; numbers that are not finite become null."""
     facts = {
         "problem": found.problem,
-        "seeds": found.count,
+        "scenarios": found.count,
         "seed": found.seed,
         "mismatch": found.percent,
         "versions": dict(found.versions),

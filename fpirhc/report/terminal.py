@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fpirhc.simulation.metrics.columns import Column, columns
+from fpirhc.simulation.simulate import SWITCHED_OFF
 from fpirhc.status import Status
 from fpirhc.summary import printable
 
@@ -41,11 +42,12 @@ def progress_bars() -> Iterator[Report]:
         yield report
 
 
-def announce_backend(comparison: Comparison) -> None:
-    """Say on standard error when loops ran without compiled C, and why."""
-    reasons = {str(e.run.settings["why not compiled"]) for e in comparison.entries if not e.run.compiled}
+def announce_backend(runs: Iterable[Run]) -> None:
+    """Print on standard error when loops of a command ran without compiled C, and why."""
+    reasons = {str(run.settings["why not compiled"]) for run in runs if not run.compiled}
     for reason in sorted(reasons):
-        print(f"fpirhc: some loops ran in CasADi's virtual machine, more slowly ({reason})", file=sys.stderr)
+        why = "--no-compile was given" if reason == SWITCHED_OFF else reason
+        print(f"fpirhc: loops ran in CasADi's virtual machine, more slowly, because {why}", file=sys.stderr)
 
 
 def show(comparison: Comparison, report: Path) -> None:

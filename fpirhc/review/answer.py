@@ -38,7 +38,7 @@ class Review:
 
     Parameters:
         problem: its answers. controllers: each one's answers by name.
-        mismatch: margin around the exact parameters, percent.
+        mismatch: range of the exact parameters, percent, see `fpirhc.plant.mismatch`.
     """
 
     problem: tuple[Answer, ...]

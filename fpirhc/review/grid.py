@@ -1,6 +1,6 @@
 """Where a review looks: points of the reference, and draws of the exact parameters from their box.
 
-The box of a parameter spans its approximate and its exact value and a margin of P percent around the exact one. At every point
+The box of a parameter spans the range of its exact value (see `fpirhc.plant.mismatch`) and its approximate value. At every point
 the input u* that the reference needs and the request r* that means it to the model are known from the symbols:
 
     u* = inverse(x^N, r^N; exact),        r* = response(x^N, u*; approximate),
@@ -17,6 +17,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.task.problem import Problem
 
 _POINTS = 41
@@ -78,11 +79,15 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
 
 
 def parameter_box(problem: Problem, mismatch: float) -> dict[str, tuple[float, float]]:
-    """Return the interval of every parameter of the plant."""
-    share = mismatch / 100
+    """Return the interval of every parameter of the plant: the range of the exact value, extended to the approximate one.
+
+    Raises:
+        InvalidValue, InvalidProblem: see `exact_ranges`.
+    """
+    ranges, parameters = exact_ranges(problem.plant, mismatch), problem.plant.parameters
     return {
-        name: (min(p.approximate, p.exact - share * abs(p.exact)), max(p.approximate, p.exact + share * abs(p.exact)))
-        for name, p in problem.plant.parameters.items()
+        n: (min(parameters[n].approximate, low), max(parameters[n].approximate, high))
+        for n, (low, high) in ranges.items()
     }
 
 

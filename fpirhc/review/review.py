@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -32,20 +31,17 @@ from fpirhc.review.well_posed import well_posed
 from fpirhc.review.zero_dynamics import is_planned, zero_dynamics, zero_dynamics_rate
 from fpirhc.task.problem import Problem
 
-LARGEST_MISMATCH = 100.0  # percent; beyond it a parameter may change its sign
-
 
 def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch: float, seed: int) -> Review:
     """Return the answers to all questions that can be asked before a run.
 
-    Parameters: `mismatch`: margin around the exact parameters, percent, 0 <= P < 100; the box spans the approximate values too.
+    Parameters: `mismatch` of the exact parameters, percent, see `fpirhc.plant.mismatch`; the box spans the approximate values too.
     `seed` of the draws from the box.
 
     Raises:
-        InvalidValue: a mismatch out of range. NotInvertible: the inputs and the controlled coordinates differ in number.
+        InvalidValue: a mismatch outside [0, 100). InvalidProblem: a range that leaves physical bounds.
+        NotInvertible: the inputs and the controlled coordinates differ in number.
     """
-    if not (math.isfinite(mismatch) and 0 <= mismatch < LARGEST_MISMATCH):
-        raise InvalidValue(f"mismatch={mismatch!r}: expected percent of at least 0 and below {LARGEST_MISMATCH:g}")
     grid = review_grid(problem, mismatch, seed)
     general = [well_posed(grid), relative_orders(grid), inverse_exists(grid), commands_inside(grid)]
     far = horizon_long_enough(grid)

@@ -27,6 +27,7 @@ from fpirhc.task.problem import Problem
 
 CHUNK = 500  # cycles per call: long enough to hide Python, short enough for progress and Ctrl-C
 Progress = Callable[[int, int], None]
+SWITCHED_OFF = "compiled=False was given"  # a reason why a loop is not compiled
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +88,7 @@ def simulator(
     chunked = loop.function.mapaccum(f"{loop.function.name()}_run", CHUNK)
     backend = native(chunked, flags) if compiled else None
     evaluator = Evaluator(backend.function if backend else chunked)
-    reason = backend.reason if backend else "not asked for"
+    reason = backend.reason if backend else SWITCHED_OFF
     return Simulator(problem, chosen, loop, evaluator, bool(backend and backend.compiled), reason)
 
 

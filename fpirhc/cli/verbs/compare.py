@@ -62,7 +62,7 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
     comparison = noted(comparison, tuned.notes) if tuned else comparison
     report = folder / "report.html"
     write_report(comparison, report)
-    announce_backend(comparison)
+    announce_backend(entry.run for entry in comparison.entries)
     if options.json:
         from fpirhc.report.as_json import to_json
 

@@ -26,7 +26,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
     from fpirhc.report.figures import save_figure
-    from fpirhc.report.terminal import progress_bars, show_run
+    from fpirhc.report.terminal import announce_backend, progress_bars, show_run
     from fpirhc.simulation.metrics import measure
     from fpirhc.simulation.simulate import simulate
     from fpirhc.studies.comparison.compare import select
@@ -46,6 +46,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     stem = "".join(c if c.isalnum() else "_" for c in name)
     run.save(folder / f"{stem}.npz")
     save_figure(run.plot(), folder / f"{stem}.png")
+    announce_backend([run])
     show_run(run, measure(task.problem, run, task.metrics), folder / f"{stem}.npz")
     return ExitCode.FINISHED if run.stop is None else ExitCode.ENDED_EARLY
 

@@ -12,10 +12,11 @@ from typing import Any
 
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError
+from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.metrics import measure
 from fpirhc.simulation.simulate import Simulator, simulator
-from fpirhc.studies.scenarios.draws import Scenario, check_percent, draw, with_exact
+from fpirhc.studies.scenarios.draws import Scenario, draw, with_exact
 from fpirhc.studies.scenarios.score import outcome, ranges, relative_error
 from fpirhc.task.problem import Problem
 
@@ -61,7 +62,7 @@ class Bench:
     """
 
     def __init__(self, task: Task, conditions: Conditions) -> None:
-        check_percent(task.problem.plant, conditions.percent)
+        exact_ranges(task.problem.plant, conditions.percent)
         self._task, self._conditions = task, conditions
         self._ranges = ranges(task.problem)
         self._simulators: dict[str, Simulator | FpirhcError] = {}

@@ -113,7 +113,7 @@ def tune(
     """
     optuna = _optuna()
     names = _chosen(task, controllers)
-    for name, value in (("trials", trials), ("seeds", count)):
+    for name, value in (("trials", trials), ("scenarios", count)):
         if value < 1:
             raise InvalidValue(f"{name} {value}: expected at least 1")
     conditions = Conditions(seed, TUNING, float(percent), compiled)

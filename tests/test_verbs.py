@@ -1,0 +1,355 @@
+"""Every command: found by a scan, explained by its help, and honest about its exit codes."""
+
+from __future__ import annotations
+
+import importlib.util
+import shlex
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from test_cli import GOOD, HORIZON, PLANNERS, TIGHT
+
+import fpirhc as fp
+from fpirhc.cli import discovery
+from fpirhc.cli import verbs as package
+from fpirhc.cli.discovery import shipped
+from fpirhc.cli.exit_codes import OF_EVERY_VERB, ExitCode
+from fpirhc.cli.main import main
+from fpirhc.problem_files.problem_file import shipped_problems
+from fpirhc.studies.comparison.optimiser_choices import OPTIMISERS
+
+ROOT = Path(__file__).resolve().parents[1]
+VERBS = tuple(shipped().values())
+THEIRS = """
+import argparse
+from fpirhc.cli.exit_codes import ExitCode
+from fpirhc.cli.verb import Verb
+
+def add(parser):
+    parser.add_argument("--code", type=int, default=0)
+
+def run(options):
+    print("theirs was here")
+    return ExitCode(options.code)
+
+VERB = Verb("theirs", "do something else", add, run, (("fpirhc theirs", "an example"),), {ExitCode.CHANGED: "it did"})
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """A working folder with a problem that is short, and its caches of commands left as they were."""
+    monkeypatch.chdir(tmp_path)
+    Path("line.py").write_text(
+        GOOD.replace("duration=2.0", "duration=0.2").replace("measure_from=1.0", "measure_from=0.1")
+    )
+    return tmp_path
+
+
+@pytest.fixture
+def scan():
+    """Commands are scanned for anew, before and after the test."""
+    discovery.shipped.cache_clear()
+    yield
+    discovery.shipped.cache_clear()
+    sys.modules.pop("fpirhc.cli.verbs.theirs", None)
+
+
+# --- Discovery --------------------------------------------------------------------------------------------------------
+
+
+def test_a_new_command_is_one_new_file(tmp_path, monkeypatch, capsys, scan):
+    """A module in the folder of commands is in the list, has help, and runs."""
+    (tmp_path / "theirs.py").write_text(THEIRS)
+    monkeypatch.setattr(package, "__path__", [*package.__path__, str(tmp_path)])
+    assert main(["theirs", "--code", "5"]) == 5
+    assert "theirs was here" in capsys.readouterr().out
+    assert main([]) == 0
+    assert "do something else" in capsys.readouterr().out
+
+
+@pytest.fixture
+def other_package(tmp_path, monkeypatch):
+    """A function that installs a package with an entry point."""
+
+    def install(name: str, target: str, code: str) -> None:
+        info = tmp_path / "other_fpirhc_package-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other-fpirhc-package\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text(f"[fpirhc.verbs]\n{name} = {target}\n")
+        (tmp_path / "other_fpirhc_package.py").write_text(code)
+        monkeypatch.syspath_prepend(str(tmp_path))
+
+    yield install
+    sys.modules.pop("other_fpirhc_package", None)
+
+
+def test_another_package_adds_a_command(other_package, capsys):
+    """It is listed without being imported, and runs when it is called."""
+    other_package("theirs", "other_fpirhc_package:VERB", THEIRS)
+    assert main([]) == 0
+    assert "theirs     (of the package other-fpirhc-package)" in capsys.readouterr().out
+    assert "other_fpirhc_package" not in sys.modules
+    assert main(["theirs"]) == 0
+    assert "theirs was here" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("raise RuntimeError('not today')", "cannot be imported (RuntimeError: not today)"),
+        ("VERB = 3", "is a int: its entry point fpirhc.verbs must name a value"),
+    ],
+)
+def test_a_broken_command_of_another_package_breaks_nothing_else(other_package, capsys, code, message):
+    """It says which package is at fault; the list of commands is as before."""
+    other_package("theirs", "other_fpirhc_package:VERB", code)
+    assert main(["theirs"]) == ExitCode.BAD_INPUT
+    assert message in capsys.readouterr().err
+    assert main(["list"]) == 0
+
+
+def test_another_package_replaces_no_command(other_package, capsys):
+    """A name that exists is ignored with a notice."""
+    other_package("list", "other_fpirhc_package:VERB", THEIRS)
+    assert main(["list"]) == 0
+    printed = capsys.readouterr()
+    assert "two_mass" in printed.out
+    assert "adds a command 'list', which exists: ignored" in printed.err
+
+
+def test_unknown_commands_get_the_nearest_name(capsys):
+    assert main(["comapre", "two_mass"]) == ExitCode.BAD_INPUT
+    assert "Did you mean 'compare'?" in capsys.readouterr().err
+
+
+# --- Help -------------------------------------------------------------------------------------------------------------
+
+
+def help_of(name: str, capsys) -> str:
+    with pytest.raises(SystemExit) as stop:
+        main([name, "--help"])
+    assert stop.value.code == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("verb", VERBS, ids=lambda v: v.name)
+def test_help_has_examples_and_every_exit_code(verb, capsys):
+    """Its own ones in its own words, and those of every command; every option has a text."""
+    printed = help_of(verb.name, capsys)
+    for line, remark in verb.examples:
+        assert line in printed
+        assert remark in printed
+    codes = printed.partition("exit codes:\n")[2].splitlines()
+    assert [int(line.split()[0]) for line in codes] == sorted({*OF_EVERY_VERB, *verb.codes})
+    for code, meaning in verb.codes.items():
+        assert f"{code:<4d} {meaning}" in printed
+    assert all(action.help for action in verb.parser()._actions)
+    assert "%%" not in printed
+
+
+@pytest.mark.parametrize("verb", VERBS, ids=lambda v: v.name)
+def test_examples_are_valid_commands(verb):
+    """Each is one that the parser of its command accepts, with problems and optimisers that exist."""
+    for line, _ in verb.examples:
+        program, name, *rest = shlex.split(line)
+        assert program == "fpirhc"
+        options = vars(shipped()[name].parser().parse_args(rest))
+        problems = [options["problem"]] if "problem" in options else options.get("problems", [])
+        assert all(p in shipped_problems() or p.startswith("my_") for p in problems)
+        assert set(options.get("optimisers") or ()) <= {*OPTIMISERS, "all"}
+        controllers = [
+            *(options.get("controllers") or ()),
+            *([options["controller"]] if "controller" in options else ()),
+        ]
+        for problem in set(problems) & set(shipped_problems()):
+            assert set(controllers) <= set(fp.load_problem(problem).controllers)
+
+
+@pytest.mark.parametrize("name", ["compare", "solve"])
+def test_help_names_every_optimiser(name, capsys):
+    """The names in the text are those that the study knows."""
+    words = " ".join(help_of(name, capsys).split())
+    assert f"{', '.join(OPTIMISERS)}, or all" in words
+
+
+def test_help_is_light():
+    """The list of commands is printed without any of the heavy libraries."""
+    heavy = ("casadi", "numpy", "scipy", "rich", "matplotlib", "control", "pandas", "osqp")
+    code = f"import sys; from fpirhc.cli.main import main; main([]); print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_pages_are_what_the_code_says():
+    """README's table of exit codes and the page about the command line are those that the script writes."""
+    spec = importlib.util.spec_from_file_location("make_command_line", ROOT / "docs" / "make_command_line.py")
+    maker = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(maker)
+    assert maker.README.read_text(encoding="utf-8") == maker.readme()
+    assert maker.PAGE.read_text(encoding="utf-8") == maker.page()
+    rows = [line.split("|") for line in maker.README.read_text(encoding="utf-8").splitlines() if line.startswith("| ")]
+    table = {int(r[1]): r[2].strip() for r in rows if r[1].strip().isdigit()}
+    assert table == {int(code): code.meaning for code in ExitCode}
+
+
+# --- Exit codes -------------------------------------------------------------------------------------------------------
+
+
+def edited(old: str, new: str) -> None:
+    text = Path("line.py").read_text()
+    assert old in text
+    Path("line.py").write_text(text.replace(old, new))
+
+
+def receding() -> None:
+    """The problem with a horizon and two planners."""
+    edited("    measure_from=0.1,\n", HORIZON.replace("1.0,", "0.1,", 1))
+    edited("controllers = {\n", PLANNERS)
+
+
+def tight() -> None:
+    """Limits that the first state violates."""
+    receding()
+    edited('limits=fp.Limits(inputs={"u": (-30.0, 30.0)})', TIGHT)
+
+
+def tunable() -> None:
+    edited("controllers = {", 'tuning = {"CTC+FPI": {"deformation.gain": fp.LogSpan(-1.0, -0.1)}}\ncontrollers = {')
+
+
+def diverging() -> None:
+    edited("- p.k * q.y", "- p.k * q.y + 1e-9 * ca.sqrt(0.5001 - q.y)")
+
+
+def too_weak() -> None:
+    edited("    measure_from", '    limits=fp.Limits(inputs={"u": (-0.01, 0.01)}),\n    measure_from')
+
+
+def taken() -> None:
+    Path("taken").write_text("a file, not a folder")
+
+
+def faster() -> None:
+    edited("2 * t", "3 * t")
+
+
+def stale() -> None:
+    edited("rate=6.0", "rate=7.0")
+
+
+# name of the command: (what to do before, its words, the exit code), one after the other
+JOURNEYS = {
+    "list": [(None, "", 0), (None, "--alll", 2)],
+    "review": [(None, "line.py", 0), (None, "line.py --mismatch 250", 2), (too_weak, "line.py", 1)],
+    "solve": [
+        (None, "line.py", 2),
+        (receding, "line.py", 0),
+        (taken, "line.py --out taken/results", 3),
+        (lambda: edited("inputs={\"u\": (-30.0, 30.0)}", TIGHT[len("limits=fp.Limits("):-1]), "line.py", 4),
+    ],
+    "run": [
+        (None, "line.py CTC --no-compile", 0),
+        (None, "line.py CCT", 2),
+        (taken, "line.py CTC --out taken/results", 3),
+        (diverging, "line.py CTC --no-compile", 4),
+    ],
+    "compare": [
+        (None, "line.py --no-compile", 0),
+        (None, "line.py --controllers CCT", 2),
+        (None, "line.py --scenarios 2 --mismatch 10 --no-compile --out twice", 0),
+        (None, "line.py --scenarios 2 --mismatch 20 --no-compile --out twice", 3),
+    ],
+    "tune": [
+        (None, "line.py", 2),
+        (tunable, "line.py --trials 2 --out tuned", 0),
+        (stale, "line.py --trials 2 --out tuned", 3),
+    ],
+    "new": [(None, "class", 2), (None, "arm", 0), (None, "arm", 3)],
+    "check": [
+        (None, "", 6),
+        (None, "--junit line.py", 3),
+        (lambda: main(["accept", "line.py", "--reason", "first", "--no-compile", "--seeds", "2"]), "--no-compile", 0),
+        (None, "lin.py", 2),
+        (faster, "--no-compile", 5),
+    ],
+    "accept": [
+        (None, "line.py --reason first --no-compile --seeds 2", 0),
+        (None, "line.py", 2),
+        (None, "line.py --reason first --baselines ../elsewhere", 3),
+    ],
+    "doctor": [(None, "--json", 0), (lambda: FAULTY.append(True), "", 7), (None, "--jsonn", 2)],
+}  # fmt: skip
+FAULTY: list[bool] = []
+
+
+@pytest.mark.parametrize("verb", VERBS, ids=lambda v: v.name)
+def test_exit_codes_are_those_of_the_help(verb, folder, monkeypatch, capsys):
+    """With right and wrong input every code that the help lists is met, and no other one."""
+    from fpirhc.doctor.examine import Diagnosis
+    from fpirhc.doctor.finding import Finding, Outcome
+
+    # The baseline of a new problem is measured in a test of its own.
+    monkeypatch.setattr("fpirhc.scaffold.create.first_baseline", lambda path: path.with_suffix(".json"))
+    monkeypatch.setattr(
+        "fpirhc.doctor.examine.examine",
+        lambda: Diagnosis({}, [Finding("a check", Outcome.FAIL if FAULTY else Outcome.OK, "found")]),
+    )
+    FAULTY.clear()
+    met = set()
+    for before, words, code in JOURNEYS[verb.name]:
+        if before:
+            before()
+        assert outcome([verb.name, *shlex.split(words)]) == code, (words, capsys.readouterr().err)
+        met.add(code)
+    assert met == set(verb.exit_codes) - {ExitCode.CRASHED, ExitCode.INTERRUPTED}
+
+
+def outcome(words: list[str]) -> int:
+    """The exit code, also where argparse ends the program."""
+    try:
+        return main(words)
+    except SystemExit as stop:
+        return int(stop.code)
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [(KeyboardInterrupt(), ExitCode.INTERRUPTED), (ZeroDivisionError("in a model"), ExitCode.CRASHED)],
+)
+def test_interrupts_and_crashes_have_codes_of_their_own(error, code, monkeypatch, capsys):
+    """A crash must not end with 1, which is an answer of the review; its traceback is printed."""
+
+    def run(options):
+        raise error
+
+    commands = {**shipped(), "list": replace(shipped()["list"], run=run)}
+    monkeypatch.setattr(discovery, "shipped", lambda: commands)
+    assert main(["list"]) == code
+    printed = capsys.readouterr().err
+    assert ("ZeroDivisionError: in a model" in printed) == (code == ExitCode.CRASHED)
+
+
+# --- Earlier names ----------------------------------------------------------------------------------------------------
+
+
+def test_bless_is_accept_for_one_version(folder, capsys):
+    """The command and the function do the same under the earlier name, and say the new one."""
+    assert main(["bless", "line.py", "--reason", " "]) == ExitCode.BAD_INPUT
+    printed = capsys.readouterr().err
+    assert "the command 'bless' is now 'accept'" in printed
+    assert "needs a reason" in printed
+    with pytest.warns(DeprecationWarning, match=r"fpirhc\.accept"), pytest.raises(ValueError, match="needs a reason"):
+        fp.bless(fp.load_problem("line.py"), " ")
+
+
+@pytest.mark.parametrize("name", ["compare", "tune"])
+def test_seeds_is_scenarios_for_one_version(name, capsys):
+    """The same value under the earlier option, with a notice; the seed is still another option."""
+    options = shipped()[name].parser().parse_args(["two_mass", "--seeds", "7", "--seed", "3"])
+    assert (options.scenarios, options.seed) == (7, 3)
+    assert "the option --seeds is now --scenarios" in capsys.readouterr().err
+    assert "--seeds" not in help_of(name, capsys)
