@@ -49,6 +49,11 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--mismatch", type=float, default=0.0, metavar="P", help="draw exact parameters within P percent (default: 0)"
     )
     command.add_argument(
+        "--metric",
+        metavar="NAME",
+        help="tune by this number of a run, such as settling.q1 (default: the relative error)",
+    )
+    command.add_argument(
         "--compile", action="store_true", help="compile every trial: pays where its runs last longer than the compiler"
     )
     command.set_defaults(command=run)
@@ -63,6 +68,7 @@ def run(options: argparse.Namespace) -> int:
 
     task = load_problem(options.problem)
     name = f"tuning_{options.seeds}x{options.mismatch:g}percent_seed{options.seed}"
+    name += f"_by_{options.metric}" if options.metric else ""
     folder = output_folder(Path(options.out) if options.out else Path("results") / task.name / name)
     try:
         with progress_bars() as progress:
@@ -74,6 +80,7 @@ def run(options: argparse.Namespace) -> int:
                 controllers=options.controllers,
                 count=options.seeds,
                 percent=options.mismatch,
+                metric=options.metric,
                 compiled=options.compile,
                 progress=progress,
             )
@@ -91,7 +98,7 @@ def _show(found: Tuning, saved: Path) -> None:
     from rich.table import Table
 
     console = Console()
-    title = f"{found.problem}: {found.trials} trials each, seed {found.seed}, {found.conditions}"
+    title = f"{found.problem}: {found.trials} trials each, seed {found.seed}, {found.conditions}, cost: {found.metric}"
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title)
     table.add_column("controller, setting", no_wrap=True)
     for head in ("before", "after", "failed"):
