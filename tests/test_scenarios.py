@@ -28,6 +28,7 @@ from fpirhc.studies.scenarios.draws import COMPARING, TUNING, draw, mismatch_of,
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.scenarios.paired import summarise, verdict
 from fpirhc.studies.scenarios.processes import DEATHS, Workers
+from fpirhc.studies.scenarios.score import outcome, ranges, relative_error
 
 LINE = '''"""A mass on a line with a wrong gain, pushed by noise."""
 import casadi as ca
@@ -219,6 +220,17 @@ def test_failures_are_counted_and_are_worse_than_any_error():
     assert "B and A show no clear difference" in told
     assert "B fails in 3 of 5 scenarios (3 ended early)" in told
     assert "Not run: C (no horizon)" in told
+
+
+def test_an_error_as_large_as_the_motion_has_diverged(task):
+    """Relative to the reference's range: 0.99 is an error, 1.01 is none; more coordinates count together."""
+    run = fp.simulate(task.problem, task.controllers["CTC"], seed=0, compiled=False)
+    assert [outcome(run, error) for error in (0.99, 1.01, math.inf)] == ["finished", "diverged", "diverged"]
+    assert outcome(replace(run, stop="signal 'x' is not finite"), 0.0) == "ended early"
+    sizes = ranges(task.problem)
+    assert sizes == pytest.approx({"y": 1.0}, rel=1e-5)  # sin(2 t) from 0 to 1.5 s
+    metrics = fp.measure(task.problem, run)
+    assert relative_error(metrics, sizes) == pytest.approx(metrics.rms_error["y"] / sizes["y"])
 
 
 def test_runs_that_end_early_or_stray_are_told_apart(task):

@@ -13,7 +13,7 @@ import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, NotSupported, OutputError, ProblemFileError
 from fpirhc.problem_files.settings import current_setting, is_whole
-from fpirhc.studies.tuning.tune import PENALTY
+from fpirhc.studies.tuning.objective import PENALTY, objective
 from fpirhc.studies.tuning.tuned_file import read_tuned, with_tuned
 
 LINE = '''"""A mass on a line with a wrong gain."""
@@ -155,6 +155,48 @@ def test_every_controller_gets_the_same_budget_and_none_gets_worse(task, tmp_pat
     error = fp.measure(task.problem, run).rms_error["y"]
     # Over 1.5 s the reference sin(2 t) moves between 0 and 1, so the relative error is the error itself.
     assert adaptive.cost == pytest.approx(error, rel=1e-5)
+
+
+def test_any_metric_with_a_direction_may_be_tuned_by(task, tmp_path):
+    """The cost is the number itself; where larger is better it has the opposite sign, and the best is the largest."""
+    largest = fp.Metric(
+        "share_inside", lambda problem, run: float((abs(run["true_error"]) < 1e-2).mean()), better="larger"
+    )
+    own = replace(task, metrics=(*task.metrics, largest))
+    for name, sign in (("max_error.y", 1), ("share_inside", -1)):
+        found = fp.tune(own, trials=4, seed=0, folder=tmp_path / name, controllers=["CTC+FPI"], metric=name)
+        changed = with_tuned(task, {e.name: e.settings for e in found.entries}).controllers["CTC+FPI"]
+        metrics = fp.measure(own.problem, fp.simulate(own.problem, changed, seed=0, compiled=False), own.metrics)
+        metric, _, element = name.partition(".")
+        assert found.entries[0].cost == pytest.approx(sign * metrics[metric][element])
+        assert found.entries[0].cost < found.entries[0].cost_before
+        assert found.facts()["metric"] == name
+    with pytest.raises(OutputError, match="metric was"):
+        fp.tune(own, trials=4, seed=0, folder=tmp_path / "max_error.y", controllers=["CTC+FPI"], metric="share_inside")
+
+
+@pytest.mark.parametrize(
+    ("metric", "error", "message"),
+    [
+        ("max_eror.y", InvalidName, "Did you mean 'max_error'"),
+        ("max_error", InvalidValue, "a number for every coordinate"),
+        ("effort.u", InvalidValue, "no better direction"),
+        ("max_error.z", InvalidName, "Did you mean 'max_error.y'"),
+    ],
+)
+def test_a_wrong_metric_is_refused(metric, error, message, task, tmp_path):
+    """Before anything runs, or as soon as a run shows that it has no such number."""
+    with pytest.raises(error, match=message):
+        fp.tune(task, trials=1, seed=0, folder=tmp_path / "t", metric=metric)
+
+
+def test_a_run_that_fails_costs_more_than_any_metric(task):
+    """Between one and two penalties, less if it lasted long; settings that cannot run cost two."""
+    aim = objective("max_error.y", task.metrics)
+    record = {"outcome": "ended early", "error": None, "lasted": 0.25, "metrics": {"max_error": {"y": None}}}
+    finished = {"outcome": "finished", "error": 0.1, "lasted": 1.0, "metrics": {"max_error": {"y": 3e5}}}
+    assert aim.cost(finished) == 3e5
+    assert 3e5 < aim.cost({**record, "lasted": 0.75}) < aim.cost(record) < aim.refused == aim.cost({"skipped": "why"})
 
 
 def test_failing_trials_cost_a_finite_penalty(task, tmp_path):

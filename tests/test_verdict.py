@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
+import numpy as np
 import pytest
 from plants import linear
 
 import fpirhc as fp
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.studies.comparison.compare import compare
+from fpirhc.simulation.metrics import Metrics, known_metrics
+from fpirhc.studies.comparison.compare import Entry, compare
+from fpirhc.studies.comparison.timing import CycleTime
+from fpirhc.studies.comparison.verdict import verdict
 
 TRACK = fp.Exponential(rate=6.0)
 
@@ -80,3 +85,79 @@ def test_unknown_entry_offers_the_nearest():
     """A comparison is read by name."""
     with pytest.raises(fp.FpirhcError, match="Did you mean 'plain'"):
         judged(fp.Sigmoid(gain=-0.5, scale=10.0))["plan"]
+
+
+# --- Its numbers ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """A controller without and one with adaptation; the tests give them errors and times of their own."""
+    return judged(fp.Sigmoid(gain=-0.5, scale=10.0)).entries
+
+
+def entry(source: Entry, micro: float = 5.0, **rms_error: float) -> Entry:
+    """The entry with these errors, and with this median time of a cycle."""
+    metrics = Metrics({"rms_error": rms_error}, {}, {m.name: m for m in known_metrics()})
+    return replace(source, metrics=metrics, cycle=CycleTime(micro, micro, micro, micro, micro))
+
+
+def said(pair, before, after, times=(5.0, 7.5)) -> str:
+    plain, adaptive = (entry(e, t, y=v) for e, t, v in zip(pair, times, (before, after), strict=True))
+    return verdict([plain, adaptive], {}, None)[0]
+
+
+def test_numbers_of_the_verdict(pair):
+    """From 0.5 m to 0.1 m is five times less, and 7.5 instead of 5 microseconds are 2.5 more."""
+    assert said(pair, 0.5, 0.1) == (
+        "adaptive lowers the rms error of y from 0.5 to 0.1 m (5 times less for y) at 2.5 more microseconds per cycle."
+    )
+    assert said(pair, 0.5, 0.1, times=(5.0, 4.0)).endswith("(5 times less for y) at no more time per cycle.")
+
+
+@pytest.mark.parametrize(
+    ("after", "words"),
+    [
+        (0.89, "lowers"),
+        (0.91, "makes no clear difference"),
+        (1.09, "makes no clear difference"),
+        (1.11, "does not help"),
+    ],
+)
+def test_a_tenth_more_or_less_is_a_difference(pair, after, words):
+    """Below 0.9 of the error it helps, above 1.1 it does not."""
+    assert said(pair, 1.0, after).startswith(f"adaptive {words}")
+
+
+def test_one_coordinate_that_is_no_better_spoils_the_verdict(pair):
+    """Ten times less in one coordinate and the same in the other is no clear difference."""
+    plain, adaptive = entry(pair[0], y=1.0, z=1.0), entry(pair[1], y=0.1, z=1.0)
+    plain, adaptive = (replace(e, run=_with_second_error(e.run)) for e in (plain, adaptive))
+    assert (
+        "makes no clear difference: the rms error of y from 1 to 0.1 m, z from 1 to 1 m"
+        in (verdict([plain, adaptive], {}, None)[0])
+    )
+
+
+def _with_second_error(run):
+    signals = tuple(
+        replace(s, elements=("y", "z"), units=("m",)) if s.name == "error" else s for s in run.layout.signals
+    )
+    return replace(run, layout=type(run.layout)(signals))
+
+
+def test_how_much_to_raise_the_scale_is_a_quarter_more_than_is_needed():
+    """The largest change of the desired response in a cycle over the map's largest step, and a quarter; then it is silent."""
+    deformation = fp.Sigmoid(gain=-0.5, scale=1e-3)
+    found = judged(deformation)
+    largest = np.abs(np.diff(found["plain"].run["desired.y"])).max()
+    needed = largest / deformation.largest_step()
+    assert f"changes by up to {largest:.3g} in one cycle" in found.verdict[0]
+    assert f"raise its scale S at least {1.25 * needed:.2g} times" in found.verdict[0]
+    assert "raise its scale" not in judged(replace(deformation, scale=1.25 * needed * 1e-3)).verdict[0]
+
+
+def test_without_a_pair_the_smallest_error_is_named(pair):
+    """By the worst coordinate of each."""
+    alone = [replace(entry(e, y=v), pair=None) for e, v in zip(pair, (0.25, 0.75), strict=True)]
+    assert verdict(alone, {}, None)[0].startswith("plain has the smallest rms error (0.25)")

@@ -91,12 +91,13 @@ def _table(comparison: Comparison) -> str:
         for n, w in comparison.skipped.items()
     )
     top = "".join(f"<th scope='col'>{_text(h)}</th>" for h in heads)
-    marked = " and ".join(
+    marked = ", ".join(
         dict.fromkeys(c.metric.heading for c in shown if c.metric.headline and c.metric.better != "neither")
     )
     caption = f"Errors, effort and cost from t = {comparison.measure_from:g} s on; seed {comparison.seed}."
     return (
-        f"<section><h2>Controllers</h2><p>{caption} The best {_text(marked)} is marked.</p><div class='scroll'><table><thead><tr>"
+        f"<section><h2>Controllers</h2><p>{caption} Marked are the best of: {_text(marked)}.</p>"
+        f"<div class='scroll'><table><thead><tr>"
         f"{top}</tr></thead><tbody>{rows}{skipped}</tbody></table></div></section>"
     )
 

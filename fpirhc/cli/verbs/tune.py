@@ -25,6 +25,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_seed(parser, "the proposals and scenarios")
     add_scenarios(parser, 1, "scenarios in every trial (default: 1)")
     add_mismatch(parser)
+    text = "tune by this number of a run, such as settling.q1 (default: the relative error)"
+    parser.add_argument("--metric", metavar="NAME", help=text)
     text = "compile every trial: pays where its runs last longer than the compiler"
     parser.add_argument("--compile", action="store_true", help=text)
 
@@ -37,6 +39,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
 
     task = load_problem(options.problem)
     name = f"tuning_{options.scenarios}x{options.mismatch:g}percent_seed{options.seed}"
+    name += f"_by_{options.metric}" if options.metric else ""
     folder = results_folder(options.out, task.name, name)
     try:
         with progress_bars() as progress:
@@ -48,6 +51,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
                 controllers=options.controllers,
                 count=options.scenarios,
                 percent=options.mismatch,
+                metric=options.metric,
                 compiled=options.compile,
                 progress=progress,
             )
@@ -65,7 +69,9 @@ def _show(tuning: Tuning, saved: Path) -> None:
     from rich.table import Table
 
     console = Console()
-    title = f"{tuning.problem}: {tuning.trials} trials each, seed {tuning.seed}, {tuning.conditions}"
+    title = (
+        f"{tuning.problem}: {tuning.trials} trials each, seed {tuning.seed}, {tuning.conditions}, cost: {tuning.metric}"
+    )
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title)
     table.add_column("controller, setting", no_wrap=True)
     for head in ("before", "after", "failed"):

@@ -1,6 +1,7 @@
 """Looks for better settings: every controller gets the same number of trials, the same scenarios and the same cost.
 
-The cost of a trial is the relative rms error (see `score`), the mean over the scenarios; what fails costs a finite penalty.
+The cost of a trial is the relative rms error (see `score`) or a metric, the mean over the scenarios; what fails costs a finite
+penalty.
 The scenarios are of a use of their own: settings are never tuned on what they are compared on. Settings are proposed by
 Optuna's tree-structured Parzen estimator. Its random numbers are drawn afresh for every trial from (seed, number of the trial),
 so that a study that was killed and goes on finds what an undisturbed one finds.
@@ -29,10 +30,10 @@ from fpirhc.studies.comparison.compare import select
 from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint
 from fpirhc.studies.scenarios.draws import TUNING
 from fpirhc.studies.scenarios.ledger import Ledger
+from fpirhc.studies.tuning.objective import Objective, objective
 from fpirhc.studies.tuning.tuned_file import as_python
 
 LEDGER = "trials.jsonl"
-PENALTY = 10.0  # relative error that no run can exceed; one that ended early costs up to twice as much, less if it lasted long
 _PRESENT = -1  # number of the trial of the settings as they are, which no budget counts
 Progress = Callable[[str, int, int], None]
 
@@ -51,12 +52,13 @@ class TunedController:
 
 @dataclass(frozen=True, eq=False)
 class Tuning:
-    """What `tune` found; untouched: controllers without a search space."""
+    """What `tune` found; metric: what the cost is; untouched: controllers without a search space."""
 
     problem: str
     trials: int
     seed: int
     conditions: str
+    metric: str
     entries: tuple[TunedController, ...]
     untouched: tuple[str, ...]
 
@@ -82,6 +84,7 @@ class Tuning:
             "trials": self.trials,
             "seed": self.seed,
             "conditions": self.conditions,
+            "metric": self.metric,
             "controllers": controllers,
             "untouched": list(self.untouched),
         }
@@ -96,6 +99,7 @@ def tune(
     controllers: Sequence[str] | None = None,
     count: int = 1,
     percent: float = 0.0,
+    metric: str | None = None,
     compiled: bool = False,
     progress: Progress | None = None,
 ) -> Tuning:
@@ -105,10 +109,13 @@ def tune(
         trials: of every controller, in all. seed: of the proposals and of the scenarios.
         folder: where finished trials are written, one by one. controllers: names (None: all that the task's tuning has).
         count, percent: number of scenarios in a trial, and how far exact parameters are drawn.
+        metric: what to tune by, 'settling.q1' or 'clipped_share' (None: the relative error); the cost has the opposite sign where
+            larger is better.
         compiled: other settings are other C code; compiling pays where the runs of a trial last longer than the compiler.
 
     Raises:
         InvalidProblem: no search space, or draws that could leave physical bounds. NotSupported: Optuna is not installed.
+        InvalidName, InvalidValue: an unknown metric, or one without a better direction.
         OutputError: the folder cannot be written, or holds results of something else.
     """
     optuna = _optuna()
@@ -117,12 +124,13 @@ def tune(
         if value < 1:
             raise InvalidValue(f"{name} {value}: expected at least 1")
     conditions = Conditions(seed, TUNING, float(percent), compiled)
-    header = {**fingerprint(task, conditions), "scenarios": count, "optuna": optuna.__version__}
+    aim = objective(metric, task.metrics)
+    header = {**fingerprint(task, conditions), "scenarios": count, "optuna": optuna.__version__, "metric": aim.name}
     with Ledger(folder / LEDGER, header) as ledger:
-        entries = tuple(_tuned(optuna, task, n, conditions, count, trials, ledger, progress) for n in names)
+        entries = tuple(_tuned(optuna, task, n, conditions, count, trials, aim, ledger, progress) for n in names)
     said = f"{count} scenario{'s' if count > 1 else ''} within {percent:g} %"
     untouched = tuple(n for n in task.controllers if n not in names)
-    return Tuning(task.name, trials, seed, said, entries, untouched)
+    return Tuning(task.name, trials, seed, said, aim.name, entries, untouched)
 
 
 def _optuna() -> ModuleType:
@@ -155,6 +163,7 @@ def _tuned(
     conditions: Conditions,
     count: int,
     trials: int,
+    aim: Objective,
     ledger: Ledger,
     progress: Progress | None,
 ) -> TunedController:
@@ -169,7 +178,7 @@ def _tuned(
             shares = {} if number == _PRESENT else _proposal(optuna, study, ranges, conditions.seed, number)
             settings = before if number == _PRESENT else _numbers(task, name, spans, shares)
             record = {"controller": name, "trial": number, "shares": shares, "settings": settings}
-            record |= _judged(task, name, settings, conditions, count)
+            record |= _judged(task, name, settings, conditions, count, aim)
             ledger.append(record)
             known[number] = record
         if number != _PRESENT:
@@ -198,7 +207,7 @@ def _numbers(task: Task, name: str, spans: TuningSpans, shares: Mapping[str, flo
 
 
 def _judged(
-    task: Task, name: str, settings: Mapping[str, float], conditions: Conditions, count: int
+    task: Task, name: str, settings: Mapping[str, float], conditions: Conditions, count: int, aim: Objective
 ) -> dict[str, float]:
     """Cost of these settings, and in how many scenarios they fail; settings that are refused fail in all."""
     try:
@@ -206,15 +215,6 @@ def _judged(
         bench = Bench(replace(task, controllers={name: changed}), conditions)
         records = [bench.record(k, name) for k in range(count)]
     except (InvalidValue, InvalidProblem):
-        return {"cost": 2 * PENALTY, "failures": count}
-    costs = [_cost(record) for record in records]
+        return {"cost": aim.refused, "failures": count}
+    costs = [aim.cost(record) for record in records]
     return {"cost": math.fsum(costs) / count, "failures": sum(r.get("outcome") != "finished" for r in records)}
-
-
-def _cost(record: Mapping[str, Any]) -> float:
-    """Relative error, at most `PENALTY`; between one and two penalties for a run that ended early, and two for none."""
-    if "skipped" in record:
-        return 2 * PENALTY
-    if record["error"] is None:
-        return float(PENALTY * (2 - record["lasted"]))
-    return float(min(record["error"], PENALTY))

@@ -12,6 +12,7 @@ from fpirhc.errors import InvalidName, InvalidValue, Mistakes, OutputError, Prob
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import Values, with_settings
 from fpirhc.studies.comparison.compare import Comparison
+from fpirhc.studies.tuning.objective import RELATIVE_ERROR
 
 FORMAT = 1
 
@@ -37,7 +38,8 @@ def read_tuned(path: str | Path, task: Task) -> TunedSettings:
         if facts["problem"] != task.name:
             raise ProblemFileError(f"'{path}' is of problem '{facts['problem']}', not of '{task.name}'")
         values = {name: dict(entry["settings"]) for name, entry in facts["controllers"].items()}
-        how = f"{facts['trials']} trials, seed {facts['seed']}, {facts['conditions']}"
+        by = "" if facts.get("metric", RELATIVE_ERROR) == RELATIVE_ERROR else f" by {facts['metric']}"
+        how = f"{facts['trials']} trials{by}, seed {facts['seed']}, {facts['conditions']}"
         notes = {
             name: f"tuned ({how}): {', '.join(f'{p} = {v:g}' for p, v in entry['settings'].items())}; "
             f"cost {entry['cost_before']:.4g} before, {entry['cost']:.4g} after"

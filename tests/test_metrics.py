@@ -1,0 +1,260 @@
+"""Metrics by value: every number that a user reads, on runs that were made by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+import pytest
+from plants import linear
+
+import fpirhc as fp
+from fpirhc.errors import InvalidName, InvalidValue
+from fpirhc.simulation.common_columns import with_common_columns
+from fpirhc.simulation.metrics import discovery, known_metrics, with_own_metrics
+from fpirhc.simulation.metrics.columns import columns
+from fpirhc.simulation.run import Run
+from fpirhc.status import Status
+from fpirhc.symbolic.layout import Layout, Signal, scalar
+
+PERIOD, CYCLES = 0.1, 100
+SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")
+
+
+def problem(**changes) -> fp.Problem:
+    """A plant with one coordinate [m] and one input [N], measured from the second half of a run on."""
+    settings = {
+        "plant": linear(1.0, 1.0),
+        "start": {"y": 0.0},
+        "period": PERIOD,
+        "duration": PERIOD * CYCLES,
+        "measure_from": 5.0,
+    }
+    return fp.Problem(reference=fp.Trajectory(lambda t: {"y": ca.sin(t)}), **{**settings, **changes})
+
+
+def run(error, *, reference=None, clipped=0.0, command=0.0, status=0, stop=None, **more) -> Run:
+    """A run with this error of 'y' in every cycle; `more` are further signals (name -> columns)."""
+    error = np.broadcast_to(np.asarray(error, dtype=float), (CYCLES,))
+    reference = np.linspace(0.0, 1.0, CYCLES) if reference is None else reference
+    signals = {
+        "time": (scalar("time", "s"), PERIOD * np.arange(CYCLES)),
+        "reference": (Signal("reference", ("y", "y'"), ("m", "m/s")), np.column_stack([reference, 0 * reference])),
+        "state": (Signal("state", ("y", "y'"), ("m", "m/s")), np.column_stack([reference - error, 0 * reference])),
+        "error": (Signal("error", ("y",), ("m",)), error),
+        "command": (Signal("command", ("u",), ("N",)), command),
+        "clipped": (scalar("clipped"), clipped),
+        "status": (scalar("status"), status),
+        **more,
+    }
+    values = [np.broadcast_to(np.asarray(v, float).T, (s.size, CYCLES)).T for s, v in signals.values()]
+    layout, log = with_common_columns(Layout(tuple(s for s, _ in signals.values())), np.hstack(values))
+    cycles = CYCLES if stop is None else CYCLES // 4
+    return Run("case", "CTC", 0, PERIOD, layout, log[:cycles], stop, False, {})
+
+
+def step(before, after, cycle):
+    """`before` up to a cycle, `after` from it on."""
+    return np.where(np.arange(CYCLES) < cycle, before, after)
+
+
+def test_errors_are_those_of_the_measured_part():
+    """Ten in the transient, which does not count; then 3 and 4 in turn: rms (12.5)^(1/2), largest 4."""
+    error = np.where(np.arange(CYCLES) < 50, 10.0, np.where(np.arange(CYCLES) % 2, 3.0, -4.0))
+    metrics = fp.measure(problem(), run(error))
+    assert metrics.rms_error["y"] == pytest.approx(np.sqrt(12.5))
+    assert metrics.max_error["y"] == 4.0
+
+
+def test_iae_is_an_integral_over_time():
+    """|e| = 2 m for the five seconds from t = 5 s on: 10 m s, whatever the period."""
+    assert fp.measure(problem(), run(-2.0)).iae["y"] == pytest.approx(10.0)
+    assert fp.measure(problem(measure_from=0.0), run(-2.0)).iae["y"] == pytest.approx(20.0)
+    assert fp.measure(problem(), run(-2.0)).units["iae"]["y"] == "m s"
+
+
+@pytest.mark.parametrize(
+    ("after", "settled"), [(0.019, 3.0), (0.021, np.nan)], ids=["inside the band", "outside the band"]
+)
+def test_settling_is_within_two_per_cent_of_the_references_range(after, settled):
+    """The reference moves by 1 m. The band is 0.02 m: an error of 0.019 m has settled, one of 0.021 m has not."""
+    first = step(0.5, after, 30)
+    found = fp.measure(problem(), run(first)).settling["y"]
+    assert found == pytest.approx(settled, nan_ok=True)
+
+
+def test_settling_takes_the_first_error_where_the_reference_rests():
+    """From 5 m off: the band is 0.1 m. Never having left the band is zero; the whole run counts, not the measured part."""
+    still = np.zeros(CYCLES)
+    assert fp.measure(problem(), run(step(5.0, 0.099, 20), reference=still)).settling["y"] == pytest.approx(2.0)
+    assert np.isnan(fp.measure(problem(), run(step(5.0, 0.101, 20), reference=still)).settling["y"])
+    assert fp.measure(problem(), run(0.01)).settling["y"] == 0.0
+
+
+def test_clipped_share_is_of_the_whole_run():
+    """Clipped in the first ten of a hundred cycles, before the measured part begins."""
+    assert fp.measure(problem(), run(0.0, clipped=step(1.0, 0.0, 10))).clipped_share == pytest.approx(0.1)
+
+
+def test_effort_is_of_the_measured_part():
+    """7 N before, and 3 N, -3 N in turn after t = 5 s."""
+    command = step(7.0, 3.0, 50) * (-1.0) ** np.arange(CYCLES)
+    assert fp.measure(problem(), run(0.0, command=command)).effort["u"] == pytest.approx(3.0)
+
+
+def test_cost_is_the_sum_of_the_measured_part_by_term():
+    """Terms 1 and 0.5 in fifty cycles, and their total; other values before do not count."""
+    cost = np.column_stack([step(9.0, 1.0, 50), step(9.0, 0.5, 50)])
+    found = fp.measure(problem(), run(0.0, cost=(Signal("cost", ("states", "deviation")), cost)))
+    assert found.cost == pytest.approx({"states": 50.0, "deviation": 25.0, "total": 75.0})
+    assert fp.measure(problem(), run(0.0)).cost == {}
+
+
+def test_statuses_are_counted_and_the_worst_is_told():
+    """Ninety cycles as they should be, seven not converged, three held."""
+    status = np.repeat([Status.OK, Status.NOT_CONVERGED, Status.HELD], [90, 7, 3])
+    found = fp.measure(problem(), run(0.0, status=status))
+    assert found.statuses == {"OK": 90, "NOT_CONVERGED": 7, "HELD": 3}
+    assert found.worst_status == "HELD"
+    assert found["cycles"] == {"": 100}
+
+
+def test_solves_are_summed_up_over_the_whole_run():
+    """Iterations 1 to 100, residuals of a tenth of that; a plan that is held for ten cycles is one plan."""
+    iterations = np.repeat(np.arange(1.0, 11.0), 10)
+    solve = np.column_stack([0 * iterations, iterations / 10, iterations / 100, iterations, 0 * iterations])
+    found = fp.measure(problem(), run(0.0, solve=(Signal("solve", SOLVE), solve)))
+    assert found.solve == pytest.approx(
+        {
+            "median_iterations": 5.5,
+            "worst_iterations": 10,
+            "median_stationarity": 0.55,
+            "worst_stationarity": 1.0,
+            "worst_feasibility": 0.1,
+            "plans": 10,
+        }
+    )
+    assert fp.measure(problem(), run(0.0)).solve == {}
+
+
+def test_a_run_that_ended_early_has_no_errors():
+    """Its errors are NaN, it never settled, and the cycle in which it ended counts as not finite."""
+    found = fp.measure(problem(), run(1.0, stop="signal 'x' is not finite"))
+    for numbers in (found.rms_error, found.max_error, found.iae, found.settling, found.effort):
+        assert np.isnan(list(numbers.values())).all()
+    assert found.statuses == {"OK": 25, "NON_FINITE": 1}
+    assert found.worst_status == "NON_FINITE"
+
+
+def test_contraction_is_the_factor_of_the_plant_and_the_gain():
+    """With y'' = 1.6 u and a believed gain of one, J = 1.6: |1 - 1.6 a| for the effective gain a, from symbols and from the run."""
+    deformation = fp.Sigmoid(gain=-0.4, scale=50.0)
+    task = problem(plant=linear(1.6, 1.0), start={"y": 0.5}, period=1e-3, duration=1.0, measure_from=0.0)
+    controllers = fp.ComputedTorque(fp.Exponential(rate=6.0), deformation), fp.ComputedTorque(fp.Exponential(rate=6.0))
+    adaptive, plain = (fp.measure(task, fp.simulate(task, c, seed=0, compiled=False)) for c in controllers)
+    factor = abs(1 - 1.6 * deformation.effective_gain())
+    assert 0.1 < factor < 0.9
+    assert adaptive["contraction.predicted"][""] == pytest.approx(factor)
+    assert adaptive["contraction.measured"][""] == pytest.approx(factor, rel=0.1)
+    assert plain["contraction.predicted"] == {}
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_every_run_has_the_same_columns(late):
+    """What the plant did is there with ideal and with late measurement; a loop that is told it does not log it twice."""
+    dead_time = fp.DeadTime(measurement=0.2) if late else fp.DeadTime()
+    task = problem(dead_time=dead_time, start={"y": 0.3}, measure_from=0.0)
+    found = fp.simulate(task, fp.ComputedTorque(fp.Exponential(rate=1.0)), seed=0, compiled=False)
+    assert {"plant_state", "plant_realised", "true_error"} <= set(found.layout.names)
+    np.testing.assert_array_equal(found["true_error"], found["reference"][:, :1] - found["plant_state"][:, :1])
+    assert np.array_equal(found["plant_state"], found["state"]) != late
+    assert np.array_equal(found["plant_realised"], found["realised"]) != late
+    assert np.array_equal(found["true_error"], found["error"]) != late
+    assert found.unit("plant_realised.y") == found.unit("realised.y")
+
+
+def test_a_run_of_an_older_version_gets_its_columns(tmp_path):
+    """A file without them is read as if it had them."""
+    found = run(np.linspace(1.0, 0.0, CYCLES))
+    old = Layout(tuple(s for s in found.layout.signals if s.name not in ("plant_state", "true_error")))
+    replace(found, layout=old, log=found.log[:, : old.size]).save(tmp_path / "old.npz")
+    again = fp.load_run(tmp_path / "old.npz")
+    np.testing.assert_array_equal(again["true_error"], found["true_error"])
+    assert fp.measure(problem(), again).rms_error == fp.measure(problem(), found).rms_error
+
+
+def test_a_problem_has_a_name_that_is_no_setting():
+    """A run knows it, and nothing that compares settings sees it."""
+    from fpirhc.describe import describe
+
+    named = replace(problem(), name="case")
+    assert fp.simulate(named, fp.ComputedTorque(fp.Exponential(rate=1.0)), seed=0, compiled=False).problem == "case"
+    assert describe(named) == describe(problem())
+
+
+# --- A metric of a user's own -----------------------------------------------------------------------------------------
+
+
+def overshoot(task, run):
+    """Largest error beyond the reference, by coordinate."""
+    return {c: float(np.max(-run[f"true_error.{c}"])) for c in run.layout["error"].elements}
+
+
+OVERSHOOT = fp.Metric("overshoot", overshoot, by="coordinate", unit="m", headline=True, order=15)
+
+
+def test_a_metric_is_one_value():
+    """Measured, with its unit, in the order of its column, and as it writes itself."""
+    metrics = fp.measure(problem(), run(np.linspace(1.0, -0.25, CYCLES)), with_own_metrics([OVERSHOOT]))
+    assert metrics["overshoot"] == {"y": 0.25}
+    headings = [c.heading for c in columns([metrics], headline=True)]
+    assert headings == ["rms error y [m]", "overshoot y [m]", "clipped"]
+    assert metrics.text("overshoot", "y") == "0.25"
+    with pytest.raises(InvalidName, match="Did you mean 'overshoot'"):
+        metrics["overshot"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"name": "rms_error"}, "is there 2 times"),
+        ({"name": "stop"}, "stands for something else"),
+        ({"name": "solve"}, "stands for something else"),
+        ({"name": "My metric"}, "small letters"),
+        ({"better": "smallest"}, "Did you mean 'smaller'"),
+        ({"compared": "exactly"}, "Did you mean 'exact'"),
+    ],
+)
+def test_a_wrong_metric_is_refused(wrong, message):
+    """One clear error that names the metric."""
+    with pytest.raises((InvalidName, InvalidValue), match=message):
+        with_own_metrics([fp.Metric(**{"name": "mine", "function": overshoot, **wrong})])
+
+
+@pytest.mark.parametrize("result", [3.0, {"y": "three"}, "three"])
+def test_a_function_that_returns_something_else_is_refused(result):
+    """By coordinate means a mapping of numbers."""
+    metric = fp.Metric("mine", lambda problem, run: result, by="coordinate")
+    with pytest.raises(InvalidValue, match="metric 'mine'"):
+        fp.measure(problem(), run(0.0), [metric])
+
+
+def test_metrics_of_an_installed_package_are_found(monkeypatch):
+    """An entry point of the group 'fpirhc.metrics' leads to one metric or to several."""
+    points = [
+        SimpleNamespace(load=lambda: OVERSHOOT),
+        SimpleNamespace(load=lambda: (replace(OVERSHOOT, name="other"),)),
+    ]
+    monkeypatch.setattr(discovery, "entry_points", lambda group: points if group == "fpirhc.metrics" else [])
+    names = [m.name for m in discovery.known_metrics.__wrapped__()]
+    assert {"overshoot", "other"} == set(names) - {m.name for m in known_metrics()}
+
+
+def test_the_best_of_a_column_follows_its_direction():
+    """Smaller, larger or neither; a run that did not reach it is never the best."""
+    for better, best in (("smaller", 1.0), ("larger", 3.0), ("neither", None)):
+        metric = replace(OVERSHOOT, better=better)
+        column = columns([fp.measure(problem(), run(0.0), [metric])])[0]
+        assert column.best([2.0, 1.0, None, np.nan, 3.0]) == best
