@@ -15,8 +15,6 @@ from fpirhc.baselines.catalogue import family_of
 from fpirhc.baselines.variants import Variant
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
-from fpirhc.controllers.wrappers.exact_model import ExactModel
-from fpirhc.controllers.wrappers.predicted import Predicted
 from fpirhc.errors import FpirhcError
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.simulation.metrics import measure
@@ -24,7 +22,6 @@ from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
 from fpirhc.status import Status
 from fpirhc.studies.comparison.compare import measure_contraction
-from fpirhc.studies.comparison.optimality import planner
 from fpirhc.studies.open_loop import solve_first
 from fpirhc.task.problem import Problem
 
@@ -126,9 +123,7 @@ def _numbers(problem: Problem, controller: Controller, run: Run) -> dict[str, Nu
 
 def first_plan(task: Task, problem: Problem, controller: Controller) -> dict[str, Number]:
     """Solve the first horizon with the controller's cost to convergence; empty for one that does not plan."""
-    while isinstance(controller, ExactModel | Predicted):
-        controller = controller.controller
-    planning = planner(controller)
+    planning = controller.planner
     cost = (planning.cost or problem.cost) if planning else None
     if cost is None or problem.horizon is None:
         return {}

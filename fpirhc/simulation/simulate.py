@@ -60,7 +60,10 @@ class Simulator:
         log, stop = _run_chunks(problem, start, self.loop.trace, self.evaluator, seed, progress)
         log.setflags(write=False)
         step_limit = self.controller.deformation.largest_step()
+        planner = self.controller.planner
+        cost = (planner.cost or problem.cost) if planner else None
         settings = {
+            "weighs_effort": cost is not None and cost.weighs_effort,
             "step_limit": step_limit if np.isfinite(step_limit) else None,
             "controller": describe(self.controller),
             "problem": describe(problem),

@@ -12,7 +12,6 @@ from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.optimisers.nlp import Fatrop, Ipopt, Osqp, SequentialQuadratic
 from fpirhc.optimisers.reduced_gradient import ReducedGradient
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.studies.comparison.optimality import planner, with_optimiser
 
 OPTIMISERS: dict[str, tuple[str, Callable[[float], Optimiser]]] = {
     "fixed-point": ("FPI", lambda tolerance: FixedPoint(iterations=1, tolerance=tolerance)),
@@ -29,27 +28,31 @@ OPTIMISERS: dict[str, tuple[str, Callable[[float], Optimiser]]] = {
 
 
 def with_optimisers(task: Task, names: Sequence[str], controllers: Sequence[str] | None) -> Task:
-    """Return the task with its receding-horizon controllers once per optimiser: the headline pair, or those named.
+    """Return the task with its planning controllers once per optimiser: the headline pair, or those named.
+
+    A controller that is named and does not plan stays as it is.
 
     Raises:
-        InvalidName: an unknown optimiser. InvalidProblem: no receding-horizon controller to vary.
+        InvalidName: an unknown optimiser. InvalidProblem: no planning controller to vary.
     """
     unknown = [n for n in names if n != "all" and n not in OPTIMISERS]
     if unknown:
         raise InvalidName(f"optimiser '{unknown[0]}' is unknown.{nearest(unknown[0], [*OPTIMISERS, 'all'])}")
     chosen = list(OPTIMISERS) if "all" in names else list(dict.fromkeys(names))
     sources = list(controllers or task.headline or task.controllers)
-    varied: dict[str, Controller] = {}
-    for name in sources:
-        found = planner(task.controllers[name])
-        if found is None:
-            continue
-        tolerance = float(getattr(found.optimiser, "tolerance", 1e-3))
-        for key in chosen:
-            label, build = OPTIMISERS[key]
-            controller = with_optimiser(task.controllers[name], build(tolerance))
-            assert controller is not None
-            varied[f"{name} ({label})"] = controller
-    if not varied:
+    planning = [name for name in sources if task.controllers[name].planner is not None]
+    if not planning:
         raise InvalidProblem(f"problem '{task.name}': none of {', '.join(sources)} plans with an optimiser")
+    varied: dict[str, Controller] = {}
+    for name in sources if controllers else planning:
+        varied |= _varied(name, task.controllers[name], chosen)
     return replace(task, controllers=varied, headline=None)
+
+
+def _varied(name: str, controller: Controller, optimisers: Sequence[str]) -> dict[str, Controller]:
+    """The controller by name, once per optimiser."""
+    if controller.planner is None:
+        return {name: controller}
+    tolerance = float(getattr(controller.planner.optimiser, "tolerance", 1e-3))
+    built = {label: build(tolerance) for label, build in (OPTIMISERS[key] for key in optimisers)}
+    return {f"{name} ({label})": controller.with_optimiser(optimiser) for label, optimiser in built.items()}
