@@ -10,7 +10,6 @@ from test_certificate import PROBLEMS, first_horizon
 
 import fpirhc as fp
 from fpirhc.horizon.problem import stage_data, transcribe
-from fpirhc.studies.comparison.optimality import with_optimiser
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -40,7 +39,7 @@ def test_one_iteration_per_cycle_is_as_good_as_converged_solving(name):
     for controller in ("RHC", "RHC+FPI"):
         once = task.controllers[controller]
         costs = []
-        for chosen in (once, with_optimiser(once, replace(once.optimiser, iterations=12))):
+        for chosen in (once, once.with_optimiser(replace(once.planner.optimiser, iterations=12))):
             run = fp.simulate(problem, chosen, seed=0)
             assert run.stop is None
             costs.append(run["cost"].sum())

@@ -15,14 +15,11 @@ from fpirhc.baselines.catalogue import NOT_COMPARED, family_of
 from fpirhc.baselines.variants import Variant
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
-from fpirhc.controllers.wrappers.exact_model import ExactModel
-from fpirhc.controllers.wrappers.predicted import Predicted
 from fpirhc.errors import FpirhcError
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.simulation.metrics import measure
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
-from fpirhc.studies.comparison.optimality import planner
 from fpirhc.studies.open_loop import solve_first
 from fpirhc.task.problem import Problem
 
@@ -112,9 +109,7 @@ def _numbers(task: Task, problem: Problem, run: Run) -> dict[str, Number]:
 
 def first_plan(task: Task, problem: Problem, controller: Controller) -> dict[str, Number]:
     """Solve the first horizon with the controller's cost to convergence; empty for one that does not plan."""
-    while isinstance(controller, ExactModel | Predicted):
-        controller = controller.controller
-    planning = planner(controller)
+    planning = controller.planner
     cost = (planning.cost or problem.cost) if planning else None
     if cost is None or problem.horizon is None:
         return {}

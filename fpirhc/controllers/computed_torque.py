@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block, rename
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.tracked import tracked_blocks
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.deformation.sigmoid import Sigmoid
@@ -31,18 +32,7 @@ class ComputedTorque(Controller):
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Blocks reference, tracking, deform, invert, limit, judge, tracking update."""
-        plant = problem.plant
-        closing, delays = closing_blocks(problem, self.deformation)
-        response = plant.response_signal("_reference_response")
-        blocks = [
-            reference_block(problem),
-            rename("target", like(plant.state, "reference"), like(plant.state, "_target")),
-            rename("nominal", response, plant.response_signal("nominal")),
-            self.tracking.law(plant, problem.period),
-            *closing,
-            self.tracking.update(plant, problem.period),
-        ]
-        return blocks, [*delays, *self.tracking.delays(plant)]
+        return tracked_blocks(problem, self.tracking, self.deformation)
 
 
 EXAMPLES = (

@@ -55,6 +55,11 @@ class Cost(ABC):
     """Contract: named stage terms and a terminal cost, as CasADi expressions."""
 
     @property
+    def weighs_effort(self) -> bool:
+        """Whether a term is known to weigh the inputs themselves, and not what they differ by from a feedforward."""
+        return False
+
+    @property
     @abstractmethod
     def uses_rate(self) -> bool:
         """Whether a term needs the previous input (which then becomes part of the stage's state)."""
@@ -99,6 +104,11 @@ class Quadratic(Cost):
     deviation: Mapping[str, float] = field(default_factory=dict)
     rate: Mapping[str, float] = field(default_factory=dict)
     terminal: Mapping[str, float] | Terminal | None = None
+
+    @property
+    def weighs_effort(self) -> bool:
+        """Whether `effort` has weights."""
+        return bool(self.effort)
 
     @property
     def uses_rate(self) -> bool:

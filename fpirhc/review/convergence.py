@@ -23,7 +23,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Loops
-from fpirhc.review.maps import constant, largest_product
+from fpirhc.review.maps import largest_product
 from fpirhc.review.neighbourhood import eigenvalues_near
 
 QUESTION = "Does the deformation converge?"
@@ -39,8 +39,13 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
     found = f"the slowest mode of the linear loop changes by {worst:.6g} per cycle"
     numbers = {"radius": worst, "smallest_radius": float(loops.radii.min())}
     deformation = controller.deformation
-    if not constant(deformation):
-        change = f"{type(deformation).__name__} changes its map on line; the factor is that of its start."
+    if not deformation.constant or loops.learns:
+        what = (
+            f"{type(controller).__name__} changes its model"
+            if loops.learns
+            else f"{type(deformation).__name__} changes its map"
+        )
+        change = f"{what} on line; the factor is that of its start."
         return Answer(QUESTION, Verdict.UNKNOWN, found, change, numbers)
     if growth.min() > _SURE:
         return Answer(QUESTION, Verdict.NO, f"{found}: it grows all along the reference", _mend(loops), numbers)

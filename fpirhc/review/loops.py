@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.computed_torque import ComputedTorque
-from fpirhc.controllers.receding_horizon import RecedingHorizon
-from fpirhc.controllers.replanning import FromMeasurement, FromPlan
-from fpirhc.controllers.wrappers.exact_model import ExactModel
-from fpirhc.controllers.wrappers.predicted import Predicted
-from fpirhc.deformation.identity import Identity
+from fpirhc.controllers.contract import Planner, without_deformation
 from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.linear import LinearLoop, linear_parameters, loop_matrices, response_slopes
-from fpirhc.review.plan_feedback import PlanFeedback, plan_gains
+from fpirhc.review.plan_feedback import plan_gains
+from fpirhc.review.stand_in import linear_stand_in
 from fpirhc.task.problem import Problem
 
 _WORK = 2e7  # entries^3 of all loops together: eigenvalues of large ones are asked for at fewer points
@@ -30,7 +25,8 @@ class Loops:
     """Linear loops with the exact parameters at points (indices into the reference's points), or the reason for none.
 
     `ideal` is the loop of a controller without deformation whose model is the plant: what the outer loop does by itself. `drawn`
-    are loops of plants from the box of parameters.
+    are loops of plants from the box of parameters. `learns`: the controller changes its model on line, so that the loops are those
+    of the model that it begins with.
     """
 
     places: tuple[int, ...]
@@ -38,6 +34,7 @@ class Loops:
     ideal: LinearLoop | None
     drawn: tuple[LinearLoop, ...] = ()
     reason: str = ""
+    learns: bool = False
 
     @property
     def radii(self) -> np.ndarray:
@@ -48,7 +45,7 @@ class Loops:
 def loops_along(grid: ReviewGrid, controller: Controller) -> Loops:
     """Return the controller's linear loops along the reference; where there are none, the reason."""
     try:
-        return _loops(grid, controller)
+        return replace(_loops(grid, controller), learns=controller.learns)
     except FpirhcError as error:
         return Loops((), (), None, reason=str(error))
     except np.linalg.LinAlgError as error:
@@ -94,46 +91,10 @@ def _thinned(places: list[int], most: int) -> list[int]:
     return [places[int(k)] for k in np.unique(np.linspace(0, len(places) - 1, count).astype(int))]
 
 
-def _gains(
-    problem: Problem, plan: RecedingHorizon | None, times: list[float], believed: np.ndarray
-) -> list[np.ndarray]:
+def _gains(problem: Problem, plan: Planner | None, times: list[float], believed: np.ndarray) -> list[np.ndarray]:
     if plan is None:
         return [np.zeros((len(problem.plant.inputs), problem.plant.state.size))] * len(times)
     cost = plan.cost or problem.cost
     assert problem.horizon is not None
     assert cost is not None
     return plan_gains(problem, problem.horizon, cost, times, believed)
-
-
-def linear_stand_in(controller: Controller) -> tuple[Controller, RecedingHorizon | None]:
-    """Return what serves a linear plant as the controller does near the reference, and the plan whose feedback it needs.
-
-    Raises:
-        NotSupported: a plan that is restarted and tracked.
-    """
-    if isinstance(controller, ExactModel):
-        return linear_stand_in(controller.controller)
-    if isinstance(controller, Predicted):
-        inner, plan = linear_stand_in(controller.controller)
-        return replace(controller, controller=inner), plan
-    if not isinstance(controller, RecedingHorizon):
-        return controller, None
-    if isinstance(controller.replanning, FromMeasurement):
-        return ComputedTorque(PlanFeedback(), controller.deformation), controller
-    if isinstance(controller.replanning, FromPlan):
-        return ComputedTorque(controller.replanning.tracking, controller.deformation), None
-    raise NotSupported("a plan that is restarted and tracked is not constant near the reference")
-
-
-def without_deformation(controller: Controller) -> Controller:
-    """Return the controller with Identity() for its deformation."""
-    if isinstance(controller, Predicted):
-        return replace(controller, controller=without_deformation(controller.controller))
-    if not controller.deformation.adapts:
-        return controller
-    if isinstance(controller, ComputedTorque):
-        return replace(controller, deformation=Identity())
-    settings: Any = controller
-    if hasattr(settings, "deformation"):
-        return replace(settings, deformation=Identity())
-    raise NotSupported(f"{type(controller).__name__} has no deformation that can be left out")

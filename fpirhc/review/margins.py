@@ -46,12 +46,14 @@ def margins_enough(problem: Problem, loops: Loops) -> Answer:
         f"largest |pole| {radius:.6g}; gain may change {gain:.3g} times, phase by {phase:.3g} deg, delay by {delay:.3g} s "
         f"({delay / problem.period:.3g} cycles)"
     )
+    if loops.learns:
+        text += "; with the model that it begins with"
     if radius >= 1:
         everywhere = float(loops.radii.min()) >= 1
         text += (
             f"; a pole is outside the unit circle {'all along' if everywhere else 'at some points of'} the reference"
         )
-        verdict = Verdict.NO if everywhere else Verdict.UNKNOWN
+        verdict = Verdict.NO if everywhere and not loops.learns else Verdict.UNKNOWN
         return Answer(QUESTION, verdict, text, "See the convergence and the rates.", numbers)
     good = gain >= LEAST_GAIN and phase >= LEAST_PHASE
     change = "" if good else "Lower the map's gain or the rate."

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from fpirhc.controllers.base import Controller
 from fpirhc.review.answer import Answer, Verdict, decided
 from fpirhc.review.grid import ReviewGrid
@@ -31,11 +29,5 @@ def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answ
 
 
 def _rate(controller: Controller) -> float | None:
-    """Rate of the tracking law, 1/s, where the controller or the one that it wraps has such a law."""
-    one: Any = controller
-    while one is not None:
-        rate = getattr(getattr(one, "tracking", None), "rate", None)
-        if rate is not None:
-            return float(rate)
-        one = getattr(one, "controller", None)
-    return None
+    """Rate of the tracking law, 1/s, where the controller has such a law."""
+    return None if controller.law is None else controller.law.speed

@@ -1,16 +1,12 @@
-"""Is the range of the map large enough? RFPT maps and the rotation hold only for requests much smaller than their own constant."""
+"""Is the range of the map large enough? Some maps hold only for requests much smaller than a constant of their own."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.rfpt import RFPT
-from fpirhc.deformation.rfpt_vector import RFPTVector
-from fpirhc.deformation.rotation import Rotation
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.maps import innermost
 
 QUESTION = "Is the map's range large enough for the requests?"
 _SPARE = 10.0
@@ -18,13 +14,10 @@ _SPARE = 10.0
 
 def range_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray) -> Answer | None:
     """Return the ratio of the map's constant to the largest request; None for a map without one."""
-    inner = innermost(deformation)
-    if isinstance(inner, RFPT | RFPTVector):
-        size, name = abs(inner.offset), "offset"
-    elif isinstance(inner, Rotation):
-        size, name = inner.radius, "radius"
-    else:
+    reach = deformation.reach
+    if reach is None:
         return None
+    size, name = reach.size, reach.name
     requests = grid.requests(believed)
     largest = float(np.nan_to_num(np.linalg.norm(np.hstack([requests, grid.responses]), axis=1)).max())
     ratio = size / max(largest, 1e-300)

@@ -7,8 +7,6 @@ from dataclasses import replace
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
-from fpirhc.controllers.slots.slotted import Slotted
-from fpirhc.controllers.wrappers.exact_model import ExactModel
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.review.answer import Answer, Review, Verdict
 from fpirhc.review.commands import commands_inside
@@ -70,9 +68,9 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer]) -> tupl
         chosen.check(grid.problem)
     except FpirhcError as error:
         return (Answer("Does the controller fit the problem?", Verdict.NO, str(error), "See the message."),)
-    inside = chosen.controller if isinstance(chosen, ExactModel) else chosen
-    if isinstance(inside, Slotted):
-        return (schedule_stable(grid.problem, inside),)
+    schedule = schedule_stable(grid.problem, chosen)
+    if schedule is not None:
+        return (schedule,)
     loops = loops_along(grid, chosen)
     outer = [rates_inside(grid, chosen, loops), zero_dynamics(zero_dynamics_rate(grid), is_planned(chosen), loops)]
     inner = [] if not chosen.deformation.adapts else _of_map(grid, chosen, loops, general)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from fpirhc.controllers.slots.floquet import floquet_radius
-from fpirhc.controllers.slots.slotted import Slotted
+from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict, decided
 from fpirhc.task.problem import Problem
@@ -11,12 +10,14 @@ from fpirhc.task.problem import Problem
 QUESTION = "Is the schedule of slots stable?"
 
 
-def schedule_stable(problem: Problem, controller: Slotted) -> Answer:
-    """Return the radius of one period, whose gains of the wrong sign the controller has already refused."""
+def schedule_stable(problem: Problem, controller: Controller) -> Answer | None:
+    """Return the radius of one period, whose gains of the wrong sign the controller has already refused; None without slots."""
     try:
-        found = floquet_radius(problem, controller.slots, controller.schedule, blend=controller.blend)
+        found = controller.floquet(problem)
     except FpirhcError as error:
         return Answer(QUESTION, Verdict.UNKNOWN, str(error))
+    if found is None:
+        return None
     if found.radius is None:
         return Answer(
             QUESTION, Verdict.UNKNOWN, f"no Floquet radius: {found.reason}", "Use a periodic schedule to know one."

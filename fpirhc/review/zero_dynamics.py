@@ -15,7 +15,8 @@ from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict, decided
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.linear import response_slopes
-from fpirhc.review.loops import Loops, linear_stand_in
+from fpirhc.review.loops import Loops
+from fpirhc.review.stand_in import linear_stand_in
 from fpirhc.review.state_matrix import state_matrices
 
 QUESTION = "Are the zero dynamics stable?"
@@ -53,7 +54,8 @@ def zero_dynamics(rate: float | None, planned: bool, loops: Loops) -> Answer:
         held = float(loops.radii.max())
         text += f"; with the plan's feedback the linear loop changes by {held:.6g} per cycle"
         change = "" if held < 1 else "Weigh the other states in the cost, or lengthen the horizon."
-        return Answer(QUESTION, decided(held < 1), text, change, numbers)
+        verdict = Verdict.UNKNOWN if loops.learns and held >= 1 else decided(held < 1)
+        return Answer(QUESTION, verdict, text, change, numbers)
     if not np.isfinite(rate) or planned or abs(rate) <= _STILL:
         change = "Undamped or not known: look at the coordinates that are not controlled in a run."
         return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)

@@ -16,15 +16,15 @@ interpretations of fixed-point transformations by the group of J. K. Tar.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.wrappers.exact_model import ExactModel
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.exponential import Exponential
+from fpirhc.tracking.base import Feedback
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,35 +63,38 @@ class LyapunovView:
 
 
 def lyapunov_view(problem: Problem, controller: Controller, run: Run) -> LyapunovView | None:
-    """Return V and its bound along a run; None where the controller does not track the reference with an Exponential law.
+    """Return V and its bound along a run; None where the controller does not track the reference with a law of one rate.
 
-    None too behind sensors or a late measurement: what the law knows is then not what the plant does.
+    None too where what the law knows is not what the plant does: behind sensors or a late measurement, or on a predicted state.
     """
-    law, since = exponential_law(controller), round(problem.measure_from / problem.period)
-    if law is None or "reference" not in run.layout or not problem.sees_plant or run.cycles < since + 2:
+    laws, since = _feedbacks(problem, controller), round(problem.measure_from / problem.period)
+    elsewhere = not problem.sees_plant or controller.feeds.get("state") in run.layout.names
+    if not laws or "reference" not in run.layout or elsewhere or run.cycles < since + 2:
         return None
-    surface, response_error = _signals(problem, law, run)
-    return LyapunovView(surface, response_error, law.rate, since)
+    rate = laws[0].rate
+    if rate is None or any(law.rate != rate for law in laws):
+        return None
+    surface, response_error = _signals(problem, laws, rate, run)
+    return LyapunovView(surface, response_error, rate, since)
 
 
-def exponential_law(controller: Controller) -> Exponential | None:
-    """The Exponential law by which a controller tracks the reference itself."""
-    inner = controller.controller if isinstance(controller, ExactModel) else controller
-    law = getattr(inner, "tracking", None)
-    return law if isinstance(law, Exponential) else None
+def _feedbacks(problem: Problem, controller: Controller) -> list[Feedback]:
+    """The law's feedback for every controlled coordinate; nothing where there is no law, or one without constant gains."""
+    law, plant = controller.law, problem.plant
+    found = [law.feedback(plant.orders[k]) for k in plant.controlled_indices] if law is not None else []
+    return [one for one in found if one is not None] if None not in found else []
 
 
-def _signals(problem: Problem, law: Exponential, run: Run) -> tuple[np.ndarray, np.ndarray]:
+def _signals(problem: Problem, laws: Sequence[Feedback], rate: float, run: Run) -> tuple[np.ndarray, np.ndarray]:
     """S and h. The feedback that the run logged is rate S plus what S' has below the highest derivative."""
     plant = problem.plant
     errors, feedback = run["reference"] - run["state"], run["desired"] - run["nominal"]
     surface, response_error = [], []
-    for k, index in enumerate(plant.controlled_indices):
-        name, order = plant.names[index], plant.orders[index]
+    for k, (index, law) in enumerate(zip(plant.controlled_indices, laws, strict=True)):
+        name, order, degree = plant.names[index], plant.orders[index], len(law.gains) - 1
         chain = [errors[:, plant.state.elements.index(name + "'" * s)] for s in range(order)]
-        degree = order if law.integral else order - 1
         rising = chain if law.integral else chain[1:]
-        drift = sum(math.comb(degree, s) * law.rate ** (degree - s) * e for s, e in enumerate(rising))
-        surface.append((feedback[:, k] - drift) / law.rate)
+        drift = sum(math.comb(degree, s) * rate ** (degree - s) * e for s, e in enumerate(rising))
+        surface.append((feedback[:, k] - drift) / rate)
         response_error.append(-np.diff(chain[-1]) / problem.period - feedback[:-1, k])
     return np.column_stack(surface), np.column_stack(response_error)

@@ -63,7 +63,10 @@ class Simulator:
         layout, log = with_common_columns(self.loop.trace, logged)
         log.setflags(write=False)
         step_limit = self.controller.deformation.largest_step()
+        planner = self.controller.planner
+        cost = (planner.cost or problem.cost) if planner else None
         settings = {
+            "weighs_effort": cost is not None and cost.weighs_effort,
             "step_limit": step_limit if np.isfinite(step_limit) else None,
             "effective_gain": float(self.controller.deformation.effective_gain()),
             "parameters": [float(v) for v in self.controller.parameters(problem.plant)],

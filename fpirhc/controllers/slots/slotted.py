@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -105,6 +105,10 @@ class Slotted(Controller):
         w = ca.SX.sym("w", len(problem.plant.names))
         found = ca.vertcat(*(c.chain.response(x, u, p, w) for c in channels))
         return Response(by_slot(channels, "realised"), ca.Function("fpirhc_slots_realised", [x, u, p, w], [found]))
+
+    def with_deformation(self, deformation: Deformation) -> Slotted:
+        """Return the controller with this deformation in every slot."""
+        return replace(self, slots=tuple(replace(slot, deformation=deformation) for slot in self.slots))
 
     def demand(self, problem: Problem) -> None:
         """None: every slot's deformation has its scale given."""

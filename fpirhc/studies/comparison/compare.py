@@ -12,10 +12,10 @@ import numpy as np
 
 from fpirhc.contraction import ContractionReport, Spectrum, assess_gain, identified_factor, spectrum_over_run
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import checked, resolved
-from fpirhc.deformation.identity import Identity
+from fpirhc.controllers.contract import checked, resolved, without_deformation
+from fpirhc.deformation.base import innermost
 from fpirhc.describe import describe
-from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, nearest
+from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, NotSupported, nearest
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
 from fpirhc.simulation.metrics import Metrics, measure
@@ -218,20 +218,12 @@ def _entry(
 
 def _pair(chosen: Mapping[str, Controller], name: str) -> str | None:
     """The controller with the same settings and no adaptation."""
-    wanted = _without_adaptation(describe(chosen[name]))
-    for other, controller in chosen.items():
-        if not controller.deformation.adapts and describe(controller) == wanted:
-            return other
-    return None
-
-
-def _without_adaptation(settings: Any) -> Any:
-    if isinstance(settings, list):
-        return [_without_adaptation(v) for v in settings]
-    if not isinstance(settings, dict):
-        return settings
-    identity = describe(Identity())
-    return {k: identity if k == "deformation" else _without_adaptation(v) for k, v in settings.items()}
+    try:
+        wanted = describe(without_deformation(chosen[name]))
+    except NotSupported:
+        return None
+    others = ((n, c) for n, c in chosen.items() if not c.deformation.adapts)
+    return next((other for other, controller in others if describe(controller) == wanted), None)
 
 
 def measure_contraction(problem: Problem, controller: Controller, run: Run) -> Contraction | None:
@@ -249,7 +241,6 @@ def measure_contraction(problem: Problem, controller: Controller, run: Run) -> C
 
 
 def _notes(asked: Controller, ready: Controller) -> tuple[str, ...]:
-    if describe(asked) == describe(ready):
-        return ()
-    scale = getattr(ready.deformation, "scale", None)
-    return (f"scale S = {scale:g} was chosen automatically",)
+    """Which settings of the deformation were chosen automatically."""
+    chosen = innermost(ready.deformation)
+    return tuple(f"{name} = {getattr(chosen, name):g} was chosen automatically" for name in asked.deformation.automatic)

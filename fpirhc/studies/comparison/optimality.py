@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
-from fpirhc.controllers.receding_horizon import RecedingHorizon
-from fpirhc.controllers.replanning import FromPlan
-from fpirhc.controllers.wrappers.exact_model import ExactModel
-from fpirhc.controllers.wrappers.predicted import Predicted
 from fpirhc.errors import FpirhcError
 from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
 from fpirhc.optimisers.fixed_point import FixedPoint
@@ -34,22 +30,21 @@ class Optimality:
     plans: int
 
 
-def planner(controller: Controller) -> RecedingHorizon | None:
-    """The receding-horizon controller inside, if there is one."""
-    inner = controller.controller if isinstance(controller, ExactModel) else controller
-    return inner if isinstance(inner, RecedingHorizon) else None
-
-
 def measure_optimality(
     problem: Problem, controller: Controller, run: Run, *, compiled: bool = True
 ) -> Optimality | None:
-    """Return the excess cost of sampled plans; None where plans do not start from the measured state, or none was solved.
+    """Return the excess cost of sampled plans; None where plans do not start from a state in the run, or none was solved.
 
-    A negative number is another local optimum that the controller found and the solve from rest did not.
+    None too for a controller that learns: the models that its plans were made with are not in the run. A negative number is another
+    local optimum that the controller found and the solve from rest did not.
     """
-    chosen = planner(checked(problem, controller))
-    if chosen is None or isinstance(chosen.replanning, FromPlan) or problem.horizon is None or run.cycles < 2:
+    ready = checked(problem, controller)
+    chosen, sees = ready.planner, ready.feeds
+    if chosen is None or not chosen.restarts or problem.horizon is None or run.cycles < 2:
         return None
+    if ready.learns or "parameters" in sees:
+        return None
+    times, states = (run[sees[n] if sees.get(n) in run.layout.names else n] for n in ("time", "state"))
     cost = chosen.cost or problem.cost
     assert cost is not None
     ocp = transcribe(problem.plant, problem.reference, problem.horizon, cost, problem.limits)
@@ -64,8 +59,8 @@ def measure_optimality(
     parameters, excess = controller.parameters(problem.plant), []
     for row in rows:
         correction = run["command_shift"][row - 1]
-        first = ocp.start(run["state"][row], run["command"][row - 1]).full().ravel()
-        data = np.asarray(data_of(run.time[row], parameters).full())
+        first = ocp.start(states[row], run["command"][row - 1]).full().ravel()
+        data = np.asarray(data_of(np.ravel(times)[row], parameters).full())
         best = solve(first, data, ocp.input_lower - correction, ocp.input_upper - correction)
         told = run["solve.cost"][row]
         if best is not None and run["status"][row] <= Status.NOT_CONVERGED:
@@ -92,13 +87,3 @@ class _Solver:
             if told[4] == Status.OK:
                 return float(told[0])
         return None
-
-
-def with_optimiser(controller: Controller, optimiser: object) -> Controller | None:
-    """The same controller with another optimiser; None when it has none."""
-    if isinstance(controller, ExactModel | Predicted):
-        inner = with_optimiser(controller.controller, optimiser)
-        return None if inner is None else replace(controller, controller=inner)
-    if isinstance(controller, RecedingHorizon):
-        return replace(controller, optimiser=optimiser)  # type: ignore[arg-type]
-    return None

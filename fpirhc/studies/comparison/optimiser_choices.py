@@ -10,25 +10,28 @@ from fpirhc.errors import InvalidName, InvalidProblem, nearest
 from fpirhc.members import member_modules
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.studies.comparison.optimality import planner, with_optimiser
+
+Choice = tuple[str, Callable[[float], Optimiser]]  # label, function of the tolerance
 
 
-def optimiser_choices() -> dict[str, tuple[str, Callable[[float], Optimiser]]]:
+def optimiser_choices() -> dict[str, Choice]:
     """Every optimiser that the command line knows: name -> (label, function of the tolerance).
 
     A member's module offers them as `CHOICES`.
     """
-    choices: dict[str, tuple[str, Callable[[float], Optimiser]]] = {}
+    choices: dict[str, Choice] = {}
     for module in member_modules("optimisers"):
         choices |= getattr(module, "CHOICES", {})
     return choices
 
 
 def with_optimisers(task: Task, names: Sequence[str], controllers: Sequence[str] | None) -> Task:
-    """Return the task with its receding-horizon controllers once per optimiser: the headline pair, or those named.
+    """Return the task with its planning controllers once per optimiser: the headline pair, or those named.
+
+    A controller that is named and does not plan stays as it is.
 
     Raises:
-        InvalidName: an unknown optimiser. InvalidProblem: no receding-horizon controller to vary.
+        InvalidName: an unknown optimiser. InvalidProblem: no planning controller to vary.
     """
     choices = optimiser_choices()
     unknown = [n for n in names if n != "all" and n not in choices]
@@ -36,17 +39,18 @@ def with_optimisers(task: Task, names: Sequence[str], controllers: Sequence[str]
         raise InvalidName(f"optimiser '{unknown[0]}' is unknown.{nearest(unknown[0], [*choices, 'all'])}")
     chosen = list(choices) if "all" in names else list(dict.fromkeys(names))
     sources = list(controllers or task.headline or task.controllers)
-    varied: dict[str, Controller] = {}
-    for name in sources:
-        found = planner(task.controllers[name])
-        if found is None:
-            continue
-        tolerance = float(getattr(found.optimiser, "tolerance", 1e-3))
-        for key in chosen:
-            label, build = choices[key]
-            controller = with_optimiser(task.controllers[name], build(tolerance))
-            assert controller is not None
-            varied[f"{name} ({label})"] = controller
-    if not varied:
+    planning = [name for name in sources if task.controllers[name].planner is not None]
+    if not planning:
         raise InvalidProblem(f"problem '{task.name}': none of {', '.join(sources)} plans with an optimiser")
+    varied: dict[str, Controller] = {}
+    for name in sources if controllers else planning:
+        varied |= _varied(name, task.controllers[name], [choices[key] for key in chosen])
     return replace(task, controllers=varied, headline=None)
+
+
+def _varied(name: str, controller: Controller, optimisers: Sequence[Choice]) -> dict[str, Controller]:
+    """The controller by name, once per optimiser; as it is where it does not plan."""
+    if controller.planner is None:
+        return {name: controller}
+    tolerance = float(getattr(controller.planner.optimiser, "tolerance", 1e-3))
+    return {f"{name} ({label})": controller.with_optimiser(build(tolerance)) for label, build in optimisers}

@@ -7,7 +7,7 @@ limit below the slew of the desired response, and a cost that weighs absolute ef
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -95,9 +95,8 @@ def _gain_cause(entry: Entry) -> str:
 
 def _slew_cause(plain: Entry, adaptive: Entry) -> str:
     """The step limit is judged by what the same controller asks for without adaptation, before anything diverges."""
-    settings: Any = adaptive.run.settings
-    limit = settings["step_limit"]
-    if limit is None or plain.run.cycles < MANY_CYCLES:
+    limit = adaptive.run.settings["step_limit"]
+    if not isinstance(limit, float) or plain.run.cycles < MANY_CYCLES:
         return ""
     largest = float(np.linalg.norm(np.diff(plain.run["desired"], axis=0), axis=1).max())
     if largest < limit:
@@ -109,25 +108,9 @@ def _slew_cause(plain: Entry, adaptive: Entry) -> str:
 
 
 def _effort_cause(entry: Entry) -> str:
-    if not _weighs_effort(entry.run.settings["controller"]) and not _own_cost_weighs_effort(entry):
+    if not entry.run.settings.get("weighs_effort"):
         return ""
     return (
         "Its cost weighs the absolute effort, so the optimum of the wrong model trades tracking against a wrong effort and "
         "adaptation realises that plan faithfully: weigh the deviation from the model's feedforward, or the input's rate."
     )
-
-
-def _own_cost_weighs_effort(entry: Entry) -> bool:
-    settings: Any = entry.run.settings
-    controller = settings["controller"]
-    plans = "optimiser" in controller or "optimiser" in controller.get("controller", {})
-    return plans and not controller.get("cost") and _weighs_effort({"cost": settings["problem"]["cost"]})
-
-
-def _weighs_effort(settings: Any) -> bool:
-    """Whether a described value holds a quadratic cost with weights on the absolute effort."""
-    if not isinstance(settings, dict):
-        return False
-    if settings.get("is") == "Quadratic" and settings.get("effort"):
-        return True
-    return any(_weighs_effort(v) for k, v in settings.items() if k in ("cost", "controller"))

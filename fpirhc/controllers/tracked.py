@@ -1,0 +1,28 @@
+"""The blocks of a controller that tracks the reference with a law and inverts the model.
+
+q^Des = q^(r),N + feedback of the tracking law;   u = inverse model of the deformed q^Des.
+"""
+
+from __future__ import annotations
+
+from fpirhc.controllers.base import closing_blocks, like, reference_block, rename
+from fpirhc.deformation.base import Deformation
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.base import Tracking
+
+
+def tracked_blocks(problem: Problem, tracking: Tracking, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
+    """Blocks reference, tracking, deform, invert, limit, judge, tracking update, and what they remember."""
+    plant = problem.plant
+    closing, delays = closing_blocks(problem, deformation)
+    response = plant.response_signal("_reference_response")
+    blocks = [
+        reference_block(problem),
+        rename("target", like(plant.state, "reference"), like(plant.state, "_target")),
+        rename("nominal", response, plant.response_signal("nominal")),
+        tracking.law(plant, problem.period),
+        *closing,
+        tracking.update(plant, problem.period),
+    ]
+    return blocks, [*delays, *tracking.delays(plant)]

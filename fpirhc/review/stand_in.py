@@ -1,0 +1,50 @@
+"""What serves a linear plant as a controller does near the reference.
+
+A controller without a plan serves it itself. A plan that restarts from the measured state is its feedback of the state; one
+that starts from its own state leaves the motion to its tracking law. A wrapper says by `linear_around` what it adds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import Planner
+from fpirhc.controllers.tracked import tracked_blocks
+from fpirhc.deformation.base import Deformation
+from fpirhc.errors import NotSupported
+from fpirhc.review.plan_feedback import PlanFeedback
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.base import Tracking
+
+
+@dataclass(frozen=True)
+class StandIn(Controller):
+    """A law in place of a plan, with the plan's deformation."""
+
+    tracking: Tracking
+    deformation: Deformation
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Blocks reference, tracking, deform, invert, limit, judge, tracking update."""
+        return tracked_blocks(problem, self.tracking, self.deformation)
+
+
+def linear_stand_in(controller: Controller) -> tuple[Controller, Planner | None]:
+    """Return what serves a linear plant as the controller does near the reference, and the plan whose feedback it needs.
+
+    Raises:
+        NotSupported: a plan that is restarted and tracked.
+    """
+    if controller.inner is not None:
+        inner, planner = linear_stand_in(controller.inner)
+        return controller.linear_around(inner), planner
+    planner = controller.planner
+    if planner is None:
+        return controller, None
+    if planner.restarts and planner.tracking is None:
+        return StandIn(PlanFeedback(), controller.deformation), planner
+    if planner.tracking is not None and not planner.restarts:
+        return StandIn(planner.tracking, controller.deformation), None
+    raise NotSupported("a plan that is restarted and tracked is not constant near the reference")
