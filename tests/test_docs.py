@@ -54,6 +54,8 @@ def test_links_lead_somewhere(page):
 def test_every_public_name_is_on_the_api_page():
     """The page is what `python docs/make_api.py` writes."""
     spec = importlib.util.spec_from_file_location("make_api", DOCS / "make_api.py")
+    assert spec is not None
+    assert spec.loader is not None
     maker = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(maker)
     assert maker.PAGE.read_text(encoding="utf-8") == maker.page()
