@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import fpirhc as fp
 
 
@@ -34,7 +36,7 @@ def pendulum(mass: float = 1.0, believed: float = 1.4) -> fp.Plant:
 
 def chain(order: int) -> fp.Plant:
     """A chain of integrators of any order: y^(order) = u / m."""
-    responses = {
+    responses: dict[int, Any] = {
         1: lambda q, u, p: {"y": u.u / p.m},
         2: lambda q, v, u, p: {"y": u.u / p.m},
         3: lambda q, v, a, u, p: {"y": u.u / p.m},

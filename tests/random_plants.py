@@ -106,7 +106,7 @@ def _plant(random: np.random.Generator, n: int, order: int, bend: float, inner: 
 
     names = [f"d{k}" for k in range(order)] + ["u", "p"]
     kind = inspect.Parameter.POSITIONAL_ONLY
-    response.__signature__ = inspect.Signature([inspect.Parameter(name, kind) for name in names])
+    vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(name, kind) for name in names])
     controlled = [f"q{k}" for k in range(n)]
     every = [*controlled, "z"] if inner else controlled
     return fp.Plant(

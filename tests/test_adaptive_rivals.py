@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -251,15 +252,21 @@ def test_lyapunov_rule_waits_while_the_command_is_clipped():
     """The gradient assumes that the plant got the command."""
     rule, bounds = fp.LyapunovRule({"p0": 2.0}), {"p0": FREE}
     steps = [
-        rule.change(Evidence(lambda: (ca.DM([3.0]), ca.DM([5.0])), None, clipped), bounds, 0.1) for clipped in (0, 1)
+        rule.change(evidence(gradient=lambda: (ca.DM([3.0]), ca.DM([5.0])), clipped=clipped), bounds, 0.1)
+        for clipped in (0, 1)
     ]
     assert [float(s) for s in steps] == pytest.approx([3.0, 0.0])
+
+
+def evidence(gradient: Any = None, equation: Any = None, clipped: Any = 0) -> Evidence:
+    """Only what the rule asks for."""
+    return Evidence(gradient, equation, clipped)
 
 
 def rule_step(rule, bounds, rows):
     matrix, error = ca.SX.sym("G", rows, len(bounds)), ca.SX.sym("h", rows)
     return ca.Function(
-        "change", [matrix, error], [rule.change(Evidence(None, lambda: (matrix, error), 0), bounds, 1e-3)]
+        "change", [matrix, error], [rule.change(evidence(equation=lambda: (matrix, error)), bounds, 1e-3)]
     )
 
 
@@ -269,7 +276,7 @@ def rule_step(rule, bounds, rows):
 def test_mass_matrix_stays_positive_definite():
     """At every cycle of a run that drives estimates into their bounds, on a plant whose load is dropped."""
     problem = replace(fp.load_problem("planar_arm").problem, duration=1.5, measure_from=0.0)
-    controllers = fp.load_problem("planar_arm").controllers
+    controllers: Any = fp.load_problem("planar_arm").controllers
     wild = replace(controllers["AID"], rule=fp.Projection(gain=1.9))
     run = fp.simulate(problem, wild, seed=0, compiled=False)
     ends = np.array(list(wild.bounds.values()))

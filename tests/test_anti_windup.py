@@ -7,6 +7,7 @@ grow while the command is clipped.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ def duffing():
 class Altered(fp.ComputedTorque):
     """Computed torque with changes made to its blocks and delays."""
 
-    changes: tuple = ()
+    changes: tuple[Any, ...] = ()
 
     def blocks(self, problem):
         """The blocks and delays, changed."""

@@ -16,6 +16,8 @@ PROBLEMS = ("two_mass", "van_der_pol", "cart_pole", "two_link_arm", "chain_of_ma
 
 def first_horizon(name):
     p = fp.load_problem(name).problem
+    assert p.horizon is not None
+    assert p.cost is not None
     ocp = transcribe(p.plant, p.reference, p.horizon, p.cost, p.limits)
     data = stage_data(p.plant, p.reference, p.horizon, p.cost)(0.0, p.plant.approximate).full()
     return ocp, data, ocp.start(p.start_state, np.zeros(ocp.input.size)).full().ravel()

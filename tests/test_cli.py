@@ -172,7 +172,7 @@ def test_ctrl_c_keeps_what_is_finished(folder, capsys, monkeypatch):
     """The finished controller is reported, the other is named as interrupted; exit code 130."""
     from fpirhc.studies.comparison import compare as study
 
-    ordinary = study.simulate
+    ordinary = vars(study)["simulate"]
 
     def interrupted(problem, controller, **settings):
         if settings["name"] == "CTC+FPI":

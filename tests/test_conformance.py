@@ -181,7 +181,7 @@ class Dishonest(Optimiser):
     """A fixed-point optimiser that changes what it is given or what it answers."""
 
     change: str
-    settings: list | None = None
+    settings: list[float] | None = None
     within: Optimiser = SETTLED
 
     def memory(self, ocp):
@@ -308,7 +308,7 @@ class Faulty(fp.ComputedTorque):
     """Computed torque with one fault."""
 
     change: str = ""
-    settings: tuple | list = field(default_factory=tuple)
+    settings: tuple[Any, ...] | list[Any] = field(default_factory=tuple)
 
     def blocks(self, problem):
         """As the contract says, but for the change."""

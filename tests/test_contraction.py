@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -45,7 +46,7 @@ def name_of(deformation: Deformation) -> str:
 def masses() -> Plant:
     """Two masses coupled by a damper and a spring; J = diag(believed mass / mass)."""
 
-    def response(q, v, u, p):  # type: ignore[no-untyped-def]
+    def response(q, v, u, p):
         spring = p.k * (q.q2 - q.q1)
         return {"q1": (u.Q1 + spring - p.b * v.q1) / p.m1, "q2": (u.Q2 - spring - p.b * v.q2) / p.m2}
 
@@ -77,8 +78,8 @@ def simulate(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(deformed, realised) as a loop logs them: realised[k] answers deformed[k - 1], and the bias swings by `drift`."""
     n = len(jacobian)
-    symbols = [ca.SX.sym(s, n) for s in ("r", "f", "d")]
-    step = ca.Function("step", symbols, [deformation.step(*symbols, {})[0]])
+    r, f, d = symbols = [ca.SX.sym(s, n) for s in ("r", "f", "d")]
+    step = ca.Function("step", symbols, [deformation.step(r, f, d, {})[0]])
     desired = np.linspace(1.0, 2.0, n)
     deformed, realised = [desired], [np.zeros(n)]
     for k in range(cycles):
@@ -180,7 +181,7 @@ def test_optimal_gain_is_best(eigenvalues: list[float], turn: float) -> None:
 
 def test_known_limits_of_the_sigmoid() -> None:
     """J = diag(1.5, 1.3): |A_c| < 3.36 for small errors, < 2.82 for all, best 1.8, factor 0.7421 at -0.5."""
-    report = check_gain(Sigmoid(gain=-0.5), Spectrum([[1.5, 1.3]]))
+    report = check_gain(Sigmoid(gain=-0.5), Spectrum(np.array([[1.5, 1.3]])))
     assert report.predicted == pytest.approx(0.74212, abs=1e-5)
     assert report.own_linear_limit == pytest.approx((-3.3607, 0.0), abs=1e-3)
     assert report.own_sector_limit == pytest.approx((-2.8210, 0.0), abs=1e-3)
@@ -191,7 +192,7 @@ def test_known_limits_of_the_sigmoid() -> None:
 
 def test_between_sector_and_linear_limit_is_a_warning() -> None:
     """Small errors converge there, so the gain is reported, not refused."""
-    report = check_gain(Sigmoid(gain=-2.9), Spectrum([[1.5, 1.3]]))
+    report = check_gain(Sigmoid(gain=-2.9), Spectrum(np.array([[1.5, 1.3]])))
     assert not report.within_sector
     assert report.contractive
     assert "oscillation" in report.text
@@ -205,15 +206,15 @@ def test_wrong_sign_says_which_is_right(deformation: Deformation) -> None:
     own = getattr(deformation, deformation.gain_name)
     sign = "negative" if own < 0 else "positive"
     with pytest.raises(NotContractive, match=rf"wrong sign.*use a {sign} {deformation.gain_name}, 0 < "):
-        check_gain(wrong, Spectrum([[1.5, 1.3]]))
+        check_gain(wrong, Spectrum(np.array([[1.5, 1.3]])))
     with pytest.raises(NotContractive, match="wrong sign"):
-        check_gain(deformation, Spectrum([[-1.5, -1.3]]))
+        check_gain(deformation, Spectrum(np.array([[-1.5, -1.3]])))
 
 
 def test_wrong_sign_in_words() -> None:
     """The sentence for the usual mistake, in full."""
     with pytest.raises(NotContractive) as caught:
-        check_gain(Sigmoid(gain=0.5), Spectrum([[1.5, 1.3]]))
+        check_gain(Sigmoid(gain=0.5), Spectrum(np.array([[1.5, 1.3]])))
     assert str(caught.value) == (
         "Sigmoid(gain=0.5) has the wrong sign, so every cycle enlarges the error; use a negative gain, "
         "0 < |gain| < 3.36 (linear limit: small errors converge) and < 2.82 (sector limit: errors of any size "
@@ -237,18 +238,19 @@ def test_both_signs_cannot_be_cured_by_a_gain(eigenvalues: list[complex]) -> Non
 def test_too_large_and_no_gain() -> None:
     """Beyond the linear limit errors grow; a map that does not iterate is no candidate."""
     with pytest.raises(NotContractive, match=r"grow by the factor 1\.38 per cycle.*recommended gain=-1\.8"):
-        check_gain(Sigmoid(gain=-4.0), Spectrum([[1.5, 1.3]]))
+        check_gain(Sigmoid(gain=-4.0), Spectrum(np.array([[1.5, 1.3]])))
     with pytest.raises(NotContractive, match="does not iterate"):
-        check_gain(Identity(), Spectrum([[1.5, 1.3]]))
-    assert assess_gain(Identity(), Spectrum([[1.5, 1.3]])).predicted == 1.0
+        check_gain(Identity(), Spectrum(np.array([[1.5, 1.3]])))
+    assert assess_gain(Identity(), Spectrum(np.array([[1.5, 1.3]]))).predicted == 1.0
 
 
 @pytest.mark.parametrize("deformation", MAPS, ids=name_of)
 def test_recommended_gain_is_contractive(deformation: Deformation) -> None:
     """The recommendation, put back into the map, passes its own check within the sector limit."""
-    spectrum = Spectrum([[1.5, 0.1]])
+    spectrum = Spectrum(np.array([[1.5, 0.1]]))
     report = check_gain(deformation, spectrum)
-    better = replace(deformation, **{deformation.gain_name: report.recommended})  # type: ignore[arg-type]
+    map: Any = deformation
+    better = replace(map, **{map.gain_name: report.recommended})
     again = check_gain(better, spectrum)
     assert again.within_sector
     assert again.predicted <= report.predicted + 1e-12
@@ -287,7 +289,7 @@ def test_contraction_along_a_run_is_logged_per_cycle():
     """The signal is the predicted factor at each cycle's own state and request: constant on two_mass, 1 - a lambda_min."""
     import fpirhc as fp
 
-    task = fp.load_problem("two_mass")
+    task: Any = fp.load_problem("two_mass")
     run = fp.simulate(task.problem, task.controllers["CTC+FPI (eq 6)"], seed=0)
     assert run["contraction"].shape == (run.cycles, 1)
     gain = task.controllers["CTC+FPI (eq 6)"].deformation.effective_gain()

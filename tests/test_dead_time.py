@@ -11,6 +11,8 @@ from plants import linear, pendulum
 from test_adaptation import stepping
 
 import fpirhc as fp
+from fpirhc.controllers.base import Controller
+from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError, InvalidValue, NotSupported
 
 DELAYS = (0, 1, 2, 3, 5, 10, 20)
@@ -21,7 +23,7 @@ def affine(effective_gain: float) -> fp.Affine:
     return fp.Affine(gain=-1.0).with_effective_gain(effective_gain)
 
 
-def iteration_radius(deformation: fp.Deformation, delay: int) -> float:
+def iteration_radius(deformation: Deformation, delay: int) -> float:
     """Spectral radius of the scalar iteration whose response is the request of `delay` cycles earlier."""
     layout = deformation.memory(("q",))
     size = delay + 1  # requests on their way, newest first
@@ -172,12 +174,12 @@ DUFFING = fp.load_problem("delayed_mass")
 LATE = replace(DUFFING.problem, duration=9.0, measure_from=4.0)  # 60 ms, rate x dead time = 0.36
 
 
-def rms_error(dead_time: float, controller: fp.Controller) -> float:
+def rms_error(dead_time: float, controller: Controller) -> float:
     problem = replace(LATE, dead_time=fp.DeadTime(inputs={"Q": dead_time}))
     return fp.measure(problem, fp.simulate(problem, controller, seed=0)).rms_error["q"]
 
 
-def controllers(believed: float) -> dict[str, fp.Controller]:
+def controllers(believed: float) -> dict[str, Controller]:
     """The forms of the deformation, for a believed dead time."""
     cycles = believed / DUFFING.problem.period
     sigmoid = fp.Sigmoid(gain=-0.5)
@@ -347,7 +349,7 @@ def test_shipped_problems_tell_what_helps(name):
     """With the same prediction FPI lowers the error; a controller that knows nothing of the dead time is the worst."""
     task = fp.load_problem(name)
     errors = {
-        c: fp.measure(task.problem, fp.simulate(task.problem, task.controllers[c], seed=0)).rms_error.popitem()[1]
+        c: [*fp.measure(task.problem, fp.simulate(task.problem, task.controllers[c], seed=0)).rms_error.values()][-1]
         for c in ("RHC", "RHC+FPI", "RHC not predicting")
     }
     assert errors["RHC+FPI"] < 0.8 * errors["RHC"]

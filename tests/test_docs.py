@@ -56,6 +56,8 @@ def test_links_lead_somewhere(page):
 def test_every_public_name_is_on_the_api_page():
     """The page is made when the site is built; it holds every public name once, and every member of a family."""
     spec = importlib.util.spec_from_file_location("make_api", DOCS / "make_api.py")
+    assert spec is not None
+    assert spec.loader is not None
     maker = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(maker)
     shown = re.findall(r"^\.\. auto\w+:: fpirhc\.(\w+)$", maker.page(), re.MULTILINE)

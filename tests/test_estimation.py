@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -15,6 +16,7 @@ from plants import linear, pendulum
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.learning.estimators.base import Seen
+from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.native import find_compiler
 
 PERIOD = 1e-2
@@ -33,7 +35,7 @@ def spring(k: float = 3.0, b: float = 1.0, believed: tuple[float, float] = (2.0,
 def task(plant: fp.Plant, **changes) -> fp.Problem:
     """Follow a sine (or what `changes` say) with a short horizon."""
     name, force = plant.names[0], next(iter(plant.inputs))
-    settings = {
+    settings: dict[str, Any] = {
         "plant": plant,
         "reference": fp.Trajectory(lambda t: {name: 0.3 * ca.sin(2 * t)}),
         "start": {name: 0.05},
@@ -96,6 +98,8 @@ def feedback(problem: fp.Problem) -> float:
     """K of u = -K y, from the plan's first input a little off the reference."""
     from fpirhc.horizon.problem import stage_data, transcribe
 
+    assert problem.horizon is not None
+    assert problem.cost is not None
     parts = problem.plant, problem.reference, problem.horizon, problem.cost
     data = stage_data(*parts)(0.0, problem.plant.approximate).full()
     plan = fp.solve(transcribe(*parts, problem.limits), RHC.optimiser, np.array([1e-3, 0.0]), data)
@@ -137,7 +141,7 @@ class Fed:
         layout, plant = estimator.memory(problem), problem.plant
         symbols = [ca.MX.sym(n, k) for n, k in (("x", 2), ("u", 1), ("f", 1), ("valid", 1), ("m", layout.size))]
         x, u, f, valid, memory = symbols
-        given = Seen(x, u, f, ca.DM(plant.approximate), valid)
+        given = Seen(*(expression(v) for v in (x, u, f, ca.DM(plant.approximate), valid)))
         parameter_change, following = estimator.step(problem)(given, layout.split(memory))
         self.function = ca.Function("fed", symbols, [parameter_change, layout.join(following)])
         self.memory = layout.start()

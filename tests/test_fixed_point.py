@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -18,7 +19,7 @@ from fpirhc.horizon.problem import stage_data, transcribe
 from fpirhc.horizon.riccati import box_policy
 from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.base import judge
-from fpirhc.optimisers.search import Given, Search
+from fpirhc.optimisers.search import Search
 from fpirhc.symbolic.driver import substitute
 from fpirhc.symbolic.native import find_compiler, generate, native
 
@@ -54,7 +55,7 @@ def test_random_box_constrained_problems_are_solved_or_honestly_not(seed, low, h
     assert low <= inputs.min() <= inputs.max() <= high
 
 
-CACHE = {}
+CACHE: dict[str, Any] = {}
 
 
 def setup_module():
@@ -142,8 +143,8 @@ def test_stage_box_programs_against_scipy(seed, size):
     assert sum(MISSED) <= 0.03 * max(len(MISSED), 100)
 
 
-POLICIES: dict = {}
-MISSED: list = []
+POLICIES: dict[Any, ca.Function] = {}
+MISSED: list[bool] = []
 
 
 def test_measured_contraction_is_the_predicted_one():
@@ -198,8 +199,9 @@ def test_the_envelope_never_rises():
     tried, plan = search.tried(type(start)(*anchor), given)
     following = search.directed(tried, plan, given)
     advance = ca.Function("advance", [*given, *anchor], [*following, plan.accepted])
-    arguments = Given(np.array([0.1, 0.0]), data, np.array([-2.0]), np.array([2.0]))
-    state, costs = begin(*arguments, optimiser.memory(ocp).start()), []
+    arguments = np.array([0.1, 0.0]), data, np.array([-2.0]), np.array([2.0])
+    state: list[ca.DM] = list(begin(*arguments, optimiser.memory(ocp).start()))
+    costs = []
     for _ in range(80):
         *state, accepted = advance(*arguments, *state)
         costs.append((float(state[7]), float(state[9]), bool(accepted)))

@@ -143,7 +143,11 @@ BAD_COSTS = {
     ),
     "shape": (fp.CustomCost(terms=lambda v: {"a": v.state.vector}), r"term 'a' must be one scalar, got shape \(2, 1\)"),
     "empty": (fp.CustomCost(terms=lambda v: {}), "at least one entry"),
-    "kind": (fp.CustomCost(terms=lambda v: v.input.torque**2), "must be {name: expression}"),
+    # Not a mapping, which is refused.
+    "kind": (
+        fp.CustomCost(terms=lambda v: v.input.torque**2),  # type: ignore[arg-type, return-value]
+        "must be {name: expression}",
+    ),
     "many": (fp.Quadratic(states={"angel": 1.0, "angle": -1.0}, effort={"torqe": np.nan}), "4 mistakes"),
 }
 

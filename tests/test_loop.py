@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -201,7 +202,8 @@ def test_save_and_load(tmp_path):
     again = fp.load_run(tmp_path / "run.npz")
     assert np.array_equal(again.log, found.log)
     assert again.layout.columns == found.layout.columns
-    assert again.settings["controller"]["is"] == "ComputedTorque"
+    settings: Any = again.settings
+    assert settings["controller"]["is"] == "ComputedTorque"
     (tmp_path / "bad.npz").write_bytes((tmp_path / "run.npz").read_bytes()[:200])
     with pytest.raises(fp.FpirhcError, match="cannot read"):
         fp.load_run(tmp_path / "bad.npz")
@@ -219,7 +221,7 @@ def test_signals_by_name():
         found["desird"]
 
 
-BAD = {
+BAD: dict[str, dict[str, Any]] = {
     "'angel' is unknown. Did you mean 'angle'": {"start": {"angel": 0.0}},
     "coordinate 'angle' has no first value": {"start": {}},
     "must be a finite number, got nan": {"start": {"angle": float("nan")}},

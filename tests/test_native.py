@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import pickle
 import stat
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -73,6 +74,7 @@ def test_damaged_library_is_built_again(cache, damage):
     """Truncated, overwritten, or with a lost checksum: the answer is right and the cache is whole again."""
     sources = module.generate(model(4.0))
     compiler = find_compiler()
+    assert compiler is not None
     module._library(sources, compiler)
     (path,) = _libraries(cache)
     checksum = path.with_suffix(".sha256")
@@ -152,8 +154,9 @@ def test_folder_that_cannot_be_written_is_replaced(tmp_path, monkeypatch):
 def test_solver_calls_stay_in_the_virtual_machine(cache):
     """IPOPT cannot be written as C; the reason says so."""
     x, p = ca.MX.sym("x"), ca.MX.sym("p")
-    options = {"ipopt.sb": "yes", "ipopt.print_level": 0, "print_time": False}
-    solver = ca.nlpsol("solver", "ipopt", {"x": x, "p": p, "f": (x - p) ** 2}, options)
+    program: dict[str, ca.MX] = {"x": x, "p": p, "f": (x - p) ** 2}
+    options: Any = {"ipopt.sb": "yes", "ipopt.print_level": 0, "print_time": False}
+    solver = ca.nlpsol("solver", "ipopt", program, options)
     given = ca.MX.sym("given")
     found = native(ca.Function("fpirhc_solve", [given], [solver(p=given)["x"]]))
     assert not found.compiled

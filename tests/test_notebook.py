@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -98,7 +99,7 @@ def read(page: str) -> Tags:
     return parser
 
 
-def shown(comparison: fp.Comparison, plan: fp.Plan) -> dict[str, object]:
+def shown(comparison: fp.Comparison, plan: fp.Plan) -> dict[str, Any]:
     entry = comparison[HOSTILE]
     assert entry.contraction is not None
     return {

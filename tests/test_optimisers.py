@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -21,11 +22,11 @@ from fpirhc.optimisers.base import judge
 from fpirhc.optimisers.nlp import quadratic_solver
 from fpirhc.symbolic.native import generate, native
 
-TASK = fp.load_problem("two_mass")
+TASK: Any = fp.load_problem("two_mass")
 GRADIENT = fp.ReducedGradient(iterations=60, tolerance=1e-4)
 BACKENDS = (fp.Ipopt(), fp.Fatrop(), fp.SequentialQuadratic(), fp.SequentialQuadratic(quadratic=fp.Osqp()))
 FIXED = fp.FixedPoint(iterations=8, tolerance=1e-6)
-EVERY = (GRADIENT, FIXED, *BACKENDS)
+EVERY: tuple[Any, ...] = (GRADIENT, FIXED, *BACKENDS)
 BOXES = {
     "free": fp.Limits(),
     "active": fp.Limits(inputs={"Q1": (-5.0, 10.0), "Q2": (-30.0, 30.0)}),
@@ -269,7 +270,7 @@ def test_chain_of_order_four_under_receding_horizon():
 
 def scaled(factor):
     """The shipped problem with every weight times `factor`."""
-    cost = TASK.problem.cost
+    cost: Any = TASK.problem.cost
     return replace(
         TASK.problem,
         cost=fp.Quadratic(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -93,8 +95,9 @@ def test_underactuated_plant_asks_for_a_choice():
         _ = two_mass_chain().controlled_names
 
 
-BAD = {
-    "approximate must be a finite number, got None": {"parameters": {**TWO, "m": fp.Parameter(None, 1.0, "kg")}},
+NO_NUMBER: Any = None
+BAD: dict[str, dict[str, Any]] = {
+    "approximate must be a finite number, got None": {"parameters": {**TWO, "m": fp.Parameter(NO_NUMBER, 1.0, "kg")}},
     "exact must be a finite number, got nan": {"parameters": {**TWO, "m": fp.Parameter(1.0, float("nan"), "kg")}},
     "has no unit": {"parameters": {**TWO, "m": fp.Parameter(1.0, 1.0, "")}},
     "Did you mean 'm'": {"response": lambda q, v, u, p: {"y": u.u / p.mm}},
@@ -111,7 +114,7 @@ BAD = {
 @pytest.mark.parametrize("message", BAD)
 def test_mistakes_are_named(message):
     """Each mistake says what, where, and how to mend it."""
-    good = {
+    good: dict[str, Any] = {
         "coordinates": {"y": "m"},
         "inputs": {"u": "N"},
         "parameters": TWO,
@@ -124,4 +127,4 @@ def test_mistakes_are_named(message):
 def test_all_mistakes_come_at_once():
     """A user sees every mistake of the parameters in one error."""
     with pytest.raises(InvalidProblem, match=r"(?s)2 mistakes.*approximate.*unit"):
-        fp.Plant({"y": "m"}, {"u": "N"}, {"m": fp.Parameter(None, 1.0, "")}, lambda q, v, u, p: {"y": u.u})
+        fp.Plant({"y": "m"}, {"u": "N"}, {"m": fp.Parameter(NO_NUMBER, 1.0, "")}, lambda q, v, u, p: {"y": u.u})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +38,7 @@ def test_one_iteration_per_cycle_is_as_good_as_converged_solving(name):
     if name == "cart_pole":  # tracking with the pole up: a swing-up has several local optima, and each may find another
         problem = replace(problem, start={"cart": 0.2, "angle": 0.2})
     for controller in ("RHC", "RHC+FPI"):
-        once = task.controllers[controller]
+        once: Any = task.controllers[controller]
         costs = []
         for chosen in (once, once.with_optimiser(replace(once.planner.optimiser, iterations=12))):
             run = fp.simulate(problem, chosen, seed=0)
@@ -50,6 +51,8 @@ def test_one_iteration_per_cycle_is_as_good_as_converged_solving(name):
 def test_iterations_in_closed_loop(name):
     """Converged to 1e-6 of the input's range, the median plan needs at most six iterations; limits become active."""
     problem = fp.load_problem(name).problem
+    assert problem.horizon is not None
+    assert problem.cost is not None
     plant, step = problem.plant, problem.horizon.step
     ocp = transcribe(plant, problem.reference, problem.horizon, problem.cost, problem.limits)
     data_of = stage_data(plant, problem.reference, problem.horizon, problem.cost)

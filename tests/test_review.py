@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -31,7 +32,7 @@ def mass(**settings) -> fp.Problem:
         parameters={"m": fp.Parameter(1.5, 1.0, "kg"), "k": fp.Parameter(6.0, 10.0, "N/m")},
         response=lambda q, v, u, p: {"q": (u.u - p.k * q.q) / p.m},
     )
-    given = {
+    given: dict[str, Any] = {
         "reference": fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(3 * t)}),
         "start": {"q": 0.0},
         "period": PERIOD,
@@ -150,6 +151,8 @@ def test_feedback_of_a_plan_is_that_of_the_riccati_equation():
     import control
     import scipy.linalg
 
+    assert problem.horizon is not None
+    assert problem.cost is not None
     [found] = plan_gains(problem, problem.horizon, problem.cost, [0.0], problem.plant.approximate)
     m, k = problem.plant.approximate
     whole = scipy.linalg.expm(np.array([[0, 1, 0], [-k / m, 0, 1 / m], [0, 0, 0]]) * 1e-2)
@@ -313,7 +316,7 @@ def test_bad_input_ends_with_2(words, said, capsys):
 def test_slots_are_judged_by_their_schedule():
     """Crane: the published radius; a controller that does not fit is a no with its reason."""
     task = fp.load_problem("crane_slots")
-    controller = task.controllers["slots+FPI"]
+    controller: Any = task.controllers["slots+FPI"]
     found = answers(task.problem, controller)
     assert about(found, "schedule").numbers["floquet_radius"] == pytest.approx(0.0485, abs=1e-3)
     wrong = replace(controller, slots=(replace(controller.slots[0], order=3), controller.slots[1]))

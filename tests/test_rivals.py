@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -318,7 +319,7 @@ VIEWED = (
 def test_surface_stays_within_its_ultimate_bound():
     """|S| <= sup|h| / rate after the transient, up to the sampling; a deformation lowers both."""
     problem = swing()
-    views = [fp.lyapunov_view(problem, c, simulate(problem, c)) for c in VIEWED]
+    views: list[Any] = [fp.lyapunov_view(problem, c, simulate(problem, c)) for c in VIEWED]
     for view in views:
         assert view.largest <= view.bound * (1 + RATE * problem.period) + 1e-9
         assert view.largest > 0.5 * view.bound
@@ -330,7 +331,9 @@ def test_view_is_shown_where_there_is_one():
     problem = swing(duration=0.3, measure_from=0.1)
     task = Task("case", Path("case.py"), "title", "", problem, {"CTC": VIEWED[0], "PID": RIVALS[0]})
     found = compare(task, seed=0, compiled=False)
-    assert found["CTC"].notes[-1] == found["CTC"].lyapunov.text
+    view = found["CTC"].lyapunov
+    assert view is not None
+    assert found["CTC"].notes[-1] == view.text
     assert found["PID"].lyapunov is None
     assert "Lyapunov's view" in render(found)
 

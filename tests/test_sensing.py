@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -32,7 +33,7 @@ GENTLE = fp.Exponential(rate=0.01, integral=False)
 
 def resting(plant, **others):
     """A plant to be held at zero."""
-    settings = {
+    settings: dict[str, Any] = {
         "reference": fp.Trajectory(lambda t: {"y": 0 * t}),
         "start": {"y": 0.0},
         "period": 1e-3,
@@ -379,7 +380,8 @@ def test_dead_time_counts_but_is_not_judged_alone():
 
 def test_all_mistakes_of_sensing_are_told_at_once():
     """Unknown names with the nearest, quantities that are not measured, sensors that are none, a polynomial that is too low."""
-    sensing = fp.Sensing({"yy": NOISE, "y'": NOISE, "y": 3.0}, fp.SavitzkyGolay(window=5, degree=1))
+    sensors: dict[str, Any] = {"yy": NOISE, "y'": NOISE, "y": 3.0}
+    sensing = fp.Sensing(sensors, fp.SavitzkyGolay(window=5, degree=1))
     with pytest.raises(InvalidProblem) as refused:
         swinging(sensing=sensing, measure_from=-1.0)
     text = str(refused.value)
@@ -400,13 +402,19 @@ def test_all_mistakes_of_sensing_are_told_at_once():
         (lambda: fp.Noise(math.nan), "deviation=nan"),
         (lambda: fp.ColouredNoise(math.inf, 1.0), "ColouredNoise.*deviation=inf"),
         (lambda: fp.ColouredNoise(1.0, 0.0), "correlation_time=0.0.*positive"),
-        (lambda: fp.Sensor(noise=0.1), r"expected a signal such as Noise\(deviation=...\)"),
+        (
+            lambda: fp.Sensor(noise=0.1),  # type: ignore[arg-type]  # a number is refused
+            r"expected a signal such as Noise\(deviation=...\)",
+        ),
         (lambda: fp.Sensor(quantum=0.0), "quantum=0.0: expected a positive number"),
         (lambda: fp.Sensor(quantum=-1.0, dropout=1.0), "quantum=-1.0.*dropout=1.0: expected a probability"),
         (lambda: fp.Sensor(dropout=math.nan), "dropout=nan"),
         (lambda: fp.SavitzkyGolay(window=10, degree=2), "odd window.*use 9 or 11"),
         (lambda: fp.SavitzkyGolay(window=3, degree=3), "more samples than the degree.*at least 5"),
-        (lambda: fp.SavitzkyGolay(window=5.0, degree=2), "whole numbers"),
+        (
+            lambda: fp.SavitzkyGolay(window=5.0, degree=2),  # type: ignore[arg-type]  # a float is refused
+            "whole numbers",
+        ),
         (lambda: fp.LowPassDifference(time_constant=0.0), r"positive number of seconds.*VelocityDifference\(\)"),
         (lambda: fp.Filtered(fp.Affine(gain=-1.0), pole=1.0), "pole=1.0.*below 1"),
         (lambda: fp.Filtered(fp.Affine(gain=-1.0), pole=math.nan), "pole=nan"),

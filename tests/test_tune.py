@@ -6,6 +6,7 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -67,7 +68,7 @@ def test_settings_are_changed_by_path_and_nothing_else_is():
         "controller.cost.states.q'": 5.0,
         "controller.optimiser.iterations": 3,
     }
-    changed = fp.with_settings(fp.ExactModel(inner), values)
+    changed: Any = fp.with_settings(fp.ExactModel(inner), values)
     assert changed.controller.deformation == fp.Sigmoid(gain=-0.7)
     assert dict(changed.controller.cost.states) == {"q": 1.0, "q'": 5.0}
     assert changed.controller.optimiser == fp.FixedPoint(iterations=3, tolerance=1e-2)
@@ -134,7 +135,7 @@ def test_mistakes_in_a_file_are_found_when_it_is_loaded(old, new, message, task,
 # --- Tuning -----------------------------------------------------------------------------------------------------------
 
 
-def records(folder: Path) -> list[dict]:
+def records(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "trials.jsonl").read_text().splitlines()[1:]]
 
 
@@ -217,7 +218,7 @@ def test_failing_trials_cost_a_finite_penalty(task, tmp_path):
 
 def test_a_disturbed_study_finds_what_a_calm_one_finds(task, tmp_path):
     """Cut anywhere and gone on with, or begun with fewer trials: the same trials, bit by bit. Trials beyond the tenth learn."""
-    settings = {"seed": 3, "count": 2, "percent": 10.0, "controllers": ["CTC+FPI"]}
+    settings: dict[str, Any] = {"seed": 3, "count": 2, "percent": 10.0, "controllers": ["CTC+FPI"]}
     calm = fp.tune(task, trials=14, folder=tmp_path / "calm", **settings)
     fp.tune(task, trials=5, folder=tmp_path / "cut", **settings)
     content = (tmp_path / "cut" / "trials.jsonl").read_bytes()

@@ -63,8 +63,8 @@ def test_response_error_times_gain_over_period_is_constant():
             problem = replace(PROBLEM, period=period, horizon=None, cost=None)
             response = np.linalg.norm(late_error(sigmoid(gain), problem)[2])
             constants.append(response * abs(gain) / period)
-    constants = np.array(constants)
-    assert np.abs(constants / constants.mean() - 1).max() < 0.10
+    sizes = np.array(constants)
+    assert np.abs(sizes / sizes.mean() - 1).max() < 0.10
 
 
 def test_sector_bound():

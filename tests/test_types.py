@@ -101,7 +101,8 @@ def test_an_opaque_step_is_built_of_calls(opaque: bool, expected: type[Expressio
 
 
 def test_an_empty_column_mixes_with_every_kind() -> None:
-    for symbols in (ca.SX, ca.MX):
-        x = symbols.sym("x")
-        assert ca.vertcat(column([]), x).shape == (1, 1)
-        assert isinstance(ca.vertcat(column([]), x), symbols)
+    assert isinstance(ca.vertcat(column([]), ca.SX.sym("x")), ca.SX)
+    graphs: list[ca.MX] = []
+    both = ca.vertcat(column(graphs), ca.MX.sym("x"))
+    assert isinstance(both, ca.MX)
+    assert both.shape == (1, 1)

@@ -129,7 +129,7 @@ def _ideal(orders: tuple[int, ...]) -> Plant:
 
     arguments = [*(f"d{k}" for k in range(max(orders))), "u", "p"]
     kind = inspect.Parameter.POSITIONAL_ONLY
-    response.__signature__ = inspect.Signature([inspect.Parameter(n, kind) for n in arguments])  # type: ignore[attr-defined]
+    vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(n, kind) for n in arguments])
     inputs = {f"u{k}": "N" for k in range(len(orders))}
     return Plant(dict.fromkeys(names, "m"), inputs, {}, response, dict(zip(names, orders, strict=True)))
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -108,5 +107,5 @@ def _draws(lower: np.ndarray, upper: np.ndarray, random: np.random.Generator) ->
 
 def each(function: ca.Function, *arguments: np.ndarray) -> np.ndarray:
     """Return a Function of columns at every row of its arguments, shape (rows, size)."""
-    table: Any = function.map(len(arguments[0]))(*(rows.T for rows in arguments))
+    table = function.map(len(arguments[0]))(*(rows.T for rows in arguments))
     return np.asarray(table.full()).T

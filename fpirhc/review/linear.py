@@ -20,7 +20,6 @@ import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -31,7 +30,7 @@ from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.sensing import Sensing
 from fpirhc.simulation.loop import close_loop
-from fpirhc.symbolic.layout import Expression
+from fpirhc.symbolic.layout import Expression, Named
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.disturbance import Step
 from fpirhc.task.problem import Problem
@@ -127,7 +126,7 @@ def linear_plant(plant: Plant, sign: float) -> Plant:
     values = np.concatenate([np.zeros(n * nx), gain.ravel(), np.zeros(nu * nx)])
     parameters = {name: Parameter(v, sign * v, "1") for name, v in zip(names, values, strict=True)}
 
-    def response(*given: Any) -> Mapping[str, Expression]:
+    def response(*given: Named) -> Mapping[str, Expression]:
         *derivatives, u, p = given
         entries = p.vector
         by_name = {c + "'" * k: d[c] for k, d in enumerate(derivatives) for c in d}
@@ -139,7 +138,7 @@ def linear_plant(plant: Plant, sign: float) -> Plant:
 
     kind = inspect.Parameter.POSITIONAL_ONLY
     arguments = [f"d{k}" for k in range(max(plant.orders))] + ["u", "p"]
-    response.__signature__ = inspect.Signature([inspect.Parameter(a, kind) for a in arguments])  # type: ignore[attr-defined]
+    vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(a, kind) for a in arguments])
     order = dict(zip(plant.names, plant.orders, strict=True))
     return Plant(plant.coordinates, plant.inputs, parameters, response, order, plant.controlled_names)
 
@@ -184,5 +183,5 @@ def _linear_problem(problem: Problem, controller: Controller) -> Problem:
 def _at_rest(function: ca.Function, start: np.ndarray) -> np.ndarray:
     """The memory after so many cycles at rest that every queue is full."""
     cycles = start.size + 2
-    moved: Any = function.mapaccum("fpirhc_resting", cycles)(start, np.zeros((function.size1_in(1), cycles)))
+    moved = function.mapaccum("fpirhc_resting", cycles)(start, np.zeros((function.size1_in(1), cycles)))
     return np.asarray(moved[0].full())[:, -1]

@@ -6,13 +6,12 @@ asked for at requests from d to r* and a little beyond both, and at states that 
 
 from __future__ import annotations
 
-from typing import Any
-
 import casadi as ca
 import numpy as np
 
 from fpirhc.contraction import Spectrum, response_jacobian
 from fpirhc.review.grid import ReviewGrid, each
+from fpirhc.symbolic.expression import kind
 
 _SHARES = (-0.25, 0.5, 1.0, 1.25)  # of the way from the nominal response to the request that the plant needs
 _SAMPLES = 2000
@@ -57,6 +56,6 @@ def _near(grid: ReviewGrid, believed: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _stacked(grid: ReviewGrid) -> ca.Function:
     """The response Jacobian as one column."""
     function = response_jacobian(grid.problem.plant)
-    kind: Any = ca.MX if grid.problem.plant.inverse_opaque else ca.SX
-    given = [kind.sym(f"v{k}", function.size1_in(k)) for k in range(function.n_in())]
+    matrix = kind(grid.problem.plant.inverse_opaque)
+    given = [matrix.sym(f"v{k}", function.size1_in(k)) for k in range(function.n_in())]
     return ca.Function("fpirhc_stacked_jacobian", given, [ca.vec(function(*given))])

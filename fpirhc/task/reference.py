@@ -79,8 +79,8 @@ class Table(Reference):
         InvalidValue: times not increasing or values not finite. InvalidShape: lengths differ or too few samples.
     """
 
-    times: Sequence[float]
-    values: Mapping[str, Sequence[float]]
+    times: Sequence[float] | np.ndarray
+    values: Mapping[str, Sequence[float] | np.ndarray]
     degree: int = 5
 
     def __post_init__(self) -> None:

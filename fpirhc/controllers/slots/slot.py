@@ -118,7 +118,7 @@ def _light_plant(plant: Plant, chain: OutputChain) -> Plant:
 
     names = [f"d{k}" for k in range(chain.order)] + ["u", "p"]
     kind = inspect.Parameter.POSITIONAL_ONLY
-    response.__signature__ = inspect.Signature([inspect.Parameter(n, kind) for n in names])  # type: ignore[attr-defined]
+    vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(n, kind) for n in names])
     return Plant({chain.coordinate: chain.unit}, {chain.input: plant.inputs[chain.input]}, {}, response, chain.order)
 
 

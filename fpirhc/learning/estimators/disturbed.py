@@ -53,7 +53,7 @@ def _response(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping
         found = plant.response(*before, _own(plant, p))
         return {c: v + p[disturbance_name(c)] if c in coordinates else v for c, v in found.items()}
 
-    response.__signature__ = inspect.signature(plant.response)  # type: ignore[attr-defined]
+    vars(response)["__signature__"] = inspect.signature(plant.response)
     return response
 
 
