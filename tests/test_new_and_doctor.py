@@ -6,17 +6,18 @@ import json
 import os
 import subprocess
 import sys
-import warnings
 from dataclasses import replace
 
+import casadi as ca
 import pytest
 
 import fpirhc as fp
 from fpirhc.cli.main import main
-from fpirhc.doctor import machine, traps
+from fpirhc.doctor import machine
 from fpirhc.doctor.examine import Diagnosis
 from fpirhc.doctor.finding import Finding, Outcome, ask
 from fpirhc.scaffold.create import create_problem
+from fpirhc.symbolic.native import Native
 
 
 @pytest.fixture
@@ -135,10 +136,7 @@ def test_doctor_finds_this_installation_in_order(capsys, tmp_path, monkeypatch):
     assert {"fpirhc", "casadi", "numpy", "python"} <= set(found["versions"])
     assert found["outcome"] in ("ok", "warn")
     checks = {c["name"]: c for c in found["checks"]}
-    assert len(checks) == len(machine.CHECKS) + len(traps.CHECKS)
-    for check in traps.CHECKS:
-        name = check.__name__.replace("_", "-")
-        assert checks[name]["outcome"] == "ok", checks[name]
+    assert list(checks) == [check.__name__.replace("_", "-") for check in machine.CHECKS]
     assert str(tmp_path / "cache") in checks["cache"]["found"]
 
 
@@ -179,28 +177,49 @@ def test_missing_solvers_are_named(monkeypatch):
     assert "missing fatrop" in found
 
 
-BROKEN = {
-    "maximum_hides_nan": ("fpirhc.doctor.traps.is_finite", lambda value: 1),
-    "nan_equals_nan": ("fpirhc.doctor.traps.within", lambda value, bound: True),
-    "conic_fatrop": ("fpirhc.doctor.traps.quadratic_solver", lambda name: None),
-    "solver_pickle": ("fpirhc.doctor.traps.pickle.dumps", lambda value: bytes(8_700_000)),
-}
-
-
-@pytest.mark.parametrize("name", BROKEN)
-def test_checks_fail_where_the_guard_is_gone(name, monkeypatch):
-    """A check that cannot fail checks nothing: with its guard taken out, each says so."""
-    monkeypatch.setattr(*BROKEN[name])
-    outcome, _, remedy = getattr(traps, name)()
+def test_a_compiler_that_computes_wrongly_fails(monkeypatch):
+    """The compiled Function is evaluated, not only built."""
+    x = ca.SX.sym("x")
+    wrong = Native(ca.Function("fpirhc_step", [x], [3 * x]), True, "")
+    monkeypatch.setattr(machine, "native", lambda function: wrong)
+    outcome, found, remedy = machine.c_compiler()
     assert outcome == Outcome.FAIL
-    assert remedy
+    assert "3 * 2 + 1 = 6" in found
+    assert "FPIRHC_CC" in remedy
 
 
-def test_banner_is_noticed(monkeypatch):
-    """IPOPT left to itself prints."""
-    loud = {"print_time": False, "ipopt.sb": "no", "ipopt.print_level": 5}
-    monkeypatch.setattr("fpirhc.optimisers.nlp.Ipopt.options", lambda self, ocp: loud)
-    assert traps.solver_banner()[0] == Outcome.WARN
+def test_a_large_cache_is_a_warning(tmp_path, monkeypatch):
+    """With what to remove."""
+    monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(machine, "_LARGE_CACHE", 10.0)
+    (machine.cache_folder() / "old.so").write_bytes(bytes(11))
+    outcome, _, remedy = machine.cache()
+    assert outcome == Outcome.WARN
+    assert "remove old libraries" in remedy
+
+
+def test_a_folder_without_room_for_results_is_a_warning(tmp_path, monkeypatch):
+    """Read-only folders, full disks: what the system says, and --out as the remedy."""
+
+    def full(**settings):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.chdir(tmp_path)
+    assert machine.results_folder()[0] == Outcome.OK
+    monkeypatch.setattr(machine.tempfile, "TemporaryFile", full)
+    outcome, found, remedy = machine.results_folder()
+    assert outcome == Outcome.WARN
+    assert "No space left" in found
+    assert "--out" in remedy
+
+
+def test_a_python_without_its_lock_fails(monkeypatch):
+    """CasADi's Functions are not made for threads that run at once."""
+    monkeypatch.setattr(machine.sys, "_is_gil_enabled", lambda: False, raising=False)
+    outcome, found, remedy = machine.python_threads()
+    assert outcome == Outcome.FAIL
+    assert "global lock off" in found
+    assert "processes" in remedy
 
 
 def test_a_check_that_raises_has_failed_and_the_rest_goes_on(capsys, monkeypatch):
@@ -209,7 +228,7 @@ def test_a_check_that_raises_has_failed_and_the_rest_goes_on(capsys, monkeypatch
     def broken_library():
         raise OSError("libfoo.so: cannot open\nmore")
 
-    findings = ask([broken_library, machine.cores])
+    findings = ask([broken_library, machine.python_threads])
     assert findings[0].outcome == Outcome.FAIL
     assert findings[0].name == "broken-library"
     assert findings[0].found == "OSError: libfoo.so: cannot open"
@@ -227,11 +246,3 @@ def test_warnings_alone_exit_with_zero(monkeypatch, capsys):
     monkeypatch.setattr("fpirhc.doctor.examine.examine", lambda: Diagnosis({}, findings))
     assert main(["doctor", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["outcome"] == "warn"
-
-
-def test_numpy_check_leaves_warnings_as_they_were():
-    """It looks at a warning without letting it out."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        traps.numpy_on_symbols()
-    assert not caught

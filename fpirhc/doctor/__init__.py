@@ -1,1 +1,1 @@
-"""What an installation has, and whether known traps of the libraries below are closed here."""
+"""What an installation has, and whether it works."""

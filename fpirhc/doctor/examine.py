@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from fpirhc.doctor import machine, traps
+from fpirhc.doctor import machine
 from fpirhc.doctor.finding import Finding, Outcome, ask
 
 
@@ -42,5 +42,5 @@ class Diagnosis:
 
 
 def examine() -> Diagnosis:
-    """Return what the installation has, and how it does in every trap."""
-    return Diagnosis(machine.versions(), ask([*machine.CHECKS, *traps.CHECKS]))
+    """Return what the installation has, and whether it works."""
+    return Diagnosis(machine.versions(), ask(machine.CHECKS))

@@ -22,9 +22,11 @@ _OTHERS = ("alpaqa", "bonmin", "knitro", "madnlp", "snopt", "worhp")
 
 
 def versions() -> dict[str, str]:
-    """Versions of fpirhc and of what its numbers depend on."""
-    found = {name: version(name) for name in ("fpirhc", "casadi", "numpy", "scipy", "osqp", "control")}
-    return {**found, "python": platform.python_version(), "machine": f"{platform.system()} {platform.machine()}"}
+    """Versions of fpirhc and of what its numbers depend on, the machine, and the cores that this process may use."""
+    packages = {name: version(name) for name in ("fpirhc", "casadi", "numpy", "scipy", "osqp", "control")}
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    machine = f"{platform.system()} {platform.machine()}, {usable} of {os.cpu_count() or usable} cores"
+    return {**packages, "python": platform.python_version(), "machine": machine}
 
 
 def solver_plugins() -> tuple[Outcome, str, str]:
@@ -79,12 +81,6 @@ def cache() -> tuple[Outcome, str, str]:
     return judged(size < _LARGE_CACHE, found, remedy, Outcome.WARN)
 
 
-def cores() -> tuple[Outcome, str, str]:
-    """Cores of the machine, and those that this process may use."""
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return fine(f"{usable} usable of {os.cpu_count() or usable}")
-
-
 def results_folder() -> tuple[Outcome, str, str]:
     """Whether results can be written where they go without --out."""
     folder = next(f for f in (Path("results"), Path()) if f.is_dir())
@@ -105,4 +101,4 @@ def python_threads() -> tuple[Outcome, str, str]:
     )
 
 
-CHECKS: tuple[Check, ...] = (solver_plugins, c_compiler, cache, cores, results_folder, python_threads)
+CHECKS: tuple[Check, ...] = (solver_plugins, c_compiler, cache, results_folder, python_threads)

@@ -1,0 +1,46 @@
+"""What contributors rely on: the same gates everywhere, links that lead somewhere, a quick lane of tests that exist."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+LANES = (ROOT / "tests" / "lanes.txt").read_text(encoding="utf-8").splitlines()
+
+
+def text(path: str) -> str:
+    return (ROOT / path).read_text(encoding="utf-8")
+
+
+def test_pre_commit_has_the_gates_of_ci():
+    """The same tools with the same arguments; ruff is given the files instead of a dot."""
+    gates = [line.replace('"$bin/', "").replace('"', "").removesuffix(" .") for line in text(".ci/gates").splitlines()]
+    commands = [line for line in gates if re.match(r"(ruff|mypy|lint-imports)\b", line)]
+    hooks = re.findall(r"entry: \.venv/bin/(.+)", text(".pre-commit-config.yaml"))
+    assert len(hooks) >= 4
+    assert hooks == commands
+
+
+def test_workflow_runs_what_contributors_run():
+    """Scripts of the repository that exist and may be executed."""
+    scripts = re.findall(r"run: (\./\S+)", text(".github/workflows/ci.yml"))
+    assert {"./.ci/gates", "./.ci/run"} <= set(scripts)
+    assert all((ROOT / script).stat().st_mode & 0o111 for script in scripts)
+    assert "./.ci/gates" in text(".ci/run")
+
+
+def test_links_of_contributing_lead_somewhere():
+    for target in re.findall(r"\]\(([^)#]+)\)", text("CONTRIBUTING.md")):
+        assert (ROOT / target).exists(), target
+    for folder in re.findall(r"`((?:fpirhc|problems|tests|docs)/[\w/.]+)`", text("CONTRIBUTING.md")):
+        assert "NAME" in folder or (ROOT / folder).exists(), folder
+
+
+@pytest.mark.parametrize("name", [line.split()[1] for line in LANES if line[:1].isdigit()])
+def test_the_quick_lane_leaves_out_tests_that_exist(name):
+    """A test that was renamed would silently come back into the quick lane; write the list anew with './scripts/test measure'."""
+    file, _, function = name.partition("::")
+    assert f"def {function.rpartition('::')[2]}(" in text(f"tests/{file}")

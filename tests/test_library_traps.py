@@ -1,0 +1,134 @@
+"""Traps of the libraries below fpirhc: what they do wrong without saying so, and that a guard here catches it.
+
+The first assertions of a test say what the library does. Where one of them fails after an upgrade, the guard may have become
+superfluous; where a later one fails, the guard does not hold.
+"""
+
+from __future__ import annotations
+
+import gc
+import pickle
+import warnings
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.errors import NotSupported
+from fpirhc.horizon.problem import OptimalControl, transcribe
+from fpirhc.horizon.rollout import rollout
+from fpirhc.optimisers.base import is_finite, status_of
+from fpirhc.optimisers.nlp import Ipopt, Osqp, SequentialQuadratic, quadratic_solver
+from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.functions import SMOOTHING, signed_power
+
+PLANT = fp.Plant(
+    coordinates={"y": "m"},
+    inputs={"u": "N"},
+    parameters={"m": fp.Parameter(approximate=1.0, exact=1.0, unit="kg")},
+    response=lambda q, v, u, p: {"y": (u.u - 0.1 * v.y - 0.1 * q.y) / p.m},
+)
+REST = fp.Trajectory(lambda t: {"y": 0 * t})
+
+
+def horizon(limits: fp.Limits, stages: int = 5) -> OptimalControl:
+    cost = fp.Quadratic(states={"y": 1.0, "y'": 0.1}, effort={"u": 0.1})
+    return transcribe(PLANT, REST, fp.Horizon(stages, 0.2), cost, limits)
+
+
+def test_a_clamp_turns_nan_into_a_full_command():
+    """CasADi's fmin and fmax drop NaN; a controller holds its last command instead."""
+    assert float(ca.fmin(1, ca.fmax(-1, ca.DM(np.nan)))) in (-1.0, 1.0)
+    limits = fp.Limits(inputs={"u": (-1.0, 1.0)})
+    problem = fp.Problem(plant=PLANT, reference=REST, start={"y": 0.0}, period=0.01, duration=0.1, limits=limits)
+    stepper = fp.Stepper(problem, fp.ComputedTorque(fp.Exponential(rate=6.0)), compiled=False)
+    command, memory = stepper.step(0.0, np.array([0.01, 0.0]), np.zeros(1), stepper.start())
+    assert 0 < abs(command[0]) < 1
+    held, _ = stepper.step(0.01, np.array([np.nan, 0.0]), np.zeros(1), memory)
+    assert held[0] == command[0]
+
+
+def test_a_maximum_hides_nan_in_a_residual():
+    """A residual folded with fmax would report convergence; the status asks for finiteness."""
+    nan = ca.DM(np.nan)
+    assert float(ca.fmax(nan, 0.0)) == 0.0
+    assert fp.Status(int(ca.DM(status_of(is_finite(nan), nan, 0.0, 1e-6)))) == fp.Status.NON_FINITE
+
+
+def test_osqp_fills_infeasible_answers_with_finite_numbers():
+    """A plan without solution is not called a success."""
+    ocp = horizon(fp.Limits(inputs={"u": (-0.1, 0.1)}, states={"y": (-0.2, 0.2)}))
+    optimiser = SequentialQuadratic(tolerance=1e-3, quadratic=Osqp())
+    memory = optimiser.memory(ocp).start()
+    first = np.array([2.0, 1.0])
+    _, diagnosis, _ = optimiser.step(ocp)(first, ocp.nodes[2], ocp.input_lower, ocp.input_upper, memory)
+    assert fp.Status(int(diagnosis[4])) != fp.Status.OK
+
+
+def test_fatrop_is_no_quadratic_solver():
+    """CasADi's conic interface to fatrop returned infeasible points as solved: it is refused."""
+    with pytest.raises(NotSupported, match="fatrop"):
+        quadratic_solver("fatrop")
+
+
+def test_ipopt_prints_nothing(capfd):
+    """Its banner would spoil what --json prints."""
+    ocp, optimiser = horizon(fp.Limits()), Ipopt(tolerance=1e-3)
+    memory = optimiser.memory(ocp).start()
+    optimiser.step(ocp)(np.array([0.1, 0.0]), ocp.nodes[2], ocp.input_lower, ocp.input_upper, memory)
+    assert capfd.readouterr().out == ""
+
+
+def test_optimisers_are_sent_as_values():
+    """A pickled solver has megabytes; workers get the settings and build their own."""
+    assert len(pickle.dumps(Ipopt(tolerance=1e-3))) < 10_000
+
+
+def test_the_owner_of_a_buffer_lives_as_long_as_its_handle():
+    """CasADi's handle does not keep the memory that it writes to; the evaluator's does."""
+    x = ca.SX.sym("x", 4)
+    evaluator = Evaluator(ca.Function("f", [x], [ca.sin(x)]))
+    evaluate, results = evaluator.evaluate, evaluator.results
+    evaluator.arguments[0][:] = 1.0
+    del evaluator
+    gc.collect()
+    evaluate()
+    np.testing.assert_allclose(results[0], np.sin(1.0), rtol=1e-15, equal_nan=False)
+
+
+def test_no_adaptation_is_no_frozen_request():
+    """A gain of zero would keep the last request for ever; Identity passes on what is desired."""
+    request, response, desired = (ca.SX([v]) for v in (1.0, 2.0, 3.0))
+    assert float(ca.DM(fp.Identity().step(request, response, desired, {})[0])) == 3.0
+
+
+def test_numpy_on_a_symbol_is_no_silent_array():
+    """It gives a CasADi expression, or refuses; an array of objects would be differentiated as a constant."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            result = np.sin(ca.SX.sym("x"))
+        except (TypeError, AttributeError):
+            return
+    assert isinstance(result, ca.SX)
+
+
+def test_a_power_has_no_finite_derivatives_at_its_kink():
+    """CasADi's derivatives of sign(e) |e|^1.5 at zero are NaN or infinite; signed_power is rounded off and has finite ones."""
+    e = ca.SX.sym("e")
+
+    def derivatives(value):
+        hessian, gradient = ca.hessian(value, e)
+        return [float(v) for v in ca.Function("derivatives", [e], [gradient, hessian])(0.0)]
+
+    assert not np.isfinite(derivatives(ca.sign(e) * ca.fabs(e) ** 1.5)).all()
+    slope, curvature = derivatives(signed_power(e, 1.5))
+    assert slope == pytest.approx(SMOOTHING**0.5)
+    assert np.isfinite(curvature)
+
+
+def test_a_longer_horizon_is_no_longer_code():
+    """Stages are accumulated calls of one Function: written out one by one they would compile for seconds."""
+    short, long = (rollout(horizon(fp.Limits(), stages)).n_nodes() for stages in (10, 40))
+    assert long < 2 * short
