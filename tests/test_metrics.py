@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
@@ -255,6 +256,6 @@ def test_metrics_of_an_installed_package_are_found(monkeypatch):
 def test_the_best_of_a_column_follows_its_direction():
     """Smaller, larger or neither; a run that did not reach it is never the best."""
     for better, best in (("smaller", 1.0), ("larger", 3.0), ("neither", None)):
-        metric = replace(OVERSHOOT, better=better)
+        metric = replace(OVERSHOOT, better=cast(Any, better))
         column = columns([fp.measure(problem(), run(0.0), [metric])])[0]
         assert column.best([2.0, 1.0, None, np.nan, 3.0]) == best

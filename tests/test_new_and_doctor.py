@@ -17,7 +17,7 @@ from fpirhc.doctor import machine
 from fpirhc.doctor.examine import Diagnosis
 from fpirhc.doctor.finding import Finding, Outcome, ask
 from fpirhc.scaffold.create import create_problem
-from fpirhc.symbolic.native import Native
+from fpirhc.symbolic.native import Native, cache_folder
 
 
 @pytest.fixture
@@ -192,7 +192,7 @@ def test_a_large_cache_is_a_warning(tmp_path, monkeypatch):
     """With what to remove."""
     monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(machine, "_LARGE_CACHE", 10.0)
-    (machine.cache_folder() / "old.so").write_bytes(bytes(11))
+    (cache_folder() / "old.so").write_bytes(bytes(11))
     outcome, _, remedy = machine.cache()
     assert outcome == Outcome.WARN
     assert "remove old libraries" in remedy
@@ -206,7 +206,7 @@ def test_a_folder_without_room_for_results_is_a_warning(tmp_path, monkeypatch):
 
     monkeypatch.chdir(tmp_path)
     assert machine.results_folder()[0] == Outcome.OK
-    monkeypatch.setattr(machine.tempfile, "TemporaryFile", full)
+    monkeypatch.setattr("tempfile.TemporaryFile", full)
     outcome, found, remedy = machine.results_folder()
     assert outcome == Outcome.WARN
     assert "No space left" in found
@@ -215,7 +215,7 @@ def test_a_folder_without_room_for_results_is_a_warning(tmp_path, monkeypatch):
 
 def test_a_python_without_its_lock_fails(monkeypatch):
     """CasADi's Functions are not made for threads that run at once."""
-    monkeypatch.setattr(machine.sys, "_is_gil_enabled", lambda: False, raising=False)
+    monkeypatch.setattr(sys, "_is_gil_enabled", lambda: False, raising=False)
     outcome, found, remedy = machine.python_threads()
     assert outcome == Outcome.FAIL
     assert "global lock off" in found

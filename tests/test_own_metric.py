@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from pathlib import Path
 
@@ -107,6 +108,6 @@ def test_a_shipped_metric_is_one_file(tmp_path, monkeypatch):
     (tmp_path / "peak.py").write_text(
         "from fpirhc.simulation.metrics.base import Metric\nMETRICS = (Metric('peak', lambda problem, run: 1.0),)\n"
     )
-    package = discovery.import_module("fpirhc.simulation.metrics")
+    package = importlib.import_module("fpirhc.simulation.metrics")
     monkeypatch.setattr(package, "__path__", [*package.__path__, str(tmp_path)])
     assert "peak" in [metric.name for metric in discovery.known_metrics.__wrapped__()]
