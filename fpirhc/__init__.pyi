@@ -78,6 +78,10 @@ from .sensing import (
 )
 from .simulation.lyapunov_view import LyapunovView, lyapunov_view
 from .simulation.metrics import Metric, Metrics, measure
+from .simulation.pictures.base import Quantity
+from .simulation.pictures.over_time import OverTime
+from .simulation.pictures.portrait import Portrait
+from .simulation.pictures.raster import Raster
 from .simulation.run import Run, load_run
 from .simulation.simulate import simulate
 from .simulation.stepper import Stepper
@@ -160,12 +164,14 @@ __all__ = [
     "Noise",
     "Osqp",
     "OutputChain",
+    "OverTime",
     "Paired",
     "Parameter",
     "PathConstraint",
     "Periodic",
     "Plan",
     "Plant",
+    "Portrait",
     "PositionDifference",
     "Predicted",
     "Problem",
@@ -173,7 +179,9 @@ __all__ = [
     "Pulse",
     "Qrqp",
     "Quadratic",
+    "Quantity",
     "RFPTVector",
+    "Raster",
     "RecedingHorizon",
     "RecursiveLeastSquares",
     "ReducedGradient",

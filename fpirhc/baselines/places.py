@@ -25,27 +25,35 @@ def baseline_path(problem: Path, folder: Path | None = None) -> Path:
 def problems_here(folder: Path, baselines: Path | None = None) -> tuple[list[Path], dict[str, str]]:
     """Return the problem files to check, and the names of those deliberately not, with their reasons.
 
-    They are those of `folder/problems` if there is such a folder, else of `folder` itself: files that define `problem` and
-    `controllers`, and every name that a baseline has, so that a problem that vanished is noticed.
+    They are those of `folder/problems` and of the folders in it if there is such a folder, else of `folder` itself: files that
+    define `problem` and `controllers`, and every name that a baseline has, so that a problem that vanished is noticed.
 
     Raises:
-        BaselineError: nothing is there to check, or `unchecked.toml` is wrong.
+        BaselineError: nothing is there to check, or an `unchecked.toml` is wrong.
     """
     place = folder / "problems" if (folder / "problems").is_dir() else folder
-    held = baselines or place / FOLDER
-    named = {path.stem: path for path in sorted(place.glob("*.py")) if _is_problem(path)}
-    for path in sorted(held.glob("*.json")):
-        named.setdefault(path.stem, place / f"{path.stem}.py")
-    unchecked = _unchecked(held / UNCHECKED)
+    places = [place, *(_inner(place) if place != folder else ())]
+    held = [baselines] if baselines else [p / FOLDER for p in places]
+    named: dict[str, Path] = {}
+    for path in (f for p in places for f in sorted(p.glob("*.py")) if _is_problem(f)):
+        named.setdefault(path.stem, path)
+    for path in (f for h in held for f in sorted(h.glob("*.json"))):
+        named.setdefault(path.stem, (place if baselines else path.parents[1]) / f"{path.stem}.py")
+    unchecked = {name: reason for h in held for name, reason in _unchecked(h / UNCHECKED).items()}
     for name in unchecked:
         if name not in named:
             raise BaselineError(f"{UNCHECKED} names '{name}', which is no problem in '{place}'; take it out")
-        if baseline_path(named[name], held).exists():
+        if baseline_path(named[name], baselines).exists():
             raise BaselineError(f"{UNCHECKED} names '{name}', which has a baseline; take it out")
     chosen = [path for name, path in sorted(named.items()) if name not in unchecked]
     if not chosen:
         raise BaselineError(f"no problem to check in '{place}'; name one, or go to the folder that has 'problems'")
     return chosen, unchecked
+
+
+def _inner(place: Path) -> list[Path]:
+    """Folders in a folder of problems that hold problems themselves."""
+    return [f for f in sorted(place.iterdir()) if f.is_dir() and any(_is_problem(p) for p in f.glob("*.py"))]
 
 
 def _is_problem(path: Path) -> bool:

@@ -3,7 +3,8 @@
 A problem file defines `problem` (a Problem) and `controllers` ({name: Controller}); its docstring's first line is its
 title. Optional: `headline`, a pair (controller without adaptation, controller with) that the verdict is about; `tuning`,
 {controller: {path of a setting: Span or LogSpan}}, where `fpirhc tune` looks for better settings; `metrics`, a sequence of
-`Metric`, which every table, file and baseline of the problem then has beside the shipped ones.
+`Metric`, which every table, file and baseline of the problem then has beside the shipped ones; `pictures`, those that the
+report has beyond the usual ones.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, Mistakes, ProblemFileError, nearest
 from fpirhc.problem_files.tuning_spans import TuningSpans, check_tuning
 from fpirhc.simulation.metrics import Metric, known_metrics, with_own_metrics
+from fpirhc.simulation.pictures.base import Picture
 from fpirhc.task.problem import Problem
 
 
@@ -37,6 +39,7 @@ class Task:
     headline: tuple[str, str] | None = None
     tuning: Mapping[str, TuningSpans] = field(default_factory=dict)
     metrics: Sequence[Metric] = field(default_factory=known_metrics)
+    pictures: tuple[Picture, ...] = ()
 
     def __post_init__(self) -> None:
         if self.problem.name != self.name:
@@ -44,9 +47,10 @@ class Task:
 
 
 def shipped_folders() -> list[Path]:
-    """Folders that shipped problems may be in: inside the installed package, or beside it in a source checkout."""
+    """Folders that shipped problems may be in: inside the installed package or beside it in a checkout, each with its gallery."""
     package = Path(__file__).resolve().parents[1]
-    return [f for f in (package / "_problems", package.parent / "problems") if f.is_dir()]
+    places = (package / "_problems", package.parent / "problems")
+    return [f for place in places for f in (place, place / "gallery") if f.is_dir()]
 
 
 def shipped_problems() -> dict[str, Path]:
@@ -110,6 +114,8 @@ def load_problem(name_or_path: str) -> Task:
     tuning, own = getattr(module, "tuning", {}), getattr(module, "metrics", ())
     if not isinstance(own, Sequence) or not all(isinstance(metric, Metric) for metric in own):
         mistakes.add("metrics must be a sequence of fpirhc.Metric, metrics = (fpirhc.Metric(...),)")
+    pictures = tuple(getattr(module, "pictures", ()))
+    _check_pictures(pictures, controllers, mistakes)
     try:
         mistakes.raise_if_any()
         check_tuning(tuning, controllers)
@@ -118,7 +124,15 @@ def load_problem(name_or_path: str) -> Task:
         raise ProblemFileError(str(error)) from None
     assert isinstance(problem, Problem)
     title, _, description = (module.__doc__ or path.stem).strip().partition("\n")
-    return Task(path.stem, path, title, description.strip(), problem, controllers, headline, tuning, metrics)
+    return Task(path.stem, path, title, description.strip(), problem, controllers, headline, tuning, metrics, pictures)
+
+
+def _check_pictures(pictures: tuple[object, ...], controllers: Mapping[str, object], mistakes: Mistakes) -> None:
+    for picture in pictures:
+        if not isinstance(picture, Picture):
+            mistakes.add(f"pictures must hold pictures such as Portrait(...), got {picture!r}")
+        else:
+            mistakes.unknown(f"picture '{picture.title}': controller", picture.controllers, controllers)
 
 
 def _import(path: Path) -> ModuleType:

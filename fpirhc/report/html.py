@@ -14,6 +14,7 @@ from fpirhc.report.page import page, write_page
 from fpirhc.report.page import picture as _picture
 from fpirhc.report.page import text as _text
 from fpirhc.report.series import chart_data
+from fpirhc.report.wanted import wanted_pictures
 from fpirhc.simulation.drawing import BANDS, PALETTE
 from fpirhc.simulation.metrics.columns import Column, columns
 
@@ -53,6 +54,7 @@ def render(comparison: Comparison) -> str:
         _table(comparison),
         _charts(comparison),
         *_pictures(comparison),
+        wanted_pictures(comparison),
         _contraction(comparison),
         _lyapunov(comparison),
         _settings(comparison),

@@ -20,6 +20,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
 from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.metrics.columns import columns
+from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
 from fpirhc.studies.comparison.optimality import Optimality, measure_optimality
@@ -73,6 +74,7 @@ class Comparison:
     versions: Mapping[str, str]
     settings: Mapping[str, Any]
     elapsed: float
+    pictures: tuple[Picture, ...] = ()
 
     def __repr__(self) -> str:
         counts = f"{len(self.entries)} controllers" + (f", {len(self.skipped)} skipped" if self.skipped else "")
@@ -158,6 +160,7 @@ def compare(
         versions=versions(),
         settings=describe(task.problem),
         elapsed=time.perf_counter() - begin,
+        pictures=task.pictures,
     )
 
 

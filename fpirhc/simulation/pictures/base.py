@@ -1,0 +1,90 @@
+"""What a picture of a report is: a title, a caption, the controllers that it shows, and a way to draw their runs.
+
+A problem file names the pictures it wants: `pictures = (fp.Portrait(...), fp.Raster(...))`. A picture draws into a figure that
+it is given, so that no plotting library is imported here.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fpirhc.simulation.run import Run
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+POINTS = 4000  # drawn per line
+
+
+@dataclass(frozen=True, eq=False)
+class Quantity:
+    """Something that a run does not log but implies: a name, a unit, and a function of the run.
+
+    Parameters:
+        name, unit: of the axis. values: function of a Run that returns one number per cycle, shape (cycles,).
+    """
+
+    name: str
+    unit: str
+    values: Callable[[Run], np.ndarray]
+
+
+class Picture(ABC):
+    """Contract of a picture.
+
+    Every picture has the attributes `title`, `caption` and `controllers` (names of those that it shows; all when empty).
+    """
+
+    title: str
+    caption: str
+    controllers: tuple[str, ...]
+
+    @abstractmethod
+    def size(self, count: int) -> tuple[float, float]:
+        """Return width and height in inches for so many controllers."""
+
+    @abstractmethod
+    def draw(self, figure: Figure, runs: Mapping[str, Run]) -> None:
+        """Draw the runs, by name of their controller, into an empty figure.
+
+        Raises:
+            InvalidName: a signal that a run does not have, with the nearest one.
+        """
+
+
+def numbers(run: Run, what: str | Quantity) -> np.ndarray:
+    """Return a signal's or a quantity's values, shape (cycles,).
+
+    Raises:
+        InvalidName: a signal that the run does not have.
+    """
+    return run[what] if isinstance(what, str) else np.asarray(what.values(run), dtype=float)
+
+
+def label(run: Run, what: str | Quantity) -> str:
+    """Return the axis label 'name [unit]' of a signal or a quantity."""
+    name, unit = (what.partition(".")[2] or what, run.unit(what)) if isinstance(what, str) else (what.name, what.unit)
+    return _literal(f"{name} [{unit}]")
+
+
+def thinned(values: np.ndarray) -> np.ndarray:
+    """Return every n-th value, few enough to draw."""
+    return values[:: max(1, values.shape[0] // POINTS)]
+
+
+def caption_axes(axis: Axes, across: str, up: str) -> None:
+    """Label an axis' two directions and draw a pale grid."""
+    axis.set_xlabel(_literal(across))
+    axis.set_ylabel(_literal(up))
+    axis.grid(visible=True, alpha=0.25)
+
+
+def _literal(text: str) -> str:
+    """A pair of dollar signs would be read as a formula."""
+    return text.replace("$", r"\$")

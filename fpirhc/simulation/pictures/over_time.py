@@ -1,0 +1,58 @@
+"""Signals over time, one panel each, the controllers in one panel on each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fpirhc.simulation.pictures.base import Picture, Quantity, caption_axes, label, numbers, thinned
+from fpirhc.simulation.run import Run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False)
+class OverTime(Picture):
+    """Panels below each other that share the time axis.
+
+    Parameters:
+        title, caption: of the picture. panels: a signal's name ("command.u") or a Quantity for each.
+        levels: values at which a panel has a dashed line (thresholds, limits), by the panel's signal or quantity name.
+        time: unit of the problem's time. since: time from which it is drawn. controllers: those shown; all when empty.
+    """
+
+    title: str
+    panels: tuple[str | Quantity, ...]
+    caption: str = ""
+    levels: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    time: str = "s"
+    since: float = 0.0
+    controllers: tuple[str, ...] = ()
+
+    def size(self, count: int) -> tuple[float, float]:
+        """Two inches and a half for each panel."""
+        del count
+        return 11.0, 2.3 * len(self.panels) + 0.6
+
+    def draw(self, figure: Figure, runs: Mapping[str, Run]) -> None:
+        """Draw the panels.
+
+        Raises:
+            InvalidName: a signal that a run does not have.
+        """
+        axes = np.atleast_1d(figure.subplots(len(self.panels), 1, sharex=True))
+        for axis, what in zip(axes, self.panels, strict=True):
+            up = ""
+            for name, run in runs.items():
+                late = run.time >= self.since
+                axis.plot(thinned(run.time[late]), thinned(numbers(run, what)[late]), lw=1, label=name)
+                up = label(run, what)
+            for level in self.levels.get(what if isinstance(what, str) else what.name, ()):
+                axis.axhline(level, color="#777777", lw=0.8, ls="--")
+            caption_axes(axis, "", up)
+        axes[-1].set_xlabel(f"time [{self.time}]")
+        axes[0].legend(fontsize=7, loc="best", framealpha=0.8)

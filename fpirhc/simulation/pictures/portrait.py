@@ -1,0 +1,49 @@
+"""One signal against another: phase portraits, friction over velocity, input over output."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fpirhc.simulation.pictures.base import Picture, Quantity, caption_axes, label, numbers, thinned
+from fpirhc.simulation.run import Run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False)
+class Portrait(Picture):
+    """A panel for each controller with the same axes: `y` over `x`.
+
+    Parameters:
+        title, caption: of the picture. x, y: a signal's name ("state.q") or a Quantity.
+        since: time from which it is drawn, to leave a transient out. controllers: those shown; all when empty.
+    """
+
+    title: str
+    x: str | Quantity
+    y: str | Quantity
+    caption: str = ""
+    since: float = 0.0
+    controllers: tuple[str, ...] = ()
+
+    def size(self, count: int) -> tuple[float, float]:
+        """As wide as the panels beside each other need it."""
+        return max(5.5, 3.7 * count), 3.6
+
+    def draw(self, figure: Figure, runs: Mapping[str, Run]) -> None:
+        """Draw the panels.
+
+        Raises:
+            InvalidName: a signal that a run does not have.
+        """
+        panels = figure.subplots(1, len(runs), sharex=True, sharey=True, squeeze=False)[0]
+        for axis, (name, run) in zip(np.atleast_1d(panels), runs.items(), strict=True):
+            late = run.time >= self.since
+            axis.plot(thinned(numbers(run, self.x)[late]), thinned(numbers(run, self.y)[late]), lw=0.8)
+            axis.set_title(name, fontsize=10)
+            caption_axes(axis, label(run, self.x), label(run, self.y))

@@ -1,0 +1,57 @@
+"""When a signal passes a threshold upwards: the spike raster of neurons, one row for each controller."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fpirhc.simulation.pictures.base import Picture, Quantity, caption_axes, numbers
+from fpirhc.simulation.run import Run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False)
+class Raster(Picture):
+    """A row of ticks for each controller, one tick where the signal passes the threshold upwards.
+
+    Parameters:
+        title, caption: of the picture. signal: a signal's name ("state.V") or a Quantity. threshold: in its unit.
+        time: unit of the problem's time. controllers: those shown; all when empty.
+    """
+
+    title: str
+    signal: str | Quantity
+    threshold: float
+    caption: str = ""
+    time: str = "s"
+    controllers: tuple[str, ...] = ()
+
+    def size(self, count: int) -> tuple[float, float]:
+        """A third of an inch for each row."""
+        return 11.0, 0.33 * count + 1.1
+
+    def draw(self, figure: Figure, runs: Mapping[str, Run]) -> None:
+        """Draw the rows, the first controller on top.
+
+        Raises:
+            InvalidName: a signal that a run does not have.
+        """
+        axis = figure.subplots()
+        events = [passages(run.time, numbers(run, self.signal), self.threshold) for run in runs.values()]
+        axis.eventplot(events, lineoffsets=[float(k) for k in range(len(runs))], linelengths=0.7, colors="#222222")
+        counts = [f"{name} ({len(times)})" for name, times in zip(runs, events, strict=True)]
+        axis.set_yticks(np.arange(len(runs)), counts, fontsize=8)
+        axis.set_ylim(len(runs) - 0.5, -0.5)
+        axis.set_xlim(0, max(float(run.time[-1]) for run in runs.values()))
+        caption_axes(axis, f"time [{self.time}]", "")
+
+
+def passages(times: np.ndarray, values: np.ndarray, threshold: float) -> np.ndarray:
+    """Return the times from which the values are above the threshold after having been at it or below."""
+    above = values > threshold
+    return times[1:][above[1:] & ~above[:-1]]

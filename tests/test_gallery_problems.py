@@ -1,0 +1,351 @@
+"""The gallery's plants are those of their sources, and its tasks show what their descriptions say.
+
+References: Hodgkin and Huxley's equations as printed in 1952 (depolarisations negative, rest at zero); LuGre friction in
+steady sliding and at break-away as printed in 1995; the rated thrust of the P220; Drexler's equations in volumes instead of
+their logarithm; SciPy's stiff integrators. Rms errors are those of the descriptions, seed 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq, fsolve
+
+import fpirhc as fp
+from fpirhc.errors import NotContractive
+
+GALLERY = (
+    "hodgkin_huxley",
+    "hodgkin_huxley_silent",
+    "order_four",
+    "stick_slip",
+    "tumour",
+    "tumour_daily",
+    "turbojet",
+    "turbojet_slow",
+)
+
+
+@cache
+def task(name):
+    """A problem of the gallery, loaded once."""
+    return fp.load_problem(name)
+
+
+@cache
+def run_of(name, controller):
+    """One run with seed 0, kept for every test that looks at it."""
+    return fp.simulate(task(name).problem, task(name).controllers[controller], seed=0)
+
+
+def rms(name, controller):
+    """Rms error of the judged coordinate."""
+    [error] = fp.measure(task(name).problem, run_of(name, controller)).rms_error.values()
+    return error
+
+
+def rate_of(plant, command):
+    """Right-hand side f(t, x) of the plant with its exact parameters under a constant command or a function of time."""
+    given = command if callable(command) else lambda t: command
+    return lambda t, x: plant.derivative_function(x, given(t), plant.exact).full().ravel()
+
+
+# Hodgkin and Huxley
+
+REST = np.array([-64.9964, 0.05296, 0.59599, 0.31773])
+
+
+def printed_in_1952(state, current):
+    """dV/dt and the gates' rates as in the original: V is the displacement from rest, depolarisations negative, mV, ms."""
+    v, (m, h, n) = -(state[0] + 65.0), state[1:]
+    ionic = 120 * m**3 * h * (v + 115) + 36 * n**4 * (v - 12) + 0.3 * (v + 10.613)
+    alpha_n, beta_n = 0.01 * (v + 10) / np.expm1((v + 10) / 10), 0.125 * np.exp(v / 80)
+    alpha_m, beta_m = 0.1 * (v + 25) / np.expm1((v + 25) / 10), 4 * np.exp(v / 18)
+    alpha_h, beta_h = 0.07 * np.exp(v / 20), 1 / (np.exp((v + 30) / 10) + 1)
+    gates = [a * (1 - g) - b * g for a, b, g in ((alpha_m, beta_m, m), (alpha_h, beta_h, h), (alpha_n, beta_n, n))]
+    return np.array([-(-current - ionic) / 1.0, *gates])
+
+
+def test_the_cell_has_the_equations_of_1952():
+    """At random voltages and gates, and a current; the sign of voltages and currents is turned."""
+    plant, random = task("hodgkin_huxley").problem.plant, np.random.default_rng(1)
+    for _ in range(50):
+        state, current = np.array([random.uniform(-90, 50), *random.uniform(0, 1, 3)]), random.uniform(-50, 50)
+        np.testing.assert_allclose(rate_of(plant, current)(0, state), printed_in_1952(state, current), rtol=1e-10)
+
+
+def test_the_cell_rests_at_minus_65_mV():
+    """Without a current the equilibrium is -64.996 mV with m, h, n = 0.053, 0.596, 0.318."""
+    rest = fsolve(lambda x: rate_of(task("hodgkin_huxley").problem.plant, 0.0)(0, x), REST, xtol=1e-12)
+    np.testing.assert_allclose(rest, [-64.9964, 0.0530, 0.5960, 0.3177], atol=6e-5)
+    np.testing.assert_allclose(REST, rest, atol=6e-5)
+
+
+def test_the_cell_fires_68_times_a_second():
+    """At a constant 10 uA/cm^2: 68.3 Hz, once the first spikes are over."""
+    found = solve_ivp(
+        rate_of(task("hodgkin_huxley").problem.plant, 10.0), (0, 300), REST, "LSODA", rtol=1e-7, atol=1e-9, max_step=0.5
+    )
+    spikes = found.t[1:][(found.y[0, 1:] > 0) & (found.y[0, :-1] <= 0)]
+    assert 1e3 / np.diff(spikes[-10:]).mean() == pytest.approx(68.3, abs=0.1)
+
+
+@pytest.mark.parametrize(("voltage", "gate", "rate"), [(-40.0, 0, 1.0), (-55.0, 2, 0.1)])
+def test_the_cell_has_no_singular_voltages(voltage, gate, rate):
+    """Where x / (1 - exp(-x)) is 0 / 0 the opening rates are their limits, and so are their slopes."""
+    problem = task("hodgkin_huxley").problem
+    rates = [
+        rate_of(problem.plant, 0.0)(0, np.array([voltage + d, 0.0, 0.0, 0.0]))[1 + gate] for d in (-1e-5, 0.0, 1e-5)
+    ]
+    assert rates[1] == pytest.approx(rate, rel=1e-12)
+    assert (rates[2] - rates[0]) / 2e-5 == pytest.approx(rate / 20, rel=1e-4)
+
+
+def test_spikes_are_counted_and_suppressed():
+    """On the wave the cell fires without adaptation and not with it; kept silent it does not fire at all."""
+
+    def spikes(name, controller):
+        above = run_of(name, controller)["state.V"] > -20.0
+        return int((above[1:] & ~above[:-1]).sum())
+
+    assert spikes("hodgkin_huxley", "CTC") >= 3
+    assert spikes("hodgkin_huxley", "RHC") >= 3
+    assert spikes("hodgkin_huxley", "CTC+FPI") == spikes("hodgkin_huxley", "RHC+FPI") == 0
+    assert spikes("hodgkin_huxley_silent", "RHC+FPI") == spikes("hodgkin_huxley_silent", "RHC") == 0
+
+
+# Relative order four
+
+
+def test_four_lags_let_go():
+    """From q = 1 at rest, without a force: q = exp(-t) (1 + t + t^2/2 + t^3/6)."""
+    plant = task("order_four").problem.plant
+    found = solve_ivp(rate_of(plant, 0.0), (0, 5), [1.0, 0, 0, 0], rtol=1e-10, atol=1e-12).y[0, -1]
+    assert found == pytest.approx(np.exp(-5) * (1 + 5 + 25 / 2 + 125 / 6), rel=1e-7)
+
+
+def test_a_gain_beyond_two_thirds_doubles_every_error():
+    """K_c A_c = 1 against a plant three times as strong as the model: errors times 1 - 3 = -2 in every cycle."""
+    controller = task("order_four").controllers["CTC+FPI, gain too large"]
+    free = replace(task("order_four").problem, limits=fp.Limits(), disturbances={}, duration=0.02, measure_from=0.0)
+    run = fp.simulate(free, controller, seed=0, compiled=False)
+    error = (run["realised"][1:] - run["desired"][:-1])[6:14, 0]
+    np.testing.assert_allclose(error[1:] / error[:-1], -2.0, atol=0.1)
+
+
+def test_noisy_positions_refuse_the_gain_or_lose():
+    """A fit over 51 ms is 24.5 cycles late: refused; told of the delay it is five times worse than no adaptation."""
+    quiet = task("order_four")
+    noisy = fp.Sensing({"q": fp.Sensor(noise=fp.Noise(1e-6))}, fp.SavitzkyGolay(window=51, degree=4))
+    problem = replace(quiet.problem, sensing=noisy)
+    with pytest.raises(NotContractive, match=r"24\.5 cycles late"):
+        fp.simulate(problem, quiet.controllers["CTC+FPI"], seed=0)
+    late = fp.Increment(fp.RFPT(offset=1e6, sign=-1.0, gain=5e-8), cycles=problem.response_delay)
+    told = fp.ComputedTorque(quiet.controllers["CTC"].tracking, late)
+    errors = [
+        fp.measure(problem, fp.simulate(problem, c, seed=0)).rms_error["q"] for c in (quiet.controllers["CTC"], told)
+    ]
+    assert errors[1] > 3 * errors[0]
+
+
+# LuGre friction
+
+
+def test_sliding_friction_is_the_printed_curve():
+    """At constant speed: F = g(v) sign v + sigma2 v, from 1.5 N near standstill to 1 N."""
+    plant = task("stick_slip").problem.plant
+    for speed in (-0.05, -1e-3, 1e-4, 1e-3, 0.02):
+        curve = np.sign(speed) * (1 + 0.5 * np.exp(-((speed / 1e-3) ** 2))) + 0.4 * speed
+
+        def bristle(z, speed=speed):
+            return rate_of(plant, 0.0)(0, [0.0, z, speed])[1]
+
+        bend = brentq(bristle, -1e-2, 1e-2, xtol=1e-16)
+        needed = plant.inverse_function([0.0, bend, speed], 0.0, plant.exact)
+        assert float(needed) == pytest.approx(curve, rel=1e-9), speed
+
+
+@pytest.mark.parametrize(("force", "slides"), [(1.2, False), (1.6, True)])
+def test_it_breaks_away_at_the_static_friction(force, slides):
+    """Raised slowly to F < F_S it creeps by -F_S / sigma0 ln(1 - F / F_S), as dz = dx (1 - sigma0 z / F_S); beyond it slides."""
+    plant = task("stick_slip").problem.plant
+    raised = rate_of(plant, lambda t: min(t / 10, 1.0) * force)
+    found = solve_ivp(raised, (0, 12), np.zeros(3), "LSODA", rtol=1e-8, atol=1e-12, max_step=0.05)
+    moved = found.y[0, -1]
+    if slides:
+        assert moved > 0.05
+    else:
+        assert moved == pytest.approx(-1.5e-4 * np.log(1 - force / 1.5), rel=0.02)
+
+
+def test_sub_steps_follow_the_bristles():
+    """The plant's own integrator against SciPy's Radau over a reversal with the command of a run: within 1 % of its rms error."""
+    name, controller = "stick_slip", "RHC+FPI"
+    problem, run = task(name).problem, run_of(name, controller)
+    begin, end = 5400, 5600  # x' changes its sign at 5.498 s
+    command, state = run["command"], run["state"]
+    now = np.array(state[begin])
+    for k in range(begin, end):
+        now = solve_ivp(rate_of(problem.plant, command[k]), (0, problem.period), now, "Radau", rtol=1e-9, atol=1e-12).y[
+            :, -1
+        ]
+    assert state[begin, 2] * state[end, 2] < 0
+    assert abs(now[0] - state[end, 0]) < 0.01 * rms(name, controller)
+
+
+def test_an_explicit_stage_of_10_ms_diverges_and_review_says_so():
+    """The exact model's bristles move at 1 000 per second: without sub-steps its plan is unstable; with them it is not."""
+    fine = task("stick_slip")
+    exact = {"RHC exact model": fine.controllers["RHC exact model"]}
+    coarse = replace(fine.problem, horizon=replace(fine.problem.horizon, discretisation=fp.RungeKutta4()))
+    answered = {
+        what: [a.verdict.value for a in fp.review(problem, exact, mismatch=0.0, seed=0).controllers["RHC exact model"]]
+        for what, problem in (("coarse", coarse), ("fine", fine.problem))
+    }
+    assert "no" in answered["coarse"]
+    assert "no" not in answered["fine"]
+    lost = fp.measure(coarse, fp.simulate(coarse, exact["RHC exact model"], seed=0)).rms_error["x"]
+    assert lost > 100 * rms("stick_slip", "RHC exact model")
+
+
+# Tumour
+
+
+def test_the_logarithm_is_drexlers_model():
+    """Volume and level of the drug by themselves, doses that change: the same volume, by SciPy."""
+    a, b, c = 0.27, 0.0074, np.log(2) / 3.9
+
+    def dose(t):
+        return 10.0 + 8.0 * np.sin(0.5 * t)
+
+    volumes = solve_ivp(
+        lambda t, x: [(a - b * x[1]) * x[0], dose(t) - c * x[1]], (0, 30), [2000.0, 0.0], rtol=1e-10, atol=1e-12
+    )
+    plant = task("tumour").problem.plant
+    found = solve_ivp(rate_of(plant, dose), (0, 30), [np.log(2000.0), a], rtol=1e-10, atol=1e-12)
+    assert found.y[0, -1] == pytest.approx(np.log(volumes.y[0, -1]), rel=1e-8)
+
+
+def test_a_dose_of_a_c_over_b_holds_the_tumour():
+    """6.485 mg/kg a day keep any volume; without a drug 2 000 mm^3 become 4.4e5 in 20 days."""
+    plant = task("tumour").problem.plant
+    hold = plant.inverse_function([np.log(500.0), 0.0], 0.0, plant.exact)
+    assert float(hold) == pytest.approx(6.485, abs=1e-3)
+    grown = solve_ivp(rate_of(plant, 0.0), (0, 20), [np.log(2000.0), 0.27], rtol=1e-9).y[0, -1]
+    assert np.exp(grown) == pytest.approx(4.43e5, rel=5e-3)
+
+
+@pytest.mark.parametrize("name", ["tumour", "tumour_daily"])
+def test_doses_are_never_negative(name):
+    """Whatever the controller asks for; and the largest dose is used at the start."""
+    for controller in task(name).controllers:
+        doses = run_of(name, controller)["command.dose"]
+        assert doses.min() >= 0.0
+        assert doses.max() <= 20.0
+    assert run_of(name, "RHC")["command.dose"].max() == pytest.approx(20.0)
+
+
+# Turbojet
+
+
+@pytest.mark.parametrize(
+    ("throttle", "small", "large"),
+    [(10.0, 34.25, 50.72), (40.0, 82.32, 112.97), (60.0, 109.9, 149.6), (100.0, 158.7, 220.3)],
+)
+def test_steady_thrust(throttle, small, large):
+    """The positive root of the published polynomial at rest, N, where a run nearby settles; the P220 is rated at 220 N."""
+    plant = task("turbojet").problem.plant
+    for parameters, expected in ((plant.approximate, small), (plant.exact, large)):
+        p = dict(zip(plant.parameters, parameters, strict=True))
+        v = throttle + p["B_UU"] * throttle**2
+        root = np.roots([p["K_TT"], p["K_T"] + p["B_T"] * v, p["c"] + p["B_U"] * v]).max()
+        assert root == pytest.approx(expected, abs=0.06)
+        found = solve_ivp(
+            lambda t, x, q=parameters: plant.derivative_function(x, throttle, q).full().ravel(),
+            (0, 30),
+            [0.95 * root, 0.0],
+        )
+        assert found.y[0, -1] == pytest.approx(root, rel=2e-3)
+
+
+def test_the_throttle_is_found_for_every_thrust():
+    """The given inverse undoes the response inside the limits, for both engines."""
+    plant, random = task("turbojet").problem.plant, np.random.default_rng(2)
+    for parameters in (plant.approximate, plant.exact):
+        for _ in range(50):
+            state, throttle = [random.uniform(20, 200), random.uniform(-20, 20)], random.uniform(0, 120)
+            response = plant.response_function(state, throttle, parameters)
+            assert float(plant.inverse_function(state, response, parameters)) == pytest.approx(throttle, abs=1e-9)
+
+
+# What the tasks show
+
+REACHED = {
+    ("order_four", "CTC"): 1.78e-2,
+    ("order_four", "CTC+FPI"): 3.8e-5,
+    ("order_four", "RHC"): 7.3e-3,
+    ("order_four", "RHC+FPI"): 2.4e-5,
+    ("hodgkin_huxley", "CTC+FPI"): 7.2e-3,
+    ("hodgkin_huxley", "RHC+FPI"): 8.9e-3,
+    ("hodgkin_huxley", "RHC offset-free"): 3.4e-2,
+    ("hodgkin_huxley", "RHC exact model"): 1.0e-2,
+    ("hodgkin_huxley_silent", "CTC"): 1.1e-2,
+    ("hodgkin_huxley_silent", "RHC"): 0.58,
+    ("hodgkin_huxley_silent", "RHC exact model"): 0.97,
+    ("tumour", "CTC"): 1.04e-2,
+    ("tumour", "RHC"): 0.14,
+    ("tumour", "RHC+FPI"): 5.1e-6,
+    ("tumour", "RHC offset-free"): 2.4e-5,
+    ("tumour", "RHC exact model"): 2.5e-2,
+    ("tumour_daily", "RHC+FPI"): 1.0e-4,
+    ("tumour_daily", "RHC offset-free"): 2.8e-5,
+    ("turbojet", "CTC"): 4.6,
+    ("turbojet", "RHC"): 4.36,
+    ("turbojet", "RHC+FPI"): 1.1e-2,
+    ("turbojet", "RHC offset-free"): 0.11,
+    ("turbojet_slow", "RHC+FPI"): 0.12,
+    ("turbojet_slow", "RHC offset-free"): 0.13,
+    ("stick_slip", "CTC"): 1.79e-3,
+    ("stick_slip", "CTC+FPI"): 1.37e-5,
+    ("stick_slip", "RHC"): 1.23e-3,
+    ("stick_slip", "RHC+FPI"): 1.25e-5,
+    ("stick_slip", "RHC exact model"): 1.5e-5,
+}
+
+
+@pytest.mark.parametrize(("name", "controller"), REACHED, ids=lambda v: v.replace(" ", "-"))
+def test_what_the_descriptions_say(name, controller):
+    """Rms errors within 10 % of what the problem's description states."""
+    assert rms(name, controller) == pytest.approx(REACHED[name, controller], rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["tumour_daily", "turbojet_slow"])
+def test_a_gentle_gain_is_worse_than_none_at_the_plans_own_rate(name):
+    """A deformation that is slower than the plan misleads it: several times the error without adaptation."""
+    assert rms(name, "RHC+FPI, gentle") > 3 * rms(name, "RHC")
+
+
+@pytest.mark.parametrize("name", GALLERY)
+def test_limits_act_for_a_part_of_the_run(name):
+    """Some controller is at a limit of its input, and nobody who finishes well is there after the transient."""
+    problem = task(name).problem
+    [(low, high)] = problem.limits.inputs.values()
+    commands = run_of(name, "RHC+FPI")["command"][:, 0], run_of(name, "RHC")["command"][:, 0]
+    touched = [np.isclose(c, low) | np.isclose(c, high) for c in commands]
+    assert any(t.any() for t in touched)
+    assert touched[0].mean() < 0.05
+    assert problem.disturbances
+
+
+@pytest.mark.parametrize("name", GALLERY)
+def test_every_task_is_complete(name):
+    """A headline pair, ways to tune each rival that adapts, pictures, and a description with figures."""
+    one = task(name)
+    assert one.headline == ("RHC", "RHC+FPI")
+    assert {"CTC+FPI", "RHC+FPI", "RHC offset-free"} <= set(one.tuning)
+    assert one.pictures
+    assert "seed 0" in one.description
