@@ -69,7 +69,6 @@ LOOPS: dict[str, tuple[Problem, Controller]] = {
     "`Filtered`": (PROBLEM, computed_torque(fp.Filtered(MAP, pole=0.5))),
     "`Tuned`": (PROBLEM, computed_torque(fp.Tuned(MAP, largest_gain=0.5))),
     "`Damped`": (PROBLEM, computed_torque(fp.Damped(MAP))),
-    "`Blended` (5 copies)": (PROBLEM, computed_torque(fp.Blended(MAP, smallest_gain=0.05, largest_gain=0.5))),
     "`Guarded`": (PROBLEM, computed_torque(fp.Guarded(MAP, largest_deformation=GUARD))),
     "`Fractional`, memory of 200 cycles": (PROBLEM, computed_torque(MAP, SHORT)),
     "`Fractional`, memory of 3334 cycles": (PROBLEM, computed_torque(MAP, LONG)),

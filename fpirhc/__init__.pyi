@@ -30,7 +30,6 @@ from .deformation.rfpt import RFPT
 from .deformation.rfpt_vector import RFPTVector
 from .deformation.rotation import Rotation
 from .deformation.sigmoid import Sigmoid
-from .deformation.wrappers.blended import Blended
 from .deformation.wrappers.damped import Damped
 from .deformation.wrappers.delayed import Increment, Paired
 from .deformation.wrappers.filtered import Filtered
@@ -65,7 +64,9 @@ from .problem_files.settings import with_settings
 from .problem_files.tuning_spans import LogSpan, Span
 from .report.html import write_report
 from .review.answer import Answer, Review
+from .review.response_prediction import Prediction, predict_response
 from .review.review import review
+from .review.suggest import Suggestion, suggest
 from .sensing import (
     LowPassDifference,
     Measured,
@@ -107,7 +108,6 @@ __all__ = [
     "Anderson",
     "Answer",
     "BacksteppingMRAC",
-    "Blended",
     "ByDesired",
     "ByError",
     "ByLookAhead",
@@ -174,6 +174,7 @@ __all__ = [
     "Portrait",
     "PositionDifference",
     "Predicted",
+    "Prediction",
     "Problem",
     "Projection",
     "Pulse",
@@ -209,6 +210,7 @@ __all__ = [
     "Step",
     "Stepper",
     "StopRun",
+    "Suggestion",
     "Table",
     "Trajectory",
     "Tuned",
@@ -237,6 +239,7 @@ __all__ = [
     "lyapunov_view",
     "measure",
     "output_chain",
+    "predict_response",
     "response_jacobian",
     "review",
     "signed_power",
@@ -245,6 +248,7 @@ __all__ = [
     "spectrum_over_box",
     "spectrum_over_run",
     "structural_order",
+    "suggest",
     "tune",
     "with_settings",
     "write_report",

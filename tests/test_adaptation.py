@@ -103,85 +103,6 @@ def test_guard_ends_over_gained_runs_bounded():
     assert fallen > 10
 
 
-def rms_by_regime(deformation, noise, seed=0):
-    """Rms response error in the settled part of the three regimes of a plant whose gain jumps 1.2 -> 15 -> 0.3."""
-    gains = np.repeat([1.2, 15.0, 0.3], CYCLES // 3)
-    white = noise * np.random.default_rng(seed).standard_normal(CYCLES)
-    _, errors, _, _ = run(deformation, lambda k, r: gains[k] * r, SMOOTH, white)
-    return [np.sqrt(np.mean(part[500:] ** 2)) for part in np.split(errors[: CYCLES - 3], 3)]
-
-
-@pytest.mark.parametrize(("noise", "seed"), [(0.0, 0), (0.1, 0), (0.1, 1)])
-def test_damped_blend_survives_a_plant_whose_gain_jumps(noise, seed):
-    """The blend alone wanders into gains that oscillate (rms 21 to 45, fixed gain 60); damped it converges (below 0.6)."""
-    sigmoid = fp.Sigmoid(gain=-0.5, scale=10.0)
-    blended = fp.Blended(sigmoid, smallest_gain=0.04, largest_gain=1.69 * sigmoid.slope)
-    assert max(rms_by_regime(fp.Damped(blended), noise, seed)) < 0.6
-    assert rms_by_regime(blended, noise, seed)[1] > 10
-
-
-def test_blend_turns_where_errors_do_not_fall():
-    """Falling errors: the position keeps its way up to its end. Rising ones: it turns after every five cycles."""
-    blended = fp.Blended(fp.Affine(gain=-0.5), smallest_gain=0.1, largest_gain=0.9)
-    step, layout = stepping(blended)
-
-    def positions(errors):
-        memory, seen = layout.start(), []
-        for error in errors:
-            _, memory = step(0.0, error, 0.0, memory)
-            seen.append(float(memory[layout.slice("blend_position")][0]))
-        return np.array(seen)
-
-    falling = positions(0.9 ** np.arange(200))
-    assert np.all(np.diff(falling) >= 0)
-    assert falling[-1] == blended.copies - 1
-    rising = positions(1.1 ** np.arange(200))
-    assert np.ptp(rising[9:]) == pytest.approx(5 * blended.speed)
-    assert np.array_equal(np.sign(np.diff(rising))[8:28], np.repeat([-1, 1, -1, 1], 5))
-
-
-def test_blend_is_a_mixture_of_its_two_nearest_copies():
-    """At sigma = 1.25 a quarter of the third copy and three quarters of the second, whatever the size of the error."""
-    blended = fp.Blended(fp.Sigmoid(gain=-0.5, scale=1.0), smallest_gain=0.04, largest_gain=0.64)
-    step, layout = stepping(blended)
-    memory = layout.start()
-    memory[layout.slice("blend_position")] = 1.25
-    copies = [float(stepping(m)[0](0.0, 3.0, 0.0, np.zeros(0))[0]) for m in blended.maps]
-    assert [m.effective_gain() for m in blended.maps] == pytest.approx([0.04, 0.08, 0.16, 0.32, 0.64])
-    assert float(step(0.0, 3.0, 0.0, memory)[0]) == pytest.approx(0.75 * copies[1] + 0.25 * copies[2], rel=1e-12)
-
-
-def test_blend_stays_within_its_bounds():
-    """Whatever happens, not-a-number included, the position is a number between the first copy and the last."""
-    blended = fp.Blended(fp.Affine(gain=-0.5), smallest_gain=0.1, largest_gain=0.9, speed=0.4)
-    step, layout = stepping(blended)
-    memory = layout.start()
-    responses = np.random.default_rng(4).standard_normal(500)
-    responses[100] = np.nan
-    for response in responses:
-        _, memory = step(0.0, response, 0.0, memory)
-        assert 0 <= float(memory[layout.slice("blend_position")][0]) <= blended.copies - 1
-    assert np.isfinite(memory.full()).all()
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"smallest_gain": 0.3, "largest_gain": 0.9},
-        {"smallest_gain": 0.1, "largest_gain": 0.2},
-        {"smallest_gain": -0.1, "largest_gain": 0.9},
-        {"smallest_gain": 0.1, "largest_gain": float("inf")},
-        {"smallest_gain": 0.25, "largest_gain": 0.25},
-        {"smallest_gain": 0.1, "largest_gain": 0.9, "copies": 1},
-        {"smallest_gain": 0.1, "largest_gain": 0.9, "speed": 0.0},
-    ],
-)
-def test_blend_needs_bounds_around_the_own_gain(settings):
-    """Bounds that leave out the map's own gain (0.25), one copy, or no motion are refused."""
-    with pytest.raises(InvalidValue, match="expected"):
-        fp.Blended(fp.Affine(gain=-0.5), **settings)
-
-
 @pytest.mark.parametrize("map_", [fp.Affine(gain=-2.0), fp.Sigmoid(gain=-1.0, scale=20.0).with_effective_gain(1.0)])
 def test_damper_stops_an_over_gained_loop(map_):
     """A lambda = 2.5: alone it diverges or cycles at its step limit, damped it stays near the limit of stability (rms 0.008)."""
@@ -226,13 +147,13 @@ def test_damper_regrows_to_the_own_gain_and_not_beyond():
 
 
 def test_wrappers_log_in_a_run():
-    """The controller logs the position and the factor by name, and the automatic scale reaches the wrapped map."""
+    """The controller logs both factors by name, and the automatic scale reaches the wrapped map."""
     from dataclasses import replace
 
     problem = replace(fp.load_problem("two_mass").problem, duration=0.1, measure_from=0.0)
-    blended = fp.Blended(fp.Sigmoid(gain=-0.5), smallest_gain=0.05, largest_gain=0.6)
-    seen = fp.simulate(problem, fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Damped(blended)), seed=0, compiled=False)
-    assert np.ptp(seen["blend_at"]) > 0
+    tuned = fp.Tuned(fp.Sigmoid(gain=-0.5), largest_gain=0.6)
+    seen = fp.simulate(problem, fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Damped(tuned)), seed=0, compiled=False)
+    assert np.ptp(seen["gain_factor"]) > 0
     assert seen["damping_factor"].max() == 1.0
 
 

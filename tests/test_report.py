@@ -94,6 +94,36 @@ def test_data_of_the_charts_is_complete(comparison):
     json.dumps(data, allow_nan=False)
 
 
+def test_predicted_band_is_drawn_around_the_distance_from_the_models_run():
+    """The headline's adaptive controller has a chart more: the distance is that of the run, and inside the band."""
+    problem = fp.Problem(
+        plant=linear(1.6, 1.0),
+        reference=fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}),
+        start={"y": 0.0},
+        period=1e-3,
+        duration=1.0,
+    )
+    track = fp.Exponential(rate=6.0)
+    controllers = {
+        "plain": fp.ComputedTorque(track),
+        "adaptive": fp.ComputedTorque(track, fp.Sigmoid(gain=-1.5, scale=5.0)),
+    }
+    task = Task("case", Path("case.py"), "case", "", problem, controllers, headline=("plain", "adaptive"))
+    found = compare(task, seed=0, compiled=False)
+    data = chart_data(found, ["#000000"])
+    [chart] = [c for c in data["charts"] if "band" in c]
+    distance, upper, lower = ([v for v in s["values"] if v is not None] for s in chart["series"])
+    entry = found["adaptive"]
+    assert chart["only"] == "adaptive"
+    apart = entry.run["state.y"] - entry.prediction.nominal.states[:, 0]
+    assert max(distance) == pytest.approx(apart.max(), rel=1e-4)
+    assert max(upper) == pytest.approx(entry.prediction.half_width["y"], rel=1e-4)
+    assert min(lower) == -max(upper)
+    assert max(np.abs(distance)) < 1.1 * max(upper)
+    assert "was predicted before the run" in render(found)
+    assert found["plain"].prediction is None
+
+
 def test_run_that_ended_early_is_told_in_words(comparison):
     """Its numbers are 'none', its reason is in the table, and its lines stop."""
     entry = comparison["plain"]

@@ -134,15 +134,19 @@ def contraction_along(
     states, deformed = _checked_rows(plant, states, deformed)
     rows = np.unique(np.linspace(0, len(states) - 1, min(len(states), LARGEST_SAMPLE)).astype(int))
     exact = np.repeat(plant.exact[None, :], len(rows), axis=0)
-    jacobians = _jacobians(plant, states[rows], deformed[rows], exact, approximate)
+    jacobians = response_jacobians(plant, states[rows], deformed[rows], exact, approximate)
     finite = np.isfinite(jacobians).all(axis=(1, 2))
     factors = np.ones(len(rows))
     factors[finite] = np.abs(1 - effective_gain * np.linalg.eigvals(jacobians[finite])).max(axis=1)
     return factors[np.searchsorted(rows, np.arange(len(states)), side="right") - 1]
 
 
-def _jacobians(plant: Plant, states: Array, deformed: Array, exact: Array, approximate: Array | None) -> Array:
-    """J of every row, shape (rows, n, n)."""
+def response_jacobians(plant: Plant, states: Array, deformed: Array, exact: Array, approximate: Array | None) -> Array:
+    """Return J of every row, shape (rows, n, n); not finite where the model's inverse is not.
+
+    Parameters: `states` (rows, nx), `deformed` requests (rows, n), `exact` parameters (rows, np); `approximate` (np,), the
+    plant's own unless given.
+    """
     model = plant.approximate if approximate is None else np.asarray(approximate, dtype=float)
     function, n = response_jacobian(plant), deformed.shape[1]
     count = len(states)
@@ -151,7 +155,7 @@ def _jacobians(plant: Plant, states: Array, deformed: Array, exact: Array, appro
 
 
 def _spectrum(plant: Plant, states: Array, deformed: Array, exact: Array, approximate: Array | None) -> Spectrum:
-    jacobians = _jacobians(plant, states, deformed, exact, approximate)
+    jacobians = response_jacobians(plant, states, deformed, exact, approximate)
     finite = jacobians[np.isfinite(jacobians).all(axis=(1, 2))]
     return Spectrum(np.linalg.eigvals(finite))
 

@@ -144,7 +144,7 @@ class Controller(ABC):
         """How much its desired response changes; None where it leaves the deformation's automatic settings open."""
         if self.inner is not None:
             return self.inner.demand(self.inner_problem(problem))
-        return reference_demand(problem) if self.planner is None else plan_demand(problem)
+        return reference_demand(problem, self.law) if self.planner is None else plan_demand(problem)
 
     def response(self, problem: Problem) -> Response | None:
         """What the controller reads as 'realised', where that is not the response of the plant's controlled coordinates."""

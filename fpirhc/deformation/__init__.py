@@ -8,7 +8,6 @@ from fpirhc.deformation.rfpt_vector import RFPTVector
 from fpirhc.deformation.rotation import Rotation
 from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.deformation.wrappers.base import Wrapper
-from fpirhc.deformation.wrappers.blended import Blended
 from fpirhc.deformation.wrappers.damped import Damped
 from fpirhc.deformation.wrappers.delayed import Increment, Paired
 from fpirhc.deformation.wrappers.filtered import Filtered
@@ -19,7 +18,6 @@ from fpirhc.deformation.wrappers.tuned import Tuned
 __all__ = [
     "RFPT",
     "Affine",
-    "Blended",
     "Damped",
     "Deformation",
     "DelayWatched",

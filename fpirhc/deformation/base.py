@@ -44,11 +44,13 @@ class Demand:
     """How much the desired response of a controller changes, for maps that choose a setting of theirs by it.
 
     change: largest change in one cycle, in units of the response. sudden: whether that is a jump once in a while, which one
-    step has to cover; otherwise it goes on from cycle to cycle, and the map needs room beyond it.
+    step has to cover; otherwise it goes on from cycle to cycle, and the map needs room beyond it. recovery: step per cycle with
+    which the plain form comes back from the largest response error that is expected (`fpirhc.contraction.basin`).
     """
 
     change: float
     sudden: bool
+    recovery: float = 0.0
 
 
 class Deformation(ABC):
@@ -114,6 +116,11 @@ class Deformation(ABC):
     def suited(self, demand: Demand) -> Self:
         """Return the map with its automatic settings chosen for how much the desired response changes."""
         return self if self.inner is None else self.around(self.inner.suited(demand))
+
+    @property
+    def slows_desired(self) -> bool:
+        """Whether a change of the desired response passes through the iteration, which is then a low-pass on it: the plain form."""
+        return True if self.inner is None else self.inner.slows_desired
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """What the map remembers besides the pair (request, desired); nothing unless it says otherwise."""

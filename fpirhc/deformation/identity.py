@@ -23,6 +23,11 @@ class Identity(Deformation):
         """It does not."""
         return False
 
+    @property
+    def slows_desired(self) -> bool:
+        """No: the request is the desired response."""
+        return False
+
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:

@@ -71,11 +71,15 @@ class Sigmoid(Deformation):
         return ("scale",) if self.scale is None else ()
 
     def suited(self, demand: Demand) -> Self:
-        """Return the map with a scale S whose largest step covers a jump, or of twice a change that goes on; at least 1."""
+        """Return the map with a scale S whose largest step covers a jump, or of twice a change that goes on; at least 1.
+
+        The largest step also covers the recovery that is demanded.
+        """
         if self.scale is not None:
             return self
-        scale = demand.change / self.with_scale(1.0).largest_step() if demand.sudden else 2 * demand.change
-        return self.with_scale(float(f"{max(1.0, scale):.3g}"))
+        step = self.with_scale(1.0).largest_step()
+        scale = demand.change / step if demand.sudden else 2 * demand.change
+        return self.with_scale(float(f"{max(1.0, scale, demand.recovery / step):.3g}"))
 
     @cached_property
     def _tanh_fixed_point(self) -> float:

@@ -130,8 +130,18 @@ def _studied(entry: Entry) -> list[str]:
 def _charts(comparison: Comparison) -> str:
     return (
         "<section><h2>Signals over time</h2><p>Drag across a chart to zoom all of them, double-click to return. Lines show "
-        f"the extremes of each short interval, so no peak is lost.</p>{_bands(comparison)}"
+        f"the extremes of each short interval, so no peak is lost.{_predicted(comparison)}</p>{_bands(comparison)}"
         "<div id='controllers' role='group' aria-label='controllers shown'></div><div id='charts'></div></section>"
+    )
+
+
+def _predicted(comparison: Comparison) -> str:
+    """What the bands of predictions are; empty where there is none."""
+    if all(e.prediction is None or e.prediction.tube is None for e in comparison.entries):
+        return ""
+    return (
+        " The band around a distance from the model's own run was predicted before the run, to first order and without "
+        "disturbances and noise."
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from fpirhc.simulation.run import Run
-    from fpirhc.studies.comparison.compare import Comparison
+    from fpirhc.studies.comparison.compare import Comparison, Entry
 
 INTERVALS = 300
 _RESPONSES = ("nominal", "desired", "deformed", "realised")
@@ -40,6 +40,7 @@ def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]
             lines = [(signal, e.run, f"{signal}.{c}") for signal in _RESPONSES]
             chart = _chart(f"{e.name}: responses of {c}", e.run.unit(f"desired.{c}"), lines, edges)
             charts.append({**chart, "only": e.name})
+    charts += [chart for e in entries for chart in _tubes(e, edges)]
     return {
         "controllers": [
             {"name": e.name, "color": palette[k % len(palette)], "slots": _slots(e.run)} for k, e in enumerate(entries)
@@ -47,6 +48,25 @@ def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]
         "time": _round(np.repeat(longest.time[edges[:-1]], 2) + _halves(longest, edges)),
         "charts": charts,
     }
+
+
+def _tubes(entry: Entry, edges: np.ndarray) -> list[dict[str, Any]]:
+    """Charts of every coordinate's distance from the model's own run inside the band that was predicted; none without a tube."""
+    prediction, run = entry.prediction, entry.run
+    if prediction is None or prediction.tube is None or not np.isfinite(prediction.tube).all():
+        return []
+    state = "plant_state" if "plant_state" in run.layout else "state"
+    places = {e: k for k, e in enumerate(run.layout[state].elements)}
+    count, charts = min(run.cycles, len(prediction.tube)), []
+    for c in (c for c in run.layout["error"].elements if c in places):
+        half = prediction.tube[:count, places[c]]
+        apart = run[f"{state}.{c}"][:count] - prediction.nominal.states[:count, places[c]]
+        lines = {"distance": apart, "predicted at most": half, "predicted at least": -half}
+        series = [{"name": name, "values": _extremes(values, edges)} for name, values in lines.items()]
+        title = f"{entry.name}: {c}, distance from the model's own run"
+        unit = run.unit(f"error.{c}")
+        charts.append({"title": title, "unit": unit, "series": series, "only": entry.name, "band": [2, 3]})
+    return charts
 
 
 def _slots(run: Run) -> list[list[float]]:

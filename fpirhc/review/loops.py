@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -75,6 +76,51 @@ def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
     ideal = loop_matrices(problem, without_deformation(stand_in)).at(model, model)
     drawn = [at(k, d) for k, d in _pairs(grid, places) if np.isfinite(grid.commands[d, k]).all()]
     return Loops(tuple(places), tuple(at(k, 0) for k in places), ideal, tuple(drawn))
+
+
+def loops_at(grid: ReviewGrid, controller: Controller, places: Sequence[int]) -> list[LinearLoop]:
+    """Return the controller's linear loops with the exact parameters at some points of the reference.
+
+    Raises:
+        NotSupported: no linear loop. And what the controller raises about a linear plant.
+    """
+    problem, plant = grid.problem, grid.problem.plant
+    believed = controller.parameters(plant)
+    stand_in, plan = linear_stand_in(controller)
+    feedbacks = _gains(problem, plan, [float(grid.times[k]) for k in places], believed)
+    matrices, slopes = loop_matrices(problem, stand_in), response_slopes(plant)
+    found = []
+    for k, feedback in zip(places, feedbacks, strict=True):
+        here = (grid.states[k], grid.commands[0, k])
+        found.append(matrices.at(*(linear_parameters(slopes, *here, p, feedback) for p in (grid.draws[0], believed))))
+    return found
+
+
+def ideal_loops(grid: ReviewGrid, controller: Controller, count: int) -> list[tuple[LinearLoop, np.ndarray]]:
+    """Return the loops of plant = model without deformation at so many points of the reference, and where they are.
+
+    With each comes the model's gain from inputs to responses of the controlled coordinates there, (n, nu).
+
+    Raises:
+        NotSupported: no linear loop, or no point where the model's inverse is finite. And what the controller raises.
+    """
+    problem, plant = grid.problem, grid.problem.plant
+    believed = controller.parameters(plant)
+    stand_in, plan = linear_stand_in(controller)
+    needed = grid.needed(believed)
+    usable = [k for k in range(len(grid.times)) if np.isfinite(needed[k]).all()]
+    if not usable:
+        raise NotSupported("the model's inverse does not exist along the reference")
+    places = _thinned(usable, count)
+    feedbacks = _gains(problem, plan, [float(grid.times[k]) for k in places], believed)
+    matrices = loop_matrices(problem, without_deformation(stand_in))
+    slopes, chosen = response_slopes(plant), list(plant.controlled_indices)
+    found = []
+    for k, feedback in zip(places, feedbacks, strict=True):
+        model = linear_parameters(slopes, grid.states[k], needed[k], believed, feedback)
+        gain = np.asarray(slopes(grid.states[k], needed[k], believed)[1].full())[chosen]
+        found.append((matrices.at(model, model), gain))
+    return found
 
 
 def _pairs(grid: ReviewGrid, places: list[int]) -> list[tuple[int, int]]:

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.contraction import Spectrum, response_jacobian
+from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid, each
 from fpirhc.symbolic.expression import kind
 
@@ -27,7 +28,9 @@ def eigenvalues_near(grid: ReviewGrid, believed: np.ndarray, draws: np.ndarray, 
     rows = draws[np.unique(np.linspace(0, len(draws) - 1, count).astype(int))]
     m, n = requests.shape
     known = (np.repeat(rows, m, axis=0), np.tile(believed, (m * len(rows), 1)))
-    jacobians = each(_stacked(grid), np.tile(states, (len(rows), 1)), np.tile(requests, (len(rows), 1)), *known)
+    jacobians = each(
+        stacked_jacobian(grid.problem.plant), np.tile(states, (len(rows), 1)), np.tile(requests, (len(rows), 1)), *known
+    )
     finite = jacobians[np.isfinite(jacobians).all(axis=1)]
     # The transposed Jacobian has the same eigenvalues.
     return np.linalg.eigvals(finite.reshape(-1, n, n)).reshape(-1, n)
@@ -53,9 +56,9 @@ def _near(grid: ReviewGrid, believed: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.vstack(states), np.vstack(requests)
 
 
-def _stacked(grid: ReviewGrid) -> ca.Function:
+def stacked_jacobian(plant: Plant) -> ca.Function:
     """The response Jacobian as one column."""
-    function = response_jacobian(grid.problem.plant)
-    matrix = kind(grid.problem.plant.inverse_opaque)
+    function = response_jacobian(plant)
+    matrix = kind(plant.inverse_opaque)
     given = [matrix.sym(f"v{k}", function.size1_in(k)) for k in range(function.n_in())]
     return ca.Function("fpirhc_stacked_jacobian", given, [ca.vec(function(*given))])

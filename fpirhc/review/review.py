@@ -20,11 +20,14 @@ from fpirhc.review.maps import largest_product
 from fpirhc.review.margins import margins_enough
 from fpirhc.review.neighbourhood import spectrum_near
 from fpirhc.review.orders import relative_orders
+from fpirhc.review.pays import pays
 from fpirhc.review.rates import rates_inside
 from fpirhc.review.reach import range_enough
 from fpirhc.review.schedule import schedule_stable
 from fpirhc.review.signs import one_sign
 from fpirhc.review.slew import slew_enough
+from fpirhc.review.speed import bears_lag, fast_enough
+from fpirhc.review.two_cycles import free_of_two_cycles
 from fpirhc.review.well_posed import well_posed
 from fpirhc.review.zero_dynamics import is_planned, zero_dynamics, zero_dynamics_rate
 from fpirhc.task.problem import Problem
@@ -88,7 +91,13 @@ def _of_map(grid: ReviewGrid, controller: Controller, loops: Loops, general: lis
     suited = _speed_and_range(grid, controller, loops)
     verdict = converges(grid, controller, loops, _doubts([*general, *suited]))
     gains = [one_sign(own, boxed), gain_admissible(deformation, own, boxed, limit)]
-    return [verdict, box_converges(loops), *gains, *suited]
+    law = [
+        fast_enough(grid, controller, own),
+        bears_lag(grid, controller, own),
+        free_of_two_cycles(grid, controller, loops),
+    ]
+    known = [a for a in law if a is not None]
+    return [verdict, box_converges(loops), *gains, *suited, *known, pays(grid, controller)]
 
 
 def _speed_and_range(grid: ReviewGrid, controller: Controller, loops: Loops) -> list[Answer]:

@@ -150,6 +150,11 @@ class Paired(_Queued):
 class Increment(_Queued):
     """The map on the deformation r - d of the pair that caused the response; see the module for parameters and errors."""
 
+    @property
+    def slows_desired(self) -> bool:
+        """No: the desired response is added after the map."""
+        return False
+
     def _request(
         self,
         requests: Expression,

@@ -7,6 +7,7 @@ import casadi as ca
 from fpirhc.symbolic.layout import Expression
 
 FORGETTING = 0.1  # share of the newest sign
+RETURNED = 0.3  # relative distance below which an error is that of two cycles before
 
 
 def forget(before: Expression, sign: Expression) -> Expression:
@@ -19,3 +20,12 @@ def growing_in_a_row(count: Expression, error: Expression, before: Expression) -
     """Return how many errors in a row alternated in sign and grew; zero when the newest did not."""
     grows = ca.logic_and(ca.dot(error, before) < 0, ca.sumsqr(error) > ca.sumsqr(before))
     return ca.if_else(grows, count + 1, 0)
+
+
+def returning_in_a_row(count: Expression, error: Expression, before: Expression, earlier: Expression) -> Expression:
+    """Return how many errors in a row alternated in sign and were those of two cycles before: what a two-cycle does.
+
+    Saturated two-cycles neither grow nor die out. White noise does not return: after eight in a row it is none.
+    """
+    back = ca.sumsqr(error - earlier) < RETURNED**2 * ca.sumsqr(error)
+    return ca.if_else(ca.logic_and(ca.dot(error, before) < 0, back), count + 1, 0)

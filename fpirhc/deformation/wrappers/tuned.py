@@ -1,14 +1,24 @@
-"""Tunes the gain of a map on line, from the sign of successive response errors.
+"""Tunes the gain of a map on line, by stochastic approximation on the signs of successive response errors.
 
-    s <- (1 - eta) s + eta sgn(h_k' h_{k-1}),      h = f - d,
-    s < -0.5: the step is too long, factor <- 0.7 factor;     s > 0.3: too short, factor <- min(1.05 factor, largest),
-    five errors in a row of alternating sign and growing size: too long at once,
-    r+ = r + factor (G(r, f, d) - r).
+    log c <- log c + gamma (sgn(h_k' h_{k-1}) - s*),      h = f - d,      1 <= c <= largest,
+    five errors in a row of alternating sign and growing size, or eight of a two-cycle:   c <- c / 2,
+    r+ = r + c (G(r, f, d) - r).
 
-In white measurement noise successive errors have the correlation -a lambda/2, so the rule settles where the effective gain times
-the plant's gain is near one, noise or not. The sign is used and not the product, because a saturated two-cycle (small, large,
-small, large) has no correlation of its amplitudes. The cap must come from a model of the plant: without one the tuner probes
-until the loop oscillates.
+s* is the mean sign that white measurement noise has at the target g* of effective gain times the plant's gain (`expected_sign`).
+So in noise the drift of c is positive below the target, negative above it and zero there, whatever the size of the noise; a smooth
+error (all signs +1) is followed faster and faster up to the cap, and an oscillation (-1) slows down. At the target log c scatters
+by sqrt(gamma / (2 k)), k = -d s / d log g: 0.25 for one component and g* = 0.5.
+
+The map's own gain is the floor, because below it the drift of the task costs more than the noise saves. Only errors that no noise
+makes lead below: alternation that grows, and a two-cycle (each error that of two cycles before), which is what growing ones end in
+where the map saturates. From there the same rule leads back. The cap must come from a model of the plant: without one a
+smooth task would drive the gain until the loop oscillates.
+
+The target is that of a response measured at once. Behind a dead time or an estimator errors are correlated otherwise, noise
+leads to the cap, and the cap decides.
+
+The signs are used and not the products, because a saturated two-cycle (small, large, small, large) has no correlation of its
+amplitudes. The price of a larger gain is chatter, up to three times that of a slow fixed gain; a smaller target halves it.
 """
 
 from __future__ import annotations
@@ -21,15 +31,15 @@ from typing import Self
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.noise_signs import expected_sign
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
-from fpirhc.deformation.wrappers.forgetting import forget, growing_in_a_row
+from fpirhc.deformation.wrappers.forgetting import growing_in_a_row, returning_in_a_row
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
-_TOO_LONG, _TOO_SHORT = -0.5, 0.3
-_SHRINK, _GROW = 0.7, 1.05
-_IN_A_ROW = 5
-_REST = 8  # cycles without a change after each change
+_RATE = 0.02  # gamma
+_GROWING, _RETURNING = 5, 8  # in a row
+_SMALLEST = 1e-3  # factor; what oscillation may lead to
 
 
 @dataclass(frozen=True)
@@ -37,14 +47,17 @@ class Tuned(Wrapper):
     """The wrapped map with its step scaled on line.
 
     Parameters:
-        map: any deformation that iterates.
+        map: any deformation that iterates; its own gain is where the tuner begins, and the smallest that noise leads to.
         largest_gain: cap of the effective gain, the bound that the model guarantees (see `assess_gain`: `sector_limit`).
+        target: g*, the product of effective gain and the plant's gain that is sought in noise, in (0, 2). 0.5 weighs tracking,
+            0.3 chatter.
 
     Raises:
-        InvalidValue: a cap that is not positive in the direction of the map's own gain, or below it.
+        InvalidValue: a cap that is not positive in the direction of the map's own gain, or below it; a target out of range.
     """
 
     largest_gain: float
+    target: float = 0.5
 
     def __post_init__(self) -> None:
         gain = self.map.effective_gain()
@@ -53,16 +66,16 @@ class Tuned(Wrapper):
                 f"Tuned(largest_gain={self.largest_gain!r}): expected a bound beyond the map's own effective gain {gain:.4g}; "
                 "assess_gain(...).sector_limit gives one. A tuner without a bound probes until the loop oscillates"
             )
+        if not 0 < self.target < 2:
+            raise InvalidValue(
+                f"Tuned(target={self.target!r}): expected a product of gain and plant between 0 and 2; 0.5 is usual"
+            )
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """The factor, the sign correlation, the rest after a change, the last error; and the map's own."""
-        own = (
-            scalar("tuner_factor", start=1.0),
-            scalar("tuner_sign"),
-            scalar("tuner_rest"),
-            scalar("tuner_growing"),
-            Signal("tuner_error", elements),
-        )
+        """The factor, how many errors in a row grew or returned alternating, the last two errors; and the map's own."""
+        counts = scalar("tuner_growing"), scalar("tuner_returning")
+        errors = Signal("tuner_error", elements), Signal("tuner_earlier", elements)
+        own = (scalar("tuner_factor", start=1.0), *counts, *errors)
         return Layout(own) + self.map.memory(elements)
 
     def shown(self) -> Mapping[str, str]:
@@ -72,27 +85,30 @@ class Tuned(Wrapper):
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return r + factor (G(r, f, d) - r)."""
+        """Return r + c (G(r, f, d) - r)."""
         inner = of_map(self, memory, request.numel())
-        wanted, following = self.map.step(request, response, desired, inner)
-        factor, error = memory["tuner_factor"], response - desired
-        seen = forget(memory["tuner_sign"], ca.sign(ca.dot(error, memory["tuner_error"])))
-        growing = growing_in_a_row(memory["tuner_growing"], error, memory["tuner_error"])
-        diverges = growing > _IN_A_ROW - 0.5
-        resting = memory["tuner_rest"] > 0.5
+        wanted, of_inner = self.map.step(request, response, desired, inner)
+        factor, error, before = memory["tuner_factor"], response - desired, memory["tuner_error"]
+        growing = growing_in_a_row(memory["tuner_growing"], error, before)
+        returning = returning_in_a_row(memory["tuner_returning"], error, before, memory["tuner_earlier"])
+        oscillates = ca.logic_or(growing > _GROWING - 0.5, returning > _RETURNING - 0.5)
+        own = {
+            "tuner_factor": ca.if_else(oscillates, ca.fmax(0.5 * factor, _SMALLEST), self._led(factor, error, before)),
+            "tuner_growing": ca.if_else(oscillates, 0, growing),
+            "tuner_returning": ca.if_else(oscillates, 0, returning),
+            "tuner_error": error,
+            "tuner_earlier": before,
+        }
+        return request + factor * (wanted - request), {**own, **of_inner}
+
+    def _led(self, factor: Expression, error: Expression, before: Expression) -> Expression:
+        """The factor after one step towards the target."""
+        product, rest = ca.dot(error, before), expected_sign(self.target, error.numel())
+        # Without a sign (no error, or none that is a number) nothing is learnt.
+        rise = ca.if_else(product > 0, 1 - rest, ca.if_else(product < 0, -1 - rest, 0))
+        floor = ca.if_else(factor < 1, _SMALLEST, 1)
         largest = self.largest_gain / self.map.effective_gain()
-        changed = ca.if_else(
-            seen < _TOO_LONG, _SHRINK * factor, ca.if_else(seen > _TOO_SHORT, ca.fmin(_GROW * factor, largest), factor)
-        )
-        kept = ca.if_else(diverges, _SHRINK * factor, ca.if_else(resting, factor, changed))
-        rest = ca.if_else(
-            ca.logic_or(diverges, ca.logic_and(ca.logic_not(resting), changed != factor)),
-            _REST,
-            ca.fmax(memory["tuner_rest"] - 1, 0),
-        )
-        own = {"tuner_factor": kept, "tuner_sign": seen, "tuner_rest": rest, "tuner_error": error}
-        own["tuner_growing"] = ca.if_else(diverges, 0, growing)
-        return request + factor * (wanted - request), {**own, **following}
+        return ca.fmin(ca.fmax(factor * ca.exp(_RATE * rise), floor), largest)
 
     def largest_step(self) -> float:
         """The map's, times the largest factor."""

@@ -55,6 +55,8 @@ function draw(spec) {
     width: box.clientWidth || 520,
     height: 210,
     series,
+    // What was predicted before the run, between its two edges.
+    bands: spec.band ? [{ series: spec.band, fill: "#0072b222" }] : [],
     scales: { x: { time: false } },
     axes: [{ ...axis }, { ...axis, size: 62 }],
     cursor: { sync: { key: sync.key } },

@@ -17,6 +17,7 @@ from fpirhc.deformation.base import innermost
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, NotSupported, nearest
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.review.response_prediction import Prediction, predict_response
 from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
 from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.metrics.columns import columns
@@ -56,6 +57,7 @@ class Entry:
     optimality: Optimality | None = None
     notes: tuple[str, ...] = ()
     lyapunov: LyapunovView | None = None
+    prediction: Prediction | None = None  # of the headline's adaptive controller, where there is one
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +218,16 @@ def _entry(
         optimality=measure_optimality(problem, ready, run, compiled=compiled),
         notes=(*_notes(controller, ready), *ready.notes(problem), *([view.text] if view else [])),
         lyapunov=view,
+        prediction=_predicted(problem, controller, compiled) if adaptive and name in (task.headline or ()) else None,
     )
+
+
+def _predicted(problem: Problem, controller: Controller, compiled: bool) -> Prediction | None:
+    """What could have been known before the run; None where the prediction does not cover it."""
+    try:
+        return predict_response(problem, controller, compiled=compiled)
+    except FpirhcError:
+        return None
 
 
 def _pair(chosen: Mapping[str, Controller], name: str) -> str | None:

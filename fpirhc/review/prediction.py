@@ -1,0 +1,156 @@
+"""What adaptation will do to the response, before a run of the plant.
+
+The model is run once as its own plant, with the controller but without its deformation: the nominal run, with states
+x_k and desired responses d_k. Along it the deformation alone is iterated with the plant's response, the library's own
+blocks from deformation to limits in it,
+
+    f_k = response(x_k, u_{k-1}; exact),    r_k = G(r_{k-1}, f_k, d_k),    u_k = inverse(x_k, r_k; approximate),
+    e_k = response(x_k, u_k; exact) - d_k,
+
+so nothing is integrated and e_k is known to first order in the deviation of the plant's run from the nominal one.
+What acts on that deviation over cycle k is the difference of the mean responses,
+
+    w_k = (response(x_k, u_k) + response(x_{k+1}, u_k)) / 2 - (d_k + the model's response(x_{k+1}, u^_k)) / 2,
+
+u^_k the model's own command. Without adaptation, and with the model for the plant (the null run), the same recursion is used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller, closing_blocks, like
+from fpirhc.controllers.contract import resolved, without_deformation
+from fpirhc.deformation.base import Deformation
+from fpirhc.errors import NotSupported
+from fpirhc.plant.plant import Plant
+from fpirhc.sensing.sensing import Sensing
+from fpirhc.simulation.simulate import simulate
+from fpirhc.symbolic.block import Block, Composite, Delay, compose
+from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.task.problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class NominalRun:
+    """The model's own run: what is predicted along; build it with `nominal_run`.
+
+    Parameters: states (cycles + 1, nx), desired (cycles, n), believed parameters (np,).
+    """
+
+    problem: Problem
+    controller: Controller
+    states: np.ndarray
+    desired: np.ndarray
+    believed: np.ndarray
+
+    @property
+    def cycles(self) -> int:
+        """Cycles of the run."""
+        return len(self.desired)
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseErrors:
+    """Along a nominal run: response errors e (cycles, n) just after each update, and w (cycles, n), response units."""
+
+    error: np.ndarray
+    force: np.ndarray
+
+
+def nominal_run(problem: Problem, controller: Controller, *, compiled: bool = True) -> NominalRun:
+    """Return the run of the controller without its deformation on its own model, without disturbances and noise.
+
+    Raises:
+        NotSupported: dead time, estimated responses, a controller whose deformation cannot be left out, a model that
+        does not stay
+            finite. And what the controller raises about the problem.
+    """
+    _check(problem)
+    chosen = resolved(problem, controller)
+    chosen.check(problem)
+    believed = chosen.parameters(problem.plant)
+    model = replace(problem, plant=_exactly(problem.plant, believed), disturbances={}, sensing=Sensing())
+    run = simulate(model, without_deformation(chosen), seed=0, compiled=compiled)
+    if run.stop is not None or run.cycles < 2:
+        raise NotSupported(f"no prediction: the model's own run ended early: {run.stop}")
+    return NominalRun(problem, chosen, run["state"], run["desired"][:-1], believed)
+
+
+def response_errors(
+    nominal: NominalRun, *, deformation: Deformation | None = None, exact: np.ndarray | None = None
+) -> ResponseErrors:
+    """Return the response errors that the recursion predicts.
+
+    Parameters: another `deformation` than the controller's (Identity() is no adaptation), and other `exact` parameters than the
+    plant's (the believed ones: the null run).
+    """
+    map_ = nominal.controller.deformation if deformation is None else deformation
+    parameters = nominal.problem.plant.exact if exact is None else np.asarray(exact, dtype=float)
+    step = _recursion(nominal, map_, parameters)
+    reads = (nominal.states[:-1], nominal.desired, nominal.states[1:])
+    run: Any = step.function.mapaccum(f"{step.function.name()}_run", nominal.cycles)
+    log = np.asarray(run(step.memory.start(), *(rows.T for rows in reads))[1].full()).T
+    return ResponseErrors(log[:, step.trace.slice("response_error")], log[:, step.trace.slice("response_force")])
+
+
+def _recursion(nominal: NominalRun, deformation: Deformation, exact: np.ndarray) -> Composite:
+    """One cycle: (memory, state, desired, next state) -> (memory, trace)."""
+    plant = nominal.problem.plant
+    closing, delays = closing_blocks(nominal.problem, deformation)
+    reads = Layout((plant.state, plant.response_signal("desired"), like(plant.state, "_state_after")))
+    held = [
+        Delay(
+            Signal("parameters", plant.parameter.elements, plant.parameter.units, tuple(nominal.believed)), "parameters"
+        ),
+        Delay(Signal("_exact", plant.parameter.elements, plant.parameter.units, tuple(map(float, exact))), "_exact"),
+    ]
+    return compose("prediction", reads, [_answer_block(plant), *closing, _judge_block(plant)], [*delays, *held])
+
+
+def _answer_block(plant: Plant) -> Block:
+    """Block (state, command before, exact parameters) -> realised."""
+    reads = (plant.state, like(plant.input, "_command_before"), like(plant.parameter, "_exact"))
+
+    def step(s: Any) -> dict[str, Expression]:
+        return {"realised": plant.controlled_response_function(s.state, s._command_before, s._exact)}
+
+    return Block("answer", Layout(reads), Layout((plant.response_signal("realised"),)), step)
+
+
+def _judge_block(plant: Plant) -> Block:
+    """Block (states, command, desired, both parameter sets) -> response error and what acts on the deviation."""
+    respond, inverse = plant.controlled_response_function, plant.inverse_function
+    reads = (
+        plant.state,
+        like(plant.state, "_state_after"),
+        plant.input,
+        plant.response_signal("desired"),
+        plant.parameter,
+        like(plant.parameter, "_exact"),
+    )
+    writes = plant.response_signal("response_error"), plant.response_signal("response_force")
+
+    def step(s: Any) -> dict[str, Expression]:
+        first, last = (respond(x, s.command, s._exact) for x in (s.state, s._state_after))
+        own = inverse(s.state, s.desired, s.parameters)
+        of_model = 0.5 * (s.desired + respond(s._state_after, own, s.parameters))
+        return {"response_error": first - s.desired, "response_force": 0.5 * (first + last) - of_model}
+
+    return Block("judge_response", Layout(reads), Layout(writes), step, opaque=plant.inverse_opaque)
+
+
+def _exactly(plant: Plant, values: np.ndarray) -> Plant:
+    """The plant with these exact parameters."""
+    named = {n: replace(p, exact=float(v)) for (n, p), v in zip(plant.parameters.items(), values, strict=True)}
+    return replace(plant, parameters=named)
+
+
+def _check(problem: Problem) -> None:
+    late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
+    if late or problem.sensing.delay(problem.plant, problem.period):
+        what = "dead time" if late else "an estimated response"
+        raise NotSupported(f"no prediction with {what}: the response must belong to the last request")

@@ -1,0 +1,135 @@
+"""Does adaptation pay, does it disturb a model that is right, and how far is the plant from the plan: answers before a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import resolved
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.review.grid import review_grid
+from fpirhc.review.loops import loops_along
+from fpirhc.review.prediction import NominalRun, ResponseErrors, nominal_run, response_errors
+from fpirhc.review.tube import tube
+from fpirhc.summary import line, number, table
+from fpirhc.task.problem import Problem
+
+_DRAWS = 16  # of the parameters' box
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What adaptation will do along the nominal run.
+
+    Parameters:
+        nominal: the model's own run. adapted, without: response errors with the deformation and without one; null: with it, the
+            model being right, where every change does harm.
+        tube: bound of |plant's state - nominal state| (cycles + 1, nx) with the deformation, to first order; the
+            largest over the box of parameters where one was asked for. None where there is none, with `reason`.
+    """
+
+    nominal: NominalRun
+    adapted: ResponseErrors
+    without: ResponseErrors
+    null: ResponseErrors
+    tube: np.ndarray | None
+    reason: str
+
+    @property
+    def helps(self) -> bool:
+        """Whether the response error is smaller with the deformation than without, in the sum of squares of all coordinates."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return bool(np.sum(self._judged(self.adapted) ** 2) < np.sum(self._judged(self.without) ** 2))
+
+    def rms(self, errors: ResponseErrors) -> dict[str, float]:
+        """Rms response error by controlled coordinate, from the problem's `measure_from` on, in units of the response."""
+        names = self.nominal.problem.plant.controlled_names
+        with np.errstate(over="ignore", invalid="ignore"):
+            squares = np.mean(self._judged(errors) ** 2, axis=0)
+        return dict(zip(names, map(float, np.sqrt(squares)), strict=True))
+
+    @property
+    def half_width(self) -> Mapping[str, float]:
+        """Largest half-width of the tube by state, from `measure_from` on; empty without a tube."""
+        if self.tube is None:
+            return {}
+        widest = self.tube[self._first :].max(axis=0)
+        return dict(zip(self.nominal.problem.plant.state.elements, map(float, widest), strict=True))
+
+    @property
+    def _first(self) -> int:
+        problem = self.nominal.problem
+        return min(round(problem.measure_from / problem.period), self.nominal.cycles - 1)
+
+    def _judged(self, errors: ResponseErrors) -> np.ndarray:
+        return errors.error[self._first :]
+
+    def __repr__(self) -> str:
+        return line(self, "helps" if self.helps else "does not help", *(f"{n} {v}" for n, v in self._facts()))
+
+    def _repr_html_(self) -> str:
+        """Errors and tube as a table, for notebooks."""
+        notes = [self.reason] if self.reason else []
+        return table("Predicted response", ("", "value"), self._facts(), notes)
+
+    def _facts(self) -> list[tuple[str, str]]:
+        kinds = {"without": self.without, "with": self.adapted, "with a right model": self.null}
+        errors = [(f"rms of {c} {k}", number(v)) for k, e in kinds.items() for c, v in self.rms(e).items()]
+        return [*errors, *((f"tube of {s}", number(v)) for s, v in self.half_width.items())]
+
+
+def predict_response(
+    problem: Problem, controller: Controller, *, mismatch: float | None = None, seed: int = 0, compiled: bool = True
+) -> Prediction:
+    """Return what the controller's deformation will do, from one run of the model and no run of the plant.
+
+    Errors that do not stay finite are predicted as they are.
+
+    Parameters: `mismatch`: margin of the parameters' box around the exact ones, percent, over whose draws the tube is the largest
+    (None: the exact parameters alone); `seed` of the draws; `compiled`: run the model in C when there is a compiler.
+
+    Raises:
+        NotSupported: see `nominal_run`; a controller without adaptation. InvalidValue: a mismatch outside [0, 100).
+        And what the controller raises about the problem.
+    """
+    if mismatch is not None and not 0 <= mismatch < 100:
+        raise InvalidValue(f"predict_response(mismatch={mismatch!r}): expected percent of at least 0 and below 100")
+    if resolved(problem, controller).deformation.effective_gain() == 0:
+        raise NotSupported(f"{type(controller).__name__} has no deformation whose effect could be predicted")
+    nominal = nominal_run(problem, controller, compiled=compiled)
+    adapted = response_errors(nominal)
+    widest, reason = _tube(nominal, adapted, mismatch, seed)
+    null = response_errors(nominal, exact=nominal.believed)
+    return Prediction(nominal, adapted, response_errors(nominal, deformation=Identity()), null, widest, reason)
+
+
+def _tube(
+    nominal: NominalRun, adapted: ResponseErrors, mismatch: float | None, seed: int
+) -> tuple[np.ndarray | None, str]:
+    gain = nominal.controller.deformation.effective_gain()
+    grid = review_grid(nominal.problem, 0.0, 0)
+    loops = loops_along(grid, nominal.controller)
+    if not np.isfinite(adapted.error).all():
+        return None, "no tube: the predicted response errors do not stay finite"
+    if loops.loops and loops.radii.max() >= 1:
+        return None, f"no tube: the loop with its deformation does not converge, {loops.radii.max():.6g} per cycle"
+    try:
+        widest = tube(nominal, adapted, gain)
+        for exact in _drawn(nominal.problem, mismatch, seed):
+            widest = np.maximum(widest, tube(nominal, response_errors(nominal, exact=exact), gain, exact))
+    except NotSupported as error:
+        return None, str(error)
+    return widest, ""
+
+
+def _drawn(problem: Problem, mismatch: float | None, seed: int) -> np.ndarray:
+    """Some draws of the exact parameters from their box, none without a mismatch."""
+    if mismatch is None:
+        return np.zeros((0, problem.plant.parameter.size))
+    draws = review_grid(problem, mismatch, seed).draws[1:]
+    count = min(len(draws), _DRAWS)
+    return draws[np.unique(np.linspace(0, len(draws) - 1, count).astype(int))] if count else draws

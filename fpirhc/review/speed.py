@@ -1,0 +1,65 @@
+"""Is the iteration fast enough for its tracking law, and how late may the response be? By the poles of the law."""
+
+from __future__ import annotations
+
+from fpirhc.contraction import Spectrum, bearable_lag, least_product
+from fpirhc.controllers.base import Controller
+from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.grid import ReviewGrid
+
+FAST = "Does the iteration keep up with its tracking law?"
+LAG = "Does it bear a small lag that nobody has modelled?"
+_SPARE = 3.0
+_DAMPING = 0.3
+_CYCLES = 3.0  # of lag that it should bear
+
+
+def fast_enough(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer | None:
+    """Return the smallest a lambda beside what the plain form needs; None for other forms, and laws without known poles."""
+    law = _law(grid, controller)
+    if law is None or not controller.deformation.slows_desired:
+        return None
+    rate, poles = law
+    product = _products(controller, own)[0]
+    ratio = product / least_product(poles, rate, grid.problem.period)
+    text = f"gain x eigenvalue is {product:.3g} and at least, {ratio:.3g} times what {poles} poles at {rate:g} 1/s need"
+    numbers = {"product": product, "ratio": ratio}
+    change = "Raise the gain, lower the rate or the period, or use the form that passes the desired response at once (Increment)."
+    if ratio >= _SPARE:
+        return Answer(FAST, Verdict.YES, text, "", numbers)
+    return Answer(FAST, Verdict.NO if ratio < 1 else Verdict.UNKNOWN, text, change, numbers)
+
+
+def bears_lag(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer | None:
+    """Return the longest unknown lag with which the fast modes are still damped.
+
+    None for laws without known poles, and where the response is late already.
+    """
+    law, period = _law(grid, controller), grid.problem.period
+    if law is None or grid.problem.response_delay > 0:
+        return None
+    (rate, poles), product = law, _products(controller, own)[1]
+    longest = bearable_lag(product, period, rate, poles, damping=_DAMPING)
+    limit = 1 / (poles * rate)
+    text = (
+        f"up to {longest:.3g} s ({longest / period:.3g} cycles) of an actuator or a sensor with damping {_DAMPING:g}; beyond "
+        f"{limit:.3g} s a fast iteration is unstable at any gain"
+    )
+    numbers = {"lag": longest, "limit": limit}
+    if longest >= _CYCLES * period:
+        return Answer(LAG, Verdict.YES, text, "", numbers)
+    return Answer(LAG, Verdict.UNKNOWN, text, "Lower the gain, or model the lag and pair through it.", numbers)
+
+
+def _law(grid: ReviewGrid, controller: Controller) -> tuple[float, int] | None:
+    """Rate and poles of the tracking law, the most demanding coordinate's; None where there is no such law."""
+    law, plant = controller.law, grid.problem.plant
+    laws = [law.feedback(plant.orders[k]) for k in plant.controlled_indices] if law else []
+    known = [(one.rate, len(one.gains)) for one in laws if one is not None and one.rate is not None]
+    return max(known, key=lambda pair: pair[1]) if known else None
+
+
+def _products(controller: Controller, own: Spectrum) -> tuple[float, float]:
+    """Smallest and largest |a lambda| along the reference."""
+    sizes = abs(controller.deformation.effective_gain()) * abs(own.eigenvalues)
+    return float(sizes.min()), float(sizes.max())

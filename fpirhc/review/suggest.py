@@ -1,0 +1,231 @@
+"""Gain and filter pole for a budget of chatter: as much adaptation as the noise of the measured response allows.
+
+The largest gain is sought with which noise alone moves no input by more than its budget per cycle, at any of some
+points of the reference (`contraction.noise`), the filter's pole following the gain so that the iteration keeps its
+damping. What noise leaves of tracking is independent of both, as long as the iteration is fast against the tracking
+law: the plant then realises d - n, which acts as -n at its response in the loop with the right model.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from fpirhc.contraction import filter_pole, noise_spread, response_jacobians
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import resolved
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.wrappers.filtered import Filtered
+from fpirhc.errors import InvalidName, InvalidValue, NotContractive, NotSupported, nearest
+from fpirhc.review.grid import ReviewGrid, review_grid
+from fpirhc.review.linear import LinearLoop, response_slopes
+from fpirhc.review.loops import loops_along
+from fpirhc.sensing.base import response_names
+from fpirhc.summary import line, number, table
+from fpirhc.task.problem import Problem
+
+RINGING = 6.0  # kappa: damping 0.2, between 4 and 8, beyond which tracking gains nothing
+_POINTS = 9
+_DRAWN = 20_000
+_BISECTIONS = 50
+_SMALLEST = 1e-6  # of the deadbeat gain
+
+
+@dataclass(frozen=True, eq=False)
+class Suggestion:
+    """Gain and pole, and what noise does with them.
+
+    Parameters:
+        deformation: the controller's own with gain and pole; put it in with `dataclasses.replace`.
+        effective_gain, pole: of it. gain: the map's own gain, `gain_name` its field.
+        chatter: by input, predicted rms of the command's step per cycle that noise causes, in the input's unit.
+        floor: by controlled coordinate, predicted rms tracking error that noise causes, in the coordinate's unit; NaN where no
+            linear loop is known.
+    """
+
+    deformation: Deformation
+    effective_gain: float
+    pole: float
+    gain_name: str
+    gain: float
+    chatter: Mapping[str, float]
+    floor: Mapping[str, float]
+
+    def __repr__(self) -> str:
+        return line(self, *(f"{name} {value}" for name, value in self._facts()))
+
+    def _repr_html_(self) -> str:
+        """Gain, pole and predictions as a table, for notebooks."""
+        return table("Suggested gain", ("", "value"), self._facts(), [])
+
+    def _facts(self) -> list[tuple[str, str]]:
+        own = [(self.gain_name, number(self.gain)), ("pole", number(self.pole))]
+        steps = [(f"step of {i} per cycle", number(v)) for i, v in self.chatter.items()]
+        return [*own, *steps, *((f"rms error of {c} from noise", number(v)) for c, v in self.floor.items())]
+
+
+def suggest(
+    problem: Problem,
+    controller: Controller,
+    *,
+    chatter: float | Mapping[str, float],
+    noise: Mapping[str, float] | None = None,
+    ringing: float = RINGING,
+) -> Suggestion:
+    """Return the largest gain, with the pole of a filter of its error, whose chatter is within a budget.
+
+    The gain ends at the deadbeat one, the inverse of the largest eigenvalue of the response Jacobian along the reference. The
+    wrappers of the deformation stay, a `Filtered` among them is replaced.
+
+    Parameters: `chatter`: rms step of the command per cycle that noise may cause, in the input's unit, by input or one for all;
+    `noise`: standard deviation of the measured response by controlled coordinate, by default that of the problem's sensors;
+    `ringing` kappa = a lambda / (1 - p), 0 for no filter.
+
+    Raises:
+        InvalidValue: a budget that is not positive, a negative noise or ringing, no noise. InvalidName: unknown input
+        or coordinate. NotSupported: a controller without adaptation; a response that is estimated, whose noise must
+        be given. NotInvertible: see `review`. NotContractive: eigenvalues that no gain suits.
+    """
+    chosen = resolved(problem, controller)
+    if chosen.deformation.effective_gain() == 0:
+        raise NotSupported(
+            f"{type(controller).__name__} has no deformation to choose a gain for; give it Sigmoid(gain=...)"
+        )
+    if not (math.isfinite(ringing) and ringing >= 0):
+        raise InvalidValue(
+            f"suggest(ringing={ringing!r}): expected a number of at least 0; 4 to 8 is usual, 0 is no filter"
+        )
+    budget, deviations = _budget(problem, chatter), _deviations(problem, noise)
+    grid = review_grid(problem, 0.0, 0)
+    jacobians, inverses = _along_the_reference(grid, chosen.parameters(problem.plant))
+    sign, largest = _largest_eigenvalue(jacobians)
+    covariance = np.diag(deviations**2)
+
+    def steps(size: float) -> np.ndarray:
+        """Rms step of every input, the largest of all points."""
+        gain, pole = sign * size, filter_pole(size * largest, ringing)
+        spreads = [noise_spread(j, covariance, gain, pole).step for j in jacobians]
+        moved = [b @ s @ b.T for b, s in zip(inverses, spreads, strict=True)]
+        return np.asarray(np.sqrt(np.max([np.diag(m) for m in moved], axis=0)))
+
+    size = _largest_within(lambda one: bool((steps(one) <= budget).all()), 1 / largest)
+    pole = filter_pole(size * largest, ringing)
+    deformation = _with(chosen.deformation, sign * size, pole)
+    own = getattr(deformation, deformation.gain_name, None)
+    name, value = ("effective gain", sign * size) if own is None else (deformation.gain_name, float(own))
+    predicted = dict(zip(problem.plant.inputs, map(float, steps(size)), strict=True))
+    floor = _floor(grid, loops_along(grid, chosen).ideal, inverses[0], covariance)
+    return Suggestion(deformation, sign * size, pole, name, value, predicted, floor)
+
+
+def _budget(problem: Problem, chatter: float | Mapping[str, float]) -> np.ndarray:
+    inputs = tuple(problem.plant.inputs)
+    given = chatter if isinstance(chatter, Mapping) else dict.fromkeys(inputs, chatter)
+    for name, value in given.items():
+        if name not in inputs:
+            raise InvalidName(f"suggest(chatter=...): input '{name}' is unknown.{nearest(name, inputs)}")
+        if not value > 0:
+            raise InvalidValue(
+                f"suggest(chatter=...): {value!r} for '{name}'; expected a positive rms step per cycle, in the unit of the input"
+            )
+    return np.array([float(given.get(name, math.inf)) for name in inputs])
+
+
+def _deviations(problem: Problem, noise: Mapping[str, float] | None) -> np.ndarray:
+    """Standard deviation of every controlled coordinate's measured response."""
+    names = problem.plant.controlled_names
+    given = _of_sensors(problem) if noise is None else noise
+    for name, value in given.items():
+        if name not in names:
+            raise InvalidName(f"suggest(noise=...): coordinate '{name}' is not controlled.{nearest(name, names)}")
+        if not 0 <= value < math.inf:
+            raise InvalidValue(
+                f"suggest(noise=...): {value!r} for '{name}'; expected a standard deviation of at least 0"
+            )
+    found = np.array([float(given.get(name, 0.0)) for name in names])
+    if not found.any():
+        raise InvalidValue(
+            "suggest: no response has noise, so no gain chatters; give noise={'"
+            + names[0]
+            + "': ...}, the standard deviation of "
+            "the measured response"
+        )
+    return found
+
+
+def _of_sensors(problem: Problem) -> dict[str, float]:
+    """Deviation of the noise of the sensors that measure responses."""
+    plant, sensing = problem.plant, problem.sensing
+    measured = dict(zip(response_names(plant), plant.controlled_names, strict=True))
+    if sensing.sensors and not set(measured) & set(sensing.estimator.measures(plant)):
+        raise NotSupported(
+            f"suggest: the response is estimated by {type(sensing.estimator).__name__}, whose noise is not white; give "
+            "noise={coordinate: standard deviation of the estimated response}"
+        )
+    times = problem.period * np.arange(_DRAWN)
+    noises = {measured[name]: sensor.noise for name, sensor in sensing.sensors.items() if name in measured}
+    random = np.random.default_rng(0)
+    return {c: float(np.std(n.values(times, random))) for c, n in noises.items() if n is not None}
+
+
+def _along_the_reference(grid: ReviewGrid, believed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Response Jacobians (points, n, n), and the model's inputs per unit of response (points, nu, n), where all are finite."""
+    plant = grid.problem.plant
+    places = np.unique(np.linspace(0, len(grid.times) - 1, _POINTS).astype(int))
+    exact = np.tile(grid.draws[0], (len(places), 1))
+    jacobians = response_jacobians(plant, grid.states[places], grid.requests(believed)[places], exact, believed)
+    slopes, chosen = response_slopes(plant), list(plant.controlled_indices)
+    gains = [np.asarray(slopes(grid.states[k], grid.commands[0, k], believed)[1].full())[chosen] for k in places]
+    usable = [k for k in range(len(places)) if np.isfinite(jacobians[k]).all() and np.isfinite(gains[k]).all()]
+    if not usable:
+        raise NotContractive(
+            "the response Jacobian is finite nowhere along the reference; see whether the problem is well posed"
+        )
+    return jacobians[usable], np.array([np.linalg.inv(gains[k]) for k in usable])
+
+
+def _largest_eigenvalue(jacobians: np.ndarray) -> tuple[float, float]:
+    """Sign of the gain, and the inverse of the deadbeat gain: the largest |lambda|^2 / |Re lambda|."""
+    values = np.linalg.eigvals(jacobians).ravel()
+    if values.real.min() * values.real.max() <= 0:
+        raise NotContractive(
+            f"the response Jacobian has eigenvalues with real parts from {values.real.min():.4g} to {values.real.max():.4g} along "
+            "the reference: no gain converges"
+        )
+    return float(np.sign(values.real[0])), float((np.abs(values) ** 2 / np.abs(values.real)).max())
+
+
+def _largest_within(fits: Callable[[float], bool], most: float) -> float:
+    low, high = _SMALLEST * most, most
+    if fits(high):
+        return high
+    for _ in range(_BISECTIONS):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low
+
+
+def _with(deformation: Deformation, gain: float, pole: float) -> Deformation:
+    """The deformation with that gain, its error filtered inside all other wrappers."""
+    inner = deformation.inner
+    if inner is None:
+        changed = deformation.with_effective_gain(gain)
+        return Filtered(changed, pole=pole) if pole else changed
+    if deformation.error_pole != inner.error_pole:  # a filter, which the new one replaces
+        return _with(inner, gain, pole)
+    return deformation.around(_with(inner, gain, pole))
+
+
+def _floor(grid: ReviewGrid, ideal: LinearLoop | None, inverse: np.ndarray, noise: np.ndarray) -> dict[str, float]:
+    """Rms of the coordinates in the loop with the right model, with noise at the response."""
+    plant = grid.problem.plant
+    if ideal is None or ideal.radius >= 1:
+        return dict.fromkeys(plant.controlled_names, math.nan)
+    entry = ideal.entry @ inverse
+    spread = scipy.linalg.solve_discrete_lyapunov(ideal.dynamics, entry @ noise @ entry.T)
+    places = [ideal.state[plant.state.elements.index(c)] for c in plant.controlled_names]
+    return {c: float(np.sqrt(spread[k, k])) for c, k in zip(plant.controlled_names, places, strict=True)}

@@ -1,0 +1,156 @@
+"""Gain and filter pole for a budget of chatter: the closed forms against simulated noise, and the suggestion against runs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import fpirhc as fp
+from fpirhc.contraction.noise import gain_within_chatter, noise_spread, request_variance, step_variance
+from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, NotContractive, NotSupported
+
+SETTINGS = [(0.198, 0.0, 1.5), (0.5, 0.0, 1.0), (0.59, 0.78, 1.5), (0.97, 0.91, 1.5), (1.9, 0.8, 1.0)]
+BUDGET = {"Q1": 0.32, "Q2": 0.555}  # N; what the plain gain -0.5 makes of a noise of 1 m/s^2
+
+
+@pytest.mark.parametrize(("gain", "pole", "eigenvalue"), SETTINGS)
+def test_variances_of_simulated_noise(gain, pole, eigenvalue):
+    """A million cycles of the loop, as one filter of white noise: both variances within 3 % of the closed forms."""
+    # r = -a g / (1 - z^-1), g = (1 - p)(lambda r z^-1 + n) / (1 - p z^-1).
+    share = gain * (1 - pole)
+    request = lfilter(
+        [-share], [1.0, -(1 + pole) + share * eigenvalue, pole], np.random.default_rng(2).normal(size=1_000_000)
+    )
+    assert np.var(request) == pytest.approx(request_variance(gain, pole, eigenvalue), rel=0.03)
+    assert np.var(np.diff(request)) == pytest.approx(step_variance(gain, pole, eigenvalue), rel=0.03)
+
+
+@pytest.mark.parametrize(("gain", "pole", "eigenvalue"), SETTINGS)
+def test_one_coordinate_is_a_case_of_several(gain, pole, eigenvalue):
+    """The Lyapunov equation gives the closed forms, and rotated coordinates rotate its covariances."""
+    spread = noise_spread(np.array([[eigenvalue]]), np.array([[4.0]]), gain, pole)
+    assert spread.request[0, 0] == pytest.approx(4 * request_variance(gain, pole, eigenvalue), rel=1e-9)
+    assert spread.step[0, 0] == pytest.approx(4 * step_variance(gain, pole, eigenvalue), rel=1e-9)
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(2, 2)))[0]
+    own, noise = np.diag([eigenvalue, 0.7 * eigenvalue]), np.diag([1.0, 2.0])
+    turned = noise_spread(turn @ own @ turn.T, turn @ noise @ turn.T, gain, pole).step
+    np.testing.assert_allclose(turned, turn @ noise_spread(own, noise, gain, pole).step @ turn.T, atol=1e-9)
+
+
+@pytest.mark.parametrize("ringing", [0.0, 1.0, 4.0, 8.0])
+@pytest.mark.parametrize("budget", [0.01, 0.05])
+def test_budget_is_spent(budget, ringing):
+    """The gain's own step variance is the budget, and near the first-order forms sqrt(B) and (2 kappa B / lambda)^(1/3)."""
+    gain, pole = gain_within_chatter(budget, ringing, 1.5)
+    deadbeat = gain == pytest.approx(1 / 1.5)
+    assert deadbeat or step_variance(gain, pole, 1.5) == pytest.approx(budget, rel=1e-6)
+    first = math.sqrt(budget) if ringing == 0 else (2 * ringing * budget / 1.5) ** (1 / 3)
+    assert deadbeat or gain == pytest.approx(first, rel=0.25)
+
+
+def test_noise_that_grows_is_refused():
+    """A gain beyond the filter's limit has no stationary noise."""
+    for call in (
+        lambda: step_variance(2.1, 0.0),
+        lambda: request_variance(0.5, 1.0),
+        lambda: noise_spread(np.eye(1), np.eye(1), 2.1, 0.0),
+    ):
+        with pytest.raises(NotContractive):
+            call()
+    with pytest.raises(InvalidShape, match="square"):
+        noise_spread(np.eye(2), np.eye(1), 0.5, 0.0)
+    for bad in ((0.0, 4.0), (-1.0, 4.0), (0.1, -1.0)):
+        with pytest.raises(InvalidValue, match="positive budget"):
+            gain_within_chatter(*bad)
+
+
+def noisy() -> fp.Problem:
+    noise = {name: fp.Sensor(noise=fp.Noise(1.0)) for name in ("q1''", "q2''")}  # m/s^2
+    return replace(fp.load_problem("two_mass").problem, sensing=fp.Sensing(noise))
+
+
+def planning() -> fp.RecedingHorizon:
+    return fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=5e-2), fp.Sigmoid(gain=-0.5, shift=0.3, scale=20.0))
+
+
+@cache
+def ran(ringing: float, noise: bool) -> tuple[fp.Suggestion, float, np.ndarray, np.ndarray]:
+    """Suggestion, mean rms error (m), rms steps of the commands (N) and rms errors from 3 s on, of one run."""
+    problem = noisy()
+    suggestion = fp.suggest(problem, planning(), chatter=BUDGET, ringing=ringing)
+    shown = problem if noise else replace(problem, sensing=fp.Sensing())
+    run = fp.simulate(shown, replace(planning(), deformation=suggestion.deformation), seed=11)
+    errors = np.array(list(fp.measure(shown, run).rms_error.values()))
+    return suggestion, float(errors.mean()), np.std(np.diff(run["command"][3000:], axis=0), axis=0), errors
+
+
+@pytest.mark.parametrize(("ringing", "published"), [(0.0, 0.564e-3), (1.0, 0.341e-3), (4.0, 0.245e-3)])
+def test_filter_buys_tracking_at_the_same_chatter(ringing, published):
+    """Two masses, accelerometers with 1 m/s^2: errors 0.56, 0.34, 0.24 mm, with the same steps of the commands each time."""
+    suggestion, error, steps, _ = ran(ringing, True)
+    assert error == pytest.approx(published, rel=0.08)
+    quiet = ran(ringing, False)[2]
+    predicted = np.array(list(suggestion.chatter.values()))
+    np.testing.assert_allclose(np.sqrt(steps**2 - quiet**2), predicted, rtol=0.06)
+    assert max(predicted / np.array(list(BUDGET.values()))) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_floor_is_what_noise_leaves_of_tracking():
+    """With a fast iteration the error that noise adds is the predicted floor, to 20 %."""
+    suggestion, _, _, errors = ran(6.0, True)
+    quiet = ran(6.0, False)[3]
+    np.testing.assert_allclose(np.sqrt(errors**2 - quiet**2), list(suggestion.floor.values()), rtol=0.2)
+
+
+def test_generous_budget_ends_at_the_deadbeat_gain():
+    """More gain than the inverse of the largest eigenvalue (1.5) buys nothing, so the chatter stays below its budget."""
+    suggestion = fp.suggest(noisy(), planning(), chatter=100.0)
+    assert suggestion.effective_gain == pytest.approx(1 / 1.5)
+    assert max(suggestion.chatter.values()) < 10
+    assert "gain" in repr(suggestion)
+    assert "Suggested" in suggestion._repr_html_()
+
+
+def test_suggestion_keeps_the_other_wrappers():
+    """A filter is replaced, a guard around it stays, and so does the sign of the gain."""
+    guarded = fp.Guarded(fp.Filtered(fp.Affine(gain=-0.1), pole=0.99), largest_deformation=1e3)
+    controller = fp.ComputedTorque(fp.Exponential(rate=6.0), guarded)
+    suggestion = fp.suggest(noisy(), controller, chatter=0.3, noise={"q1": 1.0})
+    assert isinstance(suggestion.deformation, fp.Guarded)
+    assert suggestion.deformation.map == fp.Filtered(fp.Affine(gain=suggestion.gain), pole=suggestion.pole)
+    assert suggestion.gain < 0
+    assert fp.suggest(noisy(), controller, chatter=0.3, ringing=0.0).pole == 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "words"),
+    [
+        ({"chatter": -1.0}, InvalidValue, "positive rms step"),
+        ({"chatter": {"Q1": 0.0}}, InvalidValue, "positive rms step"),
+        ({"chatter": {"Q3": 1.0}}, InvalidName, "Q3"),
+        ({"chatter": 1.0, "noise": {"q3": 1.0}}, InvalidName, "q3"),
+        ({"chatter": 1.0, "noise": {"q1": -1.0}}, InvalidValue, "standard deviation"),
+        ({"chatter": 1.0, "noise": {}}, InvalidValue, "no response has noise"),
+        ({"chatter": 1.0, "ringing": -1.0}, InvalidValue, "4 to 8"),
+    ],
+)
+def test_suggest_refuses_bad_input(settings, error, words):
+    """Negative budgets and unknown names are told with what is expected."""
+    with pytest.raises(error, match=words):
+        fp.suggest(noisy(), planning(), **settings)
+
+
+def test_suggest_needs_a_deformation_and_white_noise():
+    """Without adaptation there is nothing to choose; the noise of an estimated response must be given."""
+    with pytest.raises(NotSupported, match="no deformation"):
+        fp.suggest(noisy(), replace(planning(), deformation=fp.Identity()), chatter=1.0)
+    sensing = fp.Sensing({"q1'": fp.Sensor(noise=fp.Noise(1e-3))}, fp.VelocityDifference())
+    estimated = replace(noisy(), sensing=sensing)
+    with pytest.raises(NotSupported, match="not white"):
+        fp.suggest(estimated, planning(), chatter=1.0)
+    assert fp.suggest(estimated, planning(), chatter=1.0, noise={"q1": 1.4, "q2": 1.4}).pole > 0
