@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -18,12 +19,13 @@ from fpirhc.simulation.loop import close_loop
 def chain(order: int = 2, eigenvalue: float = 1.0, period: float = 1e-3, **settings) -> fp.Problem:
     """y^(order) = u at rest, with a model that takes y^(order) for u / eigenvalue: f = eigenvalue r."""
 
-    def response(*given):
+    def respond(*given):
         *_, u, p = given
         return {"y": u.u / p.m}
 
     kind = inspect.Parameter.POSITIONAL_ONLY
     names = [*(f"d{k}" for k in range(order)), "u", "p"]
+    response: Any = respond
     response.__signature__ = inspect.Signature([inspect.Parameter(n, kind) for n in names])
     mass = fp.Parameter(approximate=eigenvalue, exact=1.0, unit="kg")
     plant = fp.Plant(coordinates={"y": "m"}, inputs={"u": "N"}, parameters={"m": mass}, response=response, order=order)

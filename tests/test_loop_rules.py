@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -122,7 +123,7 @@ def test_automatic_scale_covers_the_basin():
     )
     still = fp.Trajectory(lambda t: {"q": 0 * t})
     problem = fp.Problem(plant, still, start={"q": 0.0}, period=PERIOD, duration=2.0, measure_from=1.5)
-    chosen = resolved(problem, torque(80.0, fp.Sigmoid(gain=-0.5)))
+    chosen: Any = resolved(problem, torque(80.0, fp.Sigmoid(gain=-0.5)))
     assert chosen.deformation.scale == pytest.approx(1.55 * least_product(3, 80.0, PERIOD) * 100.0, rel=0.01)
     settled, grown = (
         fp.simulate(problem, torque(80.0, fp.Sigmoid(gain=-0.5, scale=scale)), seed=0, compiled=False)
@@ -136,8 +137,8 @@ def test_automatic_scale_covers_the_basin():
 
 
 def cycle_limit(problem: fp.Problem, rate: float) -> float:
-    loops = [linear_loop(problem, torque(rate, fp.Affine(gain=-2 * a))).dynamics for a in (0.3, 0.6)]
-    return two_cycle_limit(*loops, (0.3, 0.6))
+    low, high = [linear_loop(problem, torque(rate, fp.Affine(gain=-2 * a))).dynamics for a in (0.3, 0.6)]
+    return two_cycle_limit(low, high, (0.3, 0.6))
 
 
 def with_secant(share: float, scale: float = 5.0) -> fp.Sigmoid:
@@ -181,8 +182,8 @@ def test_no_two_cycle_below_the_limit():
 
 def test_two_cycle_limit_of_a_gain_of_the_other_sign():
     """A model with the wrong sign and a map with a negative gain make the same loop."""
-    loops = [linear_loop(chain(2, 1.5), torque(6.0, fp.Affine(gain=-2 * a))).dynamics for a in (0.3, 0.6)]
-    assert two_cycle_limit(*loops, (-0.3, -0.6)) == pytest.approx(two_cycle_limit(*loops, (0.3, 0.6)))
+    low, high = [linear_loop(chain(2, 1.5), torque(6.0, fp.Affine(gain=-2 * a))).dynamics for a in (0.3, 0.6)]
+    assert two_cycle_limit(low, high, (-0.3, -0.6)) == pytest.approx(two_cycle_limit(low, high, (0.3, 0.6)))
     assert two_cycle_limit(np.eye(2), np.eye(2), (0.3, 0.6)) == math.inf
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,10 +23,10 @@ def undisturbed(name: str) -> fp.Problem:
     return replace(fp.load_problem(name).problem, disturbances={}, sensing=fp.Sensing(), dead_time=fp.DeadTime())
 
 
-def controller(name: str, which: str, gain: float, form=lambda m: m) -> fp.RecedingHorizon | fp.ComputedTorque:
+def controller(name: str, which: str, gain: float, form=lambda m: m) -> Any:
     """A controller of a shipped problem with the sigmoid of that gain."""
     chosen = fp.load_problem(name).controllers[which]
-    return replace(chosen, deformation=form(fp.Sigmoid(gain=gain, shift=0.3, scale=SCALES.get(name, 50.0))))
+    return chosen.with_deformation(form(fp.Sigmoid(gain=gain, shift=0.3, scale=SCALES.get(name, 50.0))))
 
 
 @cache
@@ -89,7 +90,7 @@ def test_null_run_is_predicted(gain, form):
 def contained(name: str, which: str, gain: float) -> None:
     """Every state of the run is inside the tube, widened by a tenth of its largest half-width."""
     problem, chosen = undisturbed(name), controller(name, which, gain)
-    predicted = fp.predict_response(problem, chosen)
+    predicted: Any = fp.predict_response(problem, chosen)
     run = fp.simulate(problem, chosen, seed=0)
     assert run.stop is None
     assert predicted.helps
@@ -155,7 +156,8 @@ def test_box_widens_the_tube():
         replace(undisturbed("mrac_pendulum"), duration=2.0, measure_from=1.0),
         controller("mrac_pendulum", "CTC", -0.5),
     )
-    own, boxed = (fp.predict_response(problem, chosen, mismatch=m) for m in (None, 20.0))
+    own: Any = fp.predict_response(problem, chosen)
+    boxed: Any = fp.predict_response(problem, chosen, mismatch=20.0)
     assert (boxed.tube >= own.tube - 1e-12).all()
     assert boxed.tube.max() > 1.05 * own.tube.max()
     assert "helps" in repr(own)
@@ -187,6 +189,6 @@ def test_prediction_refuses_what_it_does_not_cover():
     hanging = undisturbed("chain_of_masses")
     predicted = fp.predict_response(
         replace(hanging, duration=0.2, measure_from=0.0),
-        controller("chain_of_masses", fp.load_problem("chain_of_masses").headline[0], -0.5),
+        controller("chain_of_masses", (fp.load_problem("chain_of_masses").headline or ("",))[0], -0.5),
     )
     assert "not controlled" in predicted.reason

@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -113,7 +114,7 @@ def test_predicted_band_is_drawn_around_the_distance_from_the_models_run():
     data = chart_data(found, ["#000000"])
     [chart] = [c for c in data["charts"] if "band" in c]
     distance, upper, lower = ([v for v in s["values"] if v is not None] for s in chart["series"])
-    entry = found["adaptive"]
+    entry: Any = found["adaptive"]
     assert chart["only"] == "adaptive"
     apart = entry.run["state.y"] - entry.prediction.nominal.states[:, 0]
     assert max(distance) == pytest.approx(apart.max(), rel=1e-4)

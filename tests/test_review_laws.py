@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-
-import casadi as ca
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from chains import chain, errors_after_request

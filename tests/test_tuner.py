@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -100,6 +101,9 @@ def changing_drive() -> fp.Problem:
 @cache
 def rms_errors(plant: str, tuned: bool, gain: float = -0.5) -> tuple[float, ...]:
     """Rms tracking error of every seed, mean of the coordinates."""
+    problem: Any
+    map_: Any
+    controller: Any
     if plant == "two_mass":
         problem, map_ = noisy_two_mass(), fp.Sigmoid(gain=gain, shift=0.3, scale=20.0)
         largest = 1.2
@@ -141,7 +145,7 @@ def test_tuner_leaves_a_saturated_two_cycle():
         value, memory = step(value, 1.0, memory)
     assert float(4 * value) == pytest.approx(1.0, abs=1e-3)
     alone = ca.Function("a", [r, d], [sigmoid.step(r, 4 * r, d, {})[0]])
-    value = 30.0
+    doubled: Any = 30.0
     for _ in range(400):
-        value = alone(value, 1.0)
-    assert abs(float(4 * value) - 1.0) > 1.0
+        doubled = alone(doubled, 1.0)
+    assert abs(float(4 * doubled) - 1.0) > 1.0
