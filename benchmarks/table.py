@@ -1,4 +1,4 @@
-"""Prints a benchmark's table, and writes it into docs/performance.md when asked with --write."""
+"""Prints a benchmark's table, and writes it into a page of docs/ when asked with --write."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from fpirhc.studies.comparison.compare import versions
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "performance.md"
 
 
-def write_table(name: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print the table; with --write, replace the part of docs/performance.md between the marks of this name."""
+def write_table(name: str, heads: Sequence[str], rows: Sequence[Sequence[str]], path: Path = PAGE) -> None:
+    """Print the table; with --write, replace the part of the page between the marks of this name."""
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     lines += ["| " + " | ".join(row) + " |" for row in rows]
     found = versions()
@@ -23,11 +23,11 @@ def write_table(name: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) 
     print(text)
     if "--write" in sys.argv:
         begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
-        page = PAGE.read_text(encoding="utf-8")
+        page = path.read_text(encoding="utf-8")
         pattern = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
         if not pattern.search(page):
-            sys.exit(f"{PAGE} has no marks '{begin}' ... '{end}'")
-        PAGE.write_text(pattern.sub(lambda _: f"{begin}\n{text}\n{end}", page), encoding="utf-8")
+            sys.exit(f"{path} has no marks '{begin}' ... '{end}'")
+        path.write_text(pattern.sub(lambda _: f"{begin}\n{text}\n{end}", page), encoding="utf-8")
 
 
 def _processor() -> str:

@@ -26,6 +26,8 @@ from .controllers.wrappers.exact_model import ExactModel
 from .controllers.wrappers.predicted import ByDesired, ByModel, Predicted
 from .deformation.affine import Affine
 from .deformation.identity import Identity
+from .deformation.leaky import leaky_margin, leaky_pole
+from .deformation.model_referenced import ModelReferenced
 from .deformation.rfpt import RFPT
 from .deformation.rfpt_vector import RFPTVector
 from .deformation.rotation import Rotation
@@ -160,6 +162,7 @@ __all__ = [
     "Measured",
     "Metric",
     "Metrics",
+    "ModelReferenced",
     "MovingHorizon",
     "Noise",
     "Osqp",
@@ -233,6 +236,8 @@ __all__ = [
     "delayed_limit",
     "disturbed",
     "floquet_radius",
+    "leaky_margin",
+    "leaky_pole",
     "linear_parameters",
     "load_problem",
     "load_run",

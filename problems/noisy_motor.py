@@ -80,20 +80,24 @@ problem = fp.Problem(
     measure_from=4.0,  # s
 )
 
-late = problem.response_delay  # cycles
+late = problem.response_delay  # cycles; the estimator's own delay is certain, so nothing leaks
 optimiser = fp.FixedPoint(iterations=5, tolerance=1e-2)  # one is not enough for friction that bends at standstill
 sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=5e3)  # scale in rad/s^3
 gentle = fp.Sigmoid(gain=-0.25, shift=0.3, scale=5e3)
-adaptive = fp.Increment(sigmoid, cycles=late)
+adaptive = fp.Increment(sigmoid, cycles=late, uncertainty=0)
 
 controllers = {
     "RHC": fp.RecedingHorizon(optimiser),
     "RHC+FPI": fp.RecedingHorizon(optimiser, adaptive),
     "RHC+FPI (eq 3)": fp.RecedingHorizon(
-        optimiser, fp.Increment(fp.RFPT(offset=1e6, sign=-1.0, gain=4e-7), cycles=late)
+        optimiser, fp.Increment(fp.RFPT(offset=1e6, sign=-1.0, gain=4e-7), cycles=late, uncertainty=0)
     ),
-    "RHC+FPI, filtered error": fp.RecedingHorizon(optimiser, fp.Increment(fp.Filtered(sigmoid, pole=0.5), cycles=late)),
-    "RHC+FPI, tuned": fp.RecedingHorizon(optimiser, fp.Increment(fp.Tuned(gentle, largest_gain=0.4), cycles=late)),
+    "RHC+FPI, filtered error": fp.RecedingHorizon(
+        optimiser, fp.Increment(fp.Filtered(sigmoid, pole=0.5), cycles=late, uncertainty=0)
+    ),
+    "RHC+FPI, tuned": fp.RecedingHorizon(
+        optimiser, fp.Increment(fp.Tuned(gentle, largest_gain=0.4), cycles=late, uncertainty=0)
+    ),
     "RHC+FPI, delay not told": fp.RecedingHorizon(optimiser, gentle),
     "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }

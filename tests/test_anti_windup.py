@@ -63,7 +63,7 @@ def integral_runs(blocks, delays):
     return [*blocks[:-1], Block(update.name, update.reads, update.writes, step)], delays
 
 
-def step_of_two_metres(*changes, bumpless=False):
+def step_of_two_metres(*changes, bumpless=False, deformation=None):
     """Run from rest at 0 m to 2 m, where 1.8 N hold the plant."""
     problem = fp.Problem(
         plant=duffing(),
@@ -74,7 +74,7 @@ def step_of_two_metres(*changes, bumpless=False):
         limits=fp.Limits(inputs={"u": (-LARGEST, LARGEST)}),
     )
     law, sigmoid = fp.Exponential(rate=6.0, bumpless=bumpless), fp.Sigmoid(gain=-0.5, scale=20.0)
-    return fp.simulate(problem, Altered(law, sigmoid, changes), seed=0)
+    return fp.simulate(problem, Altered(law, deformation or sigmoid, changes), seed=0)
 
 
 def overshoot(run):

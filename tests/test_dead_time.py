@@ -59,25 +59,30 @@ def test_paired_is_stable_at_any_delay(form, delay):
     """D + 1 interleaved iterations: the rate is |1 - a|^(1/(d+1)), also at a = 1.9."""
     for gain in (0.5, 1.9):
         # The queue's own modes are zero; they form a Jordan block, whose computed eigenvalues are rounding^(1/size).
-        assert iteration_radius(form(affine(gain), cycles=delay), delay) == pytest.approx(
+        assert iteration_radius(form(affine(gain), cycles=delay, uncertainty=0), delay) == pytest.approx(
             abs(1 - gain) ** (1 / (delay + 1)), abs=1e-6
         )
-    assert iteration_radius(form(affine(2.05), cycles=delay), delay) > 1
+    assert iteration_radius(form(affine(2.05), cycles=delay, uncertainty=0), delay) > 1
 
 
 @pytest.mark.parametrize("form", [fp.Paired, fp.Increment])
 @pytest.mark.parametrize("delay", [6, 20])
 def test_uncertainty_tolerates_a_wrong_dead_time(form, delay):
     """Off by one cycle the pairs answer each other and high modes grow; with the uncertainty stated they decay."""
-    assert iteration_radius(form(affine(0.5), cycles=delay), delay + 1) > 1
+    assert iteration_radius(form(affine(0.5), cycles=delay, uncertainty=0), delay + 1) > 1
     width = round(0.3 * delay)
     for wrong in range(-width, width + 1):
         assert iteration_radius(form(affine(0.5), cycles=delay, uncertainty=width), delay + wrong) < 1
 
 
 def test_uncertainty_still_finds_the_fixed_point():
-    """With a constant task the mean over the past is exact: the response becomes the desired one."""
-    step, layout = stepping(fp.Increment(affine(0.5), cycles=6, uncertainty=2))
+    """With a constant task a mean over the past and a leak are exact: the response becomes the desired one."""
+    for form in (fp.Paired, fp.Increment):
+        _finds_the_fixed_point(form(affine(0.5), cycles=6, uncertainty=2))
+
+
+def _finds_the_fixed_point(deformation):
+    step, layout = stepping(deformation)
     memory, requests = layout.start(), [1.0] * 8
     for _ in range(600):
         request, memory = step(requests[-1], 3 + 0.7 * requests[-1 - 5], 1.0, memory)
@@ -315,7 +320,7 @@ def test_bad_settings():
             fp.SelfPaired(SIGMOID, most=most)
     with pytest.raises(InvalidValue, match="share between 0 and 1"):
         fp.SelfPaired(SIGMOID, most=5, confidence=1.0)
-    with pytest.raises(InvalidValue, match="whole cycles from 0 to the dead time of 4"):
+    with pytest.raises(InvalidValue, match="whole cycles from 0 to 4, the dead time of 4"):
         fp.Paired(SIGMOID, cycles=4, uncertainty=5)
     with pytest.raises(InvalidValue, match="residual_time=0"):
         fp.ByModel(residual_time=0.0)

@@ -17,6 +17,7 @@ from fpirhc.contraction.lag import (
     through_lag_damping,
     through_lag_limit,
 )
+from fpirhc.contraction.leaking import leaking_limit
 from fpirhc.contraction.low_pass import least_product, slowest_iteration
 from fpirhc.contraction.noise import (
     NoiseSpread,
@@ -55,6 +56,7 @@ __all__ = [
     "gain_within_chatter",
     "identified_factor",
     "lagged_limit",
+    "leaking_limit",
     "least_product",
     "linear_limit",
     "noise_spread",

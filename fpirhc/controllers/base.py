@@ -20,6 +20,7 @@ import numpy as np
 from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
+from fpirhc.controllers.mirror import measured_state, mirror_blocks, with_measured_state
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
@@ -38,11 +39,17 @@ def controller_reads(problem: Problem, controller: Controller) -> Layout:
     return Layout((scalar("time", "s"), plant.state, realised, plant.parameter))
 
 
-def compose_controller(problem: Problem, controller: Controller) -> Composite:
-    """Return the controller as one step: (memory, time, state, realised, parameters) -> (memory, trace, command)."""
+def compose_controller(problem: Problem, controller: Controller, *, ahead: bool = False) -> Composite:
+    """Return the controller as one step: (memory, time, state, realised, parameters) -> (memory, trace, command).
+
+    `ahead`: time and state are to be those in which the command acts; a block that needs the measured state then reads it too.
+    """
     ready = checked(problem, controller)
     blocks, delays = ready.blocks(problem)
-    return compose("controller", controller_reads(problem, ready), blocks, delays, outputs=("command",))
+    reads, named = controller_reads(problem, ready), with_measured_state(problem.plant, blocks)
+    if ahead and len(named) > len(blocks):
+        reads, named = reads + Layout((measured_state(problem.plant),)), blocks
+    return compose("controller", reads, named, delays, outputs=("command",))
 
 
 def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block:
@@ -95,8 +102,10 @@ def closing_blocks(
     """Return the blocks deform, invert, limit and judge with what they remember; `judged` are solver statuses."""
     plant = problem.plant
     closing, delays = commanding_blocks(problem, judged)
-    blocks = [deform_block(plant, deformation, problem.warm_up_cycles), invert_block(plant), *closing]
-    return blocks, [*delays, Delay(plant.response_signal("_deformed_last"), "deformed")]
+    mirrors, seen = mirror_blocks(problem, deformation)
+    blocks = [*mirrors, deform_block(plant, deformation, problem.warm_up_cycles), invert_block(plant), *closing]
+    before = [] if mirrors else [Delay(plant.response_signal("_deformed_last"), "deformed")]
+    return blocks, [*delays, *seen, *before]
 
 
 def commanding_blocks(problem: Problem, judged: Sequence[Signal] = ()) -> tuple[list[Block], list[Delay]]:
@@ -120,26 +129,26 @@ def _warm_up_block(blind: int) -> Block:
 def deform_block(plant: Plant, deformation: Deformation, blind: int = 1) -> Block:
     """Block (request before, realised, desired) -> deformed request; without a valid pair it passes the desired one.
 
+    A model-referenced deformation is given the model's response, '_modelled', in place of the request before.
     A pair is valid after `blind` cycles, which `started` counts: one, or more where the response is estimated from more samples.
     """
     memory = deformation.memory(plant.controlled_names)
-    reads = (
-        plant.response_signal("_deformed_last"),
-        plant.response_signal("realised"),
-        plant.response_signal("desired"),
-        scalar("warm_up"),
-    )
+    asked = "_deformed_last" if deformation.mirror is None else "_modelled"
+    responses = [plant.response_signal(name) for name in (asked, "realised", "desired")]
+    reads = (*responses, scalar("warm_up"))
 
     def step(s: Signals) -> dict[str, Expression]:
         remembered = {m: getattr(s, m) for m in memory.names}
-        deformed, following = deformation.step(s._deformed_last, s.realised, s.desired, remembered)
+        deformed, following = deformation.step(getattr(s, asked), s.realised, s.desired, remembered)
         valid = s.warm_up > blind - 0.5
         kept = {f"{m}_next": ca.if_else(valid, following[m], remembered[m]) for m in memory.names}
         shown = {name: kept[f"{source}_next"] for name, source in deformation.shown().items()}
-        return {"_deformed_unclipped": ca.if_else(valid, deformed, s.desired), **shown, **kept}
+        wanted = ca.if_else(valid, deformed, s.desired)
+        return {"_deformed_unclipped": wanted, "_deformation": wanted - s.desired, **shown, **kept}
 
-    logged = tuple(scalar(name) for name in deformation.shown())
-    return Block("deform", Layout(reads), Layout((plant.response_signal("_deformed_unclipped"), *logged)), step, memory)
+    written = [plant.response_signal(name) for name in ("_deformed_unclipped", "_deformation")]
+    logged = [scalar(name) for name in deformation.shown()]
+    return Block("deform", Layout(reads), Layout((*written, *logged)), step, memory)
 
 
 def invert_block(plant: Plant) -> Block:

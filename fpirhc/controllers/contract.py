@@ -15,8 +15,9 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.demands import plan_demand, reference_demand
+from fpirhc.controllers.form_check import check_form
 from fpirhc.controllers.gain_check import check_gain_sign, check_response_delay
-from fpirhc.deformation.base import Deformation, Demand, with_inner
+from fpirhc.deformation.base import Deformation, Demand, Mirror, with_inner
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import NotSupported
 from fpirhc.horizon.cost import Cost
@@ -150,6 +151,10 @@ class Controller(ABC):
         """What the controller reads as 'realised', where that is not the response of the plant's controlled coordinates."""
         return None if self.inner is None else self.inner.response(self.inner_problem(problem))
 
+    def unusable(self, problem: Problem, mirror: Mirror) -> str:
+        """Why a model-referenced deformation with this mirror cannot be used on this problem; empty where it can."""
+        return "" if self.inner is None else self.inner.unusable(self.inner_problem(problem), mirror)
+
     def floquet(self, problem: Problem) -> Floquet | None:
         """The stability of one period of a controller that switches; None for one that does not."""
         return None if self.inner is None else self.inner.floquet(self.inner_problem(problem))
@@ -187,6 +192,7 @@ def checked(problem: Problem, controller: Controller) -> Controller:
     """
     ready = resolved(problem, controller)
     ready.check(problem)
+    check_form(problem, ready)
     if ready.response(problem) is None:
         check_gain_sign(problem, ready.deformation)
         check_response_delay(problem, ready.deformation)

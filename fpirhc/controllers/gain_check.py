@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fpirhc.contraction import Spectrum, assess_gain, delayed_limit, linear_limit, spectrum_over_run
+from fpirhc.contraction import Spectrum, assess_gain, delayed_limit, leaking_limit, linear_limit, spectrum_over_run
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotContractive
 from fpirhc.task.problem import Problem
@@ -52,14 +52,13 @@ def check_response_delay(problem: Problem, deformation: Deformation) -> None:
     eigenvalues = np.unique(np.round(spectrum.eigenvalues.ravel() * math.copysign(1, gain), 12))
 
     def limit(pairing: float) -> float:
-        every = [(w, complex(v)) for w in weights for v in eigenvalues]
-        return min(delayed_limit(w, pairing=pairing, pole=form.pole, eigenvalue=v) for w, v in every)
+        return min(form.limit(w, complex(v), pairing) for w in weights for v in eigenvalues)
 
     if limit(form.pairing) <= abs(gain) < max(map(abs, linear_limit(spectrum.eigenvalues))):
         # A fraction of a cycle damps requests that alternate, which a window does not see.
         delay = problem.response_delay
         tried = {d: limit(d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0}
-        best = next((d for d, reached in tried.items() if abs(gain) < reached), None)
+        best = None if form.referenced else next((d for d, reached in tried.items() if abs(gain) < reached), None)
         raise NotContractive(_too_late(problem, deformation, form, limit(form.pairing), best))
 
 
@@ -70,7 +69,7 @@ def product_limit(problem: Problem, deformation: Deformation) -> float | None:
     """
     form = _form(deformation)
     weights = _delayed_weights(problem, form)
-    return min((delayed_limit(w, pairing=form.pairing, pole=form.pole) for w in weights), default=None)
+    return min((form.limit(w, 1.0, form.pairing) for w in weights), default=None)
 
 
 def _delayed_weights(problem: Problem, form: _Form) -> list[np.ndarray]:
@@ -86,15 +85,25 @@ def _delayed_weights(problem: Problem, form: _Form) -> list[np.ndarray]:
 
 @dataclass(frozen=True)
 class _Form:
-    """Which request the map is given, and the pole of the filter of its error."""
+    """Which request the map is given, its leak, the pole of the filter of its error, and whether it is given the model's answer."""
 
     pairing: float
+    leak: float
     pole: float
+    referenced: bool
+
+    def limit(self, weights: np.ndarray, eigenvalue: complex, pairing: float) -> float:
+        """Largest effective gain for a response with these weights."""
+        if self.referenced or self.leak:
+            settings = {"cycles": pairing, "leak": self.leak, "pole": self.pole}
+            return leaking_limit(weights, **settings, eigenvalue=eigenvalue, referenced=self.referenced)
+        return delayed_limit(weights, pairing=pairing, pole=self.pole, eigenvalue=eigenvalue)
 
 
 def _form(deformation: Deformation) -> _Form:
     pairing = deformation.pairing
-    return _Form((pairing.cycles or 0.0) if pairing else 0.0, deformation.error_pole)
+    cycles = (pairing.cycles or 0.0) if pairing else 0.0
+    return _Form(cycles, deformation.leak, deformation.error_pole, deformation.mirror is not None)
 
 
 def _late(weights: np.ndarray, cycles: float) -> np.ndarray:

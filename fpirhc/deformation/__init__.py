@@ -3,6 +3,8 @@
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
+from fpirhc.deformation.leaky import leaky_margin, leaky_pole
+from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.deformation.rfpt import RFPT
 from fpirhc.deformation.rfpt_vector import RFPTVector
 from fpirhc.deformation.rotation import Rotation
@@ -25,6 +27,7 @@ __all__ = [
     "Guarded",
     "Identity",
     "Increment",
+    "ModelReferenced",
     "Paired",
     "RFPTVector",
     "Rotation",
@@ -32,4 +35,6 @@ __all__ = [
     "Sigmoid",
     "Tuned",
     "Wrapper",
+    "leaky_margin",
+    "leaky_pole",
 ]

@@ -21,6 +21,20 @@ from fpirhc.symbolic.layout import Expression, Layout
 
 
 @dataclass(frozen=True)
+class Mirror:
+    """What the model's response must pass to be seen as the plant's is: the believed way of a command to its response.
+
+    Parameters:
+        cycles: dead time of the inputs, control cycles; a tuple for one per input. measurement: of the measurement, cycles.
+        lag: time constant of the actuators, s; a tuple for one per input.
+    """
+
+    cycles: float | tuple[float, ...] = 0.0
+    measurement: float = 0.0
+    lag: float | tuple[float, ...] = 0.0
+
+
+@dataclass(frozen=True)
 class Reach:
     """The setting of a map, with its size, that requests and responses must stay far below, in units of the response."""
 
@@ -32,7 +46,8 @@ class Reach:
 class Pairing:
     """With which earlier request a response is paired: that of `cycles` cycles before the last one.
 
-    cycles: None where the map estimates it on line. uncertainty: by how many cycles it may be wrong.
+    cycles: None where the map estimates it on line; of several dead times the longest.
+    uncertainty: half width of the mean over the requests around it, cycles.
     """
 
     cycles: float | None
@@ -61,6 +76,9 @@ class Deformation(ABC):
     """
 
     gain_name: ClassVar[str] = "gain"  # the field that the effective gain is proportional to
+    passes_pair: ClassVar[bool] = (
+        False  # whether an inner map is given request, response and desired response as they are
+    )
 
     if TYPE_CHECKING:
 
@@ -104,6 +122,21 @@ class Deformation(ABC):
         return None if self.inner is None else self.inner.pairing
 
     @property
+    def leak(self) -> float:
+        """Pole of the leak between the deformation of the last cycle and the next; 0: none."""
+        return 0.0 if self.inner is None else self.inner.leak
+
+    @property
+    def mirror(self) -> Mirror | None:
+        """How the model's response is seen that `step` is given as `request`; None: it is given the map's own last request."""
+        return None if self.inner is None else self.inner.mirror
+
+    @property
+    def channels(self) -> int | None:
+        """Number of controlled coordinates that the map is made for; None: any number."""
+        return None if self.inner is None else self.inner.channels
+
+    @property
     def error_pole(self) -> float:
         """Pole of a low-pass filter on the response error, from 0 (none) to below 1."""
         return 0.0 if self.inner is None else self.inner.error_pole
@@ -122,6 +155,10 @@ class Deformation(ABC):
         """Whether a change of the desired response passes through the iteration, which is then a low-pass on it: the plain form."""
         return True if self.inner is None else self.inner.slows_desired
 
+    def settled(self, request: Expression, response: Expression) -> dict[str, Expression]:
+        """What the map remembers, by name, where `request` causes `response` and that is desired; its start where not named."""
+        return {} if self.inner is None else self.inner.settled(request, response)
+
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """What the map remembers besides the pair (request, desired); nothing unless it says otherwise."""
         del elements
@@ -137,7 +174,8 @@ class Deformation(ABC):
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return the next request and what to remember.
 
-        Parameters: `request` caused `response`; `desired` is asked for now; all are CasADi columns of the same size.
+        Parameters: `request` caused `response` (or is what the model answered, see `mirror`); `desired` is asked for now; all
+        are CasADi columns of the same size.
         Values and derivatives of any order are finite at response = desired.
         """
 

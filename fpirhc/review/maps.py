@@ -18,15 +18,18 @@ def dead_cycles(problem: Problem) -> float:
 def largest_product(problem: Problem, deformation: Deformation) -> float:
     """Limit of effective gain times eigenvalue: 2, or less under a dead time or behind an estimator or a filter.
 
-    Under a dead time, unpaired: 2 sin(pi / (2 (2 d + 1))), d rounded up. Paired with the true dead time: 2. Paired with an
-    uncertainty or with another dead time: 0.5, up to which the remembered requests decay.
+    Under a dead time, unpaired: 2 sin(pi / (2 (2 d + 1))), d rounded up. Paired with the true dead time: 2. Leaky and wrong by m
+    cycles: the g of 4 p / (1 - p)^2 = g (2 + g) m^2, the theorem's, if that is below 2. Paired without a leak and wrong, or with a
+    mean of requests: 0.5, up to which the remembered requests decay.
     """
-    pairs, cycles, delayed = deformation.pairing, dead_cycles(problem), product_limit(problem, deformation)
-    if pairs is not None and pairs.cycles is None:
-        pairs = None  # the pair is estimated on line, from none on
-    if delayed is not None and (pairs is None or pairs.uncertainty == 0):
+    pairs, leak, cycles = deformation.pairing, deformation.leak, dead_cycles(problem)
+    averaged, own = pairs is not None and pairs.uncertainty > 0, (pairs.cycles or 0.0) if pairs else 0.0
+    delayed = None if averaged else product_limit(problem, deformation)
+    if delayed is not None:
         return delayed
-    if pairs is None:
+    wrong = abs(own - cycles)
+    if own == 0 and not leak:
         return 2 * math.sin(math.pi / (2 * (2 * math.ceil(cycles - 1e-9) + 1)))
-    exact = pairs.uncertainty == 0 and pairs.cycles is not None and abs(pairs.cycles - cycles) < 1e-6
-    return 2.0 if exact else 0.5
+    if wrong < 1e-6 and not averaged:
+        return 2.0
+    return min(2.0, math.sqrt(1 + 4 * leak / ((1 - leak) * wrong) ** 2) - 1) if leak else 0.5

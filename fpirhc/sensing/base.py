@@ -45,6 +45,11 @@ class DerivativeEstimator(ABC):
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
         """Block (seen) -> (state, realised); `seen` holds the entries of `measures`, `start` (nx,) is the problem's."""
 
+    @property
+    def shows_response(self) -> bool:
+        """Whether the response itself is measured, so that it is that of this instant; estimated unless it says otherwise."""
+        return False
+
     @abstractmethod
     def weights(self, order: int, period: float) -> Array:
         """Weights w_1, w_2, ... of past requests in the estimated response of a coordinate of that order."""

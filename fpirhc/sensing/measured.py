@@ -37,6 +37,11 @@ class Measured(DerivativeEstimator):
 
         return Block("estimate", Layout((seen,)), Layout((plant.state, realised)), step)
 
+    @property
+    def shows_response(self) -> bool:
+        """Whether the response itself is measured: it is."""
+        return True
+
     def weights(self, order: int, period: float) -> Array:
         """One: the response to the last request."""
         del order, period

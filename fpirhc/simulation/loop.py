@@ -13,6 +13,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, Response, error_signal, like
 from fpirhc.controllers.contract import checked
+from fpirhc.controllers.mirror import with_measured_state
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals, expression
@@ -33,7 +34,8 @@ def close_loop(problem: Problem, controller: Controller) -> Composite:
     seeing = _sense_blocks(
         problem, ready.response(problem), predicts="state_ahead" in [n for b in blocks for n in b.writes.names]
     )
-    around = [_clock_block(problem.period), *seeing, *blocks, *_actuate(problem, disturbed)]
+    own = with_measured_state(problem.plant, blocks)
+    around = [_clock_block(problem.period), *seeing, *own, *_actuate(problem, disturbed)]
     return compose(
         "loop", Layout((*disturbed, *problem.sensing.drawn)), around, [*_plant_delays(problem, ready), *delays]
     )

@@ -25,7 +25,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block, rename
 from fpirhc.controllers.demands import command_demand
-from fpirhc.deformation.base import Deformation, Demand
+from fpirhc.deformation.base import Deformation, Demand, Mirror
 from fpirhc.errors import Mistakes
 from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
@@ -57,6 +57,16 @@ class ForceMRAC(Controller):
     def parameters(self, plant: Plant) -> np.ndarray:
         """Parameters of the reference model."""
         return np.array([self.model.get(n, p.approximate) for n, p in plant.parameters.items()], dtype=float)
+
+    def unusable(self, problem: Problem, mirror: Mirror) -> str:
+        """A command and its recalculation are compared at once: with ideal sensing the last command is the model's own answer."""
+        late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
+        if problem.sensing.ideal and not late and mirror == Mirror():
+            return ""
+        return (
+            "it compares the last command with the one recalculated from the response, through no estimator, dead time or lag; "
+            "use the map itself or Increment"
+        )
 
     def check(self, problem: Problem) -> None:
         """Raise if the reference model has parameters that the plant does not have, or values that are no numbers.

@@ -7,14 +7,15 @@ that chain, y^(r) = u, so that tracking laws and deformations serve a slot as th
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Set
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, Mirror
 from fpirhc.deformation.identity import Identity
+from fpirhc.deformation.model_referenced import form_inside
 from fpirhc.errors import InvalidProblem, NotInvertible, NotSupported
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.relative_order import OutputChain, output_chain
@@ -23,6 +24,8 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Named, Signal
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
+
+First = Callable[[Signals], Mapping[str, Expression]]
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,11 @@ def channel(problem: Problem, slot: Slot, number: int) -> Channel:
 
 
 def _check_deformation(deformation: Deformation) -> None:
+    if deformation.mirror not in (None, Mirror()):
+        raise NotSupported(
+            "ModelReferenced in a slot compares with the model's response of this instant; dead time and lag keep commands of "
+            "earlier cycles, which belong to another slot after a switch; leave cycles, measurement and lag out"
+        )
     if deformation.pairing is not None:
         pairs = deformation
         while pairs.inner is not None and pairs.inner.pairing is not None:
@@ -107,6 +115,11 @@ def _check_deformation(deformation: Deformation) -> None:
         raise NotSupported(
             f"{type(pairs).__name__} keeps pairs of earlier cycles, which belong to another slot after a switch; "
             "use the map itself"
+        )
+    outer = form_inside(deformation)
+    if outer is not None:
+        raise NotSupported(
+            f"{type(outer).__name__} around a model-referenced form: put it inside, ModelReferenced({type(outer).__name__}(map))"
         )
 
 
@@ -122,10 +135,12 @@ def _light_plant(plant: Plant, chain: OutputChain) -> Plant:
     return Plant({chain.coordinate: chain.unit}, {chain.input: plant.inputs[chain.input]}, {}, response, chain.order)
 
 
-def for_channel(block: Block, one: Channel, shared: Set[str], names: Mapping[str, str]) -> Block:
+def for_channel(
+    block: Block, one: Channel, shared: Set[str], names: Mapping[str, str], first: First | None = None
+) -> Block:
     """The block on the slot's own copies of all signals that are not `shared`; `names` renames some differently.
 
-    What the block itself remembers starts afresh with every slot.
+    What the block itself remembers starts afresh with every slot, with what `first` makes of the slot's signals where it names it.
     """
 
     def renamed(signal: Signal) -> Signal:
@@ -138,7 +153,14 @@ def for_channel(block: Block, one: Channel, shared: Set[str], names: Mapping[str
     reads_begun = [] if not own or begun.name in [s.name for s in reads] else [begun]
 
     def step(s: Signals) -> dict[str, Expression]:
-        kept = [ca.if_else(getattr(s, begun.name) > 0.5, getattr(s, m.name), ca.DM(m.start_vector())) for m in own]
+        starts = first(s) if first is not None else {}
+        first_values = [
+            starts.get(m.name, ca.DM(w.start_vector())) for m, w in zip(block.memory.signals, own, strict=True)
+        ]
+        kept = [
+            ca.if_else(getattr(s, begun.name) > 0.5, getattr(s, w.name), start)
+            for w, start in zip(own, first_values, strict=True)
+        ]
         given = block.function(*(getattr(s, r.name) for r in reads), *kept)
         values = given if isinstance(given, tuple) else (given,)
         results = [renamed(w).name for w in block.writes.signals] + [f"{m.name}_next" for m in own]

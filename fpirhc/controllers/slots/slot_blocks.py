@@ -14,12 +14,12 @@ Each slot has signals of its own (`Channel.signal`), computed in every cycle; th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import casadi as ca
 
 from fpirhc.controllers.base import FINITE, clip, error_signal, like
-from fpirhc.controllers.slots.slot import Channel
+from fpirhc.controllers.slots.slot import Channel, First
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, Value, expression
@@ -110,6 +110,7 @@ def join_block(problem: Problem, channels: Sequence[Channel], one: Channel, blen
     decay = math.exp(-problem.period / blend) if blend > 0 else 0.0
     place = problem.plant.input.elements.index(one.chain.input)
     names = ("law", "free", "gain", "active", "warm_up")
+    referenced = one.slot.deformation.mirror is not None
 
     def step(s: Signals) -> dict[str, Expression]:
         law, free, gain, active, goes_on = (getattr(s, one.wire(name)) for name in names)
@@ -124,7 +125,9 @@ def join_block(problem: Problem, channels: Sequence[Channel], one: Channel, blen
             "offset": offset,
             "desired": desired,
             "kept": ca.if_else(switched, meant - desired, s._kept_before),
-            "deformed_last": ca.if_else(switched, meant, s._deformed_before[one.number]),
+            "modelled" if referenced else "deformed_last": (
+                meant if referenced else ca.if_else(switched, meant, s._deformed_before[one.number])
+            ),
             "realised": realised,
             "valid": ca.logic_and(ca.logic_and(active, running), ca.logic_not(blanked)),
             "blanked": blanked,
@@ -134,8 +137,19 @@ def join_block(problem: Problem, channels: Sequence[Channel], one: Channel, blen
     shared = [scalar(n) for n in ("warm_up", "_age", "_offset_before", "_kept_before")]
     columns = [by_slot(channels, n) for n in ("realised", "_deformed_before")]
     reads = [*(one.signal(n) for n in names), *shared, *columns, like(problem.plant.input, "_command_before")]
-    results = ("offset", "desired", "kept", "deformed_last", "realised", "valid", "blanked")
+    asked = "modelled" if referenced else "deformed_last"
+    results = ("offset", "desired", "kept", asked, "realised", "valid", "blanked")
     return Block(f"join_{one.number}", Layout(tuple(reads)), Layout(tuple(one.signal(n) for n in results)), step)
+
+
+def settled_in(one: Channel) -> First:
+    """What the slot's deformation remembers when it begins: the last command was just realised."""
+    asked = "modelled" if one.slot.deformation.mirror is not None else "deformed_last"
+
+    def first(s: Signals) -> Mapping[str, Expression]:
+        return one.slot.deformation.settled(getattr(s, one.wire(asked)), getattr(s, one.wire("realised")))
+
+    return first
 
 
 _OF_A_SLOT = (

@@ -40,6 +40,7 @@ from fpirhc.controllers.slots.slot_blocks import (
     join_block,
     judge_block,
     reference_block,
+    settled_in,
     state_block,
     switch_block,
 )
@@ -189,7 +190,7 @@ class Slotted(Controller):
             blocks.append(join_block(problem, channels, one, self.blend, self.blank))
             names = {name: f"{name}_{one.slot.coordinate}" for name in one.slot.deformation.shown()}
             names["warm_up"] = one.wire("valid")
-            blocks.append(for_channel(deform_block(light, one.slot.deformation), one, set(), names))
+            blocks.append(for_channel(deform_block(light, one.slot.deformation), one, set(), names, settled_in(one)))
             delays += delays_for_channel(law.delays(light), one)
         blocks += [command_block(problem, channels), judge_block()]
         blocks += [

@@ -22,6 +22,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, embedded, like
+from fpirhc.controllers.mirror import MEASURED
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.members import Example
@@ -195,12 +196,13 @@ class Predicted(Controller):
         plant, cycles = problem.plant, self._cycles(problem)
         if not cycles:
             return self.controller.blocks(problem)
-        inner = compose_controller(problem, self.controller)
+        inner = compose_controller(problem, self.controller, ahead=True)
         ahead = {"time": scalar("time_ahead", "s"), "state": like(plant.state, "state_ahead")}
+        feeds = {**ahead, MEASURED: plant.state}
         sent = self.by.sent(plant)
         before = Signal("_sent_before", sent.elements, sent.units, self.by.sent_at_start(problem))
         predict = _predict_block(problem, self.by, cycles, self.inputs, before, tuple(ahead.values()))
-        return [predict, embedded("controller", inner, ahead)], [Delay(before, sent.name)]
+        return [predict, embedded("controller", inner, feeds)], [Delay(before, sent.name)]
 
     def _cycles(self, problem: Problem) -> int:
         return round((self.inputs + self.measurement) / problem.period)

@@ -3,21 +3,25 @@
     unpaired   the map itself: r_k = G(r_{k-1}, f_k, d_k). Stable on f = lambda r only for a lambda < 2 sin(pi / (2 (2 d + 1))).
     Paired     r_k = G(r_{k-1-d}, f_k, d_k): d + 1 interleaved iterations without delay, stable for 0 < a lambda < 2 whatever d is,
                with the rate |1 - a lambda|^(1/(d+1)).
-    Increment  r_k = d_k + delta,  delta = G(r_{k-1-d}, f_k, d_{k-1-d}) - d_{k-1-d}: the same iteration on the deformation r - d, so
-               that a change of the desired response passes at once. Use it where the state is predicted over the dead time.
+    Increment  r_k = d_k + delta_k,  delta_k = p delta_{k-1} + (1 - p) [G(r_{k-1-d}, f_k, d_{k-1-d}) - d_{k-1-d}]: the same
+               iteration on the deformation r - d, so that a change of the desired response passes at once, and leaky. Use it where
+               the state is predicted over the dead time.
 
-d is in cycles and may be a fraction: then the pair is interpolated between two cycles. Until the first response to a request of
-this controller arrives, the request is the desired response.
+d is in cycles and may be a fraction: then the pair is interpolated between two cycles. It may be a tuple, one dead time for every
+controlled coordinate. Until the first response to a request of this controller arrives, the request is the desired response.
 
 A dead time that is wrong by even one cycle makes the interleaved iterations answer each other: high modes grow at any gain, and
-the command chatters. With an `uncertainty` of m cycles the remembered request (its deformation, in the increment form) is a mean
-over the 2 m + 1 requests around the pair with triangular weights W. The modes then obey 1 = W(z) z^-(d+1) - a lambda z^-(d'+1) and
-decay at a lambda <= 0.5 while the true dead time d' is within m cycles of d; a constant deformation is still found exactly.
+the command chatters. Two remedies:
+
+    Increment  leaks. With a dead time wrong by at most m cycles it is stable for every d if 4 p / (1 - p)^2 > g (2 + g) m^2, g the
+               effective gain times the plant's largest gain, below 2 (proof: `leaky`). The default is m = max(1, 10 % of d) and
+               the p of g = 1, or of the map's own effective gain where that is larger; so give the map the gain 1 / lambda_max.
+    Paired     with an `uncertainty` of m takes a triangular mean of the requests around the pair. Its modes decay for
+               a lambda <= 0.5 only. It has no leak, because one in the request would make the desired response late.
 """
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,12 +29,15 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Pairing
+from fpirhc.deformation.leaky import check_pole, default_pole, default_uncertainty
+from fpirhc.deformation.queue import MOST, Cycles, Queue, check_cycles, check_uncertainty, every
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.errors import InvalidValue
-from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
-MOST = 1000  # cycles of dead time: what is remembered is static
+__all__ = ["MOST", "Increment", "Paired"]
+
+_LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists
 
 
 @dataclass(frozen=True)
@@ -39,26 +46,14 @@ class _Queued(Wrapper):
 
     Parameters:
         map: any deformation that iterates.
-        cycles: dead time d between a request and its response, beyond the one cycle that every loop has.
-        uncertainty: by how many cycles the dead time may be wrong; at most d.
+        cycles: dead time d between a request and its response, beyond the one cycle that every loop has; a tuple gives every
+            controlled coordinate its own.
 
     Raises:
         InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time.
     """
 
-    cycles: float
-    uncertainty: int = 0
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.cycles) and 0 <= self.cycles <= MOST):
-            raise InvalidValue(
-                f"{type(self).__name__}(cycles={self.cycles!r}): expected a dead time between 0 and {MOST} control cycles"
-            )
-        if not 0 <= self.uncertainty <= self.cycles:
-            raise InvalidValue(
-                f"{type(self).__name__}(uncertainty={self.uncertainty!r}): expected whole cycles from 0 to the dead time of "
-                f"{self.cycles:g}"
-            )
+    cycles: Cycles
 
     @property
     def constant(self) -> bool:
@@ -68,27 +63,21 @@ class _Queued(Wrapper):
     @property
     def pairing(self) -> Pairing:
         """The dead time that it is given."""
-        return Pairing(self.cycles, self.uncertainty)
+        return Pairing(max(every(self.cycles)))
 
     @property
-    def _length(self) -> int:
-        return max(self._shares(self.uncertainty)) + 1
+    def channels(self) -> int | None:
+        """One for each dead time, where there are several."""
+        return len(self.cycles) if isinstance(self.cycles, tuple) else self.map.channels
 
-    def _shares(self, width: int) -> dict[int, float]:
-        """Weights of what was pushed k cycles ago: a triangle over `width` cycles on both sides of `cycles`, interpolated."""
-        shares: dict[int, float] = {}
-        for j in range(-width, width + 1):
-            height = (1 - abs(j) / (width + 1)) / (width + 1)
-            whole = math.floor(self.cycles) + j
-            part = self.cycles - math.floor(self.cycles)
-            for place, share in ((whole, height * (1 - part)), (whole + 1, height * part)):
-                if share > 0:
-                    shares[place] = shares.get(place, 0.0) + share
-        return shares
+    @property
+    @abstractmethod
+    def _queue(self) -> Queue:
+        """What is remembered, and for how long."""
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """The queues, how many pairs they hold, and the map's own memory."""
-        past = tuple(f"{e}@{k}" for k in range(1, self._length + 1) for e in elements)
+        past = tuple(f"{e}@{k}" for k in range(1, self._queue.length + 1) for e in elements)
         queues = Signal("queue_requests", past), Signal("queue_desired", past), Signal("queue_now", elements)
         return Layout((*queues, scalar("queue_filled"))) + self.map.memory(elements)
 
@@ -96,18 +85,18 @@ class _Queued(Wrapper):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return the next request from the pair that caused the response."""
-        inner = of_map(self, memory, request.numel())
+        inner, queue = of_map(self, memory, request.numel()), self._queue
         first = memory["queue_filled"] < 0.5
         # The first request of a run is the desired response itself.
         asked = ca.if_else(first, request, memory["queue_now"])
-        requests = self._pushed(memory["queue_requests"], request)
-        wishes = self._pushed(memory["queue_desired"], asked)
-        valid = memory["queue_filled"] >= self._length - 1
+        requests = queue.pushed(memory["queue_requests"], request)
+        wishes = queue.pushed(memory["queue_desired"], asked)
+        valid = memory["queue_filled"] >= queue.length - 1
         wanted, following = self._request(requests, wishes, response, desired, inner)
-        kept = {name: ca.if_else(valid, value, inner[name]) for name, value in following.items()}
-        filled = ca.fmin(memory["queue_filled"] + 1, self._length)
+        remembered = {name: ca.if_else(valid, value, inner[name]) for name, value in following.items()}
+        filled = ca.fmin(memory["queue_filled"] + 1, queue.length)
         queues = {"queue_requests": requests, "queue_desired": wishes, "queue_now": desired, "queue_filled": filled}
-        return ca.if_else(valid, wanted, desired), {**queues, **kept}
+        return ca.if_else(valid, wanted, desired), {**queues, **remembered}
 
     @abstractmethod
     def _request(
@@ -120,19 +109,36 @@ class _Queued(Wrapper):
     ) -> tuple[Expression, dict[str, Expression]]:
         """The next request from the queues of requests and desired responses, the response and the desired response now."""
 
-    def _pushed(self, queue: Expression, newest: Expression) -> Expression:
-        # Not an empty slice: CasADi's [:0] of one entry is that entry.
-        kept = newest.numel() * (self._length - 1)
-        return ca.vertcat(newest, queue[:kept]) if kept else newest
-
-    def _mean(self, queue: Expression, size: int, width: int) -> Expression:
-        """What was pushed `cycles` ago, a weighted mean over its neighbours within `width`."""
-        return total(share * queue[size * k : size * (k + 1)] for k, share in self._shares(width).items())
-
 
 @dataclass(frozen=True)
 class Paired(_Queued):
-    """The map on the pair that caused the response; see the module for parameters and errors."""
+    """The map on the pair that caused the response; see the module for errors.
+
+    Parameters:
+        map: any deformation that iterates.
+        cycles: dead time d, or one for every controlled coordinate.
+        uncertainty: half width of the triangular mean over the requests around the pair, whole cycles, at most d.
+    """
+
+    uncertainty: int = 0
+
+    def __post_init__(self) -> None:
+        check_cycles("Paired", self.cycles)
+        check_uncertainty("Paired", self.uncertainty, self.cycles)
+        if self.uncertainty > min(every(self.cycles)):
+            raise InvalidValue(
+                f"Paired(uncertainty={self.uncertainty!r}): the mean would reach beyond the newest request; expected whole cycles "
+                f"from 0 to the dead time of {min(every(self.cycles)):g}"
+            )
+
+    @property
+    def pairing(self) -> Pairing:
+        """The dead time that it is given, and the width of the mean."""
+        return Pairing(max(every(self.cycles)), self.uncertainty)
+
+    @property
+    def _queue(self) -> Queue:
+        return Queue(self.cycles, self.uncertainty)
 
     def _request(
         self,
@@ -143,17 +149,44 @@ class Paired(_Queued):
         memory: Mapping[str, Expression],
     ) -> tuple[Expression, dict[str, Expression]]:
         del wishes
-        return self.map.step(self._mean(requests, desired.numel(), self.uncertainty), response, desired, memory)
+        return self.map.step(self._queue.delayed(requests, desired.numel()), response, desired, memory)
 
 
 @dataclass(frozen=True)
 class Increment(_Queued):
-    """The map on the deformation r - d of the pair that caused the response; see the module for parameters and errors."""
+    """The map on the deformation r - d of the pair that caused the response, leaky; see the module for errors.
+
+    Parameters:
+        map: any deformation that iterates; the effective gain 1 / lambda_max is the usual one.
+        cycles: dead time d, or one for every controlled coordinate.
+        uncertainty: m, by how many cycles the dead time may be wrong, at most d rounded up; None: max(1, 10 % of d), and 0
+            without dead time.
+        pole: p of the leak, in [0, 1); None: from the uncertainty, by the theorem.
+    """
+
+    uncertainty: int | None = None
+    pole: float | None = None
+
+    def __post_init__(self) -> None:
+        check_cycles("Increment", self.cycles)
+        if self.uncertainty is not None:
+            check_uncertainty("Increment", self.uncertainty, self.cycles)
+        if self.pole is not None:
+            check_pole("Increment", self.pole)
 
     @property
     def slows_desired(self) -> bool:
         """No: the desired response is added after the map."""
         return False
+
+    @property
+    def leak(self) -> float:
+        """The pole p in use."""
+        return chosen_pole(self.map.effective_gain(), self.cycles, self.uncertainty, self.pole)
+
+    @property
+    def _queue(self) -> Queue:
+        return Queue(self.cycles)
 
     def _request(
         self,
@@ -163,10 +196,21 @@ class Increment(_Queued):
         desired: Expression,
         memory: Mapping[str, Expression],
     ) -> tuple[Expression, dict[str, Expression]]:
-        asked = self._mean(wishes, desired.numel(), 0)
-        deformed = self._mean(requests - wishes, desired.numel(), self.uncertainty)
-        wanted, following = self.map.step(asked + deformed, response, asked, memory)
-        return desired + (wanted - asked), following
+        size, pole = desired.numel(), self.leak
+        asked, request = self._queue.delayed(wishes, size), self._queue.delayed(requests, size)
+        wanted, following = self.map.step(request, response, asked, memory)
+        deformation = wanted - asked
+        if pole:
+            deformation = pole * (requests[:size] - wishes[:size]) + (1 - pole) * deformation
+        return desired + deformation, following
+
+
+def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: float | None) -> float:
+    """Return the pole of a leaky pairing: the given one, or that of the uncertainty for a map with this effective gain."""
+    if pole is not None:
+        return float(pole)
+    wrong = default_uncertainty(max(every(cycles))) if uncertainty is None else uncertainty
+    return default_pole(min(max(1.0, abs(gain)), _LARGEST_PRODUCT), wrong)
 
 
 def examples(inner: Deformation) -> tuple[Deformation, ...]:

@@ -7,10 +7,10 @@ A trip sets the request to the desired response, halves the step, forgets what t
     3  size         the request is further from the desired response than it may be
     4  non-finite   the response or the request is not a number
 
-A disturbance step does none of these: its errors do not alternate. After 1000 clean cycles the step grows again by 5 % every 8
-cycles (6 when it is whole). After the third trip within about 1000 cycles the guard gives up adaptation for the rest of the run
-(5, fallback). Every event is in the run: signal `adaptation_event` is its number in the cycle in which it happens, and
-`EVENTS` has the words.
+The first is not watched in a model-referenced form, which is not given its last request. A disturbance step does none of these:
+its errors do not alternate. After 1000 clean cycles the step grows again by 5 % every 8 cycles (6 when it is whole). After the
+third trip within about 1000 cycles the guard gives up adaptation for the rest of the run (5, fallback). Every event is in the run:
+signal `adaptation_event` is its number in the cycle in which it happens, and `EVENTS` has the words.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import casadi as ca
 
@@ -49,6 +50,8 @@ class Guarded(Wrapper):
         InvalidValue: a limit that is not positive.
     """
 
+    passes_pair: ClassVar[bool] = True
+
     largest_deformation: float
 
     def __post_init__(self) -> None:
@@ -72,7 +75,9 @@ class Guarded(Wrapper):
         own = {name.removeprefix("guard_"): v for name, v in memory.items() if name.startswith("guard_")}
         inner = of_map(self, memory, request.numel())
         wanted, following = self.map.step(request, response, desired, inner)
-        candidate = request + own["factor"] * (wanted - request)
+        # A model-referenced form begins at the desired response, not at the request that it is given.
+        origin = request if self.map.mirror is None else desired
+        candidate = origin + own["factor"] * (wanted - origin)
         active = ca.logic_not(ca.logic_or(own["pause"] > 0.5, own["fallback"] > 0.5))
         seen = self._watched(request, response, desired, candidate, own)
         trip = ca.logic_and(active, seen["event"] > 0.5)
@@ -100,7 +105,7 @@ class Guarded(Wrapper):
         limit = own["factor"] * self.map.largest_step()
         at_limit = (
             smooth_norm(candidate - request, 1e-12) >= _AT_LIMIT * limit
-            if math.isfinite(self.map.largest_step())
+            if math.isfinite(self.map.largest_step()) and self.map.mirror is None
             else 0
         )
         fast = own["fast"] + _FAST * (size - own["fast"])

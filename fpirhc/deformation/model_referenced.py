@@ -1,0 +1,155 @@
+"""The model-referenced form: the model's own response to the command that acted stands beside the measured one.
+
+    asked     = f^(x_k, u_{k-1}) - delta_{k-1}
+    delta_k   = G(asked + delta_{k-1}, f_k, asked) - asked
+    request_k = desired_k + delta_k
+
+f^ is the model's response, f_k the measured one, G any map. So the iteration runs on f - f^, what the model is wrong by:
+
+    an exact model leaves delta at zero, whatever the task, the period, or how far the plant drifts within a cycle;
+    a clipped command needs no anti-windup, because f^ is what the model answers to the clipped command;
+    with the affine map it is the additive disturbance estimate w+ = w + a (f - f^ - w), delta = -w; with a = 1 it is incremental
+    dynamic inversion, u_k = u_{k-1} + (d_k - f_k) / beta^.
+
+On f = lambda r the factor per cycle is 1 - a lambda, as in the other forms. They differ in what drives the error: the change of
+f - f^ here, where the plain form has that of f; but a change of the desired response passes with the model's wrong gain.
+
+f^ is seen the way f is: late by the same dead time, through the same estimator, through the actuator's lag (`Mirror`). With a dead
+time delta is leaky and paired with its own response, as in `Increment`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+
+from fpirhc.deformation.base import Deformation, Mirror, Pairing
+from fpirhc.deformation.leaky import check_pole
+from fpirhc.deformation.queue import Cycles, Queue, check_cycles, check_uncertainty, every
+from fpirhc.deformation.wrappers.base import Wrapper, of_map
+from fpirhc.deformation.wrappers.delayed import chosen_pole
+from fpirhc.errors import InvalidValue
+from fpirhc.symbolic.layout import Expression, Layout, Signal
+
+_FINITE = 1e300
+
+
+@dataclass(frozen=True)
+class ModelReferenced(Wrapper):
+    """The map on the difference between the plant's response and the model's.
+
+    Parameters:
+        map: any deformation that iterates; wrappers that change the gain or the error go inside: ModelReferenced(Filtered(map)).
+        cycles: believed dead time d of the inputs, in control cycles beyond the one that every loop has; a tuple gives every
+            input its own, and then input k belongs to controlled coordinate k.
+        measurement: believed dead time of the measurement, in cycles.
+        lag: believed time constant of the actuators, tau u_act' = u - u_act, s; a tuple for one per input. Too long a lag is nearly
+            harmless, too short a one is not, none is worst.
+        uncertainty, pole: of the leak under a dead time, as in `Increment`; both count for the sum of the dead times.
+
+    Raises:
+        InvalidValue: a dead time, lag, uncertainty or pole out of range.
+    """
+
+    cycles: Cycles = 0.0
+    measurement: float = 0.0
+    lag: float | tuple[float, ...] = 0.0
+    uncertainty: int | None = None
+    pole: float | None = None
+
+    def __post_init__(self) -> None:
+        check_cycles("ModelReferenced", self.cycles)
+        check_cycles("ModelReferenced", self.measurement, "measurement")
+        check_cycles("ModelReferenced", self._delays)
+        taus = every(self.lag)
+        if not taus or not all(isinstance(t, int | float) and math.isfinite(t) and t >= 0 for t in taus):
+            raise InvalidValue(
+                f"ModelReferenced(lag={self.lag!r}): expected a time constant of at least 0 s, or a tuple with one per input"
+            )
+        if self.uncertainty is not None:
+            check_uncertainty("ModelReferenced", self.uncertainty, self._delays)
+        if self.pole is not None:
+            check_pole("ModelReferenced", self.pole)
+
+    @property
+    def mirror(self) -> Mirror:
+        """What stands between a command and the response that it causes."""
+        return Mirror(self.cycles, self.measurement, self.lag)
+
+    @property
+    def constant(self) -> bool:
+        """What it remembers are deformations; gain and pairing stay."""
+        return self.map.constant
+
+    @property
+    def slows_desired(self) -> bool:
+        """No: the desired response is added after the map."""
+        return False
+
+    @property
+    def pairing(self) -> Pairing | None:
+        """Of several dead times the longest, that of the measurement included; None without any."""
+        longest = max(every(self._delays))
+        return Pairing(longest) if longest else None
+
+    @property
+    def channels(self) -> int | None:
+        """One for each dead time, where there are several."""
+        return len(self.cycles) if isinstance(self.cycles, tuple) else self.map.channels
+
+    @property
+    def leak(self) -> float:
+        """The pole p in use."""
+        return chosen_pole(self.map.effective_gain(), self._delays, self.uncertainty, self.pole)
+
+    def memory(self, elements: tuple[str, ...]) -> Layout:
+        """The deformations on their way, newest first, and the map's own memory."""
+        past = tuple(f"{e}@{k}" for k in range(1, self._queue.length + 1) for e in elements)
+        return Layout((Signal("own_deformation", past),)) + self.map.memory(elements)
+
+    def settled(self, request: Expression, response: Expression) -> dict[str, Expression]:
+        """The deformation is what the request exceeds the response by."""
+        past = ca.repmat(request - response, self._queue.length, 1)
+        return {"own_deformation": past, **self.map.settled(request, response)}
+
+    def step(
+        self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+    ) -> tuple[Expression, dict[str, Expression]]:
+        """Return the next request; `request` is the model's response, seen through the mirror."""
+        size, queue, past = request.numel(), self._queue, memory["own_deformation"]
+        before, pole = past[:size], self.leak
+        asked = request - queue.delayed(past, size)
+        wanted, following = self.map.step(request, response, asked, of_map(self, memory, size))
+        deformation = wanted - asked
+        if pole:
+            deformation = pole * before + (1 - pole) * deformation
+        # A response that is not a number must not be remembered.
+        remembered = ca.if_else(ca.mmin(ca.fabs(deformation) <= _FINITE), deformation, before)
+        return desired + deformation, {"own_deformation": queue.pushed(past, remembered), **following}
+
+    @property
+    def _delays(self) -> Cycles:
+        if isinstance(self.cycles, tuple):
+            return tuple(c + self.measurement for c in self.cycles)
+        return self.cycles + self.measurement
+
+    @property
+    def _queue(self) -> Queue:
+        return Queue(self._delays)
+
+
+def form_inside(deformation: Deformation) -> Deformation | None:
+    """The wrapper, if any, that would change what a model-referenced form inside it compares."""
+    while deformation.inner is not None:
+        if deformation.inner.mirror is not None and not deformation.passes_pair:
+            return deformation
+        deformation = deformation.inner
+    return None
+
+
+def examples(inner: Deformation) -> tuple[Deformation, ...]:
+    """Values for the laws, around any map."""
+    return (ModelReferenced(inner), ModelReferenced(inner, cycles=2.5))

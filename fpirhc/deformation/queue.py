@@ -1,0 +1,86 @@
+"""Past values of a vector, each entry with a delay of its own: what pairing remembers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import casadi as ca
+
+from fpirhc.errors import InvalidValue
+from fpirhc.symbolic.expression import total
+from fpirhc.symbolic.layout import Expression
+
+MOST = 1000  # cycles of dead time: what is remembered is static
+Cycles = float | tuple[float, ...]  # one dead time for all channels, or one for each
+
+
+@dataclass(frozen=True)
+class Queue:
+    """Delays in cycles, one for all entries or one each; a fraction is interpolated between two cycles.
+
+    The column that it works on holds the newest value of every entry first, then those of the cycle before, and so on.
+    """
+
+    cycles: Cycles
+    width: int = 0  # of the triangular mean around the delay, cycles to either side
+
+    @property
+    def length(self) -> int:
+        """Number of cycles that must be remembered, the newest included."""
+        return max(max(self._shares(c)) for c in every(self.cycles)) + 1
+
+    def pushed(self, queue: Expression, newest: Expression) -> Expression:
+        """The column one cycle later."""
+        # Not an empty slice: CasADi's [:0] of one entry is that entry.
+        remembered = newest.numel() * (self.length - 1)
+        return ca.vertcat(newest, queue[:remembered]) if remembered else newest
+
+    def delayed(self, queue: Expression, size: int) -> Expression:
+        """What was pushed `cycles` ago, entry by entry."""
+        if not isinstance(self.cycles, tuple):
+            shares = self._shares(self.cycles)
+            return total(share * queue[size * k : size * (k + 1)] for k, share in shares.items())
+        channels = [self._shares(c) for c in self.cycles]
+        entries = (
+            total(share * queue[size * k + j] for k, share in shares.items()) for j, shares in enumerate(channels)
+        )
+        return ca.vertcat(*entries)
+
+    def _shares(self, cycles: float) -> dict[int, float]:
+        """Weights of what was pushed k cycles ago: a triangle over `width` cycles on both sides of `cycles`, interpolated."""
+        shares: dict[int, float] = {}
+        whole, part = math.floor(cycles), cycles - math.floor(cycles)
+        for j in range(-self.width, self.width + 1):
+            height = (1 - abs(j) / (self.width + 1)) / (self.width + 1)
+            for place, share in ((whole + j, height * (1 - part)), (whole + j + 1, height * part)):
+                if share > 0:
+                    shares[place] = shares.get(place, 0.0) + share
+        return shares
+
+
+def every(cycles: Cycles) -> tuple[float, ...]:
+    """The dead times as a tuple, one entry where all channels share one."""
+    return cycles if isinstance(cycles, tuple) else (cycles,)
+
+
+def check_cycles(owner: str, cycles: Cycles, name: str = "cycles") -> None:
+    """Raise InvalidValue for a dead time that is negative, not finite, or beyond 1000 cycles, and for no dead time at all."""
+    values = every(cycles)
+    if not values or not all(isinstance(c, int | float) and math.isfinite(c) and 0 <= c <= MOST for c in values):
+        raise InvalidValue(
+            f"{owner}({name}={cycles!r}): expected a dead time between 0 and {MOST} control cycles, or a tuple with one for "
+            "every controlled coordinate"
+        )
+
+
+def check_uncertainty(owner: str, uncertainty: int, cycles: Cycles) -> None:
+    """Raise InvalidValue for an uncertainty that is no whole number or reaches beyond the shortest queue."""
+    shortest = min(every(cycles))
+    if not (
+        isinstance(uncertainty, int) and not isinstance(uncertainty, bool) and 0 <= uncertainty <= math.ceil(shortest)
+    ):
+        raise InvalidValue(
+            f"{owner}(uncertainty={uncertainty!r}): expected whole cycles from 0 to {math.ceil(shortest)}, the dead time of "
+            f"{shortest:g} rounded up: a dead time cannot be too long by more than itself"
+        )

@@ -1,0 +1,33 @@
+"""Shipped problems with another deformation or an exact model, for several tests."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import fpirhc as fp
+from fpirhc.deformation import Deformation
+
+
+def exchanged(value: Any, deformation: Deformation) -> Any:
+    """The controller with another deformation, wherever it keeps it."""
+    if hasattr(value, "controller"):
+        return replace(value, controller=exchanged(value.controller, deformation))
+    if hasattr(value, "slots"):
+        return replace(value, slots=tuple(replace(s, deformation=deformation) for s in value.slots))
+    return replace(value, deformation=deformation)
+
+
+def with_exact_model(problem: fp.Problem) -> fp.Problem:
+    """The problem whose model is its plant, with nothing that is random or disturbs."""
+    known = {n: replace(p, approximate=p.exact) for n, p in problem.plant.parameters.items()}
+    sensors = {n: replace(s, noise=None, dropout=0.0) for n, s in problem.sensing.sensors.items()}
+    plant, sensing = replace(problem.plant, parameters=known), replace(problem.sensing, sensors=sensors)
+    return replace(problem, plant=plant, disturbances={}, sensing=sensing)
+
+
+def told(problem: fp.Problem) -> dict[str, Any]:
+    """Settings of `ModelReferenced` with which it knows the problem's dead times, one for every input where they differ."""
+    cycles = tuple(problem.dead_time.inputs.get(name, 0.0) / problem.period for name in problem.plant.inputs)
+    one = cycles[0] if len(set(cycles)) == 1 else cycles
+    return {"cycles": one, "measurement": problem.dead_time.measurement / problem.period}

@@ -1,0 +1,216 @@
+"""Leaky pairing: stable for every dead time within the uncertainty, by the theorem, by the map itself, and on a plant."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_dead_time import DUFFING, LAW, affine, iteration_radius
+
+import fpirhc as fp
+from fpirhc.contraction import leaking_limit
+from fpirhc.contraction.leaking import loop_polynomial
+from fpirhc.deformation import Deformation
+from fpirhc.errors import InvalidValue, NotSupported
+
+
+def radius(product: float, pole: float, believed: int, true: int) -> float:
+    """Largest root of 1 - p / z = (1 - p) (z^-(d+1) - g z^-(d'+1))."""
+    size = max(believed, true) + 2
+    row = np.zeros(size)
+    row[0], row[1] = 1.0, -pole
+    row[believed + 1] -= 1 - pole
+    row[true + 1] += (1 - pole) * product
+    return float(np.abs(np.roots(row)).max())
+
+
+def test_theorem_on_random_draws():
+    """1000 draws of dead times up to 60 cycles, wrong by up to 7, and products in (0, 2): a pole just above the bound damps all."""
+    random = np.random.default_rng(8)
+    for _ in range(1000):
+        believed, wrong = int(random.integers(0, 61)), int(random.integers(1, 8))
+        true = max(0, believed + int(random.integers(-wrong, wrong + 1)))
+        product = float(random.uniform(0.02, 1.98))
+        assert radius(product, 1.001 * fp.leaky_pole(product, wrong), believed, true) < 1
+
+
+@pytest.mark.parametrize("product", [0.5, 1.0, 1.5])
+def test_bound_is_tight_for_one_cycle(product):
+    """A pole 1 % below the bound of m = 1 leaves some dead time unstable: the bound could not be lower."""
+    pole = 0.99 * fp.leaky_pole(product, 1)
+    assert max(radius(product, pole, d, d + wrong) for d in (40, 80, 120) for wrong in (-1, 1)) > 1
+
+
+def test_poles_and_margins():
+    """The closed form, its inverse, and a table computed independently of both by bisection over the roots."""
+    table = {
+        0.5: (0.20, 0.42, 0.56, 0.70, 0.84),
+        1.0: (0.33, 0.57, 0.68, 0.79, 0.89),
+        1.5: (0.43, 0.65, 0.75, 0.84, 0.92),
+    }
+    for product, poles in table.items():
+        for wrong, pole in zip((1, 2, 3, 5, 10), poles, strict=True):
+            found = fp.leaky_pole(product, wrong)
+            assert found == pytest.approx(pole, abs=0.006)
+            assert 4 * found / (1 - found) ** 2 == pytest.approx(product * (2 + product) * wrong**2, rel=1e-12)
+            assert fp.leaky_margin(product, found) == pytest.approx(wrong, rel=1e-12)
+    assert fp.leaky_pole(1.0, 0) == 0
+
+
+MARGINS = {  # cycles at d = 20 for the poles 0, .3, .5, .8, .9, .95; 20: any
+    0.5: (0, 1, 3, 20, 20, 20),
+    1.0: (0, 0, 2, 6, 20, 20),
+    1.5: (0, 0, 1, 4, 15, 20),
+}
+
+
+@pytest.mark.parametrize("product", MARGINS)
+def test_margin_table(product):
+    """By how many cycles a dead time of 20 may be wrong, counted with the roots; the formula never promises more."""
+    for pole, margin in zip((0, 0.3, 0.5, 0.8, 0.9, 0.95), MARGINS[product], strict=True):
+        counted = 0
+        while counted < 20 and all(radius(product, pole, 20, 20 + s * (counted + 1)) < 1 for s in (-1, 1)):
+            counted += 1
+        assert counted == margin
+        assert min(20, math.floor(fp.leaky_margin(product, pole))) <= margin
+
+
+@pytest.mark.parametrize("form", [fp.Increment, fp.ModelReferenced])
+def test_the_map_itself_follows_the_theorem(form):
+    """The default leak of a map with the product 1 tolerates a tenth of the dead time; without a leak one cycle is too much."""
+    random = np.random.default_rng(3)
+    for _ in range(12):
+        believed = int(random.integers(1, 30))
+        wrong = max(1, math.ceil(0.1 * believed))
+        true = max(0, believed + int(random.integers(-wrong, wrong + 1)))
+        deformation = form(affine(1.0), cycles=believed)
+        found = iteration_radius(deformation, true) if form is fp.Increment else referenced_radius(deformation, true)
+        assert found < 1
+        assert found == pytest.approx(radius(1.0, deformation.leak, believed, true), abs=1e-6)
+    assert iteration_radius(fp.Increment(affine(1.0), cycles=20, uncertainty=0), 21) > 1
+
+
+def referenced_radius(deformation: fp.ModelReferenced, delay: int) -> float:
+    """The same for the model-referenced form, whose model answers after the believed dead time: deltas, newest first."""
+    import casadi as ca
+
+    assert deformation.pairing is not None
+    believed = round(deformation.pairing.cycles or 0.0)
+    layout, size = deformation.memory(("q",)), max(delay, believed) + 1
+    z = ca.SX.sym("z", size + layout.size)
+    memory = layout.split(z[size:])
+    request, following = deformation.step(z[believed], z[delay], ca.SX(0), memory)
+    on = ca.vertcat(request, z[: size - 1]) if size > 1 else request
+    function = ca.Function("one", [z], [ca.jacobian(ca.vertcat(on, layout.join(following)), z)])
+    return float(np.abs(np.linalg.eigvals(function(np.zeros(z.numel())).full())).max())
+
+
+def test_leak_is_faster_than_the_mean():
+    """At the right dead time of 20 cycles and g = 1 the leak's slowest mode is .57 per cycle; a triangular mean does not decay."""
+    assert radius(1.0, fp.leaky_pole(1.0, 2), 20, 20) == pytest.approx(0.57, abs=0.01)
+    assert iteration_radius(fp.Paired(affine(1.0), cycles=20, uncertainty=2), 20) > 0.999
+
+
+def delayed_rms(true: int, deformation: Deformation) -> float:
+    """Rms error of the delayed mass with computed torque and a prediction that believe 20 cycles of dead time."""
+    dead_time = fp.DeadTime(inputs={"Q": true * DUFFING.problem.period})
+    problem = replace(DUFFING.problem, dead_time=dead_time, limits=fp.Limits())
+    controller = fp.Predicted(fp.ComputedTorque(LAW, deformation), inputs=0.02)
+    return fp.measure(problem, fp.simulate(problem, controller, seed=0)).rms_error["q"]
+
+
+FASTEST = fp.Sigmoid(gain=-0.5, scale=20.0).with_effective_gain(1 / 1.5)  # the masses' ratio is the largest eigenvalue
+
+
+@pytest.mark.parametrize("form", [fp.Increment, fp.ModelReferenced])
+@pytest.mark.parametrize("true", [14, 19, 20, 21, 22, 26])
+def test_delayed_mass_with_a_wrong_dead_time(form, true):
+    """Told an uncertainty of 30 % the error is 4.5 to 4.8 mm wherever the dead time is; at most 6 are allowed."""
+    assert delayed_rms(true, form(FASTEST, cycles=20, uncertainty=6)) <= 6e-3
+
+
+@pytest.mark.parametrize("true", [19, 21, 26])
+def test_without_a_leak_the_same_mass_swings(true):
+    """What the leak is for: .15 to .46 m."""
+    assert delayed_rms(true, fp.Increment(fp.Sigmoid(gain=-0.5, scale=20.0), cycles=20, uncertainty=0)) > 0.1
+
+
+ESTIMATE_LIMITS = {0: 10.0, 1: 6.0, 2: 4.39, 5: 2.97, 10: 2.41, 20: 2.15}
+
+
+@pytest.mark.parametrize("delay", ESTIMATE_LIMITS)
+def test_limit_of_the_additive_estimate(delay):
+    """Not paired, delta_k = .8 delta_{k-1} - .2 (f - f^): the largest gain ratio falls to 2, below which any delay is stable."""
+    weights = np.eye(delay + 1)[delay]
+
+    def stable(ratio: float) -> bool:
+        row = loop_polynomial(weights, 0.2, 0.0, 0.0, 0.0, ratio, referenced=True)
+        return bool(np.abs(np.roots(row.real)).max() < 1)
+
+    assert stable(0.999 * ESTIMATE_LIMITS[delay] - 0.01)
+    assert not stable(1.001 * ESTIMATE_LIMITS[delay] + 0.01)
+
+
+@pytest.mark.parametrize("referenced", [True, False])
+def test_limit_agrees_with_the_roots(referenced):
+    """The limit by counting turns of a curve, at random windows, pairs and leaks, is where a root leaves the circle."""
+    random = np.random.default_rng(5)
+    for _ in range(25):
+        weights = random.uniform(0, 1, int(random.integers(1, 9)))
+        weights /= weights.sum()
+        cycles, leak = float(random.integers(0, 6)), float(random.uniform(0.2, 0.8))
+        pole, ratio = float(random.choice([0.0, 0.6])), float(random.uniform(0.4, 2.5))
+        found = leaking_limit(weights, cycles=cycles, leak=leak, pole=pole, eigenvalue=ratio, referenced=referenced)
+        assert found > 0
+        for share, inside in ((0.98, True), (1.02, False)) if np.isfinite(found) else ():
+            row = loop_polynomial(weights, share * found, cycles, leak, pole, ratio, referenced)
+            assert (np.abs(np.roots(row.real)).max() < 1) == inside
+
+
+def test_a_dead_time_for_every_channel():
+    """Two coordinates whose commands are 3 and 30 cycles late, each paired with its own; told of the shorter only it swings."""
+    problem = replace(
+        fp.load_problem("two_mass").problem, dead_time=fp.DeadTime(inputs={"Q1": 3e-3, "Q2": 3e-2}), limits=fp.Limits()
+    )
+    sigmoid, errors = fp.Sigmoid(gain=-1.5, scale=50.0), {}
+    forms = {
+        "none": fp.Identity(),
+        "own": fp.Increment(sigmoid, cycles=(3, 30)),
+        "both the shorter": fp.Increment(sigmoid, cycles=3),
+        "own, model": fp.ModelReferenced(sigmoid, cycles=(3, 30)),
+    }
+    for name, deformation in forms.items():
+        run = fp.simulate(problem, fp.ComputedTorque(LAW, deformation), seed=0)
+        errors[name] = max(fp.measure(problem, run).rms_error.values())
+    assert max(errors["own"], errors["own, model"]) < 0.1 * errors["none"]
+    assert not errors["both the shorter"] < 10 * errors["own"]
+
+
+@pytest.mark.parametrize(
+    ("build", "sentence"),
+    [
+        (
+            lambda: fp.Increment(affine(0.5), cycles=4, uncertainty=5),
+            r"Increment\(uncertainty=5\): expected whole cycles from 0 to 4",
+        ),
+        (lambda: fp.ModelReferenced(affine(0.5), cycles=1.5, uncertainty=3), "expected whole cycles from 0 to 2"),
+        (lambda: fp.Increment(affine(0.5), cycles=(4, 2), uncertainty=3), "from 0 to 2"),
+        (lambda: fp.Increment(affine(0.5), cycles=4, pole=1.0), r"Increment\(pole=1.0\): expected a number from 0"),
+        (lambda: fp.Increment(affine(0.5), cycles=()), "or a tuple with one for every controlled coordinate"),
+        (lambda: fp.ModelReferenced(affine(0.5), cycles=900, measurement=200), "between 0 and 1000"),
+        (lambda: fp.leaky_pole(2.0, 1), r"leaky_pole\(product=2.0\): expected .* in \(0, 2\)"),
+        (lambda: fp.leaky_pole(1.0, -1), "uncertainty=-1"),
+        (lambda: fp.leaky_margin(1.0, 1.0), "pole=1.0"),
+    ],
+)
+def test_bad_settings(build, sentence):
+    with pytest.raises(InvalidValue, match=sentence):
+        build()
+
+
+def test_a_dead_time_too_many():
+    problem = fp.load_problem("delayed_mass").problem
+    with pytest.raises(NotSupported, match=r"3 dead times are given, but the plant has 1 controlled coordinates \(q\)"):
+        fp.simulate(problem, fp.ComputedTorque(LAW, fp.Increment(FASTEST, cycles=(1, 2, 3))), seed=0)

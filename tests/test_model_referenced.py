@@ -1,0 +1,342 @@
+"""The model-referenced form: an exact model is left alone; an estimate and incremental inversion are its cases; its worth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from exchange import exchanged, told, with_exact_model
+from plants import linear
+from test_adaptation import stepping
+from test_anti_windup import overshoot, request_kept, settled, step_of_two_metres
+from test_dead_time import affine
+
+import fpirhc as fp
+from fpirhc.controllers.contract import resolved
+from fpirhc.errors import NotSupported
+from fpirhc.problem_files.problem_file import shipped_problems
+from fpirhc.symbolic.block import Block
+
+LAW = fp.Exponential(rate=6.0)
+TWO_MASS = fp.load_problem("two_mass")
+
+
+def short(problem: fp.Problem, cycles: int) -> fp.Problem:
+    return replace(problem, duration=cycles * problem.period, measure_from=0.0)
+
+
+def noisy(problem: fp.Problem, deviation: float = 1.0) -> fp.Problem:
+    """White noise on the measured accelerations, m/s^2."""
+    return replace(problem, sensing=fp.Sensing({q: fp.Sensor(noise=fp.Noise(deviation)) for q in ("q1''", "q2''")}))
+
+
+def modelled(problem: fp.Problem, run: fp.Run) -> np.ndarray:
+    """The model's response at every state of a run to the command of the cycle before."""
+    plant = problem.plant
+    x, u = ca.SX.sym("x", plant.state.size), ca.SX.sym("u", plant.input.size)
+    response = ca.Function("f", [x, u], [plant.controlled_response_function(x, u, ca.DM(plant.approximate))])
+    before = np.vstack([np.zeros(plant.input.size), run["command"][:-1]])
+    return np.asarray(response.map(len(before))(run["state"].T, before.T).full()).T
+
+
+def commands(problem: fp.Problem, run: fp.Run, requests: np.ndarray) -> np.ndarray:
+    """The commands that the model needs for these requests at the states of a run."""
+    plant = problem.plant
+    x, r = ca.MX.sym("x", plant.state.size), ca.MX.sym("r", len(plant.controlled_names))
+    inverse = ca.Function("u", [x, r], [plant.inverse_function(x, r, plant.approximate)])
+    return np.asarray(inverse.map(len(requests))(run["state"].T, requests.T).full()).T
+
+
+@pytest.mark.parametrize("gain", [0.1, 0.4, 1.0])
+def test_affine_map_is_the_additive_disturbance_estimate(gain):
+    """w+ = w + a (f - f^ - w), r = d - w, computed here from the run's signals alone, gives its commands to 1e-12, in noise."""
+    problem = short(noisy(TWO_MASS.problem), 2000)
+    run = fp.simulate(problem, fp.ComputedTorque(LAW, fp.ModelReferenced(affine(gain))), seed=4, compiled=False)
+    seen = run["realised"] - modelled(problem, run)
+    estimate, requests = np.zeros(2), run["desired"].copy()
+    for k in range(1, run.cycles):
+        estimate = (1 - gain) * estimate + gain * seen[k]
+        requests[k] -= estimate
+    expected = commands(problem, run, requests)
+    assert np.abs(run["command"] - expected).max() <= 1e-12 * np.abs(expected).max()
+
+
+def test_unit_gain_is_incremental_inversion():
+    """u_k = u_{k-1} + B^-1 (d_k - f_k): the model's drift cancels."""
+    problem = short(noisy(TWO_MASS.problem), 2000)
+    run = fp.simulate(problem, fp.ComputedTorque(LAW, fp.ModelReferenced(affine(1.0))), seed=4, compiled=False)
+    zero = commands(problem, run, np.zeros((run.cycles, 2)))
+    moves = commands(problem, run, run["desired"] - run["realised"]) - zero
+    expected = run["command"][:-1] + moves[1:]
+    assert np.abs(run["command"][1:] - expected).max() <= 1e-12 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("form", [lambda m: m, lambda m: fp.Increment(m, cycles=0), fp.ModelReferenced])
+def test_all_forms_have_the_same_edge(form):
+    """The factor is 1 - a lambda: with lambda = 3 the product 1.9 converges and 2.1 does not, in each form."""
+    problem = fp.Problem(
+        plant=linear(3.0, 1.0),
+        reference=fp.Trajectory(lambda t: {"y": ca.sin(2 * t)}),
+        start={"y": 0.2},
+        period=1e-2,
+        duration=5.0,
+        measure_from=3.0,
+    )
+    errors = {}
+    for product in (1.9, 2.1):
+        controller = fp.ComputedTorque(fp.Exponential(rate=1.0), form(affine(product / 3)))
+        run = fp.simulate(problem, controller, seed=0)
+        late = run.time >= problem.measure_from
+        errors[product] = np.abs(run["realised"] - run["desired"])[late].max()
+    assert errors[1.9] < 0.1
+    assert errors[2.1] > 1.0
+
+
+def null_change(name: str) -> float:
+    """Largest change of the state by the form where the model is exact, relative to its largest value."""
+    module: Any = fp.load_problem(name)
+    problem = short(with_exact_model(module.problem), 400)
+    controller = module.controllers[module.headline[1]]
+    sign = -1.0 if resolved(problem, controller).deformation.effective_gain() < 0 else 1.0
+    map = fp.Sigmoid(gain=-0.5 * sign, shift=0.3 * sign, scale=50.0)
+    runs = [
+        fp.simulate(problem, exchanged(controller, d), seed=0, compiled=False)
+        for d in (fp.Identity(), fp.ModelReferenced(map, **told(problem)))
+    ]
+    key = "plant_state"
+    return float(np.abs(runs[1][key] - runs[0][key]).max() / np.abs(runs[0][key]).max())
+
+
+def adaptive_problems() -> list[str]:
+    found = []
+    for name in sorted(shipped_problems()):
+        module: Any = fp.load_problem(name)
+        adaptive = resolved(module.problem, module.controllers[module.headline[1]]).deformation
+        found += [] if isinstance(adaptive, fp.Identity) else [name]
+    return found
+
+
+@pytest.mark.parametrize("name", adaptive_problems())
+def test_exact_model_is_left_alone(name):
+    """On every shipped problem, behind its sensors and dead time, quanta included: nothing changes beyond rounding."""
+    assert null_change(name) <= 1e-9
+
+
+def test_plain_form_does_not_leave_an_exact_model_alone():
+    """What the form is for: two_link_arm under RHC and leaking_tanks, an exact model, gain -.5."""
+    for name, least in (("two_link_arm", 0.05), ("leaking_tanks", 0.02)):
+        module = fp.load_problem(name)
+        problem = with_exact_model(module.problem)
+        problem = short(problem, min(4000, problem.cycles))
+        controller = module.controllers["RHC+FPI"]
+        map = fp.Sigmoid(gain=-0.5, scale=50.0)
+        runs = [
+            fp.simulate(problem, exchanged(controller, d), seed=0, compiled=False)["state"]
+            for d in (fp.Identity(), map, fp.ModelReferenced(map))
+        ]
+        size = np.abs(runs[0]).max()
+        assert np.abs(runs[1] - runs[0]).max() > least * size
+        assert np.abs(runs[2] - runs[0]).max() <= 1e-9 * size
+
+
+def drift_of_trapezoid(period: float) -> float:
+    """Change of the rms error of an exact model by the form on mean responses, with the trapezoid for the model's mean."""
+    step, layout = stepping(fp.ModelReferenced(affine(0.6)))
+    pole, errors = 2.0, {}
+    decay = np.exp(-pole * period)
+    for adapts in (False, True):
+        x, u, memory, found = 0.0, 0.0, layout.start(), []
+        before = x
+        for k in range(round(6.0 / period)):
+            t = k * period
+            desired = np.cos(t) + 5.0 * (np.sin(t) - x)
+            request = desired
+            if k and adapts:
+                mean, model = (x - before) / period, -0.5 * pole * (x + before) + u
+                wanted, memory = step(model, mean, desired, memory)
+                request = float(wanted)
+            found.append(np.sin(t) - x)
+            u, before = request + pole * x, x
+            x = decay * x + (1 - decay) / pole * u
+        errors[adapts] = np.sqrt(np.mean(np.square(found[len(found) // 2 :])))
+    return abs(errors[True] - errors[False])
+
+
+def test_trapezoid_of_the_model_is_of_second_order():
+    """With the mean of the measured response and the trapezoid of the model's, an exact model is changed by O(T^2)."""
+    changes = [drift_of_trapezoid(period) for period in (0.04, 0.02, 0.01)]
+    orders = np.log2(np.array(changes[:-1]) / np.array(changes[1:]))
+    assert np.all(np.abs(orders - 2) < 0.1)
+
+
+# Largest rms error of the coordinates in mm: controller, deformation, what an independent prototype found
+TRACKING = (
+    ("CTC", fp.Sigmoid(gain=-2.52, scale=50.0), 0.852),
+    ("CTC", fp.ModelReferenced(fp.Sigmoid(gain=-2.52, scale=50.0)), 0.116),
+    ("CTC", fp.ModelReferenced(fp.Sigmoid(gain=-1.5, scale=50.0)), 0.407),
+    ("RHC", fp.Sigmoid(gain=-0.5, scale=20.0), 0.5255),
+    ("RHC", fp.Sigmoid(gain=-1.5, scale=20.0), 0.158),
+    ("RHC", fp.ModelReferenced(fp.Sigmoid(gain=-0.5, scale=20.0)), 0.401),
+    ("RHC", fp.ModelReferenced(fp.Sigmoid(gain=-1.5, scale=20.0)), 0.0845),
+)
+
+
+@pytest.mark.parametrize(("name", "deformation", "expected"), TRACKING)
+def test_two_mass_figures(name, deformation, expected):
+    """Tracking with the wrong model, against another implementation of the same formulas, within 5 %."""
+    run = fp.simulate(TWO_MASS.problem, exchanged(TWO_MASS.controllers[name], deformation), seed=0)
+    errors = fp.measure(TWO_MASS.problem, run).rms_error
+    assert 1e3 * max(errors.values()) == pytest.approx(expected, rel=0.05)
+
+
+def test_noise_costs_less():
+    """In noise of 1 m/s^2 it tracks better at the same gain: .57 mm, plain 1.14, increment 1.14 (CTC, -1.5)."""
+    problem, map = noisy(TWO_MASS.problem), fp.Sigmoid(gain=-1.5, scale=50.0)
+    plain, referenced = (
+        fp.measure(problem, fp.simulate(problem, fp.ComputedTorque(LAW, d), seed=0)).rms_error["q1"]
+        for d in (map, fp.ModelReferenced(map))
+    )
+    assert referenced < 0.6 * plain
+
+
+def test_limits_need_no_anti_windup():
+    """The step that the actuator cannot follow: what a clipped command means is not stored, and it overshoots as plain with it."""
+    map = fp.Sigmoid(gain=-0.5, scale=20.0)
+    run = step_of_two_metres(deformation=fp.ModelReferenced(map))
+    assert run["clipped"].any()
+    assert overshoot(run) == pytest.approx(overshoot(step_of_two_metres(deformation=map)), rel=0.05)
+    assert settled(run) < 1.6
+    assert overshoot(step_of_two_metres(request_kept, deformation=map)) > 3.8
+
+
+def test_not_a_number_is_not_remembered():
+    """One response that is not a number holds the command for a cycle; the next request is finite."""
+    step, layout = stepping(fp.ModelReferenced(affine(0.5)))
+    memory = layout.start()
+    for response in (1.0, 1.2, np.nan, 1.1, 1.1):
+        request, memory = step(1.0, response, 1.0, memory)
+        memory = memory.full().ravel()
+        assert np.isnan(float(request)) == np.isnan(response)
+    assert np.isfinite(memory).all()
+
+
+MAPS = (
+    fp.Sigmoid(gain=-1.2, scale=50.0),
+    fp.Sigmoid(gain=-1.2, scale=0.5),
+    fp.RFPT(offset=1e5, sign=-1, gain=5e-6),
+    fp.RFPTVector(offset=1e5, sign=-1, gain=5e-6),
+    fp.Rotation(fraction=0.5, radius=1e4),
+    fp.Filtered(fp.Affine(gain=-1.0), pole=0.5),
+    fp.Tuned(fp.Sigmoid(gain=-1.2, scale=50.0), largest_gain=0.9),
+    fp.Damped(fp.Affine(gain=-1.0)),
+)
+
+
+@pytest.mark.parametrize("map", MAPS, ids=lambda m: repr(m).replace(" ", ""))
+def test_every_map_on_two_coordinates(map):
+    """Saturating maps and wrappers inside, coupled coordinates: the wrong model's error falls to a hundredth of CTC's .35 m."""
+    if isinstance(map, fp.RFPT):
+        problem, law = fp.load_problem("delayed_mass").problem, LAW
+        problem = replace(problem, dead_time=fp.DeadTime())
+    else:
+        problem, law = TWO_MASS.problem, LAW
+    none, found = (
+        fp.measure(problem, fp.simulate(problem, fp.ComputedTorque(law, d), seed=0)).rms_error
+        for d in (fp.Identity(), fp.ModelReferenced(map))
+    )
+    assert all(found[name] < 0.02 * none[name] for name in none)
+
+
+def test_where_it_loses():
+    """A plant that hardly drifts with a wrong gain: planar_arm and van_der_pol_duffing at -.5, where the plain form is better."""
+    for name in ("planar_arm", "van_der_pol_duffing"):
+        module: Any = fp.load_problem(name)
+        adaptive = module.controllers[module.headline[1]]
+        map = resolved(module.problem, adaptive).deformation.with_effective_gain(fp.Sigmoid(gain=-0.5).effective_gain())
+        sums = [
+            sum(
+                fp.measure(
+                    module.problem, fp.simulate(module.problem, exchanged(adaptive, d), seed=0)
+                ).rms_error.values()
+            )
+            for d in (map, fp.ModelReferenced(map))
+        ]
+        assert sums[1] > 1.02 * sums[0]
+
+
+def test_slots_begin_where_the_last_command_was_realised():
+    """In slots the form begins with the deformation that the last command had: the command is continuous at every switch."""
+    module = fp.load_problem("crane_slots")
+    map = fp.Sigmoid(gain=-0.5, scale=50.0)
+    run = fp.simulate(module.problem, exchanged(module.controllers["slots+FPI"], fp.ModelReferenced(map)), seed=0)
+    switched = np.flatnonzero(np.diff(run["slot"].ravel())) + 1
+    assert switched.size > 2
+    jumps = np.abs(np.diff(run["command"], axis=0))
+    assert jumps[switched - 1].max() <= 1e-9 + 1e-3 * jumps.max()
+
+
+def test_force_mrac_compares_commands():
+    """Where commands are deformed the last command is the model's own answer: an exact reference model changes nothing."""
+    module = fp.load_problem("mrac_pendulum")
+    name = next(n for n, c in module.controllers.items() if isinstance(c, fp.ForceMRAC))
+    controller: Any = module.controllers[name]
+    problem = short(with_exact_model(module.problem), 1000)
+    own: Any = replace(controller, model={}, deformation=fp.ModelReferenced(fp.Affine(gain=-1.0)))
+    run = fp.simulate(problem, own, seed=0, compiled=False)
+    assert np.abs(run["command"] - run["force_desired"]).max() <= 1e-9 * np.abs(run["command"]).max()
+
+
+LATE = replace(TWO_MASS.problem, dead_time=fp.DeadTime(inputs={"Q1": 3e-3}))
+CASES = (
+    (
+        fp.Filtered(fp.ModelReferenced(affine(0.5)), pole=0.5),
+        r"Filtered around a model-referenced form.*ModelReferenced\(Filtered",
+    ),
+    (fp.Tuned(fp.ModelReferenced(affine(0.5)), largest_gain=0.9), "put it inside"),
+    (fp.Paired(fp.ModelReferenced(affine(0.5)), cycles=2), "Paired around a model-referenced form"),
+    (fp.ModelReferenced(affine(0.5), lag=(0.1, 0.1, 0.1)), r"the plant has 2 inputs \(Q1, Q2\)"),
+    (fp.ModelReferenced(affine(0.5), cycles=(1, 2, 3)), "3 dead times are given, but the plant has 2"),
+)
+
+
+@pytest.mark.parametrize(("deformation", "sentence"), CASES)
+def test_forms_that_cannot_be_used(deformation, sentence):
+    """Which form, and why."""
+    with pytest.raises(NotSupported, match=sentence):
+        fp.simulate(short(TWO_MASS.problem, 10), fp.ComputedTorque(LAW, deformation), seed=0)
+
+
+def test_controllers_that_cannot_use_it():
+    """ForceMRAC behind a dead time has nothing to mirror it with; a slot cannot keep commands of another slot."""
+    controller = fp.ForceMRAC(LAW, fp.ModelReferenced(affine(0.5)))
+    with pytest.raises(
+        NotSupported, match="ForceMRAC cannot use a model-referenced deformation here: it compares the last command"
+    ):
+        fp.simulate(short(LATE, 10), controller, seed=0)
+    module = fp.load_problem("crane_slots")
+    late = exchanged(module.controllers["slots+FPI"], fp.ModelReferenced(fp.Affine(gain=-0.5), cycles=2))
+    with pytest.raises(fp.FpirhcError, match="commands of earlier cycles, which belong to another slot"):
+        fp.simulate(module.problem, late, seed=0)
+
+
+def test_the_stored_request_is_not_read():
+    """The form costs no memory of the last request: the blocks of the loop do not read it."""
+    blocks, _ = fp.ComputedTorque(LAW, fp.ModelReferenced(affine(0.5))).blocks(TWO_MASS.problem)
+    assert all(isinstance(b, Block) and "_deformed_last" not in b.reads for b in blocks)
+
+
+def test_guard_lets_it_pass():
+    """A guard around the form changes nothing while nothing trips, and sets the request to the desired one after a trip."""
+    form = fp.ModelReferenced(fp.Sigmoid(gain=-1.5, scale=50.0))
+    problem = short(TWO_MASS.problem, 2000)
+    bare, guarded, tight = (
+        fp.simulate(problem, fp.ComputedTorque(LAW, d), seed=0, compiled=False)
+        for d in (form, fp.Guarded(form, largest_deformation=1e4), fp.Guarded(form, largest_deformation=1.0))
+    )
+    np.testing.assert_allclose(guarded["command"], bare["command"], rtol=1e-9)
+    tripped = tight["adaptation_event"].ravel() == 3
+    assert tripped.any()
+    np.testing.assert_array_equal(tight["deformed"][tripped], tight["desired"][tripped])
