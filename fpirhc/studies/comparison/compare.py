@@ -8,9 +8,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
-import numpy as np
-
-from fpirhc.contraction import ContractionReport, Spectrum, assess_gain, identified_factor, spectrum_over_run
+from fpirhc.contraction import ContractionReport, Spectrum, assess_gain
 from fpirhc.controllers.base import Controller, prepared
 from fpirhc.deformation.identity import Identity
 from fpirhc.describe import describe
@@ -19,6 +17,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
 from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.metrics.columns import columns
+from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
 from fpirhc.studies.comparison.optimality import Optimality, measure_optimality
@@ -201,14 +200,15 @@ def _entry(
     run = simulate(problem, resolved, seed=seed, name=name, compiled=compiled, progress=report)
     adaptive = not isinstance(resolved.adaptive, Identity)
     view = lyapunov_view(problem, resolved, run)
+    metrics = measure(problem, run, task.metrics)
     return Entry(
         name=name,
         run=run,
-        metrics=measure(problem, run, task.metrics),
+        metrics=metrics,
         cycle=measure_cycle(problem, resolved, run, compiled=compiled),
         adaptive=adaptive,
         pair=_pair(chosen, name) if adaptive else None,
-        contraction=measure_contraction(problem, resolved, run) if adaptive else None,
+        contraction=_contraction(problem, resolved, run, metrics),
         optimality=measure_optimality(problem, resolved, run, compiled=compiled),
         notes=(*_notes(controller, resolved), *resolved.notes(problem), *([view.text] if view else [])),
         lyapunov=view,
@@ -233,18 +233,13 @@ def _without_adaptation(settings: Any) -> Any:
     return {k: identity if k == "deformation" else _without_adaptation(v) for k, v in settings.items()}
 
 
-def measure_contraction(problem: Problem, controller: Controller, run: Run) -> Contraction | None:
-    """Predicted along the run and measured from it; None when the run is too short, or the response not the plant's own."""
-    if run.cycles < 10 or controller.response(problem) is not None:
+def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Metrics) -> Contraction | None:
+    """What stands behind the contraction that was measured; None where none was."""
+    predicted = metrics.values.get("contraction.predicted")
+    if not predicted:
         return None
-    deformation = controller.adaptive
-    rows = np.unique(np.linspace(1, run.cycles - 1, 200).astype(int))
-    spectrum = spectrum_over_run(
-        problem.plant, run["state"][rows], run["deformed"][rows], approximate=controller.parameters(problem.plant)
-    )
-    report = assess_gain(deformation, spectrum)
-    measured = identified_factor(run["deformed"], run["plant_realised"], deformation.effective_gain())
-    return Contraction(report.predicted, measured, report, spectrum)
+    spectrum, measured = sampled_spectrum(problem, run), metrics["contraction.measured"][""]
+    return Contraction(predicted[""], measured, assess_gain(controller.adaptive, spectrum), spectrum)
 
 
 def _notes(asked: Controller, resolved: Controller) -> tuple[str, ...]:
