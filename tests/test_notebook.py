@@ -133,7 +133,7 @@ def test_what_is_shown_is_what_was_found(comparison, plan):
     """Numbers and names, each where it is looked for."""
     found = {kind: read(value._repr_html_()).text for kind, value in shown(comparison, plan).items()}
     rms = f"{comparison[HOSTILE].metrics.rms_error['y']:.4g}"
-    assert rms in found["comparison"]
+    assert comparison[HOSTILE].metrics.text("rms_error", "y") in found["comparison"]
     assert rms in found["metrics"]
     assert MARKED in found["comparison"]
     assert printable(HOSTILE) in found["comparison"]
@@ -208,7 +208,7 @@ def test_terminal_shows_names_literally(comparison, capsys, monkeypatch):
         assert name in printed
     assert "report: [bold]report.html" in printed
     assert "\x1b[31m" not in printed
-    show_run(hostile_problem(), comparison[HOSTILE].run, Path("[/]run.npz"))
+    show_run(comparison[HOSTILE].run, comparison[HOSTILE].metrics, Path("[/]run.npz"))
     assert UNIT in capsys.readouterr().out
     with progress_bars() as report:
         report(HOSTILE, 1, 2)
