@@ -134,7 +134,7 @@ def test_what_is_shown_is_what_was_found(comparison, plan):
     """Numbers and names, each where it is looked for."""
     found = {kind: read(value._repr_html_()).text for kind, value in shown(comparison, plan).items()}
     rms = f"{comparison[HOSTILE].metrics.rms_error['y']:.4g}"
-    assert rms in found["comparison"]
+    assert comparison[HOSTILE].metrics.text("rms_error", "y") in found["comparison"]
     assert rms in found["metrics"]
     assert MARKED in found["comparison"]
     assert printable(HOSTILE) in found["comparison"]

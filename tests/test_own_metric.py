@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from blessed import LINE
 
 import fpirhc as fp
 from fpirhc.cli.main import main
-from fpirhc.simulation.metrics import discovery
+from fpirhc.simulation.metrics import discovery, entries
 
 OWN = '''
 
@@ -77,6 +77,10 @@ def test_scenarios_have_it(task, tmp_path):
     assert len(set(leads)) == 3
     assert found["CTC"].metrics["largest_lead"]["y"] == pytest.approx(np.median(leads))
     assert [c.short for c in found.columns][-2:] == ["largest lead y [m]", "share inside"]
+    with pytest.raises(fp.FpirhcError, match="results are never mixed: metrics was"):
+        fp.compare_scenarios(
+            replace(task, metrics=task.metrics[:-1]), count=3, percent=10.0, seed=1, folder=tmp_path, compiled=False
+        )
 
 
 def test_baselines_have_it(task, folder):
@@ -108,6 +112,5 @@ def test_a_shipped_metric_is_one_file(tmp_path, monkeypatch):
     (tmp_path / "peak.py").write_text(
         "from fpirhc.simulation.metrics.base import Metric\nMETRICS = (Metric('peak', lambda problem, run: 1.0),)\n"
     )
-    package = importlib.import_module("fpirhc.simulation.metrics")
-    monkeypatch.setattr(package, "__path__", [*package.__path__, str(tmp_path)])
+    monkeypatch.setattr(entries, "__path__", [*entries.__path__, str(tmp_path)])
     assert "peak" in [metric.name for metric in discovery.known_metrics.__wrapped__()]

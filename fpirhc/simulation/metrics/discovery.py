@@ -1,4 +1,4 @@
-"""Finds metrics: those of this folder, those of installed packages, and those of a problem file."""
+"""Finds metrics: those of the folder `entries`, those of installed packages, and those of a problem file."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 
 from fpirhc.errors import InvalidName
+from fpirhc.simulation.metrics import entries
 from fpirhc.simulation.metrics.base import Metric
 
 GROUP = "fpirhc.metrics"  # of entry points; each leads to a Metric or to a tuple of them
@@ -24,8 +25,7 @@ def known_metrics() -> tuple[Metric, ...]:
     Raises:
         InvalidName: two have the same name.
     """
-    package = import_module(__package__)
-    modules = (import_module(f"{__package__}.{m.name}") for m in pkgutil.iter_modules(package.__path__))
+    modules = (import_module(f"{entries.__name__}.{m.name}") for m in pkgutil.iter_modules(entries.__path__))
     shipped = [metric for module in modules for metric in getattr(module, "METRICS", ())]
     installed = [metric for point in entry_points(group=GROUP) for metric in _several(point.load())]
     return _ordered([*shipped, *installed])

@@ -8,9 +8,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
-import numpy as np
-
-from fpirhc.contraction import ContractionReport, Spectrum, assess_gain, identified_factor, spectrum_over_run
+from fpirhc.contraction import ContractionReport, Spectrum, assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked, resolved, without_deformation
 from fpirhc.deformation.base import innermost
@@ -21,6 +19,7 @@ from fpirhc.review.response_prediction import Prediction, predict_response
 from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
 from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.metrics.columns import columns
+from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
@@ -207,14 +206,15 @@ def _entry(
     run = simulate(problem, ready, seed=seed, name=name, compiled=compiled, progress=report)
     adaptive = ready.deformation.adapts
     view = lyapunov_view(problem, ready, run)
+    metrics = measure(problem, run, task.metrics)
     return Entry(
         name=name,
         run=run,
-        metrics=measure(problem, run, task.metrics),
+        metrics=metrics,
         cycle=measure_cycle(problem, ready, run, compiled=compiled),
         adaptive=adaptive,
         pair=_pair(chosen, name) if adaptive else None,
-        contraction=measure_contraction(problem, ready, run) if adaptive else None,
+        contraction=_contraction(problem, ready, run, metrics),
         optimality=measure_optimality(problem, ready, run, compiled=compiled),
         notes=(*_notes(controller, ready), *ready.notes(problem), *([view.text] if view else [])),
         lyapunov=view,
@@ -240,18 +240,13 @@ def _pair(chosen: Mapping[str, Controller], name: str) -> str | None:
     return next((other for other, controller in others if describe(controller) == wanted), None)
 
 
-def measure_contraction(problem: Problem, controller: Controller, run: Run) -> Contraction | None:
-    """Predicted along the run and measured from it; None when the run is too short, or the response not the plant's own."""
-    if run.cycles < 10 or controller.response(problem) is not None:
+def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Metrics) -> Contraction | None:
+    """What stands behind the contraction that was measured; None where none was."""
+    predicted = metrics.values.get("contraction.predicted")
+    if not predicted:
         return None
-    deformation = controller.deformation
-    rows = np.unique(np.linspace(1, run.cycles - 1, 200).astype(int))
-    spectrum = spectrum_over_run(
-        problem.plant, run["state"][rows], run["deformed"][rows], approximate=controller.parameters(problem.plant)
-    )
-    report = assess_gain(deformation, spectrum)
-    measured = identified_factor(run["deformed"], run["plant_realised"], deformation.effective_gain())
-    return Contraction(report.predicted, measured, report, spectrum)
+    spectrum, measured = sampled_spectrum(problem, run), metrics["contraction.measured"][""]
+    return Contraction(predicted[""], measured, assess_gain(controller.deformation, spectrum), spectrum)
 
 
 def _notes(asked: Controller, ready: Controller) -> tuple[str, ...]:

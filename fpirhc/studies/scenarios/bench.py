@@ -44,6 +44,7 @@ def fingerprint(task: Task, conditions: Conditions) -> dict[str, Any]:
         "problem": task.name,
         "problem file": _hash(task.path.read_bytes()),
         "settings": _hash(settings.encode()),
+        "metrics": _hash(json.dumps([metric.name for metric in task.metrics]).encode()),
         **asdict(conditions),
         **{name: version(name) for name in ("fpirhc", "casadi", "numpy")},
         "machine": platform.machine(),

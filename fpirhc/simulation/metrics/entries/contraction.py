@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fpirhc.contraction import identified_factor, predicted_factor, spectrum_over_run
+from fpirhc.contraction import Spectrum, identified_factor, predicted_factor, spectrum_over_run
 from fpirhc.simulation.metrics.base import Metric
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
@@ -17,10 +17,7 @@ def predicted(problem: Problem, run: Run) -> float | None:
     """Largest max|1 - a lambda| at sampled states of the run; see `fpirhc.contraction`."""
     if not _adapts(run):
         return None
-    rows = np.unique(np.linspace(1, run.cycles - 1, _SAMPLES).astype(int))
-    believed = np.array(run.settings["parameters"])
-    spectrum = spectrum_over_run(problem.plant, run["state"][rows], run["deformed"][rows], approximate=believed)
-    return predicted_factor(spectrum.eigenvalues, _gain(run))
+    return predicted_factor(sampled_spectrum(problem, run).eigenvalues, _gain(run))
 
 
 def measured(problem: Problem, run: Run) -> float | None:  # noqa: ARG001 -- every metric is given the problem
@@ -34,6 +31,13 @@ def _gain(run: Run) -> float:
     gain = run.settings["effective_gain"]
     assert isinstance(gain, float)
     return gain
+
+
+def sampled_spectrum(problem: Problem, run: Run) -> Spectrum:
+    """Eigenvalues of the response Jacobian at sampled cycles of a run, with the parameters that its controller believed."""
+    rows = np.unique(np.linspace(1, run.cycles - 1, _SAMPLES).astype(int))
+    believed = np.array(run.settings["parameters"])
+    return spectrum_over_run(problem.plant, run["state"][rows], run["deformed"][rows], approximate=believed)
 
 
 def _adapts(run: Run) -> bool:

@@ -29,7 +29,10 @@ def plans(problem: Problem, run: Run) -> int | None:  # noqa: ARG001 -- every me
     """Number of different plans."""
     if "solve" not in run.layout or not run.cycles:
         return None
-    return int(np.unique(run["solve"], axis=0).shape[0])
+    told = run["solve"]
+    # A plan that is held for some cycles is one; what is left is few enough to sort.
+    first = np.concatenate([[True], (np.diff(told, axis=0) != 0).any(axis=1)])
+    return int(np.unique(told[first], axis=0).shape[0])
 
 
 def residual(value: float) -> str:
