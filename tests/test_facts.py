@@ -231,7 +231,7 @@ def test_an_estimating_controller_is_reviewed_with_the_model_that_it_begins_with
     assert not any("needs Problem(horizon" in a.found for a in learning.values())
     margins = about(learning, "margin")
     assert margins.numbers == about(plain, "margin").numbers
-    assert "the model that it begins with" in margins.found
+    assert "before the controller has learned" in margins.found
     adaptive = fp.Estimating(replace(PLAN, deformation=fp.Affine(-0.5)), FILTER)
     verdict = about(answers(problem, adaptive), "Does the deformation converge")
     assert (verdict.verdict, verdict.change[:10]) == ("unknown", "Estimating")

@@ -278,7 +278,6 @@ def _measured_once(trial: _Trial, bad: float, entry: int | None, what: str) -> N
 
 LAWS = (
     frozen_value,
-    facts_hold,
     writes_a_command_and_a_status,
     same_arguments_same_command,
     same_command_everywhere,
@@ -286,4 +285,5 @@ LAWS = (
     bad_measurement_never_acts,
     bad_response_never_acts,
     exact_model_tracks,
+    facts_hold,
 )

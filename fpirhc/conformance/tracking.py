@@ -314,9 +314,9 @@ LAWS = (
     only_declared_signals,
     error_is_target_minus_state,
     zero_error_asks_for_the_nominal_response,
-    feedback_is_what_it_does,
     start_forgets,
     nan_shows,
     clipping_freezes,
     error_decays,
+    feedback_is_what_it_does,
 )
