@@ -22,6 +22,7 @@ import fpirhc.optimisers
 import fpirhc.tracking
 from fpirhc.conformance.laws import within
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import Planner
 from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.members import FAMILIES, Example, examples, member_classes
 from fpirhc.optimisers.base import Optimiser
@@ -80,6 +81,11 @@ class Altered(fp.Exponential):
 
     rate: float = 6.0
     change: str = ""
+
+    def feedback(self, order):
+        """As the contract says, but for the change."""
+        told = super().feedback(order)
+        return replace(told, rate=2 * self.rate) if self.change == "tells another rate" else told
 
     def law(self, plant, period):
         """As the contract says, but for the change."""
@@ -148,6 +154,7 @@ class Thawed(Tracking):
         (Altered(change="winds up"), tracking_laws.clipping_freezes),
         (Altered(change="pushes away"), tracking_laws.error_decays),
         (Altered(rate=0.2), tracking_laws.error_decays),
+        (Altered(change="tells another rate"), tracking_laws.feedback_is_what_it_does),
     ],
 )
 def test_wrong_tracking_laws_are_caught(wrong, law):
@@ -310,6 +317,11 @@ class Faulty(fp.ComputedTorque):
     change: str = ""
     settings: tuple[Any, ...] | list[Any] = field(default_factory=tuple)
 
+    @property
+    def planner(self):
+        """None, unless it tells of a plan that it does not make."""
+        return Planner(None, None, restarts=True, tracking=None) if self.change == "tells a plan" else None
+
     def blocks(self, problem):
         """As the contract says, but for the change."""
         blocks, delays = super().blocks(problem)
@@ -389,6 +401,7 @@ class Backwards(Tracking):
         (Faulty(TRACKING, change="keeps NaN"), controller_laws.bad_measurement_never_acts),
         (Faulty(TRACKING, change="trusts responses"), controller_laws.bad_response_never_acts),
         (Faulty(Backwards()), controller_laws.exact_model_tracks),
+        (Faulty(TRACKING, change="tells a plan"), controller_laws.facts_hold),
     ],
     ids=lambda v: getattr(v, "change", None),
 )

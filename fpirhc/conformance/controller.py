@@ -13,6 +13,7 @@ import numpy.typing as npt
 from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
 from fpirhc.controllers.base import Controller, compose_controller
 from fpirhc.controllers.contract import checked, resolved
+from fpirhc.describe import describe
 from fpirhc.horizon.cost import Quadratic
 from fpirhc.horizon.problem import Horizon
 from fpirhc.plant.plant import Parameter, Plant
@@ -105,6 +106,29 @@ def frozen_value(trial: _Trial, generator: np.random.Generator) -> None:  # noqa
     """A controller is a frozen value that can be hashed, copied and described."""
     is_a_frozen_value(trial.controller)
     is_a_frozen_value(resolved(trial.problem, trial.controller))
+
+
+def facts_hold(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """What it tells of itself is so: what it wraps can be exchanged, no automatic setting is left, a planner plans."""
+    ready = checked(trial.problem, trial.controller)
+    hold(
+        not ready.deformation.automatic,
+        f"resolved, its deformation still has {ready.deformation.automatic} to be chosen",
+    )
+    if ready.inner is not None:
+        same = ready.around(ready.inner)
+        hold(describe(same) == describe(ready), "around its own inner controller it is described otherwise")
+    planner = ready.planner
+    hold(
+        (planner is not None) == ("solve" in trial.stepper.signals),
+        f"its planner is {planner}, but its cycle says otherwise",
+    )
+    if planner is not None:
+        same = ready.with_optimiser(planner.optimiser)
+        hold(describe(same) == describe(ready), "with its own optimiser it is described otherwise")
+    for read, name in ready.feeds.items():
+        seen = name.startswith("_") or name in trial.stepper.signals
+        hold(seen, f"its inner controller reads '{name}' for '{read}', which is no signal of the run")
 
 
 def writes_a_command_and_a_status(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
@@ -261,4 +285,5 @@ LAWS = (
     bad_measurement_never_acts,
     bad_response_never_acts,
     exact_model_tracks,
+    facts_hold,
 )

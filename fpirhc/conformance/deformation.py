@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
+from fpirhc.conformance.deformation_facts import check_deformation_facts
 from fpirhc.conformance.laws import hold, is_a_frozen_value, keep
 from fpirhc.deformation.base import Deformation
 from fpirhc.symbolic.layout import Layout
@@ -34,6 +35,7 @@ def check_deformation(
         FpirhcError: the map is not complete, a Sigmoid without scale for instance.
     """
     keep(deformation, _Trial(deformation, tuple(elements), amplitude), LAWS, seed)
+    check_deformation_facts(deformation, seed=seed, amplitude=amplitude)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -201,6 +202,40 @@ def zero_error_asks_for_the_nominal_response(trial: _Trial, generator: np.random
             )
 
 
+def feedback_is_what_it_does(trial: _Trial, generator: np.random.Generator) -> None:
+    """A law that tells its gains feeds errors back with them, and its rate is that of all its modes."""
+    for k, order in enumerate(trial.orders):
+        told = trial.tracking.feedback(order)
+        if told is None:
+            continue
+        for _ in range(_TRIALS):
+            state, target, nominal = trial.motion(generator)
+            memory, desired, error = trial(trial.start(), state, target, nominal)
+            name = trial.plant.names[k]
+            places = [trial.plant.state.elements.index(name + "'" * s) for s in range(order)]
+            expected = np.dot(told.gains[-order:], (target - state)[places])
+            scale = 1 + float(np.abs(told.gains).max() * np.abs(target - state).max())
+            hold(
+                len(told.gains) == order + told.integral and within(desired[k] - nominal[k] - expected, _EXACT * scale),
+                f"with the integral at zero its feedback for order {order} is {desired[k] - nominal[k]:.6g}, told gains "
+                f"{told.gains} give {expected:.6g}",
+            )
+            _, later, _ = trial(memory, state, state, nominal)
+            summed = told.gains[0] * trial.period * error[k] if told.integral else 0.0
+            hold(
+                within(later[k] - nominal[k] - summed, _EXACT * scale),
+                f"after one cycle of the error {error[k]:.4g} its integral gives {later[k] - nominal[k]:.6g} for order {order}, "
+                f"told gains give {summed:.6g}",
+            )
+        if told.rate is not None:
+            degree = len(told.gains)
+            modes = [math.comb(degree, s) * told.rate ** (degree - s) for s in range(degree)]
+            hold(
+                np.allclose(told.gains, modes, rtol=1e-9),
+                f"its gains {told.gains} are not those of the rate {told.rate:g}",
+            )
+
+
 def start_forgets(trial: _Trial, generator: np.random.Generator) -> None:
     """In the first cycle of a run, what is remembered from before does not count."""
     for _ in range(_TRIALS):
@@ -283,4 +318,5 @@ LAWS = (
     nan_shows,
     clipping_freezes,
     error_decays,
+    feedback_is_what_it_does,
 )

@@ -47,7 +47,7 @@ def margins_enough(problem: Problem, loops: Loops) -> Answer:
         f"({delay / problem.period:.3g} cycles)"
     )
     if loops.learns:
-        text += "; with the model that it begins with"
+        text += ", before the controller has learned anything"
     if radius >= 1:
         everywhere = float(loops.radii.min()) >= 1
         text += (

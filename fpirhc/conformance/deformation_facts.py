@@ -1,0 +1,179 @@
+"""Laws about what a deformation tells of itself: the facts are compared with what the map does.
+
+The map is run without a plant: desired response zero, and response errors as they are given, so that everything it remembers
+goes through many cycles. An impulse of the error, in one of two runs that are otherwise the same, shows the gain, the filter and
+the pairing that the map has at that time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from fpirhc.conformance.laws import hold, keep
+from fpirhc.deformation.base import Deformation, Demand
+from fpirhc.describe import describe
+from fpirhc.symbolic.layout import Layout
+
+Array = npt.NDArray[Any]
+
+_WARM = 60  # cycles of history beyond those that a pairing needs
+_SHOWN = 24  # cycles after an impulse
+_SMALL = 1e-4  # errors, in units of the amplitude: the map is linear there
+_SAME = 1e-2  # relative
+
+
+def check_deformation_facts(deformation: Deformation, *, seed: int, amplitude: float = 1.0) -> None:
+    """Check what a deformation tells of itself; maps that pair with earlier requests keep these laws too.
+
+    Parameters: `seed` draws the vectors, `amplitude` is the size of typical responses in their unit.
+
+    Raises:
+        AssertionError: the first law that does not hold, in one sentence.
+    """
+    keep(deformation, _Cycles(deformation, amplitude), LAWS, seed)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cycles:
+    """A deformation in many cycles of one coordinate, without a plant."""
+
+    deformation: Deformation
+    amplitude: float
+
+    @cached_property
+    def layout(self) -> Layout:
+        return self.deformation.memory(("q",))
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """Function (request, response, desired, memory) -> (request, memory)."""
+        settled = self.deformation.suited(Demand(self.amplitude, sudden=True))
+        request, response, desired = (ca.SX.sym(name) for name in ("request", "response", "desired"))
+        memory = ca.SX.sym("memory", self.layout.size)
+        deformed, following = settled.step(request, response, desired, self.layout.split(memory))
+        return ca.Function(
+            "map", [request, response, desired, memory], [deformed, ca.densify(self.layout.join(following))]
+        )
+
+    @cached_property
+    def wait(self) -> int:
+        """Cycles after which every pair is one of this run."""
+        pairing = self.deformation.pairing
+        return (
+            0 if pairing is None or pairing.cycles is None else int(np.ceil(pairing.cycles)) + pairing.uncertainty + 2
+        )
+
+    def __call__(self, errors: Array) -> Array:
+        """Requests after every cycle with these response errors; the first is zero."""
+        request, memory, found = 0.0, self.layout.start(), np.empty(len(errors))
+        for k, error in enumerate(errors):
+            request, memory = (v.full() for v in self.function(request, error, 0.0, memory))
+            found[k] = request.item()
+        return found
+
+    def impulse_response(self, history: Array) -> Array:
+        """What one error after a history of errors changes in the requests, per unit of the error."""
+        size = _SMALL * self.amplitude
+        calm = np.concatenate([history, np.zeros(_SHOWN + self.wait)])
+        struck = calm.copy()
+        struck[len(history)] += size
+        return np.asarray((self(struck) - self(calm))[len(history) :]) / size
+
+    def history(self, signs: Array) -> Array:
+        return _SMALL * self.amplitude * signs
+
+
+def inner_can_be_exchanged(trial: _Cycles, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """`around` puts another map where `inner` is: around its own inner map a wrapper is what it was."""
+    deformation = trial.deformation
+    if deformation.inner is not None:
+        same = deformation.around(deformation.inner)
+        hold(describe(same) == describe(deformation), f"around its own inner map it is {same}")
+
+
+def automatic_settings_are_chosen(trial: _Cycles, generator: np.random.Generator) -> None:
+    """`suited` leaves no automatic setting open, and one step then covers the change; it leaves given settings alone."""
+    deformation = trial.deformation
+    for sudden in (False, True):
+        change = float(generator.uniform(2.0, 20.0))
+        chosen = deformation.suited(Demand(change, sudden))
+        hold(not chosen.automatic, f"suited() leaves {chosen.automatic} open")
+        if not deformation.automatic:
+            hold(describe(chosen) == describe(deformation), f"no setting is automatic, but suited() gives {chosen}")
+        else:
+            step = chosen.largest_step()
+            hold(step >= 0.99 * change, f"suited to changes of {change:.3g} its largest step is {step:.3g}")
+
+
+def constant_map_keeps_its_gain(trial: _Cycles, generator: np.random.Generator) -> None:
+    """A map that calls itself constant answers an error the same, whatever the errors before were."""
+    if not trial.deformation.constant or not trial.deformation.adapts:
+        return
+    cycles = _WARM + 2 * trial.wait
+    alternating = (-1.0) ** np.arange(cycles)
+    histories = [np.zeros(cycles), alternating, alternating * 1.05 ** np.arange(cycles), np.ones(cycles)]
+    histories.append(generator.choice([-1.0, 1.0], size=cycles))
+    first, *others = (trial.impulse_response(trial.history(h)) for h in histories)
+    for other in others:
+        missed = float(np.abs(other - first).max() / max(np.abs(first).max(), 1e-300))
+        hold(
+            missed <= _SAME,
+            f"`constant` is true, but its answer to an error changes by the share {missed:.3g} with what was before",
+        )
+
+
+def filter_and_pairing_are_told(trial: _Cycles, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """An error changes the request at once and for good, unless `error_pole` spreads it or `pairing` repeats it."""
+    deformation = trial.deformation
+    if not deformation.constant or not deformation.adapts:
+        return
+    answer, gain = trial.impulse_response(np.zeros(_WARM + 2 * trial.wait)), deformation.effective_gain()
+    pairing, pole = deformation.pairing, deformation.error_pole
+    if pairing is None:
+        expected = -gain * (1 - pole ** np.arange(1, answer.size + 1))
+        told = f"the pole {pole:g} and no pairing"
+    elif pole == 0 and pairing.uncertainty == 0 and pairing.cycles is not None and float(pairing.cycles).is_integer():
+        expected = -gain * (np.arange(answer.size) % (int(pairing.cycles) + 1) == 0)
+        told = f"pairs {pairing.cycles:g} cycles apart"
+    else:
+        return
+    missed = np.abs(answer - expected) / abs(gain)
+    worst = int(np.argmax(missed))
+    hold(
+        bool(missed[worst] <= _SAME),
+        f"it tells {told}, but {worst} cycles after an error of one the request has changed by {answer[worst]:.4g}, not by "
+        f"{expected[worst]:.4g}",
+    )
+
+
+def reach_is_told(trial: _Cycles, generator: np.random.Generator) -> None:
+    """The gain holds for requests a thousand times smaller than `reach`; without reach, for requests of any size."""
+    deformation, reach = trial.deformation, trial.deformation.reach
+    if trial.layout.size or not deformation.adapts:
+        return
+    gain, error = deformation.effective_gain(), _SMALL * trial.amplitude
+    largest = 1e3 * trial.amplitude if reach is None else 1e-3 * reach.size
+    for share in generator.uniform(-1, 1, size=5):
+        request = float(share * largest)
+        moved = float(trial.function(request, error, 0.0, trial.layout.start())[0]) - request
+        missed = abs(moved + gain * error) / abs(gain * error)
+        what = "it tells no reach" if reach is None else f"its reach is {reach.size:.3g}"
+        hold(
+            missed <= _SAME,
+            f"{what}, but at the request {request:.3g} the step misses the gain by the share {missed:.3g}",
+        )
+
+
+LAWS = (
+    inner_can_be_exchanged,
+    automatic_settings_are_chosen,
+    constant_map_keeps_its_gain,
+    filter_and_pairing_are_told,
+    reach_is_told,
+)

@@ -1,0 +1,467 @@
+"""Generic code asks objects for facts: what a user adds is treated as what ships, a wrapper of a wrapper as what it is made of."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import pytest
+from test_review import about, answers, mass, torque
+
+import fpirhc
+import fpirhc as fp
+from fpirhc.baselines.measuring import first_plan
+from fpirhc.conformance import check_deformation
+from fpirhc.conformance.deformation_facts import check_deformation_facts
+from fpirhc.controllers.base import Controller, closing_blocks, reference_block, rename
+from fpirhc.controllers.contract import resolved, without_deformation
+from fpirhc.deformation.base import Deformation, Pairing, Reach
+from fpirhc.deformation.wrappers.base import Wrapper
+from fpirhc.errors import InvalidProblem, NotSupported
+from fpirhc.simulation.lyapunov_view import lyapunov_view
+from fpirhc.studies.comparison.optimality import measure_optimality
+from fpirhc.studies.comparison.optimiser_choices import with_optimisers
+
+TRACK = fp.Exponential(rate=6.0)
+PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3))
+LIMITS = fp.Limits(inputs={"u": (-20.0, 20.0)})
+LOOKING_AHEAD = {
+    "horizon": fp.Horizon(stages=10, step=1e-2),
+    "cost": fp.Quadratic(states={"q": 1e3, "q'": 1.0}, deviation={"u": 1e-3}),
+    "limits": LIMITS,
+    "duration": 0.2,
+    "start": {"q": 0.05},
+}
+FILTER = fp.DisturbanceKalman(drift={"q": 1e-3}, measured={"q": 1e-4, "q'": 1e-4}, noise={"q": 1e-3})
+
+
+# What a user writes
+
+
+@dataclass(frozen=True)
+class Gentle(Deformation):
+    """r+ = r + (gain / 2) (f - d), as Affine, but a user's own."""
+
+    gain: float
+
+    def step(self, request, response, desired, memory):
+        """Return r + (gain / 2) (f - d)."""
+        del memory
+        return request + 0.5 * self.gain * (response - desired), {}
+
+    def effective_gain(self):
+        """-gain / 2."""
+        return -0.5 * self.gain
+
+    def secant_gain(self):
+        """The same."""
+        return -0.5 * self.gain
+
+    def largest_step(self):
+        """No bound."""
+        return float("inf")
+
+    def with_effective_gain(self, gain):
+        """Return the map with that gain."""
+        return replace(self, gain=-2 * gain)
+
+
+@dataclass(frozen=True)
+class Named(Controller):
+    """A user's own wrapper, which adds nothing."""
+
+    wrapped: Controller
+    label: str = "mine"
+
+    @property
+    def inner(self):
+        """What is wrapped."""
+        return self.wrapped
+
+    @property
+    def deformation(self):
+        """What is wrapped has it."""
+        return self.wrapped.deformation
+
+    def blocks(self, problem):
+        """The blocks of what is wrapped."""
+        return self.wrapped.blocks(problem)
+
+
+@dataclass(frozen=True)
+class Follower(Controller):
+    """A user's own controller: the reference's response is the desired one."""
+
+    deformation: Deformation = field(default_factory=fp.Identity)
+
+    def blocks(self, problem):
+        """Blocks reference, nominal, desired, and the closing ones."""
+        response = problem.plant.response_signal
+        closing, delays = closing_blocks(problem, self.deformation)
+        copies = [rename(n, response("_reference_response"), response(n)) for n in ("nominal", "desired")]
+        return [reference_block(problem), *copies, *closing], delays
+
+
+def twice(controller: Controller) -> Named:
+    """A user's wrapper of a user's wrapper."""
+    return Named(Named(controller), label="outer")
+
+
+# Deformations
+
+
+def test_a_users_map_is_reviewed_as_the_shipped_one_that_it_equals():
+    """R - 0.25 h, once as Affine and once as a user's own map: the same answers to every question."""
+    own, shipped = (answers(mass(limits=LIMITS), fp.ComputedTorque(TRACK, d)) for d in (Gentle(-0.5), fp.Affine(-0.5)))
+    assert about(own, "Does the deformation converge").verdict == "yes"
+    assert own == shipped
+
+
+def test_a_users_map_keeps_the_laws_and_a_liar_does_not():
+    """A map without wrappers is constant by itself; one that tells what is not so is found."""
+    check_deformation(Gentle(-0.5), seed=1)
+
+    @dataclass(frozen=True)
+    class Steady(fp.Damped):
+        constant = True
+
+    @dataclass(frozen=True)
+    class Quick(fp.Filtered):
+        error_pole = 0.0
+
+    @dataclass(frozen=True)
+    class Early(fp.Paired):
+        pairing = Pairing(2.0)
+
+    @dataclass(frozen=True)
+    class Boundless(fp.RFPT):
+        reach = None
+
+    @dataclass(frozen=True)
+    class Narrow(fp.RFPT):
+        reach = Reach("offset", 1e6)
+
+    @dataclass(frozen=True)
+    class Finished(fp.Sigmoid):
+        def suited(self, demand):  # noqa: ARG002
+            return self
+
+    @dataclass(frozen=True)
+    class Stubborn(fp.Filtered):
+        def around(self, inner):
+            return replace(self, map=inner, pole=0.5 * self.pole)
+
+    inner = fp.Affine(gain=-1.0)
+    liars = {
+        Steady(inner): "constant map",
+        Quick(inner, pole=0.5): "filter and pairing",
+        Early(inner, cycles=3): "filter and pairing",
+        Boundless(offset=10.0, sign=-1, gain=0.05): "reach",
+        Narrow(offset=10.0, sign=-1, gain=0.05): "reach",
+        Finished(gain=-0.5): "automatic settings",
+        Stubborn(inner, pole=0.5): "inner can be exchanged",
+    }
+    for liar, law in liars.items():
+        with pytest.raises(AssertionError, match=f"breaks the law '{law}"):
+            check_deformation_facts(liar, seed=1)
+
+
+def test_facts_go_through_wrappers():
+    """Reach, pairing, pole and what is automatic are those of the map inside; a wrapper with a memory is not constant by itself."""
+    inside = fp.Paired(fp.Filtered(fp.RFPT(offset=1e3, sign=-1, gain=1e-4), pole=0.3), cycles=4, uncertainty=1)
+    outside = fp.Damped(inside)
+    assert (outside.reach, outside.pairing, outside.error_pole) == (Reach("offset", 1e3), Pairing(4, 1), 0.3)
+    assert inside.constant
+    assert not outside.constant
+    assert fp.Damped(fp.Sigmoid(gain=-0.5)).automatic == ("scale",)
+    assert isinstance(inside, Wrapper)
+
+
+# Automatic settings
+
+
+@pytest.mark.parametrize("wrap", [lambda c: c, twice], ids=["alone", "wrapped twice"])
+def test_a_users_controller_takes_the_recommended_map(wrap):
+    """The scale of Sigmoid(gain=-0.5) is chosen for it as for a shipped controller on the same reference."""
+    problem = mass(reference=fp.Trajectory(lambda t: {"q": 40.0 * t**3}), start={"q": 0.0}, period=2e-2)
+    chosen = resolved(problem, wrap(Follower(fp.Sigmoid(gain=-0.5)))).deformation
+    assert chosen == resolved(problem, fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5))).deformation
+    assert chosen.scale == pytest.approx(2 * 2e-2 * 240.0, rel=1e-2)  # twice what q'' = 240 t changes in one cycle
+    run = fp.simulate(mass(duration=0.1), wrap(Follower(fp.Sigmoid(gain=-0.5))), seed=0, compiled=False)
+    assert run.stop is None
+    assert run.settings["step_limit"] > 0
+
+
+def test_settings_are_chosen_for_the_problem_that_the_inner_controller_sees():
+    """An exact model chooses a plan's scale with the exact gain 1 / 1.0, another one with the approximate 1 / 1.5."""
+    problem, plan = mass(**LOOKING_AHEAD), replace(PLAN, deformation=fp.Damped(fp.Sigmoid(gain=-0.5)))
+    own, exact = (resolved(problem, twice(c)).deformation.largest_step() for c in (plan, fp.ExactModel(plan)))
+    assert [own, exact] == pytest.approx([40.0 / 1.5, 40.0], rel=1e-2)
+
+
+# Controllers
+
+
+@pytest.mark.parametrize(
+    ("controller", "settings"),
+    [
+        (torque(), {}),
+        (fp.Predicted(torque(), inputs=2e-3), {"dead_time": fp.DeadTime(inputs={"u": 2e-3})}),
+        (fp.ExactModel(replace(PLAN, deformation=fp.Affine(-0.5))), LOOKING_AHEAD),
+        (fp.Estimating(PLAN, FILTER), LOOKING_AHEAD),
+    ],
+    ids=["torque", "predicted", "exact model", "estimating"],
+)
+def test_a_wrapper_of_a_wrapper_is_reviewed_as_what_it_is_made_of(controller, settings):
+    """Two wrappers of a user's own change no answer."""
+    problem = mass(**settings)
+    plain, wrapped = answers(problem, controller), answers(problem, twice(controller))
+    assert {q: (a.verdict, a.found.replace("Named", type(controller).__name__)) for q, a in wrapped.items()} == {
+        q: (a.verdict, a.found) for q, a in plain.items()
+    }
+
+
+def test_an_estimating_controller_is_reviewed_with_the_model_that_it_begins_with():
+    """It has its horizon; its margins are those of the wrapped controller, and no verdict is final where the model changes."""
+    problem = mass(**LOOKING_AHEAD)
+    plain, learning = (answers(problem, c) for c in (PLAN, fp.Estimating(PLAN, FILTER)))
+    assert not any("needs Problem(horizon" in a.found for a in learning.values())
+    margins = about(learning, "margin")
+    assert margins.numbers == about(plain, "margin").numbers
+    assert "before the controller has learned" in margins.found
+    adaptive = fp.Estimating(replace(PLAN, deformation=fp.Affine(-0.5)), FILTER)
+    verdict = about(answers(problem, adaptive), "Does the deformation converge")
+    assert (verdict.verdict, verdict.change[:10]) == ("unknown", "Estimating")
+
+
+def test_plan_metrics_are_those_of_the_planner_inside():
+    """The first plan of a baseline, whatever is around: estimating, predicting, exact, or a user's own."""
+    task = replace(fp.load_problem("leaking_tanks"), controllers={})
+    plain = task_plans(task, fp.load_problem("leaking_tanks").controllers["RHC"])
+    assert plain["plan.status"] == "OK"
+    for wrap in (twice, fp.ExactModel, lambda c: fp.Predicted(c, inputs=1.0)):
+        assert task_plans(task, wrap(fp.load_problem("leaking_tanks").controllers["RHC"])) == plain
+    assert task_plans(task, fp.load_problem("leaking_tanks").controllers["RHC offset-free"]) == plain
+    assert task_plans(task, fp.ComputedTorque(TRACK)) == {}
+
+
+def task_plans(task, controller) -> dict[str, object]:
+    """Metrics of the first plan."""
+    return first_plan(task, task.problem, controller)
+
+
+def test_optimality_and_lyapunov_see_through_wrappers():
+    """The same figures with two wrappers around; a controller that learns has no plans that could be solved again."""
+    problem = mass(**LOOKING_AHEAD)
+    for controller in (PLAN, twice(PLAN)):
+        run = fp.simulate(problem, controller, seed=0, compiled=False)
+        found = measure_optimality(problem, controller, run, compiled=False)
+        assert found is not None
+        assert found.plans > 10
+        assert 0 <= found.worst < 1e-2
+    estimating = fp.Estimating(PLAN, FILTER)
+    run = fp.simulate(problem, estimating, seed=0, compiled=False)
+    assert measure_optimality(problem, estimating, run, compiled=False) is None
+    law = fp.ComputedTorque(TRACK)
+    run = fp.simulate(problem, law, seed=0, compiled=False)
+    plain = lyapunov_view(problem, law, run)
+    assert plain is not None
+    assert plain.text == lyapunov_view(problem, twice(law), run).text
+    assert lyapunov_view(problem, fp.ComputedTorque(fp.Fractional(6.0, 0.9)), run) is None
+
+
+def test_plans_on_a_predicted_state_are_judged_from_there():
+    """The plans of a predicting controller begin where and when the command acts: solved again, nearly optimal."""
+    problem = mass(dead_time=fp.DeadTime(inputs={"u": 2e-3}), **LOOKING_AHEAD)
+    controller = fp.Predicted(PLAN, inputs=2e-3)
+    run = fp.simulate(problem, controller, seed=0, compiled=False)
+    found = measure_optimality(problem, controller, run, compiled=False)
+    assert found is not None
+    assert -1e-6 < found.worst < 1e-2
+    assert lyapunov_view(problem, fp.Predicted(fp.ComputedTorque(TRACK), inputs=2e-3), run) is None
+
+
+def test_optimisers_vary_inside_wrappers():
+    """Compare delayed_mass --optimisers reduced-gradient: both plans are inside Predicted."""
+    varied = with_optimisers(fp.load_problem("delayed_mass"), ["reduced-gradient"], None)
+    assert list(varied.controllers) == ["RHC (reduced gradient)", "RHC+FPI (reduced gradient)"]
+    for controller in varied.controllers.values():
+        assert isinstance(controller, fp.Predicted)
+        assert isinstance(controller.planner.optimiser, fp.ReducedGradient)
+    run = fp.simulate(
+        replace(varied.problem, duration=20 * varied.problem.period, measure_from=0.0),
+        twice(controller),
+        seed=0,
+        compiled=False,
+    )
+    assert run.stop is None
+
+
+def test_no_named_controller_is_dropped():
+    """leaking_tanks by name: each of them is varied; one that does not plan stays, and alone it is refused."""
+    task = fp.load_problem("leaking_tanks")
+    task = replace(task, controllers={**task.controllers, "CTC": fp.ComputedTorque(TRACK)})
+    names = list(task.controllers)
+    varied = with_optimisers(task, ["ipopt"], names)
+    assert list(varied.controllers) == [*(f"{n} (IPOPT)" for n in names if n != "CTC"), "CTC"]
+    assert isinstance(varied.controllers["RHC offset-free (IPOPT)"].planner.optimiser, fp.Ipopt)
+    with pytest.raises(InvalidProblem, match="none of CTC plans"):
+        with_optimisers(task, ["ipopt"], ["CTC"])
+
+
+def test_a_pair_is_found_through_wrappers():
+    """Without its deformation a wrapped controller is described as the wrapped plain one."""
+    plain, adaptive = (twice(fp.ComputedTorque(TRACK, d)) for d in (fp.Identity(), fp.Affine(-0.5)))
+    assert without_deformation(adaptive) == plain
+    assert without_deformation(plain) is plain
+    with pytest.raises(NotSupported, match="no deformation that can be replaced"):
+        Named(fp.AccelerationFeedback(TRACK, gain=1.0)).with_deformation(fp.Affine(-0.5))
+
+
+def test_a_wrapper_that_hides_its_inner_controller_says_what_to_do():
+    """A wrapper whose inner controller is in no field must say how it is rebuilt."""
+
+    @dataclass(frozen=True)
+    class Listed(Named):
+        wrapped: tuple[Controller, ...]
+
+        @property
+        def inner(self):
+            return self.wrapped[0]
+
+    with pytest.raises(NotSupported, match=r"override around\(\)"):
+        Listed((PLAN,)).with_optimiser(fp.ReducedGradient(iterations=5, tolerance=1e-3))
+
+
+# What generic code names
+
+PACKAGE = Path(fpirhc.__file__).parent
+CONTRACTS = (
+    "controllers.contract.Controller",
+    "controllers.on_failure.OnFailure",
+    "controllers.replanning.Replanning",
+    "controllers.slots.schedules.Schedule",
+    "controllers.wrappers.predicted.Predictor",
+    "deformation.base.Deformation",
+    "horizon.cost.Cost",
+    "learning.estimators.base.Estimator",
+    "learning.rules.base.Rule",
+    "optimisers.base.Optimiser",
+    "plant.integrators.Integrator",
+    "sensing.base.DerivativeEstimator",
+    "task.disturbance.Disturbance",
+    "tracking.base.Tracking",
+)
+GENERIC = (
+    "baselines",
+    "cli",
+    "contraction",
+    "problem_files",
+    "report",
+    "review",
+    "scaffold",
+    "simulation",
+    "studies",
+    "task",
+)
+GENERIC_FILES = (
+    "controllers/base.py",
+    "controllers/contract.py",
+    "controllers/demands.py",
+    "controllers/gain_check.py",
+)
+GENERIC_FILES += ("controllers/tracked.py", "deformation/base.py", "deformation/wrappers/base.py", "tracking/base.py")
+# Values that generic code builds for itself; it asks nobody whether he is one.
+BUILDS = {
+    "controllers/contract.py": {"Identity"},  # no adaptation: the neutral map
+    "review/linear.py": {"RungeKutta4", "Step"},  # of the linear problem
+    "studies/comparison/optimality.py": {"FixedPoint"},  # the converged optimum
+    "studies/comparison/optimiser_choices.py": {
+        "FixedPoint",
+        "ReducedGradient",
+        "Ipopt",
+        "Fatrop",
+        "SequentialQuadratic",
+    },  # names of the command line
+    "task/problem.py": {"RungeKutta4"},  # the default
+}
+
+
+def contracts() -> tuple[type, ...]:
+    """The families' contracts."""
+    found = []
+    for path in CONTRACTS:
+        module, _, name = path.rpartition(".")
+        found.append(getattr(importlib.import_module(f"fpirhc.{module}"), name))
+    return tuple(found)
+
+
+def named_members(path: Path, used: set[str]) -> set[str]:
+    """Names in `used` that a file imports or defines and that are members of a family."""
+    module = importlib.import_module(".".join(["fpirhc", *path.relative_to(PACKAGE).with_suffix("").parts]))
+    families = contracts()
+    values = {name: getattr(module, name, None) for name in used}
+    return {n for n, v in values.items() if inspect.isclass(v) and issubclass(v, families) and v not in families}
+
+
+def asked_classes(tree: ast.AST) -> set[str]:
+    """Names of classes in isinstance, issubclass, `type(x) is` and class patterns."""
+    found: list[ast.AST] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("isinstance", "issubclass"):
+            found.append(node.args[1])
+        elif isinstance(node, ast.MatchClass):
+            found.append(node.cls)
+        elif (
+            isinstance(node, ast.Compare)
+            and isinstance(node.left, ast.Call)
+            and getattr(node.left.func, "id", "") == "type"
+        ):
+            found += node.comparators
+    return {n.id for one in found for n in ast.walk(one) if isinstance(n, ast.Name)}
+
+
+def files() -> list[Path]:
+    """All modules of the package that can be imported without starting something."""
+    return [p for p in sorted(PACKAGE.rglob("*.py")) if p.name not in ("__main__.py", "__init__.py", "worker.py")]
+
+
+def test_nobody_is_asked_for_his_class():
+    """No isinstance, issubclass, type comparison or pattern on a member of a family, in any file."""
+    ladders = {}
+    for path in files():
+        members = named_members(path, asked_classes(ast.parse(path.read_text(encoding="utf-8"))))
+        if members:
+            ladders[str(path.relative_to(PACKAGE))] = members
+    assert not ladders
+
+
+def test_generic_code_names_no_members():
+    """It imports contracts; the few values that it builds for itself are listed above."""
+    found = {}
+    for path in files():
+        name = path.relative_to(PACKAGE).as_posix()
+        if name.split("/")[0] not in GENERIC and name not in GENERIC_FILES:
+            continue
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        imported = {a.asname or a.name for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for a in n.names}
+        members = {m for m in named_members(path, imported) if _is_foreign(path, m)}
+        if members:
+            found[name] = members
+    assert found == BUILDS
+
+
+def _is_foreign(path: Path, name: str) -> bool:
+    """Whether a class is a concrete one of another part of the package than the file's."""
+    module = importlib.import_module(".".join(["fpirhc", *path.relative_to(PACKAGE).with_suffix("").parts]))
+    one: type = getattr(module, name)
+    return not inspect.isabstract(one) and one.__module__.split(".")[1] != path.relative_to(PACKAGE).parts[0]
+
+
+def test_the_search_finds_a_ladder():
+    """The scan itself: a ladder over concrete maps is seen."""
+    text = "def f(m):\n    return isinstance(m, RFPT | Rotation) or type(m) is Affine\n"
+    assert asked_classes(ast.parse(text)) == {"RFPT", "Rotation", "Affine"}
