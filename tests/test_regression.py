@@ -21,6 +21,7 @@ from fpirhc.baselines.judging import Judgement, Row, judge
 from fpirhc.baselines.junit import to_junit
 from fpirhc.baselines.markdown import to_markdown
 from fpirhc.baselines.measuring import DIVERGED, FINISHED, Measurement
+from fpirhc.baselines.outline import outline
 from fpirhc.baselines.places import problems_here
 from fpirhc.baselines.reading import read_baseline
 from fpirhc.baselines.settings import fingerprint, settings_of
@@ -345,9 +346,9 @@ def test_hostile_names_are_only_text(name):
     """XML parses to the same number of cases, Markdown holds no tag, link, mention or column of theirs."""
     row = Row(name, f"cost.{name}", 1.0, name, 0.1, "changed")
     judgement = Judgement(name, (row,), (f"stale: {name}",), "", name, name, (name,))
-    root = Xml.fromstring(to_junit([judgement]))
+    root = Xml.fromstring(to_junit(outline([judgement])))
     assert [len(suite) for suite in root] == [2]
-    page = to_markdown([judgement], [(name, name)])
+    page = to_markdown(outline([judgement], [(name, name)]))
     tags = _Tags()
     tags.feed(page)
     assert tags.found == {("code", ())}
@@ -435,9 +436,10 @@ def test_pytest_plugin(pytester, blessed):
     assert read_baseline(file) == second
 
 
-def test_pytest_plugin_wants_a_reason(pytester):
-    """An empty one is refused before anything runs."""
+@pytest.mark.parametrize("option", ["--fpirhc-accept", "--fpirhc-bless"])
+def test_pytest_plugin_wants_a_reason(option, pytester):
+    """An empty one is refused before anything runs, under the earlier name too."""
     pytester.makepyfile(test_line=TEST)
-    result = pytester.runpytest_subprocess("--fpirhc-accept", " ")
+    result = pytester.runpytest_subprocess(option, " ")
     assert result.ret == pytest.ExitCode.USAGE_ERROR
     result.stderr.fnmatch_lines(["*needs a reason*"])

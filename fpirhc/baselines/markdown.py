@@ -4,35 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from fpirhc.baselines.judging import Judgement, Row
-from fpirhc.baselines.words import HEADS, cells, headline, remarks
+from fpirhc.baselines.outline import Line, Outline
+from fpirhc.baselines.words import HEADS
 
 MARK = "<!-- fpirhc check -->"
 _PLAIN = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789 .,+-=/'\u00b1")
 
 
-def to_markdown(judgements: Sequence[Judgement], unchecked: Sequence[tuple[str, str]]) -> str:
+def to_markdown(outline: Outline) -> str:
     """Return the page: what changed in full, what holds in one line per problem."""
-    good = sum(j.holds for j in judgements)
-    parts = [MARK, f"### fpirhc check: {good} of {len(judgements)} problems hold", ""]
-    for judgement in judgements:
-        parts.append(f"**{_escaped(headline(judgement))}**")
+    good = sum(section.holds for section in outline.sections)
+    parts = [MARK, f"### fpirhc check: {good} of {len(outline.sections)} problems hold", ""]
+    for section in outline.sections:
+        parts += [f"**{_escaped(section.headline)}**", ""]
+        parts += _table([line for line in section.lines if not line.holds])
+        parts += [f"- {_escaped(text)}" for text in section.remarks]
         parts.append("")
-        if judgement.changed:
-            parts += _table(judgement.changed)
-        parts += [f"- {_escaped(text)}" for text in remarks(judgement)]
-        parts.append("")
-    parts += [f"- {_code(name)} is not checked: {_escaped(reason)}" for name, reason in unchecked]
+    parts += [f"- {_code(name)} is not checked: {_escaped(reason)}" for name, reason in outline.unchecked]
     return "\n".join(parts).rstrip() + "\n"
 
 
-def _table(rows: Sequence[Row]) -> list[str]:
-    lines = ["| " + " | ".join(HEADS) + " |", "| --- | --- | ---: | ---: | ---: | --- |"]
-    for row in rows:
-        controller, metric, old, new, band, verdict = cells(row)
+def _table(lines: Sequence[Line]) -> list[str]:
+    if not lines:
+        return []
+    table = ["| " + " | ".join(HEADS) + " |", "| --- | --- | ---: | ---: | ---: | --- |"]
+    for line in lines:
+        controller, metric, old, new, band, verdict = line.cells
         texts = (_code(controller), _code(metric), _escaped(old), _escaped(new), _escaped(band), f"**{verdict}**")
-        lines.append("| " + " | ".join(texts) + " |")
-    return [*lines, ""]
+        table.append("| " + " | ".join(texts) + " |")
+    return [*table, ""]
 
 
 def _code(text: str) -> str:

@@ -55,7 +55,7 @@ def fpirhc_check(request: pytest.FixtureRequest) -> Callable[..., Judgement | No
     def check(problem: str | Path, controller: str | None = None) -> Judgement | None:
         __tracebackhide__ = True
         from fpirhc.baselines.check import check_baseline
-        from fpirhc.baselines.words import headline, remarks, told
+        from fpirhc.baselines.words import headline, remarks, sentence
         from fpirhc.problem_files.problem_file import load_problem
 
         path = config.rootpath / problem
@@ -67,8 +67,8 @@ def fpirhc_check(request: pytest.FixtureRequest) -> Callable[..., Judgement | No
             return None
         judgement = check_baseline(task, controllers=names, compiled=compiled)
         if not judgement.holds:
-            lines = [headline(judgement), told(judgement.changed), *remarks(judgement)]
-            pytest.fail("\n".join(line for line in lines if line), pytrace=False)
+            lines = [headline(judgement), *map(sentence, judgement.changed), *remarks(judgement)]
+            pytest.fail("\n".join(lines), pytrace=False)
         return judgement
 
     return check

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -11,28 +9,28 @@ from rich.text import Text
 
 from fpirhc.baselines.bands import FACTOR, Metric
 from fpirhc.baselines.baseline import Baseline
-from fpirhc.baselines.judging import Judgement
-from fpirhc.baselines.words import HEADS, cells, clean, headline, number, remarks, shown
+from fpirhc.baselines.outline import Outline
+from fpirhc.baselines.words import HEADS, clean, number
 
 _MOSTLY = 0.9  # share of a band; its digits are rounded
 _STYLES = {"holds": "", "better": "bold green", "worse": "bold red"}
 
 
-def show_judgements(judgements: Sequence[Judgement], unchecked: Sequence[tuple[str, str]], every: bool) -> None:
-    """Print a table and a sentence for every problem."""
+def show_check(outline: Outline, every: bool) -> None:
+    """Print a table and a sentence for every problem; of the metrics that hold the rms errors, or `every` one."""
     console = Console()
-    for judgement in judgements:
-        rows = shown(judgement, every)
-        if rows:
-            table = _table(judgement.problem)
-            for row in rows:
-                table.add_row(*(Text(text) for text in cells(row)), style=_STYLES.get(row.verdict, "bold yellow"))
+    for section in outline.sections:
+        lines = [line for line in section.lines if every or line.in_summary]
+        if lines:
+            table = _table(section.problem)
+            for line in lines:
+                table.add_row(*map(Text, line.cells), style=_STYLES.get(line.verdict, "bold yellow"))
             console.print(table)
-        _say(console, headline(judgement))
-        for text in remarks(judgement):
+        _say(console, section.headline)
+        for text in section.remarks:
             _say(console, f"  {text}")
-    for name, reason in unchecked:
-        _say(console, f"{clean(name)}: not checked ({clean(reason)})")
+    for name, reason in outline.unchecked:
+        _say(console, f"{name}: not checked ({reason})")
 
 
 def show_baseline(baseline: Baseline, path: str) -> None:
@@ -67,7 +65,7 @@ def _source(metric: Metric) -> str:
 
 
 def _table(problem: str) -> Table:
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=Text(clean(problem)))
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=Text(problem))
     for k, head in enumerate(HEADS):
         table.add_column(head, justify="left" if k in (0, 1, 5) else "right")
     return table

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Sequence
 from pathlib import Path
 
 from fpirhc.baselines.judging import OUTCOME, Judgement, Row
@@ -58,28 +57,11 @@ def remarks(judgement: Judgement) -> list[str]:
     return said
 
 
-def shown(judgement: Judgement, every: bool) -> list[Row]:
-    """The rows to show: all, or those that changed and the rms errors of the others."""
-    if every:
-        return list(judgement.rows)
-    return [r for r in judgement.rows if not r.holds or r.metric.startswith("rms_error.")]
-
-
-def rows_of(judgement: Judgement) -> dict[str, list[Row]]:
-    """Rows by controller."""
-    found: dict[str, list[Row]] = {}
-    for row in judgement.rows:
-        found.setdefault(row.controller, []).append(row)
-    return found
-
-
-def told(rows: Sequence[Row]) -> str:
-    """Rows as lines of plain text."""
-    return "\n".join(
-        f"{c[0]}: {c[1]} was {c[2]}, is {c[3]}" + ("" if row.metric == OUTCOME else f" ({c[4]})") + f": {c[5]}"
-        for row in rows
-        for c in [cells(row)]
-    )
+def sentence(row: Row) -> str:
+    """One comparison as a line of plain text."""
+    controller, metric, old, new, band, verdict = cells(row)
+    within = "" if row.metric == OUTCOME else f" ({band})"
+    return f"{controller}: {metric} was {old}, is {new}{within}: {verdict}"
 
 
 def check_replaceable(path: Path, mark: str) -> None:

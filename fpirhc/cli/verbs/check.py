@@ -28,8 +28,9 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.baselines import junit, markdown
+    from fpirhc.baselines.outline import outline
     from fpirhc.baselines.places import problems_here, write_whole
-    from fpirhc.baselines.terminal import show_judgements
+    from fpirhc.baselines.terminal import show_check
     from fpirhc.baselines.words import check_replaceable
 
     for path, mark in ((options.junit, junit.MARK), (options.markdown, markdown.MARK)):
@@ -37,11 +38,12 @@ def _run(options: argparse.Namespace) -> ExitCode:
             check_replaceable(path, mark)
     problems, unchecked = (options.problems, {}) if options.problems else problems_here(Path(), options.baselines)
     judgements = _judgements(options, list(dict.fromkeys(map(str, problems))))
-    show_judgements(judgements, list(unchecked.items()), options.all)
+    contents = outline(judgements, list(unchecked.items()))
+    show_check(contents, options.all)
     if options.junit:
-        write_whole(junit.to_junit(judgements), options.junit, "report")
+        write_whole(junit.to_junit(contents), options.junit, "report")
     if options.markdown:
-        write_whole(markdown.to_markdown(judgements, list(unchecked.items())), options.markdown, "report")
+        write_whole(markdown.to_markdown(contents), options.markdown, "report")
     return _code(judgements)
 
 
