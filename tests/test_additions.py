@@ -38,15 +38,26 @@ NAMED = '''
 """A controller under another name."""
 from dataclasses import dataclass
 
-from fpirhc.controllers.wrappers.base import ControllerWrapper
+from fpirhc.controllers.base import Controller
 
 
 @dataclass(frozen=True)
-class Named(ControllerWrapper):
+class Named(Controller):
     """The inner controller, unchanged."""
 
-    controller: object
+    controller: Controller
     title: str
+
+    @property
+    def inner(self):
+        return self.controller
+
+    @property
+    def deformation(self):
+        return self.controller.deformation
+
+    def blocks(self, problem):
+        return self.controller.blocks(problem)
 
 
 def examples(inner):

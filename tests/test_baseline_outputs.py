@@ -63,7 +63,7 @@ def test_metrics_that_hold_are_not_in_the_way(texts, capsys):
 def test_junit_counts_what_it_holds():
     """As a CI reads it: a case per controller, one failure per controller with changes, an error where nothing can be said."""
     suites = {suite.get("name"): suite for suite in Xml.fromstring(to_junit(EVERY))}
-    counts = {n: tuple(int(s.get(k)) for k in ("tests", "failures", "errors")) for n, s in suites.items()}
+    counts = {n: tuple(int(s.get(k) or 0) for k in ("tests", "failures", "errors")) for n, s in suites.items()}
     assert counts == {"good": (1, 0, 0), "bad": (3, 2, 0), "missing": (1, 0, 1), "broken": (1, 0, 1)}
     for name, suite in suites.items():
         assert len(suite) == counts[name][0]

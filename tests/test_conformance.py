@@ -320,7 +320,8 @@ class Faulty(fp.ComputedTorque):
     @property
     def planner(self):
         """None, unless it tells of a plan that it does not make."""
-        return Planner(None, None, restarts=True, tracking=None) if self.change == "tells a plan" else None
+        nothing: Any = None
+        return Planner(nothing, None, restarts=True, tracking=None) if self.change == "tells a plan" else None
 
     def blocks(self, problem):
         """As the contract says, but for the change."""

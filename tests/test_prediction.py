@@ -87,6 +87,15 @@ def test_null_run_is_predicted(gain, form):
     assert np.sqrt(np.mean(predicted**2)) == pytest.approx(np.sqrt(np.mean(real**2)), rel=0.05)
 
 
+def test_informed_controller_has_nothing_to_adapt_to():
+    """Told the exact parameters, a controller with a deformation is its own null run."""
+    told = fp.ExactModel(controller("two_mass", "CTC", -0.5))
+    predicted = fp.predict_response(replace(undisturbed("two_mass"), duration=0.5, measure_from=0.2), told)
+    np.testing.assert_array_equal(predicted.adapted.error, predicted.null.error)
+    assert max(predicted.rms(predicted.without).values()) < 1e-9
+    assert not predicted.helps
+
+
 def contained(name: str, which: str, gain: float) -> None:
     """Every state of the run is inside the tube, widened by a tenth of its largest half-width."""
     problem, chosen = undisturbed(name), controller(name, which, gain)
@@ -186,6 +195,9 @@ def test_prediction_refuses_what_it_does_not_cover():
         fp.predict_response(problem, fp.ComputedTorque(fp.Exponential(rate=6.0)))
     with pytest.raises(InvalidValue, match="mismatch"):
         fp.predict_response(problem, chosen, mismatch=-1.0)
+    motor = fp.load_problem("mrac_pendulum")
+    with pytest.raises(NotSupported, match="ForceMRAC"):
+        fp.predict_response(motor.problem, motor.controllers["force MRAC"])
     hanging = undisturbed("chain_of_masses")
     predicted = fp.predict_response(
         replace(hanging, duration=0.2, measure_from=0.0),

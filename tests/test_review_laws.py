@@ -91,3 +91,18 @@ def test_benefit_is_not_known_under_dead_time():
     assert "dead time" in found.found
     assert answer(late, fp.Paired(fp.Affine(gain=-0.5), cycles=1), "two-cycles") is None
     assert answer(late, fp.Paired(fp.Affine(gain=-0.5), cycles=1), "small lag") is None
+
+
+def test_chatter_is_told_and_what_to_do():
+    """A noisy accelerometer: the step of the command is that of `suggest` at the same gain; without limits it is small."""
+    noisy = moving(sensing=fp.Sensing({"y''": fp.Sensor(noise=fp.Noise(1.0))}))
+    loud = answer(replace(noisy, limits=fp.Limits(inputs={"u": (-20.0, 20.0)})), fp.Affine(gain=-1.0), "chatter")
+    assert loud.verdict == "unknown"
+    assert "suggest" in loud.change
+    controller = fp.ComputedTorque(fp.Exponential(rate=RATE), fp.Affine(gain=-0.1))
+    same = fp.suggest(noisy, controller, chatter=loud.numbers["step_u"], ringing=0.0)
+    assert same.gain == pytest.approx(-1.0, rel=1e-3)
+    quiet = answer(noisy, fp.Filtered(fp.Affine(gain=-1.0), pole=0.9), "chatter")
+    assert quiet.verdict == "yes"
+    assert quiet.numbers["step_u"] < 0.3 * loud.numbers["step_u"]
+    assert answer(moving(), fp.Affine(gain=-1.0), "chatter") is None

@@ -20,9 +20,12 @@ from __future__ import annotations
 
 import math
 
+from fpirhc.deformation.queue import Cycles, every
 from fpirhc.errors import InvalidValue
 
 _BEYOND = 1.01, 1e-3  # share and amount by which a pole exceeds the bound, at which nothing is damped
+
+_LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists
 
 
 def leaky_pole(product: float, uncertainty: float) -> float:
@@ -80,3 +83,11 @@ def _check_product(owner: str, product: float) -> None:
             f"{owner}(product={product!r}): expected effective gain times largest eigenvalue in (0, 2); outside it the iteration "
             "diverges with the right dead time too"
         )
+
+
+def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: float | None) -> float:
+    """Return the pole of a leaky pairing: the given one, or that of the uncertainty for a map with this effective gain."""
+    if pole is not None:
+        return float(pole)
+    wrong = default_uncertainty(max(every(cycles))) if uncertainty is None else uncertainty
+    return default_pole(min(max(1.0, abs(gain)), _LARGEST_PRODUCT), wrong)

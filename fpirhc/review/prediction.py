@@ -65,11 +65,10 @@ def nominal_run(problem: Problem, controller: Controller, *, compiled: bool = Tr
     """Return the run of the controller without its deformation on its own model, without disturbances and noise.
 
     Raises:
-        NotSupported: dead time, estimated responses, a controller whose deformation cannot be left out, a model that
-        does not stay
-            finite. And what the controller raises about the problem.
+        NotSupported: dead time, estimated responses, a controller that does not track or plan with one model, a
+            model that does not stay finite. And what the controller raises about the problem.
     """
-    _check(problem)
+    _check(problem, controller)
     chosen = resolved(problem, controller)
     chosen.check(problem)
     believed = chosen.parameters(problem.plant)
@@ -149,7 +148,12 @@ def _exactly(plant: Plant, values: np.ndarray) -> Plant:
     return replace(plant, parameters=named)
 
 
-def _check(problem: Problem) -> None:
+def _check(problem: Problem, controller: Controller) -> None:
+    if controller.learns or controller.feeds or (controller.law is None and controller.planner is None):
+        raise NotSupported(
+            f"no prediction for {type(controller).__name__}: it needs a controller that tracks or plans with one model and one "
+            "map, and is given the measured state"
+        )
     late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
     if late or problem.sensing.delay(problem.plant, problem.period):
         what = "dead time" if late else "an estimated response"

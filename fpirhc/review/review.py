@@ -9,6 +9,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.review.answer import Answer, Review, Verdict
+from fpirhc.review.chatter import chatter_small
 from fpirhc.review.commands import commands_inside
 from fpirhc.review.convergence import box_converges, converges
 from fpirhc.review.gain import gain_admissible
@@ -96,7 +97,7 @@ def _of_map(grid: ReviewGrid, controller: Controller, loops: Loops, general: lis
         bears_lag(grid, controller, own),
         free_of_two_cycles(grid, controller, loops),
     ]
-    known = [a for a in law if a is not None]
+    known = [a for a in (*law, chatter_small(grid, controller)) if a is not None]
     return [verdict, box_converges(loops), *gains, *suited, *known, pays(grid, controller)]
 
 

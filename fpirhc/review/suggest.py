@@ -15,22 +15,20 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from fpirhc.contraction import filter_pole, noise_spread, response_jacobians
+from fpirhc.contraction import filter_pole
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import InvalidName, InvalidValue, NotContractive, NotSupported, nearest
-from fpirhc.review.grid import ReviewGrid, review_grid
-from fpirhc.review.linear import LinearLoop, response_slopes
+from fpirhc.review.grid import review_grid
+from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import loops_along
-from fpirhc.sensing.base import response_names
+from fpirhc.review.noise_along import Noisy, noisy_points
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
 
 RINGING = 6.0  # kappa: damping 0.2, between 4 and 8, beyond which tracking gains nothing
-_POINTS = 9
-_DRAWN = 20_000
 _BISECTIONS = 50
 _SMALLEST = 1e-6  # of the deadbeat gain
 
@@ -91,7 +89,27 @@ def suggest(
         be given. NotInvertible: see `review`. NotContractive: eigenvalues that no gain suits.
     """
     chosen = resolved(problem, controller)
-    if chosen.deformation.effective_gain() == 0:
+    _check(chosen, ringing)
+    budget = _budget(problem, chatter)
+    grid = review_grid(problem, 0.0, 0)
+    noisy = noisy_points(grid, chosen, noise)
+    sign, largest = _largest_eigenvalue(noisy.jacobians)
+
+    def fits(size: float) -> bool:
+        return bool((noisy.steps(sign * size, filter_pole(size * largest, ringing)) <= budget).all())
+
+    size = _largest_within(fits, 1 / largest)
+    pole = filter_pole(size * largest, ringing)
+    deformation = _with(chosen.deformation, sign * size, pole)
+    own = getattr(deformation, deformation.gain_name, None)
+    name, value = ("effective gain", sign * size) if own is None else (deformation.gain_name, float(own))
+    predicted = dict(zip(problem.plant.inputs, map(float, noisy.steps(sign * size, pole)), strict=True))
+    floor = _floor(loops_along(grid, chosen).ideal, noisy, problem)
+    return Suggestion(deformation, sign * size, pole, name, value, predicted, floor)
+
+
+def _check(controller: Controller, ringing: float) -> None:
+    if controller.deformation.effective_gain() == 0:
         raise NotSupported(
             f"{type(controller).__name__} has no deformation to choose a gain for; give it Sigmoid(gain=...)"
         )
@@ -99,27 +117,6 @@ def suggest(
         raise InvalidValue(
             f"suggest(ringing={ringing!r}): expected a number of at least 0; 4 to 8 is usual, 0 is no filter"
         )
-    budget, deviations = _budget(problem, chatter), _deviations(problem, noise)
-    grid = review_grid(problem, 0.0, 0)
-    jacobians, inverses = _along_the_reference(grid, chosen.parameters(problem.plant))
-    sign, largest = _largest_eigenvalue(jacobians)
-    covariance = np.diag(deviations**2)
-
-    def steps(size: float) -> np.ndarray:
-        """Rms step of every input, the largest of all points."""
-        gain, pole = sign * size, filter_pole(size * largest, ringing)
-        spreads = [noise_spread(j, covariance, gain, pole).step for j in jacobians]
-        moved = [b @ s @ b.T for b, s in zip(inverses, spreads, strict=True)]
-        return np.asarray(np.sqrt(np.max([np.diag(m) for m in moved], axis=0)))
-
-    size = _largest_within(lambda one: bool((steps(one) <= budget).all()), 1 / largest)
-    pole = filter_pole(size * largest, ringing)
-    deformation = _with(chosen.deformation, sign * size, pole)
-    own = getattr(deformation, deformation.gain_name, None)
-    name, value = ("effective gain", sign * size) if own is None else (deformation.gain_name, float(own))
-    predicted = dict(zip(problem.plant.inputs, map(float, steps(size)), strict=True))
-    floor = _floor(grid, loops_along(grid, chosen).ideal, inverses[0], covariance)
-    return Suggestion(deformation, sign * size, pole, name, value, predicted, floor)
 
 
 def _budget(problem: Problem, chatter: float | Mapping[str, float]) -> np.ndarray:
@@ -133,59 +130,6 @@ def _budget(problem: Problem, chatter: float | Mapping[str, float]) -> np.ndarra
                 f"suggest(chatter=...): {value!r} for '{name}'; expected a positive rms step per cycle, in the unit of the input"
             )
     return np.array([float(given.get(name, math.inf)) for name in inputs])
-
-
-def _deviations(problem: Problem, noise: Mapping[str, float] | None) -> np.ndarray:
-    """Standard deviation of every controlled coordinate's measured response."""
-    names = problem.plant.controlled_names
-    given = _of_sensors(problem) if noise is None else noise
-    for name, value in given.items():
-        if name not in names:
-            raise InvalidName(f"suggest(noise=...): coordinate '{name}' is not controlled.{nearest(name, names)}")
-        if not 0 <= value < math.inf:
-            raise InvalidValue(
-                f"suggest(noise=...): {value!r} for '{name}'; expected a standard deviation of at least 0"
-            )
-    found = np.array([float(given.get(name, 0.0)) for name in names])
-    if not found.any():
-        raise InvalidValue(
-            "suggest: no response has noise, so no gain chatters; give noise={'"
-            + names[0]
-            + "': ...}, the standard deviation of "
-            "the measured response"
-        )
-    return found
-
-
-def _of_sensors(problem: Problem) -> dict[str, float]:
-    """Deviation of the noise of the sensors that measure responses."""
-    plant, sensing = problem.plant, problem.sensing
-    measured = dict(zip(response_names(plant), plant.controlled_names, strict=True))
-    if sensing.sensors and not set(measured) & set(sensing.estimator.measures(plant)):
-        raise NotSupported(
-            f"suggest: the response is estimated by {type(sensing.estimator).__name__}, whose noise is not white; give "
-            "noise={coordinate: standard deviation of the estimated response}"
-        )
-    times = problem.period * np.arange(_DRAWN)
-    noises = {measured[name]: sensor.noise for name, sensor in sensing.sensors.items() if name in measured}
-    random = np.random.default_rng(0)
-    return {c: float(np.std(n.values(times, random))) for c, n in noises.items() if n is not None}
-
-
-def _along_the_reference(grid: ReviewGrid, believed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Response Jacobians (points, n, n), and the model's inputs per unit of response (points, nu, n), where all are finite."""
-    plant = grid.problem.plant
-    places = np.unique(np.linspace(0, len(grid.times) - 1, _POINTS).astype(int))
-    exact = np.tile(grid.draws[0], (len(places), 1))
-    jacobians = response_jacobians(plant, grid.states[places], grid.requests(believed)[places], exact, believed)
-    slopes, chosen = response_slopes(plant), list(plant.controlled_indices)
-    gains = [np.asarray(slopes(grid.states[k], grid.commands[0, k], believed)[1].full())[chosen] for k in places]
-    usable = [k for k in range(len(places)) if np.isfinite(jacobians[k]).all() and np.isfinite(gains[k]).all()]
-    if not usable:
-        raise NotContractive(
-            "the response Jacobian is finite nowhere along the reference; see whether the problem is well posed"
-        )
-    return jacobians[usable], np.array([np.linalg.inv(gains[k]) for k in usable])
 
 
 def _largest_eigenvalue(jacobians: np.ndarray) -> tuple[float, float]:
@@ -220,12 +164,12 @@ def _with(deformation: Deformation, gain: float, pole: float) -> Deformation:
     return deformation.around(_with(inner, gain, pole))
 
 
-def _floor(grid: ReviewGrid, ideal: LinearLoop | None, inverse: np.ndarray, noise: np.ndarray) -> dict[str, float]:
+def _floor(ideal: LinearLoop | None, noisy: Noisy, problem: Problem) -> dict[str, float]:
     """Rms of the coordinates in the loop with the right model, with noise at the response."""
-    plant = grid.problem.plant
+    plant = problem.plant
     if ideal is None or ideal.radius >= 1:
         return dict.fromkeys(plant.controlled_names, math.nan)
-    entry = ideal.entry @ inverse
-    spread = scipy.linalg.solve_discrete_lyapunov(ideal.dynamics, entry @ noise @ entry.T)
+    entry = ideal.entry @ noisy.inverses[0]
+    spread = scipy.linalg.solve_discrete_lyapunov(ideal.dynamics, entry @ noisy.covariance @ entry.T)
     places = [ideal.state[plant.state.elements.index(c)] for c in plant.controlled_names]
     return {c: float(np.sqrt(spread[k, k])) for c, k in zip(plant.controlled_names, places, strict=True)}
