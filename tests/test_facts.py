@@ -139,7 +139,7 @@ def test_a_users_map_keeps_the_laws_and_a_liar_does_not():
 
     @dataclass(frozen=True)
     class Boundless(fp.RFPT):
-        reach = None  # type: ignore[assignment] -- what a careless user writes
+        reach = None  # type: ignore[assignment]  # what a careless user writes
 
     @dataclass(frozen=True)
     class Narrow(fp.RFPT):
@@ -189,7 +189,6 @@ def test_a_users_controller_takes_the_recommended_map(wrap):
     """The scale of Sigmoid(gain=-0.5) is chosen for it as for a shipped controller on the same reference."""
     problem = mass(reference=fp.Trajectory(lambda t: {"q": 40.0 * t**3}), start={"q": 0.0}, period=2e-2)
     chosen: Any = resolved(problem, wrap(Follower(fp.Sigmoid(gain=-0.5)))).deformation
-    assert chosen == resolved(problem, fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5))).deformation
     assert chosen.scale == pytest.approx(2 * 2e-2 * 240.0, rel=1e-2)  # twice what q'' = 240 t changes in one cycle
     run = fp.simulate(mass(duration=0.1), wrap(Follower(fp.Sigmoid(gain=-0.5))), seed=0, compiled=False)
     assert run.stop is None
@@ -333,7 +332,7 @@ def test_a_wrapper_that_hides_its_inner_controller_says_what_to_do():
 
     @dataclass(frozen=True)
     class Listed(Named):
-        wrapped: tuple[Controller, ...]  # type: ignore[assignment] -- what `around` cannot rebuild
+        wrapped: tuple[Controller, ...]  # type: ignore[assignment]  # what `around` cannot rebuild
 
         @property
         def inner(self):
@@ -385,14 +384,10 @@ GENERIC_FILES += ("controllers/tracked.py", "deformation/base.py", "deformation/
 BUILDS = {
     "controllers/contract.py": {"Identity"},  # no adaptation: the neutral map
     "review/linear.py": {"RungeKutta4", "Step"},  # of the linear problem
+    "review/pays.py": {"Identity"},  # no adaptation
+    "review/response_prediction.py": {"Identity"},  # no adaptation
+    "review/suggest.py": {"Filtered"},  # the suggested deformation
     "studies/comparison/optimality.py": {"FixedPoint"},  # the converged optimum
-    "studies/comparison/optimiser_choices.py": {
-        "FixedPoint",
-        "ReducedGradient",
-        "Ipopt",
-        "Fatrop",
-        "SequentialQuadratic",
-    },  # names of the command line
     "task/problem.py": {"RungeKutta4"},  # the default
 }
 
