@@ -304,6 +304,20 @@ def test_what_counts_as_a_problem_file(text, counts, folder):
     assert unchecked == {}
 
 
+def test_folders_of_a_problems_folder_are_checked_too(tmp_path):
+    """Each with its own baselines and its own reasons for having none; folders without problems are passed over."""
+    inner = tmp_path / "problems" / "gallery"
+    (inner / "baselines").mkdir(parents=True)
+    (tmp_path / "problems" / "notes").mkdir()
+    for path in (tmp_path / "problems" / "one.py", inner / "two.py", inner / "three.py"):
+        path.write_text("problem, controllers = 1, {}")
+    (inner / "baselines" / "gone.json").write_text("{}")
+    (inner / "baselines" / "unchecked.toml").write_text('three = "slow"')
+    found, unchecked = problems_here(tmp_path)
+    assert [str(p.relative_to(tmp_path / "problems")) for p in found] == ["gallery/gone.py", "one.py", "gallery/two.py"]
+    assert unchecked == {"three": "slow"}
+
+
 def test_other_versions_are_told_where_something_changed(folder, capsys):
     """They explain a change; alone they are none."""
     path = folder / "baselines" / "noisy.json"

@@ -23,8 +23,9 @@ for name, run in runs.items():
     print(f"{name:16s} {1e3 * error:.3g} mm")
 
 # %%
-# At each reversal the force must rise to 1.5 N before the sledge moves. Without
-# adaptation it waits until the error is large enough.
+# At each reversal the bristles bend the other way before they slip: friction lags
+# behind the velocity and turns over by 2 N within a twentieth of a second. The model
+# knows nothing of it, so RHC alone learns of it from the error only.
 
 [portrait] = task.pictures
 portrait.draw(plt.figure(figsize=(8, 3), layout="constrained"), runs)

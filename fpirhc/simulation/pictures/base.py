@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-POINTS = 4000  # drawn per line
+INTERVALS = 2000  # of a line over time, each drawn by its two extremes
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +74,17 @@ def label(run: Run, what: str | Quantity) -> str:
     return _literal(f"{name} [{unit}]")
 
 
-def thinned(values: np.ndarray) -> np.ndarray:
-    """Return every n-th value, few enough to draw."""
-    return values[:: max(1, values.shape[0] // POINTS)]
+def extremes(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and values of the extremes of equal intervals in their order; a short series as it is.
+
+    Every n-th value alone would show a command that alternates from cycle to cycle as a smooth line.
+    """
+    if values.size <= 2 * INTERVALS:
+        return times, values
+    edges = np.linspace(0, values.size, INTERVALS + 1).astype(int)
+    parts = [(a, values[a:b]) for a, b in pairwise(edges)]
+    places = np.array([sorted((a + int(np.argmin(v)), a + int(np.argmax(v)))) for a, v in parts]).ravel()
+    return times[places], values[places]
 
 
 def caption_axes(axis: Axes, across: str, up: str) -> None:

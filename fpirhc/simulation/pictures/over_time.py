@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fpirhc.simulation.pictures.base import Picture, Quantity, caption_axes, label, numbers, thinned
+from fpirhc.simulation.pictures.base import Picture, Quantity, caption_axes, extremes, label, numbers
 from fpirhc.simulation.run import Run
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class OverTime(Picture):
             up = ""
             for name, run in runs.items():
                 late = run.time >= self.since
-                axis.plot(thinned(run.time[late]), thinned(numbers(run, what)[late]), lw=1, label=name)
+                axis.plot(*extremes(run.time[late], numbers(run, what)[late]), lw=1, label=name)
                 up = label(run, what)
             for level in self.levels.get(what if isinstance(what, str) else what.name, ()):
                 axis.axhline(level, color="#777777", lw=0.8, ls="--")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fpirhc.simulation.pictures.base import Picture, Quantity, caption_axes, label, numbers, thinned
+from fpirhc.simulation.pictures.base import Picture, Quantity, caption_axes, label, numbers
 from fpirhc.simulation.run import Run
 
 if TYPE_CHECKING:
@@ -44,6 +44,6 @@ class Portrait(Picture):
         panels = figure.subplots(1, len(runs), sharex=True, sharey=True, squeeze=False)[0]
         for axis, (name, run) in zip(np.atleast_1d(panels), runs.items(), strict=True):
             late = run.time >= self.since
-            axis.plot(thinned(numbers(run, self.x)[late]), thinned(numbers(run, self.y)[late]), lw=0.8)
+            axis.plot(numbers(run, self.x)[late], numbers(run, self.y)[late], lw=0.8)
             axis.set_title(name, fontsize=10)
             caption_axes(axis, label(run, self.x), label(run, self.y))

@@ -1,0 +1,139 @@
+"""Pictures that a problem wants: what they draw is what the runs hold, and a mistake in one spoils neither file nor report."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import fpirhc as fp
+from fpirhc.errors import InvalidName, ProblemFileError
+from fpirhc.report.wanted import wanted_pictures
+from fpirhc.simulation.pictures.base import extremes
+from fpirhc.simulation.pictures.raster import passages
+
+
+def spring(time=1.0):
+    """A mass on a spring that follows two periods of a sine."""
+    plant = fp.Plant(
+        coordinates={"q": "m"},
+        inputs={"u": "N"},
+        order=2,
+        response=lambda q, v, u, p: {"q": (u.u - q.q) / p.mass},
+        parameters={"mass": fp.Parameter(approximate=1.2, exact=1.0, unit="kg")},
+    )
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"q": ca.sin(4 * ca.pi * t)}),
+        start={"q": 0.0, "q'": 4 * np.pi},
+        period=1e-3,
+        duration=time,
+    )
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """Two controllers on the spring."""
+    controllers = {
+        "slow": fp.ComputedTorque(fp.Exponential(rate=5.0)),
+        "quick": fp.ComputedTorque(fp.Exponential(rate=20.0)),
+    }
+    return {n: fp.simulate(spring(), c, seed=0, compiled=False) for n, c in controllers.items()}
+
+
+ENERGY = fp.Quantity("energy", "J", lambda run: 0.5 * (run["state.q"] ** 2 + run["state.q'"] ** 2))
+
+
+def test_a_line_over_time_is_the_signal(runs):
+    """One panel per signal, one line per run, with its numbers; levels are horizontal lines; times in the problem's unit."""
+    figure = Figure()
+    fp.OverTime("t", panels=("command.u", ENERGY), levels={"energy": (3.0,)}, time="days", since=0.25).draw(
+        figure, runs
+    )
+    upper, lower = figure.axes
+    np.testing.assert_array_equal(upper.lines[1].get_ydata(), runs["quick"]["command.u"][250:])
+    np.testing.assert_array_equal(lower.lines[0].get_ydata(), ENERGY.values(runs["slow"])[250:])
+    assert lower.lines[2].get_ydata()[0] == 3.0
+    assert (upper.get_ylabel(), lower.get_ylabel()) == ("u [N]", "energy [J]")
+    assert lower.get_xlabel() == "time [days]"
+
+
+def test_an_alternating_command_is_drawn_as_wide_as_it_is():
+    """Extremes of intervals, not every n-th value; in their order, and nothing but values of the series."""
+    times = np.arange(20_000) * 1e-3
+    values = np.where(np.arange(20_000) % 2, 60.0, -60.0) * (times > 5)
+    when, what = extremes(times, values)
+    assert what.size == 4000
+    assert np.all(np.diff(when) >= 0)
+    assert (what[-100:].min(), what[-100:].max()) == (-60.0, 60.0)
+    np.testing.assert_array_equal(what, values[np.searchsorted(times, when)])
+    assert extremes(times[:10], values[:10])[0].size == 10
+
+
+def test_a_portrait_has_a_panel_for_each_run(runs):
+    """Y over x with their units."""
+    figure = Figure()
+    fp.Portrait("p", x="state.q", y="state.q'").draw(figure, runs)
+    assert [a.get_title() for a in figure.axes] == ["slow", "quick"]
+    np.testing.assert_array_equal(figure.axes[0].lines[0].get_xdata(), runs["slow"]["state.q"])
+    assert figure.axes[0].get_ylabel() == "q' [m/s]"
+
+
+def test_a_raster_counts_passages_upwards(runs):
+    """Two sines pass half their height twice upwards; a signal that begins above has not passed."""
+    figure = Figure()
+    fp.Raster("r", signal="reference.q", threshold=0.5, time="ms").draw(figure, runs)
+    assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ["slow (2)", "quick (2)"]
+    times = np.arange(6.0)
+    np.testing.assert_array_equal(passages(times, np.array([2.0, 0, 2, 2, 1, 3]), 1.0), [2.0, 5.0])
+
+
+def test_an_unknown_signal_is_named(runs):
+    """With the nearest one."""
+    with pytest.raises(InvalidName, match=r"'state\.p'.*state\.q"):
+        fp.Portrait("p", x="state.p", y="state.q").draw(Figure(), runs)
+
+
+FILE = '''"""A spring."""
+from test_pictures import spring
+import fpirhc as fp
+problem = spring(0.05)
+controllers = {"CTC": fp.ComputedTorque(fp.Exponential(rate=5.0))}
+pictures = (%s,)
+'''
+
+
+@pytest.mark.parametrize(
+    ("written", "said"),
+    [
+        ("'phase'", r"pictures must hold pictures such as Portrait\(\.\.\.\), got 'phase'"),
+        ("fp.Portrait('p', x='state.q', y='state.q', controllers=('CTX',))", r"picture 'p': controller 'CTX'.*CTC"),
+    ],
+)
+def test_mistakes_in_a_file_are_told_when_it_is_loaded(written, said, tmp_path, monkeypatch):
+    """What is no picture, and controllers that are not there."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    path = tmp_path / "spring.py"
+    path.write_text(FILE % written)
+    with pytest.raises(ProblemFileError, match=said):
+        fp.load_problem(str(path))
+
+
+def test_a_picture_that_cannot_be_drawn_leaves_the_report_whole(tmp_path, monkeypatch):
+    """Its place says why; one whose controllers did not run is left out; without pictures there is no section."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    path = tmp_path / "spring.py"
+    path.write_text(
+        FILE % "fp.Portrait('good', x='state.q', y='error.q'), fp.Portrait('bad', x='state.p', y='state.q')"
+    )
+    comparison = fp.compare(fp.load_problem(str(path)), seed=0, compiled=False)
+    page = wanted_pictures(comparison)
+    assert page.count("<img") == 1
+    assert "bad is not drawn" in page
+    absent = replace(comparison.pictures[0], controllers=("RHC",))
+    assert wanted_pictures(replace(comparison, pictures=(absent,))) == ""
+    assert wanted_pictures(replace(comparison, pictures=())) == ""
