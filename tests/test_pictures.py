@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -57,7 +58,7 @@ def test_a_line_over_time_is_the_signal(runs):
     upper, lower = figure.axes
     np.testing.assert_array_equal(upper.lines[1].get_ydata(), runs["quick"]["command.u"][250:])
     np.testing.assert_array_equal(lower.lines[0].get_ydata(), ENERGY.values(runs["slow"])[250:])
-    assert lower.lines[2].get_ydata()[0] == 3.0
+    assert np.asarray(lower.lines[2].get_ydata())[0] == 3.0
     assert (upper.get_ylabel(), lower.get_ylabel()) == ("u [N]", "energy [J]")
     assert lower.get_xlabel() == "time [days]"
 
@@ -134,6 +135,7 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_report_whole(tmp_path, monkey
     page = wanted_pictures(comparison)
     assert page.count("<img") == 1
     assert "bad is not drawn" in page
-    absent = replace(comparison.pictures[0], controllers=("RHC",))
+    first: Any = comparison.pictures[0]
+    absent = replace(first, controllers=("RHC",))
     assert wanted_pictures(replace(comparison, pictures=(absent,))) == ""
     assert wanted_pictures(replace(comparison, pictures=())) == ""
