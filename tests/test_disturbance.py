@@ -35,7 +35,9 @@ class Sawtooth(Disturbance):
 
 
 @pytest.mark.parametrize(
-    "disturbance", [fp.Step(0.3, -3.0), fp.Pulse(0.2, 0.7, 2.0), fp.Sine(2.0, 0.7, 0.3), Sawtooth()], ids=repr
+    "disturbance",
+    [fp.Step(0.3, -3.0), fp.Pulse(0.2, 0.7, 2.0), fp.Sine(2.0, 0.7, 0.3), Sawtooth()],
+    ids=lambda d: type(d).__name__,
 )
 def test_jump_and_slew_are_the_largest_changes(disturbance):
     """Between close samples no value changes by more than the slew says and one jump more; the largest of each does happen."""
