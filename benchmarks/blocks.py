@@ -59,6 +59,9 @@ LOOPS: dict[str, tuple[Problem, Controller]] = {
     "plain loop": (PROBLEM, computed_torque(MAP)),
     "dead time of inputs and measurement (4 cycles)": (LATE, computed_torque(MAP)),
     "`Increment` (4 cycles)": (PROBLEM, computed_torque(fp.Increment(MAP, cycles=4))),
+    "`ModelReferenced`": (PROBLEM, computed_torque(fp.ModelReferenced(MAP))),
+    "`ModelReferenced` (4 cycles)": (PROBLEM, computed_torque(fp.ModelReferenced(MAP, cycles=4))),
+    "`ModelReferenced` through a lag": (PROBLEM, computed_torque(fp.ModelReferenced(MAP, lag=1e-2))),
     "`SelfPaired` (at most 10 cycles)": (PROBLEM, computed_torque(fp.SelfPaired(MAP, most=10))),
     "`Predicted` by the model (3 cycles)": (EQUALLY_LATE, fp.Predicted(computed_torque(MAP), inputs=3e-3)),
     "`Predicted` by desired (3 cycles)": (
@@ -66,6 +69,7 @@ LOOPS: dict[str, tuple[Problem, Controller]] = {
         fp.Predicted(computed_torque(MAP), inputs=3e-3, by=fp.ByDesired()),
     ),
     "sensors and `SavitzkyGolay`": (SEEN, computed_torque(fp.Affine(gain=-0.1))),
+    "the same, `ModelReferenced` with its twin": (SEEN, computed_torque(fp.ModelReferenced(fp.Affine(gain=-0.1)))),
     "`Filtered`": (PROBLEM, computed_torque(fp.Filtered(MAP, pole=0.5))),
     "`Tuned`": (PROBLEM, computed_torque(fp.Tuned(MAP, largest_gain=0.5))),
     "`Damped`": (PROBLEM, computed_torque(fp.Damped(MAP))),

@@ -32,6 +32,7 @@ from fpirhc.controllers.gain_check import check_gain_sign
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.problem_files.problem_file import shipped_problems
+from fpirhc.review.form import recommended_form
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
 
@@ -229,8 +230,16 @@ def main() -> None:
             rows.append(shown(name, values, mark=condition != "exact"))
             _count(wins, condition, values)
         write_table(f"forms {condition}", heads, rows, PAGE)
+    advice = [[name, *_advice(task(name))] for name in names]
+    write_table("forms review", ["problem", "as shipped", "dead time", "lag"], advice, PAGE)
     summary = [[form, *(str(v) for v in counts.values())] for form, counts in wins.items()]
     write_table("forms wins", ["best or within 10 % of the best", *CONDITIONS], summary, PAGE)
+
+
+def _advice(one: Task) -> list[str]:
+    """What a review recommends in three of the conditions."""
+    tasks = [one, late(one), lagging(one)]
+    return ["–" if t is None else recommended_form(t.problem)[0] for t in tasks]
 
 
 def _count(wins: dict[str, dict[str, int]], condition: str, values: list[float]) -> None:

@@ -18,6 +18,7 @@ import fpirhc as fp
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import NotSupported
 from fpirhc.problem_files.problem_file import shipped_problems
+from fpirhc.review.form import recommended_form, right_form
 from fpirhc.symbolic.block import Block
 
 LAW = fp.Exponential(rate=6.0)
@@ -322,6 +323,13 @@ def test_controllers_that_cannot_use_it():
         fp.simulate(module.problem, late, seed=0)
 
 
+def test_a_plan_has_no_model_beside_it():
+    """As the map of an optimiser the form is refused, with what to use."""
+    planner = fp.FixedPoint(iterations=1, map=fp.ModelReferenced(fp.Affine(gain=-2.0)), tolerance=1e-2)
+    with pytest.raises(NotSupported, match=r"FixedPoint\(map=ModelReferenced.*use the map inside"):
+        fp.simulate(short(TWO_MASS.problem, 10), fp.RecedingHorizon(planner), seed=0)
+
+
 def test_the_stored_request_is_not_read():
     """The form costs no memory of the last request: the blocks of the loop do not read it."""
     blocks, _ = fp.ComputedTorque(LAW, fp.ModelReferenced(affine(0.5))).blocks(TWO_MASS.problem)
@@ -340,3 +348,16 @@ def test_guard_lets_it_pass():
     tripped = tight["adaptation_event"].ravel() == 3
     assert tripped.any()
     np.testing.assert_array_equal(tight["deformed"][tripped], tight["desired"][tripped])
+
+
+def test_review_says_which_form():
+    """Advice with a reason: model-referenced, but plain where the response is estimated late; never a no."""
+    expected = {"two_mass": "model-referenced", "delayed_mass": "model-referenced", "three_link_arm": "plain"}
+    for name, form in expected.items():
+        module = fp.load_problem(name)
+        assert recommended_form(module.problem)[0] == form
+    assert right_form(TWO_MASS.problem, fp.ModelReferenced(affine(0.5))).verdict == "yes"
+    advice = right_form(TWO_MASS.problem, affine(0.5))
+    assert advice.verdict == "unknown"
+    assert "it is plain; measurements speak for model-referenced" in advice.found
+    assert advice.change.startswith("Try ModelReferenced")

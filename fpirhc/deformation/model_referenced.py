@@ -30,7 +30,7 @@ from fpirhc.deformation.base import Deformation, Mirror, Pairing
 from fpirhc.deformation.leaky import check_pole, chosen_pole
 from fpirhc.deformation.queue import Cycles, Queue, check_cycles, check_uncertainty, every
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
-from fpirhc.errors import InvalidValue
+from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 _FINITE = 1e300
@@ -138,6 +138,19 @@ class ModelReferenced(Wrapper):
     @property
     def _queue(self) -> Queue:
         return Queue(self._delays)
+
+
+def require_own_requests(owner: str, deformation: Deformation) -> None:
+    """Check that a map may be given its own last request, as a plan has nothing else.
+
+    Raises:
+        NotSupported: a model-referenced form.
+    """
+    if deformation.mirror is not None:
+        raise NotSupported(
+            f"{owner}(map={type(deformation).__name__}(...)): a model-referenced form compares a plant with its model, and a "
+            "plan's gradient has no model beside it; use the map inside"
+        )
 
 
 def form_inside(deformation: Deformation) -> Deformation | None:

@@ -40,6 +40,7 @@ import numpy as np
 
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.model_referenced import require_own_requests
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.horizon.augmented_lagrangian import augmented
 from fpirhc.horizon.hessian_models import GaussNewton, HessianModel, hessian_end, hessian_stage, linear_stage
@@ -117,8 +118,10 @@ class FixedPoint(Optimiser):
         """Raise if the cost is not convex along the reference, or the tolerance cannot be met.
 
         Raises:
-            NotSupported: a quadratic model of such a cost has no minimum. InvalidValue: a tolerance below the rounding of inputs.
+            NotSupported: a quadratic model of such a cost has no minimum; a model-referenced map.
+            InvalidValue: a tolerance below the rounding of inputs.
         """
+        require_own_requests("FixedPoint", self.map)
         reach = np.abs(np.concatenate([ocp.input_lower, ocp.input_upper, ocp.nodes[1].ravel()]))
         rounding = _DIGITS * float(reach[np.isfinite(reach)].max(initial=0.0))
         if self.tolerance < rounding:

@@ -21,6 +21,7 @@ import numpy as np
 
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.model_referenced import require_own_requests
 from fpirhc.errors import NotContractive, NotSupported
 from fpirhc.horizon.auxiliary import auxiliary_gradient, auxiliary_hessian
 from fpirhc.horizon.problem import OptimalControl
@@ -69,6 +70,7 @@ class FullSpaceFixedPoint(Optimiser):
                 "FullSpaceFixedPoint serves problems without limits only (it is a baseline); for limits use FixedPoint()"
             )
         if self.map is not None:
+            require_own_requests("FullSpaceFixedPoint", self.map)
             largest = 2 / _scaling(ocp, self.scaled)[1] ** 2
             gain = max(self.map.secant_gain(), self.map.effective_gain(), key=abs)
             if not 0 < gain < largest:

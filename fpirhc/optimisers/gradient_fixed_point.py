@@ -19,6 +19,7 @@ import casadi as ca
 
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.model_referenced import require_own_requests
 from fpirhc.errors import NotContractive, NotSupported
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.reference_expansion import steepest_curvature
@@ -73,6 +74,7 @@ class GradientFixedPoint(Optimiser):
             raise NotSupported("GradientFixedPoint keeps input limits only; for state limits use FixedPoint()")
         largest = 2 / _steepest(ocp)
         chosen = self._map(ocp)
+        require_own_requests("GradientFixedPoint", chosen)
         gain = max(chosen.secant_gain(), chosen.effective_gain(), key=abs)
         if not 0 < gain < largest:
             raise NotContractive(

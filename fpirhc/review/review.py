@@ -12,6 +12,7 @@ from fpirhc.review.answer import Answer, Review, Verdict
 from fpirhc.review.chatter import chatter_small
 from fpirhc.review.commands import commands_inside
 from fpirhc.review.convergence import box_converges, converges
+from fpirhc.review.form import right_form
 from fpirhc.review.gain import gain_admissible
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.horizon import horizon_long_enough
@@ -98,7 +99,8 @@ def _of_map(grid: ReviewGrid, controller: Controller, loops: Loops, general: lis
         free_of_two_cycles(grid, controller, loops),
     ]
     known = [a for a in (*law, chatter_small(grid, controller)) if a is not None]
-    return [verdict, box_converges(loops), *gains, *suited, *known, pays(grid, controller)]
+    form = right_form(grid.problem, deformation)
+    return [verdict, box_converges(loops), *gains, *suited, *known, form, pays(grid, controller)]
 
 
 def _speed_and_range(grid: ReviewGrid, controller: Controller, loops: Loops) -> list[Answer]:

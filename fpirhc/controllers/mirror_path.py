@@ -1,0 +1,105 @@
+"""The believed way of the commands to the model: dead time of every input, then the actuators' lag."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+
+from fpirhc.deformation.base import Mirror
+from fpirhc.deformation.queue import Queue, every
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.layout import Expression, Signal, scalar
+from fpirhc.task.problem import Problem
+
+MEASURED = "_measured_state"  # the state that the response belongs to, where a controller may act on a predicted one
+NONE = 1e-9  # a fraction of a cycle below this is none
+
+
+def measured_state(plant: Plant) -> Signal:
+    """The signal of the measured state."""
+    return Signal(MEASURED, plant.state.elements, plant.state.units)
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """The believed way from the commands to the model.
+
+    `counts`: whether the first cycles differ from the others. The whole cycles of the measurement's dead time are put before the
+    model: the twin lives in the time of the samples.
+    """
+
+    problem: Problem
+    mirror: Mirror
+    counts: bool
+
+    @property
+    def late(self) -> int:
+        """Whole cycles of the measurement's dead time."""
+        return math.floor(self.mirror.measurement + NONE)
+
+    @property
+    def fraction(self) -> float:
+        """What is left of it, in cycles."""
+        rest = self.mirror.measurement - self.late
+        return rest if rest > NONE else 0.0
+
+    @property
+    def decays(self) -> tuple[float, ...]:
+        """Share of an actuator's distance from its command that is left after one cycle; empty where none lags."""
+        taus = every(self.mirror.lag)
+        return tuple(math.exp(-self.problem.period / t) if t else 0.0 for t in taus) if any(taus) else ()
+
+    @property
+    def queue(self) -> Queue:
+        """Of the commands; the newest one is that of the last cycle."""
+        if isinstance(self.mirror.cycles, tuple):
+            return Queue(tuple(c + self.late for c in self.mirror.cycles))
+        return Queue(self.mirror.cycles + self.late)
+
+    @property
+    def memory(self) -> tuple[Signal, ...]:
+        """Commands on their way, what lagging actuators do, and the cycles so far."""
+        plant, length = self.problem.plant, self.queue.length
+        start = tuple(self.problem.dead_time.commands_before(plant))
+        names = tuple(f"{e}@{k}" for k in range(1, length) for e in plant.input.elements)
+        queued = (Signal("mirror_commands", names, start=start * (length - 1)),) if length > 1 else ()
+        lagging = (Signal("mirror_actuators", plant.input.elements, plant.input.units, start),) if self.decays else ()
+        counted = (scalar("mirror_cycles"),) if self.counts else ()
+        return (*queued, *lagging, *counted)
+
+    @property
+    def reads(self) -> tuple[Signal, ...]:
+        """What every mirror reads."""
+        plant = self.problem.plant
+        before = Signal("_command_before", plant.input.elements, plant.input.units)
+        return measured_state(plant), before, plant.parameter
+
+    def acted(self, s: Signals) -> tuple[Expression, Expression, dict[str, Expression]]:
+        """What acted in the last cycle: at its end, in the mean, and what is remembered."""
+        size, newest = self.problem.plant.input.size, s._command_before
+        remembered: dict[str, Expression] = {}
+        if self.counts:
+            first = ca.DM(self.problem.dead_time.commands_before(self.problem.plant))
+            newest = ca.if_else(s.mirror_cycles < 0.5, first, newest)
+            remembered["mirror_cycles_next"] = ca.fmin(s.mirror_cycles + 1, self.late + 1)
+        column = newest
+        if self.queue.length > 1:
+            column = ca.vertcat(newest, s.mirror_commands)
+            remembered["mirror_commands_next"] = column[: size * (self.queue.length - 1)]
+        arrived = self.queue.delayed(column, size)
+        if not self.decays:
+            return arrived, arrived, remembered
+        decay = ca.DM(self.decays) if len(self.decays) > 1 else self.decays[0]
+        share = ca.DM(_mean_shares(every(self.mirror.lag), self.problem.period))
+        away = s.mirror_actuators - arrived
+        end = arrived + decay * away
+        return end, arrived + share * away, {**remembered, "mirror_actuators_next": end}
+
+
+def _mean_shares(taus: Sequence[float], period: float) -> list[float]:
+    """Mean over one cycle of what is left of an actuator's distance from its command: (tau / T) (1 - e^(-T / tau))."""
+    return [t / period * -math.expm1(-period / t) if t else 0.0 for t in taus]

@@ -1,0 +1,155 @@
+"""A twin of the plant: what the estimator would show if the plant were the model.
+
+The twin is the model with the deformation taken off, f^(x, u) - delta, which is what the plant is believed to do, integrated over
+the cycle; its samples pass the estimator that the plant's pass. What the estimator makes of delta is added again. With an exact
+model delta is zero and both estimates are the same number, late, rounded and smoothed as they are.
+
+A twin would drift away from the plant. So after each cycle it is put where its own estimate of the state is the controller's, and
+what the estimator remembers of it is moved along the same path, a polynomial below the plant's order, which no estimate of the
+response sees: the twin's response is always the model's, and never that of the move.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.controllers.mirror_path import MEASURED, Path
+from fpirhc.plant.plant import Plant
+from fpirhc.sensing.base import response_names
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.expression import Signals, expression, total
+from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.task.problem import Problem
+
+BEFORE = "_deformation_before"
+_FINITE = 1e300
+
+
+def twin_block(path: Path) -> Block:
+    """Block (measured state, last command, last deformation, parameters) -> the twin's estimated response and the deformation's."""
+    problem, plant = path.problem, path.problem.plant
+    start, names = problem.start_state, problem.sensing.estimator.measures(plant)
+    estimate = problem.sensing.estimator.block(plant, problem.period, start, Signal("_seen", names))
+    own = tuple(Signal(f"mirror_{m.name}", m.elements, m.units, m.start) for m in estimate.memory.signals)
+    twin = Signal("mirror_state", plant.state.elements, plant.state.units, tuple(map(float, start)))
+    seen, calm = _seen(problem, names), np.zeros(len(plant.names))
+    resting = np.asarray(seen(start, np.zeros(plant.input.size), plant.approximate, calm).full()).ravel()
+    late = (Signal("mirror_sample", names, start=tuple(map(float, resting))),) if path.fraction else ()
+    advance, moves, past = (
+        problem.integrator.step(plant, problem.period),
+        _Moves(problem, names, path),
+        _Deformations(path),
+    )
+
+    def step(s: Signals) -> dict[str, Expression]:
+        end, mean, remembered = path.acted(s)
+        acting, answered, following = past.seen(s)
+        waits = s.mirror_cycles < path.late + 0.5  # the samples still show the start
+        at = ca.if_else(waits, s.mirror_state, advance(s.mirror_state, mean, s.parameters, -acting))
+        sample = seen(at, end, s.parameters, -acting)
+        arrived = (1 - path.fraction) * sample + path.fraction * s.mirror_sample if late else sample
+        state, response, *memories = estimate.function(arrived, *(getattr(s, m.name) for m in own))
+        away = getattr(s, MEASURED) - state
+        # What is not finite must not be remembered.
+        move = ca.if_else(ca.mmin(ca.fabs(away) <= _FINITE), away, 0)
+        remembered |= {"mirror_state_next": at + moves.state @ move, **following}
+        if late:
+            remembered["mirror_sample_next"] = sample + moves.sample @ move
+        for signal, value, matrix in zip(own, memories, moves.memory, strict=True):
+            remembered[f"{signal.name}_next"] = value + matrix @ move
+        return {"_modelled": response + answered, **remembered}
+
+    writes, memory = (
+        Layout((plant.response_signal("_modelled"),)),
+        Layout((*path.memory, past.memory, twin, *late, *own)),
+    )
+    reads = Layout((*path.reads, plant.response_signal(BEFORE)))
+    return Block("mirror", reads, writes, step, memory, opaque=problem.integrator.opaque)
+
+
+class _Deformations:
+    """Deformations of earlier cycles: the one that acts, and what the estimator shows of them."""
+
+    def __init__(self, path: Path) -> None:
+        plant = path.problem.plant
+        self._plant, self._names = plant, plant.controlled_names
+        self._acting = path.queue
+        estimator, period = path.problem.sensing.estimator, path.problem.period
+        every_weight = [estimator.weights(plant.orders[k], period) for k in plant.controlled_indices]
+        self._weights = [np.convolve(w, [1 - path.fraction, path.fraction]) for w in every_weight]
+        self._length = max(max(w.size for w in self._weights) - 1, 1) + self._acting.length - 1
+
+    @property
+    def memory(self) -> Signal:
+        return Signal("mirror_deformations", tuple(f"{e}@{k}" for k in range(1, self._length + 1) for e in self._names))
+
+    def seen(self, s: Signals) -> tuple[Expression, Expression, dict[str, Expression]]:
+        """The forcing of every coordinate that stands for the acting deformation, its estimated response, what is remembered."""
+        size = len(self._names)
+        column = ca.vertcat(getattr(s, BEFORE), s.mirror_deformations)
+        late = [self._acting.delayed(column[size * j :], size) for j in range(max(w.size for w in self._weights))]
+        answered = [
+            total(v * late[j][k] for j, v in enumerate(weights) if v != 0) for k, weights in enumerate(self._weights)
+        ]
+        forcing: list[Expression] = [expression(0.0)] * len(self._plant.names)
+        for place, value in zip(self._plant.controlled_indices, ca.vertsplit(late[0]), strict=True):
+            forcing[place] = value
+        kept = {"mirror_deformations_next": column[: size * self._length]}
+        return ca.vertcat(*forcing), ca.vertcat(*answered), kept
+
+
+def _seen(problem: Problem, names: Sequence[str]) -> ca.Function:
+    """Function (state, command that acted, parameters, forcing) -> what the sensors show without noise, rounded as they round."""
+    plant = problem.plant
+    x, u, p = plant._symbols()
+    w = ca.SX.sym("w", len(plant.names))
+    values = dict(zip(plant.state.elements, ca.vertsplit(x), strict=True))
+    answered = plant.controlled_response_function(x, u, p) + w[list(plant.controlled_indices)]
+    values |= dict(zip(response_names(plant), ca.vertsplit(answered), strict=True))
+    entries = []
+    for name in names:
+        sensor = problem.sensing.sensors.get(name)
+        quantum = sensor.quantum if sensor is not None else None
+        entries.append(values[name] if quantum is None else quantum * ca.floor(values[name] / quantum + 0.5))
+    return ca.Function("fpirhc_mirror_seen", [x, u, p, w], [ca.densify(ca.vertcat(*entries))])
+
+
+class _Moves:
+    """Matrices that turn a move of the estimated state into moves of the twin and of what its estimator remembers."""
+
+    def __init__(self, problem: Problem, names: Sequence[str], path: Path) -> None:
+        plant, period = problem.plant, problem.period
+        self.state = ca.DM(_drift(plant, path.fraction * period))
+        places = {e: k for k, e in enumerate(plant.state.elements)}
+        rows = [np.asarray(self.state)[places[n]] if n in places else np.zeros(plant.state.size) for n in names]
+        self.sample = ca.DM(np.array(rows))
+        ahead = _drift(plant, period)
+        # What is remembered at a start is linear in the start; a cycle later the start would have been on the same path.
+        columns = [
+            _remembered(problem, names, unit) for unit in (np.zeros(plant.state.size), *np.eye(plant.state.size))
+        ]
+        self.memory = [
+            ca.DM(np.column_stack([c[k] - columns[0][k] for c in columns[1:]]) @ ahead) for k in range(len(columns[0]))
+        ]
+
+
+def _remembered(problem: Problem, names: Sequence[str], start: np.ndarray) -> list[np.ndarray]:
+    """What the estimator remembers at a start, signal by signal."""
+    block = problem.sensing.estimator.block(problem.plant, problem.period, start, Signal("_seen", tuple(names)))
+    return [m.start_vector() for m in block.memory.signals]
+
+
+def _drift(plant: Plant, time: float) -> np.ndarray:
+    """Matrix by which a state moves in that time while all highest derivatives are zero: Taylor's formula."""
+    elements = plant.state.elements
+    found = np.zeros((len(elements), len(elements)))
+    for k, element in enumerate(elements):
+        for j, other in enumerate(elements):
+            power = len(other) - len(element)
+            if other.rstrip("'") == element.rstrip("'") and power >= 0:
+                found[k, j] = time**power / math.factorial(power)
+    return found

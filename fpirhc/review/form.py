@@ -1,0 +1,48 @@
+"""Which form of the iteration a problem wants."""
+
+from __future__ import annotations
+
+from fpirhc.deformation.base import Deformation
+from fpirhc.review.answer import Answer, Verdict
+from fpirhc.task.problem import Problem
+
+PLAIN, INCREMENT, REFERENCED = "plain", "increment", "model-referenced"
+_TRY = {
+    PLAIN: "Try the map itself.",
+    INCREMENT: "Try Increment(map, cycles=problem.response_delay).",
+    REFERENCED: "Try ModelReferenced(map, cycles=...).",
+}
+LATE = 1.0  # cycles of an estimator's delay, beyond which what the model is wrong by is known too late
+
+
+def recommended_form(problem: Problem) -> tuple[str, str]:
+    """Return the form that the measurements of docs/which-form.md speak for, and why."""
+    delay = problem.sensing.delay(problem.plant, problem.period)
+    waits = bool(problem.dead_time.measurement or any(problem.dead_time.inputs.values()))
+    if delay > LATE:
+        why = f"the response is estimated {delay:.3g} cycles late"
+        corrected = f"{why}, and the plain form corrects the lateness too"
+        return (INCREMENT, f"{why} after a dead time, in which the plain form swings") if waits else (PLAIN, corrected)
+    if waits:
+        return REFERENCED, "told of the dead time it leaks, and leaves an exact model alone"
+    return REFERENCED, "it leaves an exact model alone whatever the period and the plant's drift"
+
+
+def form_of(deformation: Deformation) -> str:
+    """The form in use."""
+    if deformation.mirror is not None:
+        return REFERENCED
+    if not deformation.slows_desired:
+        return INCREMENT
+    return PLAIN if deformation.pairing is None else "paired"
+
+
+def right_form(problem: Problem, deformation: Deformation) -> Answer:
+    """Whether the form in use is the recommended one; advice, so never no."""
+    question = "Is it the form of the iteration that the problem wants?"
+    form, why = recommended_form(problem)
+    used = form_of(deformation)
+    text = f"it is {used}; measurements speak for {form}, because {why}"
+    if used == form:
+        return Answer(question, Verdict.YES, f"it is {used}: {why}")
+    return Answer(question, Verdict.UNKNOWN, text, _TRY[form])
