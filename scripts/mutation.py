@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import json
 import os
 import random
 import shlex
@@ -15,20 +16,24 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from difflib import unified_diff
 from itertools import chain, zip_longest
 from pathlib import Path
+from subprocess import PIPE
+from typing import Any
 
 from cosmic_ray.commands.init import init
-from cosmic_ray.mutating import mutate_and_test
+from cosmic_ray.mutating import use_mutation
+from cosmic_ray.plugins import get_operator
 from cosmic_ray.work_db import use_db
-from cosmic_ray.work_item import TestOutcome, WorkItem
+from cosmic_ray.work_item import WorkItem
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE, SURVIVORS = ROOT / "docs/mutation.md", ROOT / "results/mutation"
+SPARE, FACTOR = 20.0, 4.0  # s, and times the time without a fault: from which the tests are taken to hang
 BEGIN, END = "<!-- table: written by scripts/mutate -->", "<!-- end of the table -->"
 HEAD = "| module | faults there | tried | killed | survived | score | seed | tests |\n|---|--:|--:|--:|--:|--:|--:|---|"
 
@@ -61,11 +66,16 @@ def main() -> int:
         _copy_checkout(Path(folder))
         os.chdir(folder)
         os.environ |= {"PYTHONPATH": folder, "PYTHONDONTWRITEBYTECODE": "1"}
-        print(HEAD)
-        for module, tests in targets:
-            row = _try_module(module, tests, options)
-            print(row, flush=True)
-            _write(row)
+        # A changed file has a new time, so that its compiled form is not used.
+        subprocess.run([options.python, "-m", "compileall", "-q", "fpirhc"], check=True)
+        with subprocess.Popen(
+            [options.python, str(ROOT / "scripts/mutation_worker.py")], stdin=PIPE, stdout=PIPE, text=True
+        ) as process:
+            print(HEAD)
+            for module, tests in targets:
+                row = _try_module(module, tests, options, Worker(process))
+                print(row, flush=True)
+                _write(row)
     return 0
 
 
@@ -97,30 +107,46 @@ def _copy_checkout(folder: Path) -> None:
             shutil.copy2(ROOT / name, folder / name)
 
 
-def _try_module(module: str, tests: str, options: argparse.Namespace) -> Row:
-    command = f"{shlex.quote(options.python)} -m pytest -x -q -p no:xdist -p no:cacheprovider --lane quick {tests}"
-    limit = 20 + 4 * _seconds(command)
+def _try_module(module: str, tests: str, options: argparse.Namespace, worker: Worker) -> Row:
+    arguments = ["-x", "-q", "-p", "no:xdist", "-p", "no:cacheprovider", "--lane", "quick", *shlex.split(tests)]
+    sound = worker.run(arguments, 600.0)
+    if not sound["passed"]:  # else every fault would count as noticed
+        raise SystemExit(f"the tests fail without a fault: pytest {shlex.join(arguments)}\n{sound['output']}")
     faults = _faults(module)
     sample = _sample(faults, options.sample, random.Random(f"{options.seed} {module}"))
-    survivors = []
-    for item in sample:
-        result = mutate_and_test(item.mutations, command, limit)
-        if result.test_outcome is None or result.test_outcome is TestOutcome.INCOMPETENT:
-            raise SystemExit(f"{module}: a fault could not be tried: {result.output}")
-        if result.test_outcome is TestOutcome.SURVIVED:
-            survivors.append(str(result.diff))
+    limit = SPARE + FACTOR * sound["seconds"]
+    survivors = [diff for diff in (_survivor(item, arguments, limit, worker) for item in sample) if diff]
     report = SURVIVORS / (module.removesuffix(".py").replace("/", ".") + ".diff")
     report.write_text("\n".join(survivors), encoding="utf-8")
     return Row(module, len(faults), len(sample), len(sample) - len(survivors), options.seed, tests)
 
 
-def _seconds(command: str) -> float:
-    """How long the tests take on the module as it is; they must pass, or every fault would count as noticed."""
-    begin = time.monotonic()
-    outcome = subprocess.run(shlex.split(command), capture_output=True, text=True, check=False)
-    if outcome.returncode:
-        raise SystemExit(f"the tests fail without a fault:\n{command}\n{outcome.stdout[-4000:]}{outcome.stderr[-2000:]}")
-    return time.monotonic() - begin
+def _survivor(item: WorkItem, arguments: Sequence[str], limit: float, worker: Worker) -> str:
+    """The fault as a difference of texts where the tests pass all the same; empty where one of them fails."""
+    [fault] = item.mutations
+    operator = get_operator(fault.operator_name)(**fault.operator_args)
+    with use_mutation(fault.module_path, operator, fault.occurrence) as (before, after):
+        if after is None:
+            raise SystemExit(f"{fault.module_path}: {fault.operator_name} {fault.occurrence} cannot be made")
+        if not worker.run(arguments, limit)["passed"]:
+            return ""
+    path = fault.module_path.as_posix()
+    return "\n".join(unified_diff(before.splitlines(), after.splitlines(), path, path, n=0, lineterm=""))
+
+
+@dataclass(frozen=True)
+class Worker:
+    """The process that runs the tests; see `mutation_worker`."""
+
+    process: subprocess.Popen[str]
+
+    def run(self, arguments: Sequence[str], limit: float) -> dict[str, Any]:
+        """Whether the tests pass within the limit (s), how long they took, and what they printed last."""
+        assert self.process.stdin
+        assert self.process.stdout
+        self.process.stdin.write(json.dumps({"arguments": arguments, "limit": limit}) + "\n")
+        self.process.stdin.flush()
+        return json.loads(self.process.stdout.readline())
 
 
 def _faults(module: str) -> list[WorkItem]:
