@@ -13,6 +13,7 @@ import os
 import random
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -60,7 +61,10 @@ def main() -> int:
     options = _options()
     targets = [t for t in _targets() if not options.words or any(word in t[0] for word in options.words)]
     if not targets:
-        raise SystemExit(f"no module of scripts/mutation.toml has one of these words in its path: {', '.join(options.words)}")
+        raise SystemExit(
+            f"no module of scripts/mutation.toml has one of these words in its path: {', '.join(options.words)}"
+        )
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the copy is removed
     SURVIVORS.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         _copy_checkout(Path(folder))
@@ -155,7 +159,9 @@ def _faults(module: str) -> list[WorkItem]:
         init([Path(module)], database, {})
         items = database.work_items
     hints = list(_hints(ast.parse(Path(module).read_text(encoding="utf-8"))))
-    return [i for i in items if not any(a <= i.mutations[0].start_pos and i.mutations[0].end_pos <= b for a, b in hints)]
+    return [
+        i for i in items if not any(a <= i.mutations[0].start_pos and i.mutations[0].end_pos <= b for a, b in hints)
+    ]
 
 
 def _hints(tree: ast.Module) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:

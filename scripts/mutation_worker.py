@@ -18,7 +18,18 @@ from pathlib import Path
 
 import pytest
 
-LIBRARIES = ("casadi", "numpy", "scipy.signal", "scipy.linalg", "scipy.optimize", "scipy.stats", "osqp", "control", "pandas", "rich")
+LIBRARIES = (
+    "casadi",
+    "numpy",
+    "scipy.signal",
+    "scipy.linalg",
+    "scipy.optimize",
+    "scipy.stats",
+    "osqp",
+    "control",
+    "pandas",
+    "rich",
+)
 
 
 def main() -> None:

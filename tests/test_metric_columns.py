@@ -197,7 +197,9 @@ def test_spectrum_is_sampled_from_the_second_to_the_last_cycle(adaptive, monkeyp
 
     task, found = adaptive
     asked = []
-    monkeypatch.setattr(contraction, "spectrum_over_run", lambda plant, x, r, approximate: asked.append((x, r, approximate)))
+    monkeypatch.setattr(
+        contraction, "spectrum_over_run", lambda plant, x, r, approximate: asked.append((x, r, approximate))
+    )
     for cycles in (1000, 50):
         sampled_spectrum(task, cut(found, cycles))
     (long, requests, believed), (short, *_) = asked

@@ -12,6 +12,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.contraction import Spectrum
+from fpirhc.deformation.base import Deformation
 from fpirhc.review.commands import commands_inside
 from fpirhc.review.convergence import box_converges, converges
 from fpirhc.review.gain import gain_admissible
@@ -53,7 +54,7 @@ def loops(*radii: float, ideal: float | None = 0.5, **more: Any) -> Loops:
     return Loops(tuple(range(len(radii))), tuple(map(loop, radii)), None if ideal is None else loop(ideal), **more)
 
 
-def torque(deformation: fp.Deformation) -> fp.ComputedTorque:
+def torque(deformation: Deformation) -> fp.ComputedTorque:
     return fp.ComputedTorque(fp.Exponential(rate=1.0), deformation)
 
 
@@ -93,7 +94,9 @@ def test_the_range_along_the_reference_is_told(grid):
     assert convergence(grid, loops(0.5, 1.25)).found.endswith("per cycle (between 0.5 and 1.25 along the reference)")
 
 
-@pytest.mark.parametrize(("ideal", "begin"), [(1.0, "The outer loop"), (0.999, "Change the gain"), (None, "Change the gain")])
+@pytest.mark.parametrize(
+    ("ideal", "begin"), [(1.0, "The outer loop"), (0.999, "Change the gain"), (None, "Change the gain")]
+)
 def test_the_fault_of_an_outer_loop_is_not_the_gains(grid, ideal, begin):
     """A loop that does not converge with the right model needs another rate, and no other gain."""
     assert convergence(grid, loops(2.0, ideal=ideal)).change.startswith(begin)
@@ -145,7 +148,8 @@ def test_share_of_the_box_that_converges(drawn, verdict, text):
 
 
 def admissible(gain: float, own: Any, boxed: Any, limit: float = 2.0) -> fp.Answer:
-    return gain_admissible(fp.Affine(gain), *(Spectrum(np.array(e, complex)[:, None]) for e in (own, boxed)), limit)
+    plant, box = (Spectrum(np.array(eigenvalues, complex)[:, None]) for eigenvalues in (own, boxed))
+    return gain_admissible(fp.Affine(gain), plant, box, limit)
 
 
 def test_numbers_of_the_gain():
@@ -159,7 +163,9 @@ def test_numbers_of_the_gain():
         {"gain": -0.5, "recommended": -1.6, "factor": 0.75, "sector_limit": -8 / 3, "linear_limit": -8 / 3}
     )
     late = admissible(-0.5, [1.0], [1.0, 1.5], limit=1.0)
-    assert [late.numbers[n] for n in ("recommended", "sector_limit", "linear_limit")] == pytest.approx([-0.8, -4 / 3, -4 / 3])
+    assert [late.numbers[n] for n in ("recommended", "sector_limit", "linear_limit")] == pytest.approx(
+        [-0.8, -4 / 3, -4 / 3]
+    )
 
 
 @pytest.mark.parametrize(
@@ -214,7 +220,10 @@ def test_a_map_is_fast_enough_at_twice_the_speed(ratio, verdict):
 def test_a_map_without_bound_is_fast_enough(grid):
     """The affine map takes a step of any size."""
     one = slew_enough(grid, fp.Affine(-0.5), grid.problem.plant.approximate, None)
-    assert (one.verdict, one.found) == ("yes", "the request changes by up to 14 per second; the map's step has no bound")
+    assert (one.verdict, one.found) == (
+        "yes",
+        "the request changes by up to 14 per second; the map's step has no bound",
+    )
 
 
 def test_disturbances_ask_for_speed_as_well():
@@ -278,6 +287,9 @@ def test_share_of_the_limits(rows, limits, verdict, own, widest):
 
 def test_range_of_the_commands():
     """That of the plant's own parameters, at the points where there is a command."""
-    assert commands([[-1.25, 2.5, math.nan], [-9.0, 9.0, 9.0]], None).found == "needed: u -1.25 to 2.5; no input has limits"
+    assert (
+        commands([[-1.25, 2.5, math.nan], [-9.0, 9.0, 9.0]], None).found
+        == "needed: u -1.25 to 2.5; no input has limits"
+    )
     none = commands([[math.nan, math.nan]], (-4.0, 8.0))
     assert (none.verdict, none.found) == ("unknown", "no finite command is known")

@@ -70,7 +70,9 @@ def test_several_coordinates():
         "FPI lowers the rms error of y from 1 to 0.5 m, z from 2 to 0.2 rad (10 times less for z) at no more time per cycle.",
     )
     worse = entry("FPI", "RHC", errors={"y": 1.5, "z": 4.0})
-    assert said(plain, worse) == ("FPI does not help: it raises the rms error of y from 1 to 1.5 m, z from 2 to 4 rad.",)
+    assert said(plain, worse) == (
+        "FPI does not help: it raises the rms error of y from 1 to 1.5 m, z from 2 to 4 rad.",
+    )
     mixed = entry("FPI", "RHC", errors={"y": 0.1, "z": 4.0})
     assert said(plain, mixed)[0].startswith("FPI makes no clear difference: the rms error of y from 1 to 0.1 m, z from")
 
