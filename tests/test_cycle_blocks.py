@@ -16,6 +16,7 @@ from fpirhc.controllers.base import (
     Controller,
     clip,
     commanding_blocks,
+    compose_controller,
     controller_reads,
     deform_block,
     invert_block,
@@ -23,6 +24,7 @@ from fpirhc.controllers.base import (
 )
 from fpirhc.controllers.contract import Planner, Response, checked, resolved, without_deformation
 from fpirhc.controllers.demands import command_demand, plan_demand, reference_demand
+from fpirhc.controllers.mirror import MEASURED
 from fpirhc.deformation.base import Deformation, Demand
 from fpirhc.errors import InvalidValue, NotContractive, NotSupported
 from fpirhc.status import Status
@@ -152,6 +154,23 @@ def test_the_request_is_deformed_once_the_pair_is_valid(counted, blind, valid):
     found = cycle(block, **pair, warm_up=float(counted))
     assert found["_deformed_unclipped"].tolist() == ([11.0, 20.5] if valid else [4.0, 4.0])
     assert found["_deformation"].tolist() == ([7.0, 16.5] if valid else [0.0, 0.0])
+
+
+def test_one_blind_cycle_where_nothing_else_is_said():
+    """The first cycle has no pair, the second has one."""
+    pair = {"_deformed_last": [10.0, 20.0], "realised": [2.0, 3.0], "desired": [4.0, 4.0]}
+    block = deform_block(masses().plant, fp.Affine(-1.0))
+    assert [cycle(block, **pair, warm_up=k)["_deformation"].tolist() for k in (0.0, 1.0)] == [[0.0, 0.0], [7.0, 16.5]]
+
+
+def test_a_predicting_controller_reads_the_measured_state_too():
+    """A mirror needs it: it is the state itself, unless the controller's state is that of another time."""
+    adaptive = fp.ComputedTorque(TRACK, fp.ModelReferenced(fp.Affine(-0.5)))
+    own, ahead = (compose_controller(masses(), adaptive, **k).reads for k in ({}, {"ahead": True}))
+    assert own.names == ("time", "state", "realised", "parameters")
+    assert ahead.names == (*own.names, MEASURED)
+    plain = compose_controller(masses(), fp.ComputedTorque(TRACK), ahead=True).reads
+    assert plain.names == own.names
 
 
 def test_command_of_a_request():

@@ -155,6 +155,18 @@ def test_settling_counts_the_size_of_the_first_error():
     assert np.isnan(fp.measure(problem(), run(error, reference=still)).settling["y"])
 
 
+def test_settling_of_a_small_motion():
+    """A millimetre: the band is 0.02 mm. The floor of the band is there for a reference that rests and an error of zero."""
+    small = np.linspace(0.0, 1e-3, CYCLES)
+    assert fp.measure(problem(), run(step(5e-4, 1.9e-5, 30), reference=small)).settling["y"] == pytest.approx(3.0)
+    assert np.isnan(fp.measure(problem(), run(step(5e-4, 2.1e-5, 30), reference=small)).settling["y"])
+
+
+def test_a_run_that_ended_early_inside_the_band_has_not_settled():
+    """Nobody knows whether it would have stayed there."""
+    assert np.isnan(fp.measure(problem(), run(0.01, stop="signal 'x' is not finite")).settling["y"])
+
+
 def test_plans_that_return_are_counted_once():
     """Two plans in turn are two, and one that is held is one."""
     assert of_solves(np.arange(CYCLES) // 10 % 2).solve["plans"] == 2
