@@ -6,59 +6,17 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
-import casadi as ca
 import numpy as np
 import pytest
+from hand_made_runs import CYCLES, SOLVE, problem, run, step
 from plants import linear
 
 import fpirhc as fp
 from fpirhc.errors import InvalidName, InvalidValue
-from fpirhc.simulation.common_columns import with_common_columns
 from fpirhc.simulation.metrics import discovery, known_metrics, with_own_metrics
 from fpirhc.simulation.metrics.columns import columns
-from fpirhc.simulation.run import Run
 from fpirhc.status import Status
-from fpirhc.symbolic.layout import Layout, Signal, scalar
-
-PERIOD, CYCLES = 0.1, 100
-SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")
-
-
-def problem(**changes) -> fp.Problem:
-    """A plant with one coordinate [m] and one input [N], measured from the second half of a run on."""
-    settings = {
-        "plant": linear(1.0, 1.0),
-        "start": {"y": 0.0},
-        "period": PERIOD,
-        "duration": PERIOD * CYCLES,
-        "measure_from": 5.0,
-    }
-    return fp.Problem(reference=fp.Trajectory(lambda t: {"y": ca.sin(t)}), **{**settings, **changes})
-
-
-def run(error, *, reference=None, clipped=0.0, command=0.0, status=0, stop=None, **more) -> Run:
-    """A run with this error of 'y' in every cycle; `more` are further signals (name -> columns)."""
-    error = np.broadcast_to(np.asarray(error, dtype=float), (CYCLES,))
-    reference = np.linspace(0.0, 1.0, CYCLES) if reference is None else reference
-    signals = {
-        "time": (scalar("time", "s"), PERIOD * np.arange(CYCLES)),
-        "reference": (Signal("reference", ("y", "y'"), ("m", "m/s")), np.column_stack([reference, 0 * reference])),
-        "state": (Signal("state", ("y", "y'"), ("m", "m/s")), np.column_stack([reference - error, 0 * reference])),
-        "error": (Signal("error", ("y",), ("m",)), error),
-        "command": (Signal("command", ("u",), ("N",)), command),
-        "clipped": (scalar("clipped"), clipped),
-        "status": (scalar("status"), status),
-        **more,
-    }
-    values = [np.broadcast_to(np.asarray(v, float).T, (s.size, CYCLES)).T for s, v in signals.values()]
-    layout, log = with_common_columns(Layout(tuple(s for s, _ in signals.values())), np.hstack(values))
-    cycles = CYCLES if stop is None else CYCLES // 4
-    return Run("case", "CTC", 0, PERIOD, layout, log[:cycles], stop, False, {})
-
-
-def step(before, after, cycle):
-    """`before` up to a cycle, `after` from it on."""
-    return np.where(np.arange(CYCLES) < cycle, before, after)
+from fpirhc.symbolic.layout import Layout, Signal
 
 
 def test_errors_are_those_of_the_measured_part():

@@ -1,0 +1,202 @@
+"""Mutation testing: how many small faults in a module the tests notice. Called by scripts/mutate, in the tool's environment.
+
+Cosmic Ray makes the faults, in a copy of the checkout. A sample of them is tried: the seed shuffles the places of a module, and
+one fault of every place is taken in turn until there are enough, so that a line with many operators does not fill the sample.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import os
+import random
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import tomllib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from difflib import unified_diff
+from itertools import chain, zip_longest
+from pathlib import Path
+from subprocess import PIPE
+from typing import Any
+
+from cosmic_ray.commands.init import init
+from cosmic_ray.mutating import use_mutation
+from cosmic_ray.plugins import get_operator
+from cosmic_ray.work_db import use_db
+from cosmic_ray.work_item import WorkItem
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE, SURVIVORS = ROOT / "docs/mutation.md", ROOT / "results/mutation"
+SPARE, FACTOR = 20.0, 4.0  # s, and times the time without a fault: from which the tests are taken to hang
+BEGIN, END = "<!-- table: written by scripts/mutate -->", "<!-- end of the table -->"
+HEAD = "| module | faults there | tried | killed | survived | score | seed | tests |\n|---|--:|--:|--:|--:|--:|--:|---|"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table."""
+
+    module: str
+    faults: int
+    tried: int
+    killed: int
+    seed: int
+    tests: str
+
+    def __str__(self) -> str:
+        score = f"{100 * self.killed / self.tried:.0f} %" if self.tried else "-"
+        numbers = f"{self.faults} | {self.tried} | {self.killed} | {self.tried - self.killed} | {score} | {self.seed}"
+        return f"| `{self.module}` | {numbers} | `{self.tests}` |"
+
+
+def main() -> int:
+    """Try the faults of the wanted modules and write the table after each module."""
+    options = _options()
+    targets = [t for t in _targets() if not options.words or any(word in t[0] for word in options.words)]
+    if not targets:
+        raise SystemExit(
+            f"no module of scripts/mutation.toml has one of these words in its path: {', '.join(options.words)}"
+        )
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the copy is removed
+    SURVIVORS.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        _copy_checkout(Path(folder))
+        os.chdir(folder)
+        os.environ |= {"PYTHONPATH": folder, "PYTHONDONTWRITEBYTECODE": "1"}
+        # A changed file has a new time, so that its compiled form is not used.
+        subprocess.run([options.python, "-m", "compileall", "-q", "fpirhc"], check=True)
+        with subprocess.Popen(
+            [options.python, str(ROOT / "scripts/mutation_worker.py")], stdin=PIPE, stdout=PIPE, text=True
+        ) as process:
+            print(HEAD)
+            for module, tests in targets:
+                row = _try_module(module, tests, options, Worker(process))
+                print(row, flush=True)
+                _write(row)
+    return 0
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="scripts/mutate", description="Count the small faults that the tests notice.")
+    parser.add_argument("words", nargs="*", metavar="WORD", help="try the modules whose path has one of these words")
+    parser.add_argument("--sample", type=int, default=15, metavar="N", help="most faults of a module (15)")
+    parser.add_argument("--seed", type=int, default=0, help="of the sample (0)")
+    parser.add_argument("--python", default=str(ROOT / ".venv/bin/python"), help="interpreter that runs the tests")
+    return parser.parse_args()
+
+
+def _targets() -> Iterator[tuple[str, str]]:
+    """Every module with its tests; files that hold a docstring only are left out."""
+    for target in tomllib.loads((ROOT / "scripts/mutation.toml").read_text(encoding="utf-8"))["target"]:
+        paths = sorted(path for pattern in target["modules"] for path in ROOT.glob(pattern))
+        for path in paths:
+            if len(ast.parse(path.read_text(encoding="utf-8")).body) > 1:
+                yield path.relative_to(ROOT).as_posix(), " ".join(target["tests"])
+
+
+def _copy_checkout(folder: Path) -> None:
+    """Copy what git knows, and new files that it does not ignore."""
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    for name in filter(None, listed.split("\0")):
+        if (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / name)
+
+
+def _try_module(module: str, tests: str, options: argparse.Namespace, worker: Worker) -> Row:
+    arguments = ["-x", "-q", "-p", "no:xdist", "-p", "no:cacheprovider", "--lane", "quick", *shlex.split(tests)]
+    sound = worker.run(arguments, 600.0)
+    if not sound["passed"]:  # else every fault would count as noticed
+        raise SystemExit(f"the tests fail without a fault: pytest {shlex.join(arguments)}\n{sound['output']}")
+    faults = _faults(module)
+    sample = _sample(faults, options.sample, random.Random(f"{options.seed} {module}"))
+    limit = SPARE + FACTOR * sound["seconds"]
+    survivors = [diff for diff in (_survivor(item, arguments, limit, worker) for item in sample) if diff]
+    report = SURVIVORS / (module.removesuffix(".py").replace("/", ".") + ".diff")
+    report.write_text("\n".join(survivors), encoding="utf-8")
+    return Row(module, len(faults), len(sample), len(sample) - len(survivors), options.seed, tests)
+
+
+def _survivor(item: WorkItem, arguments: Sequence[str], limit: float, worker: Worker) -> str:
+    """The fault as a difference of texts where the tests pass all the same; empty where one of them fails."""
+    [fault] = item.mutations
+    operator = get_operator(fault.operator_name)(**fault.operator_args)
+    with use_mutation(fault.module_path, operator, fault.occurrence) as (before, after):
+        if after is None:
+            raise SystemExit(f"{fault.module_path}: {fault.operator_name} {fault.occurrence} cannot be made")
+        if not worker.run(arguments, limit)["passed"]:
+            return ""
+    path = fault.module_path.as_posix()
+    return "\n".join(unified_diff(before.splitlines(), after.splitlines(), path, path, n=0, lineterm=""))
+
+
+@dataclass(frozen=True)
+class Worker:
+    """The process that runs the tests; see `mutation_worker`."""
+
+    process: subprocess.Popen[str]
+
+    def run(self, arguments: Sequence[str], limit: float) -> dict[str, Any]:
+        """Whether the tests pass within the limit (s), how long they took, and what they printed last."""
+        assert self.process.stdin
+        assert self.process.stdout
+        self.process.stdin.write(json.dumps({"arguments": arguments, "limit": limit}) + "\n")
+        self.process.stdin.flush()
+        return json.loads(self.process.stdout.readline())
+
+
+def _faults(module: str) -> list[WorkItem]:
+    """Every fault that the tool knows for a module, but for those of type hints, which nothing reads at run time."""
+    with tempfile.TemporaryDirectory() as folder, use_db(str(Path(folder, "faults.sqlite"))) as database:
+        init([Path(module)], database, {})
+        items = database.work_items
+    hints = list(_hints(ast.parse(Path(module).read_text(encoding="utf-8"))))
+    return [
+        i for i in items if not any(a <= i.mutations[0].start_pos and i.mutations[0].end_pos <= b for a, b in hints)
+    ]
+
+
+def _hints(tree: ast.Module) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
+    """Begin and end of annotations and of what stands under `if TYPE_CHECKING`."""
+    for node in ast.walk(tree):
+        parts = [getattr(node, "annotation", None), getattr(node, "returns", None)]
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            parts += [node.test, *node.body]
+        for part in parts:
+            if part is not None:
+                yield (part.lineno, part.col_offset), (part.end_lineno, part.end_col_offset)
+
+
+def _sample(faults: Sequence[WorkItem], size: int, generator: random.Random) -> list[WorkItem]:
+    """One fault of every place in turn, places and faults shuffled."""
+    places: dict[tuple[object, object], list[WorkItem]] = {}
+    for item in sorted(faults, key=lambda i: (i.mutations[0].operator_name, i.mutations[0].occurrence)):
+        places.setdefault((item.mutations[0].start_pos, item.mutations[0].end_pos), []).append(item)
+    shuffled = [places[key] for key in sorted(places)]
+    generator.shuffle(shuffled)
+    for one in shuffled:
+        generator.shuffle(one)
+    return [item for item in chain.from_iterable(zip_longest(*shuffled)) if item is not None][:size]
+
+
+def _write(row: Row) -> None:
+    """Put the line into the table of the page, in place of an older one of the same module."""
+    before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
+    table, _, after = rest.partition(END)
+    rows = {line.split("`")[1]: line for line in table.splitlines() if line.startswith("| `")}
+    rows[row.module] = str(row)
+    order = {module: place for place, (module, _) in enumerate(_targets())}
+    lines = [rows[module] for module in sorted(rows.keys() & order.keys(), key=lambda m: order[m])]
+    PAGE.write_text(before + "\n".join([BEGIN, "", HEAD, *lines, "", END]) + after, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,350 @@
+"""The blocks that all controllers share, one cycle by value; and the demands that choose automatic settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.contraction import step_for_basin
+from fpirhc.controllers.base import (
+    Controller,
+    clip,
+    commanding_blocks,
+    compose_controller,
+    controller_reads,
+    deform_block,
+    invert_block,
+    reference_block,
+)
+from fpirhc.controllers.contract import Planner, Response, checked, resolved, without_deformation
+from fpirhc.controllers.demands import command_demand, plan_demand, reference_demand
+from fpirhc.controllers.mirror import MEASURED
+from fpirhc.deformation.base import Deformation, Demand
+from fpirhc.errors import InvalidValue, NotContractive, NotSupported
+from fpirhc.status import Status
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.layout import scalar
+
+PERIOD = 0.1
+TIMES = np.linspace(0.0, 10.0, 100001)
+TRACK = fp.Exponential(rate=2.0)
+
+
+def masses(**settings: Any) -> fp.Problem:
+    """Two masses, 2 and 4 kg, taken for 1 and 8; b'' also feels a force of 3 N. Along sin 2t and cos t."""
+    plant = fp.Plant(
+        coordinates={"a": "m", "b": "rad"},
+        inputs={"u": "N", "w": "N"},
+        parameters={"m": fp.Parameter(1.0, 2.0, "kg"), "n": fp.Parameter(8.0, 4.0, "kg")},
+        response=lambda q, v, u, p: {"a": u.u / p.m, "b": (u.w - 3.0) / p.n},
+    )
+    usual: dict[str, Any] = {"start": {"a": 0.0, "b": 1.0}, "period": PERIOD, "duration": 10.0}
+    reference = fp.Trajectory(lambda t: {"a": ca.sin(2 * t), "b": ca.cos(t)})
+    return fp.Problem(plant, reference, **(usual | settings))
+
+
+def cycle(block: Block, **signals: Any) -> dict[str, np.ndarray]:
+    """What a block writes in one cycle."""
+    memory = [block.memory.start()] if block.memory.size else []
+    values = [ca.DM(signals.get(s.name, np.zeros(s.size))) for s in block.reads.signals]
+    results = block.function(*memory, *values) if memory else block.function(*values)
+    results = results if isinstance(results, tuple | list) else [results]
+    names = block.function.name_out()
+    return {name: np.asarray(r.full()).ravel() for name, r in zip(names, results, strict=True)}
+
+
+def closing(problem: fp.Problem, *judged: str) -> dict[str, Block]:
+    return {b.name: b for b in commanding_blocks(problem, [scalar(name) for name in judged])[0]}
+
+
+LIMITED = masses(limits=fp.Limits(inputs={"u": (-2.0, 3.0)}))
+BELIEVED, STATE = [1.0, 8.0], [0.0, 0.0, 0.0, 0.0]
+
+
+# One cycle
+
+
+def test_a_command_inside_its_limits_is_passed():
+    """The stored request is the wanted one, nothing is clipped and nothing held."""
+    wanted = {"command_unclipped": [2.5, 99.0], "_deformed_unclipped": [7.0, 8.0], "desired": [1.0, 1.0]}
+    found = cycle(closing(LIMITED)["limit"], **wanted, state=STATE, parameters=BELIEVED)
+    assert found["command"].tolist() == [2.5, 99.0]
+    assert found["deformed"].tolist() == [7.0, 8.0]
+    assert (found["clipped"].item(), found["_held"].item()) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("unclipped", "clipped"), [(5.0, 3.0), (-5.0, -2.0)])
+def test_a_clipped_command_changes_the_stored_request(unclipped, clipped):
+    """By what the model's input gain, 1 / 1 kg, makes of the difference: the request that the command meant."""
+    wanted = {"command_unclipped": [unclipped, 99.0], "_deformed_unclipped": [7.0, 8.0], "desired": [1.0, 1.0]}
+    found = cycle(closing(LIMITED)["limit"], **wanted, state=STATE, parameters=BELIEVED)
+    assert found["command"].tolist() == [clipped, 99.0]
+    assert found["deformed"] == pytest.approx([7.0 + clipped - unclipped, 8.0])
+    assert (found["clipped"].item(), found["_held"].item()) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_a_command_that_is_not_finite_is_held(wrong):
+    """One entry is enough: the last command goes on, clipped, and the next cycle begins from the desired response."""
+    wanted = {"command_unclipped": [1.0, wrong], "_deformed_unclipped": [7.0, 8.0], "desired": [1.5, 2.5]}
+    last = {"_command_before": [4.0, 5.0], "state": STATE, "parameters": BELIEVED}
+    found = cycle(closing(LIMITED)["limit"], **wanted, **last)
+    assert found["command"].tolist() == [3.0, 5.0]
+    assert found["deformed"].tolist() == [1.5, 2.5]
+    assert found["_held"].item() == 1.0
+
+
+def test_a_response_that_is_not_affine_is_evaluated_where_it_was_clipped():
+    """u^3 / m at the clipped 2 N is 8, whatever was wanted; unclipped the wanted request is kept to the last digit."""
+    plant = fp.Plant(
+        coordinates={"a": "m"},
+        inputs={"u": "N"},
+        parameters={"m": fp.Parameter(1.0, 1.0, "kg")},
+        response=lambda q, v, u, p: {"a": u.u**3 / p.m},
+        inverse=lambda q, v, r, p: {"u": ca.sign(r.a) * ca.fabs(p.m * r.a) ** (1 / 3)},
+    )
+    problem = fp.Problem(
+        plant,
+        fp.Trajectory(lambda t: {"a": t**3}),
+        start={"a": 0.0},
+        period=PERIOD,
+        duration=1.0,
+        limits=fp.Limits(inputs={"u": (-2.0, 2.0)}),
+    )
+    block = closing(problem)["limit"]
+    for command, request, stored in ((3.0, 27.0, 8.0), (1.0, 1.0 + 1e-15, 1.0 + 1e-15)):
+        found = cycle(block, command_unclipped=command, _deformed_unclipped=request, state=[0.0, 0.0], parameters=1.0)
+        assert found["deformed"].item() == stored
+
+
+def test_clip_takes_one_side_or_both():
+    """A free side leaves the entry as it is."""
+    u = ca.SX([-9.0, -9.0, 9.0, 9.0])
+    lower, upper = np.array([-1.0, -np.inf, -np.inf, -1.0]), np.array([1.0, 1.0, np.inf, np.inf])
+    down, up = (np.asarray(ca.evalf(clip(v, lower, upper)).full()).ravel().tolist() for v in (u, -u))
+    assert (down, up) == ([-1.0, -9.0, 9.0, 9.0], [1.0, 1.0, -9.0, -1.0])
+
+
+def test_the_worst_status_of_a_cycle_counts():
+    """A held command is not finite; otherwise the solver's status stands, the worst of several."""
+    judge = closing(LIMITED, "first", "second")["judge"]
+    assert cycle(judge, _held=0.0, first=1.0, second=2.0)["status"].item() == 2.0
+    assert cycle(judge, _held=0.0, first=2.0, second=1.0)["status"].item() == 2.0
+    assert cycle(judge, _held=1.0, first=1.0)["status"].item() == int(Status.NON_FINITE)
+    assert cycle(closing(LIMITED)["judge"], _held=0.0)["status"].item() == 0.0
+
+
+def test_warm_up_counts_the_blind_cycles():
+    """One without an estimator; it stops there."""
+    running = closing(LIMITED)["running"]
+    assert [cycle(running, warm_up=k)["_warm_up_now"].item() for k in (0.0, 1.0, 5.0)] == [1.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize(("counted", "blind", "valid"), [(0, 1, False), (1, 1, True), (2, 3, False), (3, 3, True)])
+def test_the_request_is_deformed_once_the_pair_is_valid(counted, blind, valid):
+    """Affine(-1): request + 0.5 (desired - realised) = 10 + 0.5 (4 - 2); before that the desired response."""
+    block = deform_block(masses().plant, fp.Affine(-1.0), blind)
+    pair = {"_deformed_last": [10.0, 20.0], "realised": [2.0, 3.0], "desired": [4.0, 4.0]}
+    found = cycle(block, **pair, warm_up=float(counted))
+    assert found["_deformed_unclipped"].tolist() == ([11.0, 20.5] if valid else [4.0, 4.0])
+    assert found["_deformation"].tolist() == ([7.0, 16.5] if valid else [0.0, 0.0])
+
+
+def test_one_blind_cycle_where_nothing_else_is_said():
+    """The first cycle has no pair, the second has one."""
+    pair = {"_deformed_last": [10.0, 20.0], "realised": [2.0, 3.0], "desired": [4.0, 4.0]}
+    block = deform_block(masses().plant, fp.Affine(-1.0))
+    assert [cycle(block, **pair, warm_up=k)["_deformation"].tolist() for k in (0.0, 1.0)] == [[0.0, 0.0], [7.0, 16.5]]
+
+
+def test_a_predicting_controller_reads_the_measured_state_too():
+    """A mirror needs it: it is the state itself, unless the controller's state is that of another time."""
+    adaptive = fp.ComputedTorque(TRACK, fp.ModelReferenced(fp.Affine(-0.5)))
+    own, ahead = (compose_controller(masses(), adaptive, **k).reads for k in ({}, {"ahead": True}))
+    assert own.names == ("time", "state", "realised", "parameters")
+    assert ahead.names == (*own.names, MEASURED)
+    plain = compose_controller(masses(), fp.ComputedTorque(TRACK), ahead=True).reads
+    assert plain.names == own.names
+
+
+def test_command_of_a_request():
+    """The believed masses of 1 and 8 kg and the force of 3 N."""
+    found = cycle(invert_block(masses().plant), state=STATE, _deformed_unclipped=[5.0, 0.5], parameters=BELIEVED)
+    assert found["command_unclipped"].tolist() == [5.0, 7.0]
+
+
+def test_error_is_of_the_judged_coordinates():
+    """Reference minus state, in their units; the response is that of the controlled ones."""
+    problem = masses(judged=("b",))
+    found = cycle(reference_block(problem), time=0.5, state=[0.1, 0.2, 0.3, 0.4])
+    assert found["error"] == pytest.approx([np.cos(0.5) - 0.2])
+    assert found["_reference_response"] == pytest.approx([-4 * np.sin(1.0), -np.cos(0.5)])
+    assert found["reference"] == pytest.approx([np.sin(1.0), np.cos(0.5), 2 * np.cos(1.0), -np.sin(0.5)])
+    assert reference_block(problem).writes["error"].units == ("rad",)
+
+
+# Facts of controllers
+
+
+PLANNER = Planner(fp.FixedPoint(iterations=1, tolerance=1e-3), None, True, None)
+
+
+@dataclass(frozen=True)
+class Telling(Controller):
+    """A controller that tells facts of its own, on the plant that it sees."""
+
+    deformation: Deformation = field(default_factory=fp.Identity)
+    of_its_own: bool = False
+
+    learns = True
+    planner = PLANNER
+    feeds = MappingProxyType({"state": "predicted"})
+
+    def blocks(self, problem):  # noqa: ARG002
+        """None: only its facts are asked for."""
+        return [], []
+
+    def parameters(self, plant):
+        """Twice the approximate ones."""
+        return 2 * plant.approximate
+
+    def demand(self, problem):
+        """The first approximate parameter."""
+        return Demand(float(problem.plant.approximate[0]), sudden=True)
+
+    def response(self, problem):
+        """The plant's, under the same name, where it reads responses of its own."""
+        plant = problem.plant
+        return (
+            Response(plant.response_signal("realised"), plant.controlled_response_function) if self.of_its_own else None
+        )
+
+    def unusable(self, problem, mirror):  # noqa: ARG002
+        """Names the mass."""
+        return f"mass {problem.plant.approximate[0]}"
+
+    def floquet(self, problem) -> Any:
+        """Anything."""
+        return problem.plant.approximate[0]
+
+    def notes(self, problem):
+        """Name the mass."""
+        return (f"mass {problem.plant.approximate[0]}",)
+
+    def check(self, problem):
+        """Refuse, naming the mass."""
+        raise InvalidValue(f"mass {problem.plant.approximate[0]}")
+
+    def with_optimiser(self, optimiser):  # noqa: ARG002
+        """Return another map, so that the change is seen."""
+        return replace(self, deformation=fp.Affine(-0.5))
+
+
+def test_a_wrapper_tells_the_facts_of_what_it_wraps():
+    """On the problem that the inner controller sees: the exact mass of 2 kg in place of 1 kg."""
+    problem, inner = masses(), Telling(fp.Affine(-0.25))
+    outer = fp.ExactModel(inner)
+    mirror: Any = None
+    assert outer.learns
+    assert (outer.planner, dict(outer.feeds)) == (inner.planner, {"state": "predicted"})
+    assert outer.demand(problem) == Demand(2.0, sudden=True)
+    assert outer.unusable(problem, mirror) == "mass 2.0"
+    stability: Any = outer.floquet(problem)
+    assert stability == 2.0
+    assert outer.notes(problem) == ("mass 2.0",)
+    assert outer.response(problem) is None
+    assert fp.ExactModel(replace(inner, of_its_own=True)).response(problem) is not None
+    with pytest.raises(InvalidValue, match=r"mass 2\.0"):
+        outer.check(problem)
+    assert outer.with_deformation(fp.Identity()) == fp.ExactModel(Telling())
+    assert outer.with_optimiser(PLANNER.optimiser) == fp.ExactModel(Telling(fp.Affine(-0.5)))
+    assert without_deformation(outer) == fp.ExactModel(Telling())
+    assert without_deformation(fp.ExactModel(Telling())) == fp.ExactModel(Telling())
+
+
+def test_a_controller_that_stands_alone_has_no_facts_of_others():
+    """It believes the approximate parameters, learns nothing, plans nothing, and tracks by its own law."""
+    problem, alone = masses(), fp.ComputedTorque(TRACK)
+    mirror: Any = None
+    assert (alone.inner, alone.learns, alone.planner, dict(alone.feeds)) == (None, False, None, {})
+    assert alone.law is fp.ExactModel(alone).law is TRACK
+    assert alone.parameters(problem.plant).tolist() == [1.0, 8.0]
+    assert (alone.response(problem), alone.floquet(problem)) == (None, None)
+    assert (alone.unusable(problem, mirror), alone.notes(problem)) == ("", ())
+    assert alone.inner_problem(problem) is problem
+    alone.check(problem)
+    with pytest.raises(NotSupported, match="ComputedTorque has no optimiser"):
+        alone.with_optimiser(PLANNER.optimiser)
+    with pytest.raises(NotSupported, match="no field that holds its `inner`"):
+        alone.around(alone)
+    assert controller_reads(problem, alone).names == ("time", "state", "realised", "parameters")
+
+
+def test_automatic_settings_are_chosen_and_others_kept():
+    """A controller without automatic settings comes back as it is, within wrappers too."""
+    problem = masses()
+    given = fp.ExactModel(fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5, scale=3.0)))
+    assert resolved(problem, given) is given
+    chosen: Any = resolved(problem, fp.ExactModel(fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5))))
+    exact = given.inner_problem(problem)
+    assert chosen.deformation == fp.Sigmoid(gain=-0.5).suited(reference_demand(exact, TRACK))
+
+
+def test_checks_before_a_run():
+    """The wrong sign is refused, and so is late or filtered measurement for a controller with responses of its own."""
+    with pytest.raises(NotContractive, match="wrong sign"):
+        checked(masses(), fp.ComputedTorque(TRACK, fp.Affine(0.5)))
+
+    class Own(Telling):
+        def check(self, problem):
+            """Accept."""
+
+    own = Own(fp.Identity(), of_its_own=True)
+    assert checked(masses(), own) == own
+    for late in ({"measurement": 0.1}, {"inputs": {"u": 0.1, "w": 0.0}}):
+        with pytest.raises(NotSupported, match="leave dead time out"):
+            checked(masses(dead_time=fp.DeadTime(**late)), own)
+    with pytest.raises(NotSupported, match="leave sensing out"):
+        checked(masses(sensing=fp.Sensing(sensors=dict.fromkeys(["a", "b"], fp.Sensor(quantum=0.1)))), own)
+
+
+# Demands
+
+
+def test_a_reference_asks_for_its_largest_change_in_a_cycle():
+    """That of (-4 sin 2t, -cos t): the largest size of (-8 cos 2t, sin t) per second."""
+    demand = reference_demand(masses())
+    assert demand.change == pytest.approx(np.hypot(8 * np.cos(2 * TIMES), np.sin(TIMES)).max() * PERIOD, rel=1e-3)
+    assert (demand.sudden, demand.recovery) == (False, 0.0)
+
+
+def test_a_tracking_law_asks_for_the_basin_of_its_largest_error():
+    """What the model does without commands is (0, -3 / 8); the reference asks for (-4 sin 2t, -cos t): the largest distance."""
+    largest = np.hypot(-4 * np.sin(2 * TIMES), -np.cos(TIMES) + 3 / 8).max()
+    assert reference_demand(masses(), TRACK).recovery == pytest.approx(
+        step_for_basin(largest, 3, 2.0, PERIOD), rel=1e-4
+    )
+
+
+def test_a_plan_asks_for_a_jump_between_the_limits():
+    """5 N on 1 kg and 16 N on 8 kg: (5, 2). An input without a limit bounds nothing."""
+    demand = plan_demand(masses(limits=fp.Limits(inputs={"u": (-2.0, 3.0), "w": (-8.0, 8.0)})))
+    assert demand.change == pytest.approx(np.hypot(5.0, 2.0))
+    assert (demand.sudden, demand.recovery) == (True, 0.0)
+    for free in ({"u": (-2.0, 3.0)}, {"u": (-2.0, 3.0), "w": (0.0, np.inf)}):
+        with pytest.raises(InvalidValue, match="input 'w' has no finite limits"):
+            plan_demand(masses(limits=fp.Limits(inputs=free)))
+
+
+def test_a_filtered_command_asks_for_its_largest_change_in_a_cycle():
+    """With masses of 2 and 4 kg u = (-8 sin 2t, 3 - 4 cos t): the largest size of (-16 cos 2t, 4 sin t) N/s."""
+    demand = command_demand(masses(), np.array([2.0, 4.0]))
+    largest = np.hypot(16 * np.cos(2 * TIMES), 4 * np.sin(TIMES)).max()
+    assert demand.change == pytest.approx(largest * PERIOD, rel=1e-3)
+    assert not demand.sudden

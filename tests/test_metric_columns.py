@@ -1,0 +1,222 @@
+"""What users read of the metrics: columns, units and texts; and the ends of every definition, on runs that were made by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hand_made_runs import CYCLES, SOLVE, problem, run, step
+from plants import linear
+
+import fpirhc as fp
+from fpirhc.simulation.metrics import known_metrics
+from fpirhc.simulation.metrics.columns import columns
+from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
+from fpirhc.simulation.metrics.entries.solve import iterations, residual
+from fpirhc.status import Status
+from fpirhc.symbolic.layout import Signal
+
+BY_NAME = {metric.name: metric for metric in known_metrics()}
+
+
+def of_solves(plans) -> Any:
+    """Metrics of a run with these plans, cycle by cycle: one number stands for a whole plan."""
+    plans = np.asarray(plans, dtype=float)
+    solve = np.column_stack([plans, 0 * plans, 0 * plans, -1 + 0 * plans, 0 * plans])
+    return fp.measure(problem(), run(0.0, solve=(Signal("solve", SOLVE), solve)))
+
+
+def cut(source, cycles: int):
+    """The first cycles of a run."""
+    return replace(source, log=source.log[:cycles])
+
+
+@pytest.fixture(scope="module")
+def adaptive():
+    """A run of computed torque with adaptation and its problem, a thousand cycles."""
+    task = problem(plant=linear(1.6, 1.0), start={"y": 0.5}, period=1e-3, duration=1.0, measure_from=0.0)
+    controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.4, scale=50.0))
+    return task, fp.simulate(task, controller, seed=0, compiled=False)
+
+
+# What stands where
+
+
+def test_columns_of_a_report(adaptive):
+    """Errors, settling, effort, clipping, cost, contraction, solves: from what users ask first to what explains it."""
+    task, found = adaptive
+    solve = np.column_stack([np.arange(CYCLES)] * 5)
+    made = run(0.0, cost=(Signal("cost", ("states",)), 1.0), solve=(Signal("solve", SOLVE), solve))
+    metrics = [fp.measure(problem(), made), fp.measure(task, found)]
+    assert [c.heading for c in columns(metrics)] == [
+        "rms error y [m]",
+        "max error y [m]",
+        "settled y [s]",
+        "rms u [N]",
+        "clipped",
+        "cost",
+        "contraction predicted",
+        "contraction measured",
+        "iterations",
+        "worst residual",
+    ]
+    assert [c.short for c in columns(metrics, headline=True)] == ["rms y [m]", "clipped", "factor"]
+
+
+def test_order_of_a_file():
+    """Files list every number, the number of cycles first."""
+    assert list(BY_NAME)[:4] == ["cycles", "rms_error", "max_error", "iae"]
+    assert list(BY_NAME)[-6:] == [
+        "solve.median_iterations",
+        "solve.worst_iterations",
+        "solve.median_stationarity",
+        "solve.worst_stationarity",
+        "solve.worst_feasibility",
+        "plans",
+    ]
+    assert list(BY_NAME).index("settling") < list(BY_NAME).index("effort") < list(BY_NAME).index("status")
+
+
+def test_which_numbers_a_finished_run_must_have():
+    """A run may end unsettled, have no factor, or an optimiser without residuals; everything else is a fault of the run."""
+    assert {name for name, m in BY_NAME.items() if not m.finite} == {
+        "settling",
+        "contraction.predicted",
+        "contraction.measured",
+        "solve.median_stationarity",
+        "solve.worst_stationarity",
+        "solve.worst_feasibility",
+    }
+
+
+def test_smallest_steps():
+    """A share counts cycles, a settling time counts periods; a factor below 1e-4 is rounding."""
+    share, settling = (BY_NAME[name].step for name in ("clipped_share", "settling"))
+    assert share is not None
+    assert settling is not None
+    assert (share(0.5, 200), settling(0.5, 200)) == (0.005, 0.5)
+    assert {n for n, m in BY_NAME.items() if m.floor == 1e-4} == {"contraction.predicted", "contraction.measured"}
+    assert {m.floor for m in BY_NAME.values()} == {1e-4, 1e-12}
+
+
+def test_numbers_as_texts():
+    """An optimiser that counts nothing logs -1; a residual is its power of ten; a share is in percent."""
+    assert [iterations(v) for v in (-1.0, 0.0, 0.4, 1.0, 12.0)] == ["-", "0", "0", "1", "12"]
+    assert residual(0.00123) == "1e-03"
+    assert BY_NAME["solve.median_iterations"].text is BY_NAME["solve.worst_iterations"].text is iterations
+    assert BY_NAME["solve.median_stationarity"].text is residual
+    assert BY_NAME["clipped_share"].text(0.125) == "12.5 %"
+
+
+# The ends of definitions
+
+
+def test_a_run_that_ended_at_once_has_no_numbers():
+    """Without a cycle nothing is known but the end."""
+    solve = (Signal("solve", SOLVE), np.ones((CYCLES, 5)))
+    found = fp.measure(problem(), cut(run(1.0, stop="signal 'x' is not finite", solve=solve), 0))
+    assert np.isnan([found.clipped_share, found.settling["y"], found.effort["u"], found.rms_error["y"]]).all()
+    assert found.solve == {}
+    assert found.statuses == {"NON_FINITE": 1}
+    assert found["cycles"] == {"": 0}
+
+
+def test_one_cycle_is_enough_for_a_solve():
+    """Its plan is one plan."""
+    solve = (Signal("solve", SOLVE), np.ones((CYCLES, 5)))
+    found = fp.measure(problem(measure_from=0.0), cut(run(0.0, solve=solve), 1))
+    assert found.solve["plans"] == 1
+    assert found.solve["worst_iterations"] == 1
+
+
+def test_end_of_a_run_counts_beside_other_cycles_that_were_not_finite():
+    """Two held cycles of that status, and the one in which the run ended; a status that never occurred counts zero."""
+    status = np.where(np.arange(CYCLES) < 2, float(Status.NON_FINITE), 0.0)
+    found = fp.measure(problem(), run(0.0, status=status, stop="signal 'x' is not finite"))
+    assert found.statuses == {"OK": 23, "NON_FINITE": 3}
+    assert found["status"] == {s.name: {"OK": 23, "NON_FINITE": 3}.get(s.name, 0) for s in Status}
+
+
+def test_settling_is_the_cycle_after_the_last_one_outside():
+    """Outside up to the last cycle but one: settled in the last; outside in the last: not settled."""
+    assert fp.measure(problem(), run(step(0.5, 0.0, 99))).settling["y"] == pytest.approx(9.9)
+    assert np.isnan(fp.measure(problem(), run(0.5)).settling["y"])
+    assert fp.measure(problem(), run(step(0.5, 0.0, 1))).settling["y"] == pytest.approx(0.1)
+    assert fp.measure(problem(), run(0.0, reference=np.zeros(CYCLES))).settling["y"] == 0.0
+
+
+def test_settling_counts_the_size_of_the_first_error():
+    """From 5 m below the band is 0.1 m as well; a later and larger error does not widen it."""
+    still = np.zeros(CYCLES)
+    assert fp.measure(problem(), run(step(-5.0, 0.099, 20), reference=still)).settling["y"] == pytest.approx(2.0)
+    error = np.where(np.arange(CYCLES) == 1, 50.0, step(5.0, 0.101, 20))
+    assert np.isnan(fp.measure(problem(), run(error, reference=still)).settling["y"])
+
+
+def test_settling_of_a_small_motion():
+    """A millimetre: the band is 0.02 mm. The floor of the band is there for a reference that rests and an error of zero."""
+    small = np.linspace(0.0, 1e-3, CYCLES)
+    assert fp.measure(problem(), run(step(5e-4, 1.9e-5, 30), reference=small)).settling["y"] == pytest.approx(3.0)
+    assert np.isnan(fp.measure(problem(), run(step(5e-4, 2.1e-5, 30), reference=small)).settling["y"])
+
+
+def test_a_run_that_ended_early_inside_the_band_has_not_settled():
+    """Nobody knows whether it would have stayed there."""
+    assert np.isnan(fp.measure(problem(), run(0.01, stop="signal 'x' is not finite")).settling["y"])
+
+
+def test_plans_that_return_are_counted_once():
+    """Two plans in turn are two, and one that is held is one."""
+    assert of_solves(np.arange(CYCLES) // 10 % 2).solve["plans"] == 2
+    assert of_solves(np.zeros(CYCLES)).solve["plans"] == 1
+    assert of_solves(np.arange(CYCLES)).solve["plans"] == CYCLES
+
+
+def test_a_run_that_ended_early_has_no_cost():
+    """A sum over fewer cycles would look like a small cost."""
+    cost = (Signal("cost", ("states",)), 1.0)
+    assert fp.measure(problem(), run(0.0, cost=cost)).cost == {"states": 50.0, "total": 50.0}
+    assert fp.measure(problem(), run(0.0, cost=cost, stop="signal 'x' is not finite")).cost == {}
+
+
+# Contraction
+
+
+def test_contraction_needs_ten_cycles(adaptive):
+    """Fewer say nothing; ten do."""
+    task, found = adaptive
+    for cycles, names in ((9, set()), (10, {"contraction.predicted", "contraction.measured"})):
+        metrics = fp.measure(task, cut(found, cycles))
+        assert {m.name for m, _, _ in metrics if m.name.startswith("contraction")} == names
+
+
+def test_contraction_is_that_of_an_adapting_controller(adaptive):
+    """Neither a controller without a logged contraction nor one without a gain has a factor."""
+    task, found = adaptive
+    layout = type(found.layout)(tuple(s for s in found.layout.signals if s.name != "contraction"))
+    columns_left = [k for k, c in enumerate(found.layout.columns) if c in layout.columns]
+    silent = replace(found, layout=layout, log=found.log[:, columns_left])
+    gainless = replace(found, settings={k: v for k, v in found.settings.items() if k != "effective_gain"})
+    for other in (silent, gainless):
+        assert fp.measure(task, other)["contraction.predicted"] == {}
+
+
+def test_spectrum_is_sampled_from_the_second_to_the_last_cycle(adaptive, monkeypatch):
+    """The first cycle has no request before it; a long run is thinned to 200 cycles."""
+    from fpirhc.simulation.metrics.entries import contraction
+
+    task, found = adaptive
+    asked = []
+    monkeypatch.setattr(
+        contraction, "spectrum_over_run", lambda plant, x, r, approximate: asked.append((x, r, approximate))
+    )
+    for cycles in (1000, 50):
+        sampled_spectrum(task, cut(found, cycles))
+    (long, requests, believed), (short, *_) = asked
+    assert (len(long), len(requests), len(short)) == (200, 200, 49)
+    np.testing.assert_array_equal(long[[0, -1]], found["state"][[1, 999]])
+    np.testing.assert_array_equal(requests[[0, -1]], found["deformed"][[1, 999]])
+    np.testing.assert_array_equal(short, found["state"][1:50])
+    assert believed == pytest.approx([1.0])

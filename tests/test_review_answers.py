@@ -1,0 +1,295 @@
+"""Where the answers of a review change, and their numbers, on loops and grids that were made by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.contraction import Spectrum
+from fpirhc.deformation.base import Deformation
+from fpirhc.review.commands import commands_inside
+from fpirhc.review.convergence import box_converges, converges
+from fpirhc.review.gain import gain_admissible
+from fpirhc.review.grid import ReviewGrid, review_grid
+from fpirhc.review.linear import LinearLoop
+from fpirhc.review.loops import Loops
+from fpirhc.review.slew import slew_enough
+
+PERIOD, CYCLES = 0.1, 100
+EDGE = math.log(100) / CYCLES  # of the logarithm of a factor per cycle
+
+
+def mass(**settings: Any) -> fp.Problem:
+    """2 kg and 10 N/m, taken for 1.5 kg and 6 N/m, along 0.5 sin 3t: u* = -4 sin 3t N, r* = -4.667 sin 3t, J = 0.75."""
+    plant = fp.Plant(
+        coordinates={"q": "m"},
+        inputs={"u": "N"},
+        parameters={"m": fp.Parameter(1.5, 2.0, "kg"), "k": fp.Parameter(6.0, 10.0, "N/m")},
+        response=lambda q, v, u, p: {"q": (u.u - p.k * q.q) / p.m},
+    )
+    usual: dict[str, Any] = {"start": {"q": 0.0, "q'": 1.5}, "period": PERIOD, "duration": PERIOD * CYCLES}
+    return fp.Problem(plant, fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(3 * t)}), **(usual | settings))
+
+
+@pytest.fixture(scope="module")
+def grid() -> ReviewGrid:
+    """Points of the reference."""
+    return review_grid(mass(), 0.0, 0)
+
+
+def loop(radius: float) -> LinearLoop:
+    """A loop with one mode."""
+    one = np.array([[radius]])
+    return LinearLoop(one, one, one, np.array([0]), PERIOD)
+
+
+def loops(*radii: float, ideal: float | None = 0.5, **more: Any) -> Loops:
+    """Loops with these radii at points of the reference."""
+    return Loops(tuple(range(len(radii))), tuple(map(loop, radii)), None if ideal is None else loop(ideal), **more)
+
+
+def torque(deformation: Deformation) -> fp.ComputedTorque:
+    return fp.ComputedTorque(fp.Exponential(rate=1.0), deformation)
+
+
+def convergence(grid: ReviewGrid, ours: Loops, deformation: Any = None, doubts: list[str] | None = None) -> fp.Answer:
+    return converges(grid, torque(deformation or fp.Affine(-0.5)), ours, doubts or [])
+
+
+# Convergence
+
+
+@pytest.mark.parametrize(
+    ("logarithms", "verdict"),
+    [
+        ((-1.01 * EDGE,), "yes"),
+        ((-0.99 * EDGE,), "unknown"),
+        ((0.99 * EDGE,), "unknown"),
+        ((1.01 * EDGE,), "no"),
+        ((-5 * EDGE, -0.99 * EDGE), "unknown"),
+        ((-5 * EDGE, -1.01 * EDGE), "yes"),
+        ((5 * EDGE, 0.99 * EDGE), "unknown"),
+        ((5 * EDGE, 1.01 * EDGE), "no"),
+        ((-math.inf,), "yes"),
+    ],
+)
+def test_convergence_is_a_hundredfold_change_over_the_run(grid, logarithms, verdict):
+    """Errors that shrink a hundredfold at every point converge, those that grow so diverge; all else is unknown."""
+    radii = np.exp(logarithms)
+    one = convergence(grid, loops(*radii))
+    assert one.verdict == verdict
+    assert one.found.startswith(f"the slowest mode of the linear loop changes by {max(radii):.6g} per cycle")
+    assert one.numbers == {"radius": max(radii), "smallest_radius": min(radii)}
+    assert bool(one.change) == (verdict != "yes")
+
+
+def test_the_range_along_the_reference_is_told(grid):
+    """What is unknown has its smallest and its largest factor."""
+    assert convergence(grid, loops(0.5, 1.25)).found.endswith("per cycle (between 0.5 and 1.25 along the reference)")
+
+
+@pytest.mark.parametrize(
+    ("ideal", "begin"), [(1.0, "The outer loop"), (0.999, "Change the gain"), (None, "Change the gain")]
+)
+def test_the_fault_of_an_outer_loop_is_not_the_gains(grid, ideal, begin):
+    """A loop that does not converge with the right model needs another rate, and no other gain."""
+    assert convergence(grid, loops(2.0, ideal=ideal)).change.startswith(begin)
+
+
+def test_a_loop_that_changes_on_line_is_unknown(grid):
+    """Whether the map changes or the model, its factor is that of the start."""
+    tuned = fp.Tuned(fp.Sigmoid(gain=-0.5, scale=20.0), largest_gain=1.0)
+    for one, name in (
+        (convergence(grid, loops(0.5), tuned), "Tuned changes its map"),
+        (convergence(grid, loops(0.5, learns=True)), "ComputedTorque changes its model"),
+    ):
+        assert (one.verdict, one.change) == ("unknown", f"{name} on line; the factor is that of its start.")
+    none = convergence(grid, Loops((), (), None, reason="the inverse does not exist"))
+    assert (none.verdict, none.found) == ("unknown", "no linear loop: the inverse does not exist")
+
+
+def test_doubts_and_steep_maps_speak_against_convergence(grid):
+    """J = 0.75 and A = -A_c / 2: the product reaches its limit 2 at A_c = -16 / 3, where a large error may oscillate."""
+    assert convergence(grid, loops(0.5), fp.Affine(-5.33)).verdict == "yes"
+    steep = convergence(grid, loops(0.5), fp.Affine(-5.36), ["the map is too slow"])
+    assert steep.verdict == "unknown"
+    assert steep.found.endswith(
+        ", but its steepest secant makes 2.01 of the 2 that converge near the reference; the map is too slow"
+    )
+    wrong = convergence(grid, loops(0.5), fp.Affine(0.5))
+    assert wrong.found.endswith("but near the reference the response Jacobian changes its sign")
+
+
+@pytest.mark.parametrize(
+    ("drawn", "verdict", "text"),
+    [
+        ((0.5, 0.9), "yes", "in 100 % of 2 draws; the worst mode changes by 0.9 per cycle"),
+        ((0.5, 1.0), "unknown", "in 50 % of 2 draws; the worst mode changes by 1 per cycle"),
+        ((0.5, 0.9, 1.25), "unknown", "in 66.7 % of 3 draws; the worst mode changes by 1.25 per cycle"),
+        ((), "yes", "in 100 % of 1 draws; the worst mode changes by 0.25 per cycle"),
+    ],
+)
+def test_share_of_the_box_that_converges(drawn, verdict, text):
+    """Of the draws; without draws of the loops along the reference."""
+    one = box_converges(loops(0.25, drawn=tuple(map(loop, drawn))))
+    radii = drawn or (0.25,)
+    assert (one.verdict, one.found, bool(one.change)) == (verdict, text, verdict == "unknown")
+    assert one.numbers == {"share": pytest.approx(np.mean(np.array(radii) < 1)), "radius": max(radii)}
+    assert box_converges(Loops((), (), None, reason="none")).found == "no linear loop: none"
+
+
+# The gain
+
+
+def admissible(gain: float, own: Any, boxed: Any, limit: float = 2.0) -> fp.Answer:
+    plant, box = (Spectrum(np.array(eigenvalues, complex)[:, None]) for eigenvalues in (own, boxed))
+    return gain_admissible(fp.Affine(gain), plant, box, limit)
+
+
+def test_numbers_of_the_gain():
+    """J from 1 to 1.5: A = -A_c / 2 below 2 / 1.5, best 1 / 1.25; under a dead time that halves the limit half of it all."""
+    one = admissible(-0.5, [1.0], [1.0, 1.5])
+    assert (one.verdict, one.change) == ("yes", "")
+    assert one.found == (
+        "gain = -0.5; admissible 0 to -2.67 for errors of any size, to -2.67 for small ones; recommended -1.6"
+    )
+    assert one.numbers == pytest.approx(
+        {"gain": -0.5, "recommended": -1.6, "factor": 0.75, "sector_limit": -8 / 3, "linear_limit": -8 / 3}
+    )
+    late = admissible(-0.5, [1.0], [1.0, 1.5], limit=1.0)
+    assert [late.numbers[n] for n in ("recommended", "sector_limit", "linear_limit")] == pytest.approx(
+        [-0.8, -4 / 3, -4 / 3]
+    )
+
+
+@pytest.mark.parametrize(
+    ("gain", "limit", "verdict"),
+    [
+        (-1.99, 2.0, "yes"),
+        (-2.01, 2.0, "unknown"),
+        (-3.99, 2.0, "unknown"),
+        (-4.01, 2.0, "no"),
+        (0.5, 2.0, "no"),
+        (-0.99, 1.0, "yes"),
+        (-1.99, 1.0, "unknown"),
+        (-2.01, 1.0, "no"),
+    ],
+)
+def test_where_a_gain_stops_being_admissible(gain, limit, verdict):
+    """J = 1, and up to 2 in the box: the plant bears |A_c| < 4, the box |A_c| < 2, and half of both at half the limit."""
+    one = admissible(gain, [1.0], [1.0, 2.0], limit)
+    assert one.verdict == verdict
+    assert one.change == ("" if verdict == "yes" else f"Use gain = {-4 / 3 * limit / 2:.3g}.")
+
+
+def test_both_signs_have_no_gain():
+    """In the box alone the plant's own limits are told; on the plant itself there is nothing to recommend."""
+    box = admissible(-0.5, [1.0], [-1.0, 1.0])
+    assert (box.verdict, box.change) == ("unknown", "Use gain = -2.")  # A = 1 / J
+    own = admissible(-0.5, [-1.0, 1.0], [-1.0, 1.0])
+    assert (own.verdict, own.change) == ("no", "See the question about the eigenvalues' sign.")
+
+
+# The slew
+
+
+def slew(problem: fp.Problem, step: float, ideal: LinearLoop | None = None) -> fp.Answer:
+    """The answer for a map with this largest step per cycle."""
+    unit = fp.Sigmoid(gain=-0.5, scale=1.0)
+    own = review_grid(problem, 0.0, 0)
+    return slew_enough(own, unit.with_scale(step / unit.largest_step()), problem.plant.approximate, ideal)
+
+
+@pytest.mark.parametrize(("ratio", "verdict"), [(2.01, "yes"), (1.99, "unknown"), (1.01, "unknown"), (0.99, "no")])
+def test_a_map_is_fast_enough_at_twice_the_speed(ratio, verdict):
+    """The request is 4.667 sin 3t: 14 per second."""
+    one = slew(mass(), ratio * 14.0 * PERIOD)
+    assert one.verdict == verdict
+    assert one.found == f"the request changes by up to 14 per second, the map by {ratio * 14:.3g}"
+    assert one.numbers == {"needed": pytest.approx(14.0, rel=1e-3), "limit": pytest.approx(ratio * 14.0), "jump": 0.0}
+    change = f"Raise the map's scale at least {2 / ratio:.2g} times, or leave it out to have it chosen."
+    assert one.change == ("" if verdict == "yes" else change)
+
+
+def test_a_map_without_bound_is_fast_enough(grid):
+    """The affine map takes a step of any size."""
+    one = slew_enough(grid, fp.Affine(-0.5), grid.problem.plant.approximate, None)
+    assert (one.verdict, one.found) == (
+        "yes",
+        "the request changes by up to 14 per second; the map's step has no bound",
+    )
+
+
+def test_disturbances_ask_for_speed_as_well():
+    """A jump of 3 N on 2 kg is 1.5, of 2 m/s2 on the coordinate 2; a sine of 4 N at 5 rad/s asks for 4 x 5 / 2 per second."""
+    by = {"u": fp.Sine(amplitude=4.0, frequency=5.0 / (2 * math.pi))}
+    one = slew(mass(disturbances=by), 0.75)
+    assert one.numbers["needed"] == pytest.approx(14.0 + 10.0, rel=1e-3)
+    two = slew(mass(disturbances={"u": fp.Step(at=1.0, size=-3.0)}), 0.7)
+    assert two.numbers["jump"] == pytest.approx(1.5)
+    assert two.found.endswith("; a jump of a disturbance takes it 3 cycles")
+    both = {"u": fp.Step(at=1.0, size=3.0), "q": fp.Step(at=1.0, size=2.0)}
+    assert slew(mass(disturbances=both), 0.7).numbers["jump"] == pytest.approx(2.0)
+
+
+def test_a_start_off_the_reference_asks_for_speed():
+    """Commands 6 (1/2)^k N per metre off: the first change, 3 N or 2 m/s2 of the model, in a period of 0.1 s is 20 per second."""
+    plan = LinearLoop(np.diag([0.5, 0.5]), np.eye(2), np.array([[6.0, 0.0]]), np.array([0, 1]), PERIOD)
+    one = slew(mass(start={"q": 1.0, "q'": 1.5}), 1.0, plan)
+    assert one.numbers["needed"] == pytest.approx(20.0)
+    assert one.found.startswith("the request changes by up to 20 per second after the start, the map")
+    near = slew(mass(start={"q": 0.5, "q'": 1.5}), 1.0, plan)
+    assert near.numbers["needed"] == pytest.approx(14.0, rel=1e-3)
+    assert "after the start" not in near.found
+
+
+# The commands
+
+
+def commands(rows: Any, limits: tuple[float, float] | None) -> fp.Answer:
+    """The answer for these commands, shape (draws, points)."""
+    own = review_grid(mass(**({"limits": fp.Limits(inputs={"u": limits})} if limits else {})), 0.0, 0)
+    made = replace(own)
+    made.__dict__["commands"] = np.array(rows, dtype=float)[..., None]
+    return commands_inside(made)
+
+
+@pytest.mark.parametrize(
+    ("rows", "limits", "verdict", "own", "widest"),
+    [
+        ([[-2.0, 4.0]], (-4.0, 8.0), "yes", 2 / 3, 2 / 3),
+        ([[-2.0, 7.0], [-3.9, 8.0]], (-4.0, 8.0), "yes", 5 / 6, 1.0),
+        ([[-2.0, 7.0], [-4.6, 0.0]], (-4.0, 8.0), "unknown", 5 / 6, 1.1),
+        ([[-2.0, 8.6], [0.0, 9.2]], (-4.0, 8.0), "no", 1.1, 1.2),
+        ([[-4.6, 2.0]], (-4.0, 8.0), "no", 1.1, 1.1),
+        ([[math.nan, 5.0]], (-4.0, 8.0), "yes", 0.5, 0.5),
+        ([[-9.0, 3.0]], (-math.inf, 3.0), "yes", 0.0, 0.0),
+        ([[-9.0, 3.1]], (-math.inf, 3.0), "no", 2.0, 2.0),
+        ([[-3.0, 9.0]], (-3.0, math.inf), "yes", 0.0, 0.0),
+        ([[-3.1, 9.0]], (-3.0, math.inf), "no", 2.0, 2.0),
+    ],
+)
+def test_share_of_the_limits(rows, limits, verdict, own, widest):
+    """Of the way from the middle to the limit; a one-sided limit is kept or not."""
+    one = commands(rows, limits)
+    assert one.verdict == verdict
+    assert one.numbers == pytest.approx({"share_of_limits": own, "share_over_box": widest})
+    assert one.found.endswith(f"; {100 * own:.3g} % of the limits, {100 * widest:.3g} % over the box")
+    change = f"Slow the reference down, or widen the limits {widest:.2g} times."
+    assert one.change == ("" if verdict == "yes" else change)
+
+
+def test_range_of_the_commands():
+    """That of the plant's own parameters, at the points where there is a command."""
+    assert (
+        commands([[-1.25, 2.5, math.nan], [-9.0, 9.0, 9.0]], None).found
+        == "needed: u -1.25 to 2.5; no input has limits"
+    )
+    none = commands([[math.nan, math.nan]], (-4.0, 8.0))
+    assert (none.verdict, none.found) == ("unknown", "no finite command is known")
