@@ -1,4 +1,4 @@
-"""The tracking error of the controlled coordinates and its integral, as tracking laws pass them on."""
+"""The tracking error of the controlled coordinates and its integral: signals and blocks that tracking laws share."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def integral_update(plant: Plant, period: float) -> Block:
 
 
 def integral_delay(plant: Plant) -> tuple[Delay, ...]:
-    """The integral in the next cycle is what the update made of it."""
+    """Delay that carries the updated integral to the next cycle."""
     return (Delay(integral_signal(plant, "_integral_before"), "integral"),)
 
 
