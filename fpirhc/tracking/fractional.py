@@ -14,8 +14,8 @@ cycles it is the sum of Gruenwald and Letnikov over the last L cycles, solved fo
 
 The law needs L multiplications and L remembered numbers per coordinate in every cycle, L = memory / period. For beta < 1 it answers
 a change of the measured S with the gain (1 - beta) / period, many times `rate`, in the next cycle, and the first desired response
-is large. So a constant response error h leaves S = period^(1-beta) h / rate^beta, less than the h / rate of the exponential law, while
-measurement noise and dead time matter more. For beta > 1 both effects are reversed.
+is large. So a constant response error h leaves S = period^(1-beta) h / rate^beta, less than the h / rate of the exponential law,
+while measurement noise and dead time matter more. For beta > 1 both effects are reversed.
 
 References:
     I. Podlubny, Fractional Differential Equations, Academic Press 1999, ch. 2 and 7 (sum, short memory).
