@@ -124,7 +124,7 @@ def examples(family: str, inner: Any = None) -> tuple[Any, ...]:
 
 
 def public_member(name: str) -> Any:
-    """The member of that name from the module whose file is named like it (`FooBar` in `foo_bar.py`); None if there is none."""
+    """The member `FooBar` of the module `foo_bar`, or of a module of another distribution; None if there is none."""
     for kind in FAMILIES.values():
         for package in kind.packages:
             root = importlib.import_module(package)

@@ -58,7 +58,7 @@ class RungeKutta4(Integrator):
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period` seconds."""
         rate = plant.forced_derivative_function
-        x, u, p, w = (ca.SX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))
+        x, u, p, w = _symbols(rate)
         h = period / self.substeps
         x_next = x
         for _ in range(self.substeps):
@@ -73,7 +73,7 @@ class Euler(Integrator):
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period` seconds."""
         rate = plant.forced_derivative_function
-        x, u, p, w = (ca.SX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))
+        x, u, p, w = _symbols(rate)
         x_next = x + period * rate(x, u, p, w)
         return ca.Function("fpirhc_euler", [x, u, p, w], [x_next], ["x", "u", "p", "w"], ["x_next"])
 
@@ -100,7 +100,7 @@ class Cvodes(Integrator):
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period` seconds."""
         rate = plant.forced_derivative_function
-        x, u, p, w = (ca.SX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))
+        x, u, p, w = _symbols(rate)
         data = ca.vertcat(u, p, w)
         options = {"reltol": self.tolerance, "abstol": self.tolerance}
         solver = ca.integrator(
@@ -118,3 +118,8 @@ def runge_kutta_4(rate: Callable[[Expression], Expression], x: Expression, h: fl
     k3 = rate(x + h / 2 * k2)
     k4 = rate(x + h * k3)
     return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def _symbols(rate: ca.Function) -> tuple[ca.SX, ...]:
+    """Symbols (x, u, p, w) of the arguments of the forced derivative."""
+    return tuple(ca.SX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))

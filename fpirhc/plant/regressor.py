@@ -93,7 +93,7 @@ class Regressor:
 
     @cached_property
     def covered(self) -> tuple[int, ...]:
-        """Places, among the plant's parameters, of those that theta depends on."""
+        """Places of the plant's parameters on which theta depends."""
         _, _, p = self.plant._symbols()
         pattern = ca.DM(ca.jacobian_sparsity(self.theta_function(p), p), 1).full()
         return tuple(int(k) for k in np.flatnonzero(pattern.any(axis=0)))
@@ -174,7 +174,7 @@ class Regressor:
             if len(points) > len(self.names):
                 raise InvalidValue(
                     f"Regressor(names={tuple(self.names)}): the combinations depend on each other (one is a sum of multiples "
-                    "of others), so they cannot be told apart; leave one out"
+                    "of others), so no data can distinguish them; leave one out"
                 )
             points.append(_varied(self.plant, random))
         return points

@@ -106,7 +106,7 @@ def find_problem(name_or_path: str) -> Path:
 
 
 def load_problem(name_or_path: str) -> Task:
-    """Import a problem file and check what it defines.
+    """Import a problem file and check its definitions.
 
     Raises:
         ProblemFileError: the file raises an error on import (the message shows the line), or a definition is missing or wrong.

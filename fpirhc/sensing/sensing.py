@@ -30,7 +30,7 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
 from fpirhc.task.dead_time import delay_block
 
-_STREAM = 1  # keeps the sensors' random series apart from those of disturbances
+_STREAM = 1  # separates the sensors' random series from the series of disturbances
 
 
 @dataclass(frozen=True, eq=False)

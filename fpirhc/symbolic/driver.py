@@ -1,6 +1,6 @@
 """Bodies in C for Functions whose composed graph is slow to run as generated code.
 
-A driver is a hand-written loop around generated leaf functions that computes what a composed Function computes. The composed
+A driver is a hand-written loop around generated leaf functions, with the same results as a composed Function. The composed
 Function stays the definition: the virtual machine runs it, and it is compiled where a driver does not fit. When C is generated
 for a Function that calls it, its body is replaced by a call of the driver.
 """

@@ -1,4 +1,4 @@
-"""Compiles Functions to C, once: the compiled library is kept in a content-addressed cache.
+"""Compilation of Functions to C, with a content-addressed cache of the compiled libraries.
 
 The key of a library is a hash of the generated C, the compiler and its version, the flags, the machine and CasADi's version, so
 a library can never be another model's. It is compiled in a folder of its own, its checksum is stored, and both are renamed into
@@ -57,7 +57,7 @@ class Native:
 
 
 def find_compiler() -> str | None:
-    """Path of the C compiler: FPIRHC_CC, else CC, cc, gcc or clang; None when FPIRHC_CC is 'none' or nothing is found.
+    """Path of the C compiler: FPIRHC_CC, else CC, cc, gcc or clang; None where FPIRHC_CC is 'none' or there is none.
 
     Where FPIRHC_CC names a compiler, no other one replaces it.
     """
@@ -85,7 +85,7 @@ def native(function: ca.Function, flags: Sequence[str] = ()) -> Native:
 
 
 def generate(function: ca.Function) -> tuple[str, ...]:
-    """Return the C files of `function`: its own, under a fixed name, and those of the drivers that it calls.
+    """Return the C files of `function`: its own under a fixed name, and the files of the drivers that it calls.
 
     Raises:
         NotSupported: a part of it cannot be written as C.

@@ -1,6 +1,6 @@
 """Dead time of a plant: the time that commands and measurements take to arrive.
 
-A dead time of (d + phi) control cycles, 0 <= phi < 1, is kept by a queue: the input that acts in a cycle is
+A queue implements a dead time of (d + phi) control cycles, 0 <= phi < 1: the input that acts in a cycle is
 
     (1 - phi) u_{k-d} + phi u_{k-d-1},
 

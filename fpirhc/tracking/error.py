@@ -10,6 +10,19 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 
 
+def law_signals(plant: Plant) -> tuple[Layout, Layout]:
+    """Signals that the law of an integrating tracking law reads and writes."""
+    reads = (
+        plant.state,
+        Signal("_target", plant.state.elements, plant.state.units),
+        plant.response_signal("nominal"),
+        scalar("warm_up"),
+        integral_signal(plant, "_integral_before"),
+    )
+    writes = (error_signal(plant), plant.response_signal("desired"), integral_signal(plant, "_integral_used"))
+    return Layout(reads), Layout(writes)
+
+
 def integral_update(plant: Plant, period: float) -> Block:
     """Block that integrates the error, except while the command is clipped."""
     reads = (error_signal(plant), scalar("clipped"), integral_signal(plant, "_integral_used"))

@@ -21,9 +21,9 @@ from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, total
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression
 from fpirhc.tracking.base import Feedback, Tracking
-from fpirhc.tracking.error import error_chains, error_signal, integral_delay, integral_signal, integral_update
+from fpirhc.tracking.error import error_chains, integral_delay, integral_update, law_signals
 
 
 @dataclass(frozen=True)
@@ -64,14 +64,7 @@ class Exponential(Tracking):
     def law(self, plant: Plant, period: float) -> Block:
         """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
         del period
-        reads = (
-            plant.state,
-            Signal("_target", plant.state.elements, plant.state.units),
-            plant.response_signal("nominal"),
-            scalar("warm_up"),
-            integral_signal(plant, "_integral_before"),
-        )
-        writes = (error_signal(plant), plant.response_signal("desired"), integral_signal(plant, "_integral_used"))
+        reads, writes = law_signals(plant)
 
         def step(s: Signals) -> dict[str, Expression]:
             errors = error_chains(plant, s._target - s.state)
@@ -84,7 +77,7 @@ class Exponential(Tracking):
                 "_integral_used": integral,
             }
 
-        return Block("tracking", Layout(reads), Layout(writes), step)
+        return Block("tracking", reads, writes, step)
 
     def update(self, plant: Plant, period: float) -> Block:
         """Block that integrates the error, except while the command is clipped."""

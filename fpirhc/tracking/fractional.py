@@ -34,9 +34,9 @@ from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.tracking.base import Tracking
-from fpirhc.tracking.error import error_chains, error_signal, integral_delay, integral_signal, integral_update
+from fpirhc.tracking.error import error_chains, integral_delay, integral_update, law_signals
 
 MOST = 20_000  # cycles of memory: the memory has a fixed size
 _REACH = 20.0  # memory x rate by default
@@ -108,14 +108,7 @@ class Fractional(Tracking):
         cycles, size = self.cycles(period), len(plant.controlled_names)
         past = tuple(f"{c}@{j}" for c in plant.controlled_names for j in range(1, cycles + 1))
         memory = Layout((Signal("decay_past", past), Signal("decay_first", plant.controlled_names)))
-        reads = (
-            plant.state,
-            Signal("_target", plant.state.elements, plant.state.units),
-            plant.response_signal("nominal"),
-            scalar("warm_up"),
-            integral_signal(plant, "_integral_before"),
-        )
-        writes = (error_signal(plant), plant.response_signal("desired"), integral_signal(plant, "_integral_used"))
+        reads, writes = law_signals(plant)
         weights, stiffness = ca.DM(self.weights(cycles)), (self.rate * period) ** self.order
 
         def step(s: Signals) -> dict[str, Expression]:
@@ -137,7 +130,7 @@ class Fractional(Tracking):
                 "decay_first_next": first,
             }
 
-        return Block("tracking", Layout(reads), Layout(writes), step, memory, opaque=True)
+        return Block("tracking", reads, writes, step, memory, opaque=True)
 
     def update(self, plant: Plant, period: float) -> Block:
         """Block that integrates the error, except while the command is clipped."""

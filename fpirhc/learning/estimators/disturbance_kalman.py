@@ -175,9 +175,9 @@ class DisturbanceKalman(Estimator):
         rank = int(np.linalg.matrix_rank(stacked[rows] / np.abs(stacked[rows]).max(axis=1, keepdims=True), tol=1e-9))
         if rank < len(a):
             raise NotSupported(
-                f"DisturbanceKalman: a constant {disturbances} cannot be told from {measured}: [A - I, B; C, 0] has rank "
+                f"DisturbanceKalman: a constant {disturbances} cannot be determined from {measured}: [A - I, B; C, 0] has rank "
                 f"{rank} and needs {len(a)} (Pannocchia and Rawlings 2003); measure another state, or disturb the response "
-                "of a coordinate that acts on what is measured"
+                "of a coordinate that acts on a measured state"
             )
 
 
