@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-_SECTION = re.compile(r"^(Parameters|Raises|References|Returns|Yields|Note|Example|Examples):$")
+_SECTION = re.compile(r"^(Args|Parameters|Raises|References|Returns|Yields|Note|Example|Examples):$")
 
 
 def rewritten(lines: list[str]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Settings as plain data: what a value was made of, for reports, files and comparisons of settings."""
+"""Settings of a value as plain data, for reports, files and comparisons of settings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 
 def describe(value: Any) -> Any:
-    """Return `value` as JSON-able data; a dataclass becomes {"is": its class, field: ...}, a function its name.
+    """Return `value` as data for JSON; a dataclass becomes {"is": its class, field: ...}, a function its name.
 
     A dataclass field with the metadata {"setting": False} is left out: it names the value and changes nothing.
     """

@@ -1,7 +1,7 @@
 """Misuse raises one of these; a bad outcome of a run is data, not an exception.
 
-Every error says what is wrong, where, what was expected, and how to mend it. `Mistakes` collects
-all of a value's mistakes, so that a user sees them together.
+Every message states what is wrong, where, what was expected, and how to mend it. `Mistakes` collects all mistakes of a value,
+so that a user sees them together.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class InvalidName(FpirhcError, AttributeError, KeyError):
 
 
 class InvalidValue(FpirhcError, ValueError):
-    """A number or value outside what is allowed."""
+    """A number or value outside its allowed range."""
 
 
 class InvalidShape(FpirhcError, ValueError):
@@ -42,11 +42,11 @@ class NotInvertible(FpirhcError, ValueError):
 
 
 class NotContractive(FpirhcError, ValueError):
-    """No gain, or not this gain, makes the fixed-point iteration converge."""
+    """The fixed-point iteration does not converge with this gain, or with any gain."""
 
 
 class NotSupported(FpirhcError, ValueError):
-    """A valid wish that this member of a family cannot serve; the message names one that can."""
+    """A valid setting that this member of a family cannot serve; the message names a member that can."""
 
 
 class OutputError(FpirhcError, OSError):
@@ -62,11 +62,11 @@ class CompileError(FpirhcError, RuntimeError):
 
 
 class WorkerDied(FpirhcError, RuntimeError):
-    """Processes that compute for this one die again and again."""
+    """Worker processes died repeatedly."""
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:
-    """Return ' Did you mean ...? Valid: ...' for a message about an unknown `name`."""
+    """Return ' Did you mean ...? Valid: ...', the end of a message about an unknown `name`."""
     names = list(valid)
     if not names:
         return " No names are valid here."
@@ -80,14 +80,14 @@ class Mistakes:
 
     def __init__(self, where: str) -> None:
         self._where = where
-        self._found: list[str] = []
+        self._mistakes: list[str] = []
 
     def add(self, mistake: str) -> None:
-        """Note one mistake."""
-        self._found.append(mistake)
+        """Add one mistake."""
+        self._mistakes.append(mistake)
 
     def unknown(self, what: str, names: Iterable[str], valid: Iterable[str]) -> None:
-        """Note each of `names` that is not in `valid`, with the nearest valid name."""
+        """Add a mistake, with the nearest valid name, for each of `names` that is not in `valid`."""
         allowed = list(valid)
         for name in names:
             if name not in allowed:
@@ -97,10 +97,10 @@ class Mistakes:
         """Raise InvalidProblem with all mistakes, if there is one.
 
         Raises:
-            InvalidProblem: listing every mistake found.
+            InvalidProblem: with a list of all mistakes.
         """
-        if len(self._found) == 1:
-            raise InvalidProblem(f"{self._where}: {self._found[0]}")
-        if self._found:
-            lines = "\n".join(f"  {k}. {m}" for k, m in enumerate(self._found, 1))
-            raise InvalidProblem(f"{self._where}: {len(self._found)} mistakes\n{lines}")
+        if len(self._mistakes) == 1:
+            raise InvalidProblem(f"{self._where}: {self._mistakes[0]}")
+        if self._mistakes:
+            lines = "\n".join(f"  {k}. {m}" for k, m in enumerate(self._mistakes, 1))
+            raise InvalidProblem(f"{self._where}: {len(self._mistakes)} mistakes\n{lines}")

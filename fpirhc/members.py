@@ -1,4 +1,4 @@
-"""Members of families, found by looking into the packages: an addition is one new file.
+"""Members of families, found by a search of the packages: an addition is one new file.
 
 A family is a contract (a class such as `Deformation`) and a package. Its members are the modules below that package, and
 the modules of other distributions that name themselves in the entry-point group `fpirhc.members`. A member's module
@@ -7,7 +7,7 @@ the modules of other distributions that name themselves in the entry-point group
 - carries `EXAMPLES`, values of these classes that the conformance laws use; a module whose members wrap another value has a
   function `examples(inner)` instead, which returns values around any inner one.
 
-A controller or an estimator that needs a problem of its own is given as an `Example`.
+A controller or an estimator that needs a problem of its own stands there as an `Example`.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ GROUP = "fpirhc.members"  # entry points of other distributions; each names a mo
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """A contract and where its members live.
+    """A contract and the packages of its members.
 
-    Parameters:
-        contract: "module:Class" of the contract. packages: packages that are searched, with all that is below them.
+    Args:
+        contract: "module:Class" of the contract.
+        packages: names of the packages that are searched, with everything below them.
     """
 
     contract: str
@@ -39,8 +40,8 @@ class Family:
     def type(self) -> type:
         """The contract's class."""
         module, _, name = self.contract.partition(":")
-        found: type = getattr(importlib.import_module(module), name)
-        return found
+        contract: type = getattr(importlib.import_module(module), name)
+        return contract
 
 
 FAMILIES: Mapping[str, Family] = {
@@ -56,12 +57,14 @@ FAMILIES: Mapping[str, Family] = {
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """A value with the problem that it is tried on.
+    """A value with the problem on which the laws try it.
 
-    Parameters:
-        value: the member; None: the controller of that name in the shipped problem.
-        problem: name of a shipped problem; empty: the problem of the family's laws. controller: a name in that problem.
-        changes: fields of the problem that are replaced. left: share of the error that the laws let it leave (None: theirs).
+    Args:
+        value: the member; None: the controller called `controller` in the shipped problem.
+        problem: name of a shipped problem; empty: the problem of the family's laws.
+        controller: name of a controller in that problem.
+        changes: fields of the problem that are replaced.
+        left: largest share of the error that may remain; None: the bound of the laws.
     """
 
     value: Any = None
@@ -73,8 +76,8 @@ class Example:
 
 def modules(*packages: str) -> Iterator[ModuleType]:
     """Every module below the packages, and every module that another distribution names in the entry-point group."""
-    others = tuple(entry.value for entry in entry_points(group=GROUP))
-    for name in (*packages, *others):
+    foreign = tuple(entry.value for entry in entry_points(group=GROUP))
+    for name in (*packages, *foreign):
         root = importlib.import_module(name)
         yield root
         for info in pkgutil.walk_packages(getattr(root, "__path__", ()), f"{name}."):
@@ -106,9 +109,11 @@ def member_classes(family: str) -> tuple[type, ...]:
 
 
 def examples(family: str, inner: Any = None) -> tuple[Any, ...]:
-    """Example values of every member of the family; `inner` is what those that wrap another value are given.
+    """Example values of every member of the family.
 
-    Without `inner`, members that wrap another value are left out.
+    Args:
+        family: a key of `FAMILIES`.
+        inner: the value that wrappers are built around; None leaves wrappers out.
     """
     values: list[Any] = []
     for module in member_modules(family):
@@ -119,12 +124,12 @@ def examples(family: str, inner: Any = None) -> tuple[Any, ...]:
 
 
 def public_member(name: str) -> Any:
-    """The member of that name from the module whose file is named like it (`FooBar` in `foo_bar.py`); None if there is none."""
+    """The member `FooBar` of the module `foo_bar`, or of a module of another distribution; None if there is none."""
     for kind in FAMILIES.values():
         for package in kind.packages:
             root = importlib.import_module(package)
             for info in pkgutil.walk_packages(root.__path__, f"{package}."):
                 if info.name.rpartition(".")[2].replace("_", "") == name.lower():
                     return getattr(importlib.import_module(info.name), name, None)
-    offered = (getattr(importlib.import_module(e.value), name, None) for e in entry_points(group=GROUP))
-    return next((value for value in offered if value is not None), None)
+    foreign = (getattr(importlib.import_module(e.value), name, None) for e in entry_points(group=GROUP))
+    return next((value for value in foreign if value is not None), None)

@@ -1,4 +1,4 @@
-"""What became of a control cycle or a solve: a closed enum whose text is the remedy in words."""
+"""Outcomes of a control cycle or a solve, each with its remedy in words."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Status(IntEnum):
 
     @property
     def remedy(self) -> str:
-        """A sentence that says what happened and what to do next."""
+        """A sentence that states what happened and what to do next."""
         return _REMEDIES[self]
 
 

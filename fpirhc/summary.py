@@ -1,6 +1,6 @@
-"""How results show themselves: one line where they are printed, a small table in a notebook.
+"""Short forms of results: one line for a terminal, a small table for a notebook.
 
-Names and reasons come from a user's files, so all of them are escaped for where they are shown.
+Names and reasons come from a user's files, so all of them are escaped for the place where they appear.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]], notes:
 
 
 def printable(text: str) -> str:
-    """Return the text with what cannot be printed, such as escape codes of a terminal, written out; new lines stay."""
+    """Return the text with unprintable characters, such as escape codes of a terminal, written out; new lines stay."""
     return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode("ascii") for c in text)
 
 

@@ -332,7 +332,7 @@ TWO_TASK = fp.Problem(
             TWO_TASK,
             fp.DisturbanceKalman({"b": 1.0}, {"a": 1.0}, {"a": 1.0}),
             NotSupported,
-            r"w_b cannot be told from a",
+            r"w_b cannot be determined from a",
         ),
         (TWO_TASK, fp.DisturbanceKalman({"a": 1.0}, {"a": 1.0, "z": 1.0}), InvalidProblem, "'z' is unknown"),
         (TWO_TASK, fp.DisturbanceKalman({"z": 1.0}, {"a": 1.0}), InvalidProblem, "'z' is unknown"),

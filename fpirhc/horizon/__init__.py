@@ -1,1 +1,1 @@
-"""The horizon: its cost, its discretised model, and the gradient of its auxiliary function."""
+"""Horizons: cost, discretised model, limits, and the gradient of the auxiliary function."""

@@ -1,4 +1,4 @@
-"""State bounds moved into the cost by an augmented Lagrangian, so that an optimiser of input bounds can serve them.
+"""State bounds as terms of the cost by an augmented Lagrangian, for optimisers that keep input bounds only.
 
 For a bounded state x with multiplier y and weight w, every stage (and the end) gets the term
 
@@ -6,9 +6,11 @@ For a bounded state x with multiplier y and weight w, every stage (and the end) 
 
 Its gradient is the multiplier that the update gives, so the stationarity of the augmented problem is that of the constrained one
 with the new multipliers. w_k = 10 rho / c_k, with c_k the compliance of the state along the reference, the middle eigenvalue of
-J M^-1 J', makes most patterns of violation shrink by an order of magnitude per update; rho is raised where that is not enough.
+J M^-1 J', makes most patterns of violation shrink by an order of magnitude per update. A larger rho helps where that is not enough.
 
-References: M. R. Hestenes, J. Optim. Theory Appl. 4(5), 1969; R. T. Rockafellar, SIAM J. Control 12(2), 1974.
+References:
+    M. R. Hestenes, J. Optim. Theory Appl. 4(5), 1969.
+    R. T. Rockafellar, SIAM J. Control 12(2), 1974.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 _STIFFNESS = 10.0
-_MOVED = 1e-6  # relative eigenvalue below which a pattern in time cannot be moved at all
+_REACHABLE = 1e-6  # relative eigenvalue below which the inputs do not reach a pattern in time
 
 
 def bounded_states(ocp: OptimalControl) -> list[int]:
@@ -38,16 +40,16 @@ def augmented(ocp: OptimalControl) -> OptimalControl:
     y, factor = ca.SX.sym("y", len(places)), ca.SX.sym("rho")
     penalty = _penalty(ocp, s, y, places, factor * weights)
     cost, terms = ocp.stage_cost(s, u, theta)
-    given = ca.vertcat(theta, factor, y)
+    augmented_data = ca.vertcat(theta, factor, y)
     names = tuple(ocp.state.elements[k] for k in places)
-    stage = ca.Function("fpirhc_augmented_stage", [s, u, given], [cost + penalty, ca.vertcat(terms, penalty)])
-    final = ca.Function("fpirhc_augmented_end", [s, given], [ocp.terminal_cost(s, theta) + penalty])
-    dynamics = ca.Function("fpirhc_dynamics", [s, u, given], [ocp.dynamics(s, u, theta)])
+    stage = ca.Function("fpirhc_augmented_stage", [s, u, augmented_data], [cost + penalty, ca.vertcat(terms, penalty)])
+    final = ca.Function("fpirhc_augmented_end", [s, augmented_data], [ocp.terminal_cost(s, theta) + penalty])
+    dynamics = ca.Function("fpirhc_dynamics", [s, u, augmented_data], [ocp.dynamics(s, u, theta)])
     states, inputs, data = ocp.nodes
-    # As steep as it gets where every bound is active: the plain fixed-point step must be short enough there.
-    steep = np.zeros((ocp.state.size, ocp.state.size))
-    steep[places, places] = weights
-    along = replace(ocp.along, q=ocp.along.q + steep, final=ocp.along.final + steep)
+    # The curvature where every bound is active: the plain fixed-point step must be short enough there.
+    steepest = np.zeros((ocp.state.size, ocp.state.size))
+    steepest[places, places] = weights
+    along = replace(ocp.along, q=ocp.along.q + steepest, final=ocp.along.final + steepest)
     return replace(
         ocp,
         data=Layout((*ocp.data.signals, scalar("penalty"), Signal("multipliers", names))),
@@ -79,16 +81,16 @@ def penalty_weights(ocp: OptimalControl) -> np.ndarray:
     sensitivity, model = ocp.along.sensitivity(), ocp.along.hessian()
     ridge = 1e-9 * np.trace(model) / model.shape[0]
     reach = np.array([_reach(sensitivity[:, k], model + ridge * np.eye(model.shape[0])) for k in bounded_states(ocp)])
-    # A state that no input moves along the reference is weighed like the others.
+    # A state that no input reaches along the reference has the weight of the others.
     usable = np.isfinite(reach) & (reach > 0)
     return _STIFFNESS / np.where(usable, reach, reach[usable].max() if usable.any() else 1.0)
 
 
 def _reach(rows: np.ndarray, model: np.ndarray) -> float:
-    """Middle eigenvalue of J M^-1 J': how far multipliers of this state move it, between smooth and sharp patterns in time."""
+    """Middle eigenvalue of J M^-1 J': effect of a state's multipliers on it, between smooth and sharp patterns in time."""
     try:
         values = np.linalg.eigvalsh(rows @ np.linalg.solve(model, rows.T))
-        return float(np.median(values[values >= _MOVED * values[-1]]))
+        return float(np.median(values[values >= _REACHABLE * values[-1]]))
     except np.linalg.LinAlgError:
         return float("nan")
 

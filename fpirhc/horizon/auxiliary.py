@@ -2,7 +2,7 @@
 
     Psi(S, U, mu) = V(S, U) + sum_{i<N} mu_i' (s_{i+1} - F(s_i, u_i)),    z = (S, U, mu),
 
-where S = (s_1 ... s_N) are free and the dynamics are constraints. At a solution grad Psi = 0. Its Hessian is the KKT matrix:
+where S = (s_1 ... s_N) are unknowns and the dynamics are constraints. At a solution grad Psi = 0. Its Hessian is the KKT matrix:
 symmetric and indefinite, with inertia (N (ns + nu), N ns).
 """
 
@@ -20,10 +20,10 @@ def auxiliary(ocp: OptimalControl) -> ca.Function:
     multipliers = ca.MX.sym("mu", ocp.state.size, n)
     s0, data = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size, n + 1)
     before = ca.horzcat(s0, states[:, : n - 1])
-    following = ocp.dynamics.map(n)(before, inputs, data[:, :n])
+    next_states = ocp.dynamics.map(n)(before, inputs, data[:, :n])
     costs, _ = ocp.stage_cost.map(n)(before, inputs, data[:, :n])
     value = ca.sum2(costs) + ocp.terminal_cost(states[:, n - 1], data[:, n])
-    value += ca.dot(multipliers, states - following)
+    value += ca.dot(multipliers, states - next_states)
     names = ["S", "U", "mu", "s0", "data"]
     return ca.Function("fpirhc_auxiliary", [states, inputs, multipliers, s0, data], [value], names, ["psi"])
 
@@ -46,6 +46,6 @@ def auxiliary_hessian(ocp: OptimalControl) -> ca.Function:
     shaped = (ca.reshape(states, ns, n), ca.reshape(inputs, nu, n), ca.reshape(multipliers, ns, n))
     hessian, _ = ca.hessian(auxiliary(ocp)(*shaped, s0, data), z)
     flat = ca.Function("fpirhc_hessian", [z, s0, data], [hessian])
-    given = [ca.MX.sym(name, rows, n) for name, rows in (("S", ns), ("U", nu), ("mu", ns))]
-    packed = ca.vertcat(*(ca.vec(v) for v in given))
-    return ca.Function("fpirhc_auxiliary_hessian", [*given, s0, data], [flat(packed, s0, data)])
+    arguments = [ca.MX.sym(name, rows, n) for name, rows in (("S", ns), ("U", nu), ("mu", ns))]
+    packed = ca.vertcat(*(ca.vec(v) for v in arguments))
+    return ca.Function("fpirhc_auxiliary_hessian", [*arguments, s0, data], [flat(packed, s0, data)])

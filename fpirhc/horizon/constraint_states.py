@@ -1,7 +1,7 @@
-"""Limits on what is not a state: rates of inputs, paths, and the end of the horizon.
+"""Limits of other quantities than states: rates of inputs, paths, and the end of the horizon.
 
-Each becomes an entry z of the stage's state that is written one stage later, z_{i+1} = c(s_i, u_i, theta_i), and is bounded there.
-So every optimiser that keeps bounds of states keeps them too, and they are verified and named like states.
+Each limit adds an entry z to the stage's state, z_{i+1} = c(s_i, u_i, theta_i), with bounds. So every optimiser that keeps bounds
+of states keeps these limits too, and they are verified and named like states.
 """
 
 from __future__ import annotations
@@ -18,12 +18,20 @@ from fpirhc.symbolic.expression import Value, expression
 from fpirhc.symbolic.layout import Expression
 from fpirhc.task.limits import Limits
 
-_HAIR = 1e-9
+_GAP = 1e-9  # half width of the bounds of a terminal equality
 
 
 @dataclass(frozen=True, eq=False)
 class ConstraintState:
-    """One entry: its name, unit, expression, and bounds (infinite where free)."""
+    """One further entry of the stage's state.
+
+    Args:
+        name: of the entry.
+        unit: of the entry.
+        expression: of the stage before.
+        lower: bound; infinite where free.
+        upper: bound; infinite where free.
+    """
 
     name: str
     unit: str
@@ -43,7 +51,7 @@ def rates(limits: Limits, plant: Plant, view: View, step: float) -> list[Constra
 
 
 def paths(limits: Limits, view: View) -> list[ConstraintState]:
-    """Expressions of state and input of stages 0 ... N-1 that are to stay in an interval."""
+    """Limited expressions of state and input of stages 0 ... N-1."""
     return [
         ConstraintState(name, path.unit, expression(path.expression(view)), path.lower, path.upper)
         for name, path in limits.paths.items()
@@ -51,22 +59,29 @@ def paths(limits: Limits, view: View) -> list[ConstraintState]:
 
 
 def ends(
-    names: tuple[str, ...], plant: Plant, following: Expression, target: Expression, last: Expression
+    names: tuple[str, ...], plant: Plant, next_state: Expression, target: Expression, last: Expression
 ) -> list[ConstraintState]:
-    """State minus reference at the end of the horizon, zero before whatever the state is.
+    """State minus reference at the end of the horizon, and zero in all earlier stages.
 
-    The bounds leave a hair's breadth: interior-point solvers count a fixed variable as an equation, and would find too many.
+    The bounds leave a small gap, because an interior-point solver counts a fixed variable as an equation.
+
+    Args:
+        names: states that must meet the reference.
+        plant: the plant.
+        next_state: state after the stage.
+        target: reference after the stage.
+        last: 1 in the last stage, 0 before.
     """
     places = {e: k for k, e in enumerate(plant.state.elements)}
     units = dict(zip(plant.state.elements, plant.state.units, strict=True))
     return [
-        ConstraintState(f"{e} at the end", units[e], last * (following[places[e]] - target[places[e]]), -_HAIR, _HAIR)
+        ConstraintState(f"{e} at the end", units[e], last * (next_state[places[e]] - target[places[e]]), -_GAP, _GAP)
         for e in names
     ]
 
 
 def hard(written: list[ConstraintState], soft: frozenset[str]) -> list[ConstraintState]:
-    """Those that bind: not soft."""
+    """The entries whose limits are not soft."""
     return [w for w in written if w.name not in soft]
 
 
@@ -93,7 +108,7 @@ def soft_names(limits: Limits, plant: Plant) -> frozenset[str]:
 
 
 def _entry(name: str, plant: Plant) -> str:
-    """A rate is softened by the name of its input."""
+    """Name of the entry; a rate is softened by the name of its input."""
     return f"{name} rate" if name in plant.inputs else name
 
 

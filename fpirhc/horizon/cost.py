@@ -1,7 +1,7 @@
 """Costs along a horizon.
 
-The cost of a plan is V = sum_{i<N} step l(s_i, u_i, t_i) + T(s_N, t_N): a stage cost, given as a rate and made of named terms,
-and a terminal cost.
+The cost of a plan is V = sum_{i<N} step l(s_i, u_i, t_i) + T(s_N, t_N): a stage cost, which is a rate with named terms, and a
+terminal cost.
 """
 
 from __future__ import annotations
@@ -23,7 +23,17 @@ from fpirhc.symbolic.layout import Expression, Named
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What a stage shows its cost, each by name: view.state.q1, view.reference["q1'"], view.input.Q1, ..."""
+    """Arguments of a stage's cost, with entries by name: view.state.q1, view.reference["q1'"], view.input.Q1.
+
+    Args:
+        state: the plant's state.
+        reference: nominal state.
+        input: input of the stage.
+        input_before: input of the stage before; NaN unless the cost uses it.
+        feedforward: the model's input along the reference; NaN unless the cost uses it.
+        parameters: of the model.
+        time: s.
+    """
 
     state: Named
     reference: Named
@@ -36,7 +46,13 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """The model over one stage around the first reference point: s+ = A s + B u, with the step in s."""
+    """The model over one stage around the first reference point, s+ = A s + B u.
+
+    Args:
+        a: shape (nx, nx).
+        b: shape (nx, nu).
+        step: length of the stage, s.
+    """
 
     a: np.ndarray
     b: np.ndarray
@@ -44,7 +60,7 @@ class Linearisation:
 
 
 class Terminal(ABC):
-    """Contract: a terminal cost that is computed from the problem."""
+    """Contract: a quadratic terminal cost that is computed from the problem."""
 
     @abstractmethod
     def weight(self, cost: Quadratic, plant: Plant, linearisation: Linearisation) -> np.ndarray:
@@ -56,13 +72,13 @@ class Cost(ABC):
 
     @property
     def weighs_effort(self) -> bool:
-        """Whether a term is known to weigh the inputs themselves, and not what they differ by from a feedforward."""
+        """Whether a term weighs the inputs themselves, and not their difference from a feedforward; False where unknown."""
         return False
 
     @property
     @abstractmethod
     def uses_rate(self) -> bool:
-        """Whether a term needs the previous input (which then becomes part of the stage's state)."""
+        """Whether a term needs the input of the stage before, which then becomes part of the stage's state."""
 
     @property
     @abstractmethod
@@ -71,7 +87,11 @@ class Cost(ABC):
 
     @abstractmethod
     def check(self, plant: Plant) -> None:
-        """Raise InvalidProblem with all mistakes of the cost for this plant."""
+        """Raise if the cost does not fit the plant.
+
+        Raises:
+            InvalidProblem: all mistakes together.
+        """
 
     @abstractmethod
     def stage(self, view: View) -> Mapping[str, Expression]:
@@ -90,13 +110,13 @@ class Quadratic(Cost):
 
         l = sum w (x - x^N)^2 + sum w u^2 + sum w (u - u^ff)^2 + sum w (u_i - u_{i-1})^2
 
-    Parameters:
+    Args:
         states: weights of the state errors (q1, q1', ...).
         effort: weights of the absolute inputs.
-        deviation: weights of the inputs relative to the model's feedforward along the reference. With a wrong model
-            prefer it to `effort`: absolute effort biases the plan towards the wrong model's effort.
+        deviation: weights of the inputs relative to the model's feedforward along the reference. It suits a wrong model better
+            than `effort`, which biases the plan.
         rate: weights of the change of the inputs from stage to stage.
-        terminal: None (the state weights at the last state, times the step), weights by state name, or LQRTerminal().
+        terminal: weights by state name, or LQRTerminal(); None: the state weights times the step.
     """
 
     states: Mapping[str, float]
@@ -127,13 +147,13 @@ class Quadratic(Cost):
             InvalidProblem: all mistakes together.
         """
         mistakes = Mistakes("cost")
-        given = self.terminal if isinstance(self.terminal, Mapping) else {}
+        terminal = self.terminal if isinstance(self.terminal, Mapping) else {}
         groups = {
             "states": (self.states, plant.state.elements),
             "effort": (self.effort, plant.input.elements),
             "deviation": (self.deviation, plant.input.elements),
             "rate": (self.rate, plant.input.elements),
-            "terminal": (given, plant.state.elements),
+            "terminal": (terminal, plant.state.elements),
         }
         for what, (weights, valid) in groups.items():
             mistakes.unknown(f"{what}:", weights, valid)
@@ -147,7 +167,7 @@ class Quadratic(Cost):
         mistakes.raise_if_any()
 
     def stage(self, view: View) -> dict[str, Expression]:
-        """Return the terms 'states', and 'effort', 'deviation', 'rate' where weighed."""
+        """Return the term 'states', and the terms 'effort', 'deviation', 'rate' where they have weights."""
         terms = {"states": _squares(self.states, view.state, view.reference)}
         if self.effort:
             terms["effort"] = total(w * view.input[n] ** 2 for n, w in self.effort.items())
@@ -174,7 +194,7 @@ class Quadratic(Cost):
 class LQRTerminal(Terminal):
     """The infinite-horizon weight: P of the discrete algebraic Riccati equation, from the linearised model.
 
-    It makes a short horizon act like an endless one near the reference. `control` is used to solve the equation.
+    Near the reference a short horizon then acts like an infinite one. The package `control` solves the equation.
     """
 
     def weight(self, cost: Quadratic, plant: Plant, linearisation: Linearisation) -> np.ndarray:
@@ -199,12 +219,13 @@ class LQRTerminal(Terminal):
 
 @dataclass(frozen=True, eq=False)
 class CustomCost(Cost):
-    """Any CasADi cost.
+    """A cost given as CasADi expressions.
 
-    Parameters:
+    Args:
         terms: function of a View that returns {term: cost per second}.
-        terminal: function of a View that returns the terminal cost, or None for none.
-        rate: whether `terms` uses view.input_before. feedforward: whether it uses view.feedforward.
+        terminal: function of a View that returns the terminal cost; None: zero.
+        rate: whether `terms` uses view.input_before.
+        feedforward: whether `terms` uses view.feedforward.
     """
 
     terms: Callable[[View], Mapping[str, Expression]]
@@ -214,16 +235,16 @@ class CustomCost(Cost):
 
     @property
     def uses_rate(self) -> bool:
-        """As given."""
+        """Whether `terms` uses view.input_before."""
         return self.rate
 
     @property
     def uses_feedforward(self) -> bool:
-        """As given."""
+        """Whether `terms` uses view.feedforward."""
         return self.feedforward
 
     def check(self, plant: Plant) -> None:
-        """Nothing can be said before the terms are built."""
+        """Accept every plant: mistakes show when the terms are built."""
 
     def stage(self, view: View) -> Mapping[str, Expression]:
         """Return the user's terms."""

@@ -1,9 +1,9 @@
-"""The stage of a horizon expanded around a trajectory: what second-order sweeps need.
+"""The stage of a horizon expanded around a trajectory, for second-order sweeps.
 
-    s+ = F(s, u, theta),   A = dF/ds,  B = dF/du,   l_s, l_u,   and the bend Q = l_ss, S = l_us, R = l_uu.
+    s+ = F(s, u, theta),   A = dF/ds,  B = dF/du,   l_s, l_u,   and the second derivatives Q = l_ss, S = l_us, R = l_uu.
 
-How the bend is modelled is a choice. `GaussNewton` takes the cost's own second derivatives and linear dynamics: positive
-semi-definite for convex stage costs whatever the model is. `ExactHessian` adds lambda' d^2F of the dynamics.
+`GaussNewton` uses the second derivatives of the cost and linear dynamics; they are positive semi-definite for convex stage costs
+and every model. `ExactHessian` adds lambda' d^2F of the dynamics.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from fpirhc.horizon.problem import OptimalControl
 
 
 class HessianModel(ABC):
-    """Contract: the second derivatives of a stage that a sweep uses."""
+    """Contract: a model of a stage's second derivatives."""
 
     @abstractmethod
-    def curved(self, cost: ca.SX, following: ca.SX, costate: ca.SX) -> ca.SX:
-        """Return the scalar whose Hessian with respect to (s, u) is used."""
+    def curved(self, cost: ca.SX, next_state: ca.SX, costate: ca.SX) -> ca.SX:
+        """Return the scalar whose Hessian with respect to (s, u) the sweep uses."""
 
 
 @dataclass(frozen=True)
 class GaussNewton(HessianModel):
     """The Hessian of the stage cost alone."""
 
-    def curved(self, cost: ca.SX, following: ca.SX, costate: ca.SX) -> ca.SX:  # noqa: ARG002
+    def curved(self, cost: ca.SX, next_state: ca.SX, costate: ca.SX) -> ca.SX:  # noqa: ARG002
         """Return l."""
         return cost
 
@@ -37,18 +37,18 @@ class GaussNewton(HessianModel):
 class ExactHessian(HessianModel):
     """The Hessian of the stage's Hamiltonian: quadratic convergence near a strict minimum, indefinite far from it."""
 
-    def curved(self, cost: ca.SX, following: ca.SX, costate: ca.SX) -> ca.SX:
+    def curved(self, cost: ca.SX, next_state: ca.SX, costate: ca.SX) -> ca.SX:
         """Return l + lambda' F."""
-        return cost + ca.dot(costate, following)
+        return cost + ca.dot(costate, next_state)
 
 
 def linear_stage(ocp: OptimalControl) -> ca.Function:
     """Function (s, u, theta) -> (s+, l, A (ns, ns), B (ns, nu), l_s, l_u)."""
     s, u, theta = stage_symbols(ocp)
-    following, (cost, _) = ocp.dynamics(s, u, theta), ocp.stage_cost(s, u, theta)
-    jacobians = [ca.jacobian(following, s), ca.jacobian(following, u)]
+    next_state, (cost, _) = ocp.dynamics(s, u, theta), ocp.stage_cost(s, u, theta)
+    jacobians = [ca.jacobian(next_state, s), ca.jacobian(next_state, u)]
     gradients = [ca.gradient(cost, s), ca.gradient(cost, u)]
-    return _dense("fpirhc_linear_stage", [s, u, theta], [following, cost, *jacobians, *gradients])
+    return _dense("fpirhc_linear_stage", [s, u, theta], [next_state, cost, *jacobians, *gradients])
 
 
 def hessian_stage(ocp: OptimalControl, hessian: HessianModel) -> ca.Function:
@@ -59,7 +59,7 @@ def hessian_stage(ocp: OptimalControl, hessian: HessianModel) -> ca.Function:
     curved = hessian.curved(cost, ocp.dynamics(s, u, theta), costate)
     slope = ca.gradient(curved, u)
     results = [ca.hessian(curved, s)[0], ca.jacobian(slope, s), ca.jacobian(slope, u)]
-    return _dense("fpirhc_bent_stage", [s, u, theta, costate], results)
+    return _dense("fpirhc_hessian_stage", [s, u, theta, costate], results)
 
 
 def hessian_end(ocp: OptimalControl) -> ca.Function:
@@ -67,7 +67,7 @@ def hessian_end(ocp: OptimalControl) -> ca.Function:
     s, _, theta = stage_symbols(ocp)
     final = ocp.terminal_cost(s, theta)
     hessian, slope = ca.hessian(final, s)
-    return _dense("fpirhc_bent_end", [s, theta], [final, slope, hessian])
+    return _dense("fpirhc_hessian_end", [s, theta], [final, slope, hessian])
 
 
 def stage_symbols(ocp: OptimalControl) -> tuple[ca.SX, ca.SX, ca.SX]:

@@ -3,7 +3,7 @@
     minimise  V(U) = sum_{i<N} l(s_i, u_i, theta_i) + T(s_N, theta_N)
     where     s_{i+1} = F(s_i, u_i, theta_i),  s_0 given,  bounds on u_i and on s_1 ... s_N.
 
-theta_i is what stage i is given: its time, the reference, the feedforward and the model's parameters.
+theta_i are the data of stage i: its time, the reference, the feedforward and the model's parameters.
 """
 
 from __future__ import annotations
@@ -38,15 +38,17 @@ from fpirhc.task.reference import Reference
 
 @dataclass(frozen=True)
 class Horizon:
-    """How far and in which steps a controller looks ahead.
+    """Length and stages of a controller's prediction.
 
-    Parameters:
-        stages: number of stages N. step: length of one stage, s, with the input held.
-        discretisation: how the model moves over one stage (RungeKutta4(), Euler()).
+    Args:
+        stages: number of stages N.
+        step: length of one stage, s, over which the input is constant.
+        discretisation: integrator of the model over one stage: RungeKutta4(), Euler().
         terminal: names of states that must meet the reference at the end of the horizon.
 
     Raises:
         InvalidValue: fewer than one stage, or a step that is not positive.
+        NotSupported: an integrator that is not made of plain expressions.
     """
 
     stages: int
@@ -65,14 +67,28 @@ class Horizon:
 
 @dataclass(frozen=True, eq=False)
 class OptimalControl:
-    """The standard form; sizes: ns = state.size, nu = input.size, ntheta = data.size.
+    """The standard form; sizes: ns = state.size, nu = input.size, ntheta = data.size. Bounds are infinite where free.
 
-    dynamics: (s, u, theta) -> s_next. stage_cost: (s, u, theta) -> (l, terms). terminal_cost: (s, theta) -> T.
-    start: (x, u before) -> s_0, from the plant's state and the input of the stage before.
-    Bounds are infinite where free; an optimiser may be given other input bounds from call to call. `curvature` (nu) is the second
-    derivative of the cost rate along each input near the reference: it turns gradients into the units of the inputs. `nodes` are
-    the states, inputs and data along the reference from t = 0, `along` the quadratic model of the cost there. The last `written`
-    entries of the state are limits of rates, paths and the end: s_0 says nothing about them.
+    Args:
+        stages: number of stages N.
+        step: length of one stage, s.
+        state: signal of s_i.
+        input: signal of u_i.
+        data: layout of theta_i.
+        dynamics: (s, u, theta) -> s_next.
+        stage_cost: (s, u, theta) -> (l, terms).
+        terminal_cost: (s, theta) -> T.
+        terms: names of the stage cost's terms.
+        start: (x, u before) -> s_0, from the plant's state and the input of the stage before.
+        state_lower: bounds of s_1 ... s_N, shape (ns,).
+        state_upper: bounds of s_1 ... s_N, shape (ns,).
+        input_lower: bounds of u_i, shape (nu,); a call of an optimiser may have others.
+        input_upper: bounds of u_i, shape (nu,); a call of an optimiser may have others.
+        curvature: second derivative of the cost rate along each input near the reference, shape (nu,); it converts gradients to the
+            units of the inputs.
+        nodes: states, inputs and data along the reference from t = 0.
+        along: quadratic model of the cost along the reference.
+        written: number of the last entries of the state, which are limits of rates, paths and the end; they are zero in s_0.
     """
 
     stages: int
@@ -101,7 +117,7 @@ class OptimalControl:
 
 
 def data_layout(plant: Plant, horizon: Horizon) -> Layout:
-    """What one stage is given; with a terminal equality also whether it is the last, and the reference after it."""
+    """Layout of one stage's data; a terminal equality adds whether the stage is the last, and the reference after it."""
     signals = (
         scalar("time", "s"),
         Signal("reference", plant.state.elements, plant.state.units),
@@ -122,46 +138,23 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
     cost.check(plant)
     limits.check(plant)
     _check_terminal(plant, horizon)
-    nx, layout = plant.state.size, data_layout(plant, horizon)
-    keeps_input = cost.uses_rate or bool(limits.rates)
-    free = plant.input.size * keeps_input
-    x, before = ca.SX.sym("x", nx), ca.SX.sym("before", free)
-    u, theta = ca.SX.sym("u", plant.input.size), ca.SX.sym("theta", layout.size)
-    view = _view(plant, ca.vertcat(x, before), u, layout.split(theta), cost, keeps_input)
-    try:
-        advance = _advance(plant, horizon)
-        moved = advance(x, u, view.parameters.vector)
-        extra = _written(plant, horizon, limits, view, moved, layout.split(theta))
-        soft = softened(extra, limits, plant, x)
-        terms = {**_scalar_terms(cost.stage(view)), **soft}
-        given = cost.terminal_cost(view, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.step)
-        end = sum((soft[f"soft {e}"] for e in limits.soft if e in limits.states), start=ca.SX(0))
-        final = _scalar_terms({"terminal": given})["terminal"] + horizon.step * end
-    except InvalidName as error:
-        raise InvalidProblem(f"cost: {error}") from None
-    binding = hard(extra, soft_names(limits, plant))
-    state = _stage_state(plant, keeps_input, binding)
-    s = ca.vertcat(x, before, ca.SX.sym("z", len(binding)))
-    following = ca.vertcat(moved, *([u] if keeps_input else []), *(w.expression for w in binding))
-    stacked = ca.vertcat(*terms.values())
-    column = horizon.step * stacked
-    lower, upper = hard_state_bounds(limits, plant)
-    dynamics = ca.Function("fpirhc_dynamics", [s, u, theta], [ca.densify(following)])
-    stage_cost = ca.Function("fpirhc_stage_cost", [s, u, theta], [ca.sum1(column), ca.densify(column)])
-    terminal_cost = ca.Function("fpirhc_terminal_cost", [s, theta], [ca.densify(final)])
+    stage = _stage_expressions(plant, reference, horizon, cost, limits)
+    binding, free = stage.binding, stage.before.numel()
+    dynamics, stage_cost, terminal_cost = _stage_functions(stage, horizon.step)
     nodes = _nodes(plant, reference, horizon, cost, (free, len(binding)))
-    _check_finite(tuple(terms), stage_cost, terminal_cost, nodes, cost)
+    _check_finite(tuple(stage.terms), stage_cost, terminal_cost, nodes, cost)
     along = expand_along(dynamics, stage_cost, terminal_cost, nodes)
+    lower, upper = hard_state_bounds(limits, plant)
     return OptimalControl(
         stages=horizon.stages,
         step=horizon.step,
-        state=state,
+        state=_stage_state(plant, bool(free), binding),
         input=plant.input,
-        data=layout,
+        data=data_layout(plant, horizon),
         dynamics=dynamics,
         stage_cost=stage_cost,
         terminal_cost=terminal_cost,
-        terms=tuple(terms),
+        terms=tuple(stage.terms),
         start=_start(plant, free, len(binding)),
         state_lower=np.concatenate([lower, np.full(free, -np.inf), [w.lower for w in binding]]),
         state_upper=np.concatenate([upper, np.full(free, np.inf), [w.upper for w in binding]]),
@@ -196,6 +189,54 @@ def stage_data(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost)
     return ca.Function("fpirhc_horizon_data", [start, parameters], [table], ["t", "p"], ["data"])
 
 
+@dataclass(frozen=True, eq=False)
+class _Stage:
+    """Symbols x, before, u, theta of one stage, and its expressions; `before` is empty unless the input is part of the state."""
+
+    x: Expression
+    before: Expression
+    u: Expression
+    theta: Expression
+    x_next: Expression
+    terms: dict[str, Expression]
+    final: Expression
+    binding: list[ConstraintState]
+
+
+def _stage_expressions(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits) -> _Stage:
+    layout = data_layout(plant, horizon)
+    keeps_input = cost.uses_rate or bool(limits.rates)
+    x, before = ca.SX.sym("x", plant.state.size), ca.SX.sym("before", plant.input.size * keeps_input)
+    u, theta = ca.SX.sym("u", plant.input.size), ca.SX.sym("theta", layout.size)
+    data = layout.split(theta)
+    view = _view(plant, ca.vertcat(x, before), u, data, cost, keeps_input)
+    try:
+        advance = _advance(plant, horizon)
+        x_next = advance(x, u, view.parameters.vector)
+        written = _written(plant, horizon, limits, view, x_next, data)
+        soft = softened(written, limits, plant, x)
+        terms = {**_scalar_terms(cost.stage(view)), **soft}
+        terminal = cost.terminal_cost(view, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.step)
+        end = sum((soft[f"soft {e}"] for e in limits.soft if e in limits.states), start=ca.SX(0))
+        final = _scalar_terms({"terminal": terminal})["terminal"] + horizon.step * end
+    except InvalidName as error:
+        raise InvalidProblem(f"cost: {error}") from None
+    return _Stage(x, before, u, theta, x_next, terms, final, hard(written, soft_names(limits, plant)))
+
+
+def _stage_functions(stage: _Stage, step: float) -> tuple[ca.Function, ca.Function, ca.Function]:
+    """Functions of the dynamics, the stage cost and the terminal cost."""
+    u, theta, binding = stage.u, stage.theta, stage.binding
+    s = ca.vertcat(stage.x, stage.before, ca.SX.sym("z", len(binding)))
+    s_next = ca.vertcat(stage.x_next, *([u] if stage.before.numel() else []), *(w.expression for w in binding))
+    costs = step * ca.vertcat(*stage.terms.values())
+    return (
+        ca.Function("fpirhc_dynamics", [s, u, theta], [ca.densify(s_next)]),
+        ca.Function("fpirhc_stage_cost", [s, u, theta], [ca.sum1(costs), ca.densify(costs)]),
+        ca.Function("fpirhc_terminal_cost", [s, theta], [ca.densify(stage.final)]),
+    )
+
+
 def _check_terminal(plant: Plant, horizon: Horizon) -> None:
     mistakes = Mistakes("horizon")
     mistakes.unknown("terminal: state", horizon.terminal, plant.state.elements)
@@ -219,32 +260,32 @@ def _start(plant: Plant, free: int, written: int) -> ca.Function:
 
 
 def _written(
-    plant: Plant, horizon: Horizon, limits: Limits, view: View, moved: Expression, given: Mapping[str, Expression]
+    plant: Plant, horizon: Horizon, limits: Limits, view: View, x_next: Expression, data: Mapping[str, Expression]
 ) -> list[ConstraintState]:
-    found = [*rates(limits, plant, view, horizon.step), *paths(limits, view)]
-    for entry in found:
+    entries = [*rates(limits, plant, view, horizon.step), *paths(limits, view)]
+    for entry in entries:
         if ca.SX(entry.expression).numel() != 1:
             raise InvalidProblem(f"limits: path '{entry.name}' must be one scalar, got {entry.expression.shape}")
     if horizon.terminal:
-        found += ends(horizon.terminal, plant, moved, given["target"], given["last"])
-    return found
+        entries += ends(horizon.terminal, plant, x_next, data["target"], data["last"])
+    return entries
 
 
 def _view(
-    plant: Plant, s: Expression, u: Expression, given: Mapping[str, Expression], cost: Cost, keeps_input: bool
+    plant: Plant, s: Expression, u: Expression, data: Mapping[str, Expression], cost: Cost, keeps_input: bool
 ) -> View:
     nx, inputs = plant.state.size, plant.input.elements
-    # What the cost does not ask for is NaN, so that using it anyway is found at once.
+    # What the cost does not declare is NaN, so that an undeclared use shows at once.
     before = s[nx:] if keeps_input else ca.SX.nan(len(inputs))
-    feedforward = given["feedforward"] if cost.uses_feedforward else ca.SX.nan(len(inputs))
+    feedforward = data["feedforward"] if cost.uses_feedforward else ca.SX.nan(len(inputs))
     return View(
         state=Named(plant.state.elements, s[:nx], "state"),
-        reference=Named(plant.state.elements, given["reference"], "state"),
+        reference=Named(plant.state.elements, data["reference"], "state"),
         input=Named(inputs, u, "input"),
         input_before=Named(inputs, before, "input"),
         feedforward=Named(inputs, feedforward, "input"),
-        parameters=Named(plant.parameter.elements, given["parameters"], "parameter"),
-        time=given["time"],
+        parameters=Named(plant.parameter.elements, data["parameters"], "parameter"),
+        time=data["time"],
     )
 
 
@@ -257,21 +298,25 @@ def _advance(plant: Plant, horizon: Horizon) -> ca.Function:
 
 def _linearise(plant: Plant, reference: Reference, horizon: Horizon, advance: ca.Function) -> Linearisation:
     x, u, p = plant._symbols()
-    following = advance(x, u, p)
-    jacobians = ca.Function("fpirhc_linear", [x, u, p], [ca.jacobian(following, x), ca.jacobian(following, u)])
+    x_next = advance(x, u, p)
+    jacobians = ca.Function("fpirhc_linear", [x, u, p], [ca.jacobian(x_next, x), ca.jacobian(x_next, u)])
     state, response = reference.function(plant)(0.0)
     needed = plant.inverse_function(state, response[list(plant.controlled_indices)], plant.approximate)
     a, b = jacobians(state, needed, plant.approximate)
     return Linearisation(np.asarray(a.full()), np.asarray(b.full()), horizon.step)
 
 
-def _scalar_terms(given: Mapping[str, Expression]) -> dict[str, Expression]:
-    """Terms as scalar expressions, or all that is wrong with them."""
+def _scalar_terms(expressions: Mapping[str, Expression]) -> dict[str, Expression]:
+    """Terms as scalar expressions.
+
+    Raises:
+        InvalidProblem: all mistakes together.
+    """
     mistakes = Mistakes("cost")
-    if not isinstance(given, Mapping) or not given:
-        mistakes.add(f"the terms must be {{name: expression}} with at least one entry, got {given!r}")
+    if not isinstance(expressions, Mapping) or not expressions:
+        mistakes.add(f"the terms must be {{name: expression}} with at least one entry, got {expressions!r}")
         mistakes.raise_if_any()
-    terms = {str(name): ca.SX(value) for name, value in given.items()}
+    terms = {str(name): ca.SX(value) for name, value in expressions.items()}
     for name, value in terms.items():
         if value.numel() != 1:
             mistakes.add(f"term '{name}' must be one scalar, got shape {value.shape}; sum its entries with ca.sum1")
@@ -286,9 +331,9 @@ def _nodes(
     table = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
     data = np.asarray(table.full())
     layout = data_layout(plant, horizon)
-    given = {name: data[layout.slice(name)] for name in ("reference", "feedforward")}
-    states = np.vstack([given["reference"], given["feedforward"][: extra[0]], np.zeros((extra[1], data.shape[1]))])
-    return states, given["feedforward"][:, : horizon.stages], data
+    along = {name: data[layout.slice(name)] for name in ("reference", "feedforward")}
+    states = np.vstack([along["reference"], along["feedforward"][: extra[0]], np.zeros((extra[1], data.shape[1]))])
+    return states, along["feedforward"][:, : horizon.stages], data
 
 
 def _check_finite(
@@ -301,9 +346,9 @@ def _check_finite(
     states, inputs, data = nodes
     values = stage_cost(states[:, 0], inputs[:, 0], data[:, 0])[1].full().ravel()
     final = float(terminal_cost(states[:, -1], data[:, -1]))
-    told = [(name, value, "at t = 0") for name, value in zip(names, values, strict=True)]
+    terms = [(name, value, "at t = 0") for name, value in zip(names, values, strict=True)]
     mistakes = Mistakes("cost")
-    for name, value, where in [*told, ("terminal", final, "at the end of the horizon")]:
+    for name, value, where in [*terms, ("terminal", final, "at the end of the horizon")]:
         if not np.isfinite(value):
             hint = "" if cost.uses_rate else "; say CustomCost(rate=True) if it uses input_before"
             hint += "" if cost.uses_feedforward else "; say CustomCost(feedforward=True) if it uses feedforward"

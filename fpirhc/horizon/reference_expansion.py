@@ -13,12 +13,21 @@ import casadi as ca
 import numpy as np
 
 _POWER_STEPS = 50
-_MARGIN = 1.1  # a power iteration comes from below
+_MARGIN = 1.1  # a power iteration approaches the eigenvalue from below
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceExpansion:
-    """Stage by stage: A (N, ns, ns), B (N, ns, nu), Q (N, ns, ns), S (N, nu, ns), R (N, nu, nu); Q of the end (ns, ns)."""
+    """The quadratic model, stage by stage.
+
+    Args:
+        a: A, shape (N, ns, ns).
+        b: B, shape (N, ns, nu).
+        q: Q, shape (N, ns, ns).
+        s: S, shape (N, nu, ns).
+        r: R, shape (N, nu, nu).
+        final: Q of the end, shape (ns, ns).
+    """
 
     a: np.ndarray
     b: np.ndarray
@@ -40,14 +49,14 @@ class ReferenceExpansion:
         return result
 
     def sensitivity(self) -> np.ndarray:
-        """Return dS/dU, shape (N, ns, N nu): how the states s_1 ... s_N follow the inputs."""
+        """Return dS/dU, shape (N, ns, N nu): the derivatives of the states s_1 ... s_N by the inputs."""
         stages, ns, nu = self.b.shape
-        moved, found = np.zeros((ns, stages * nu)), np.empty((stages, ns, stages * nu))
+        slope, slopes = np.zeros((ns, stages * nu)), np.empty((stages, ns, stages * nu))
         for i in range(stages):
-            moved = self.a[i] @ moved
-            moved[:, i * nu : (i + 1) * nu] += self.b[i]
-            found[i] = moved
-        return found
+            slope = self.a[i] @ slope
+            slope[:, i * nu : (i + 1) * nu] += self.b[i]
+            slopes[i] = slope
+        return slopes
 
     def hessian(self) -> np.ndarray:
         """Return M (N nu, N nu), the Hessian of V with the dynamics linearised."""
@@ -70,26 +79,35 @@ def expand_along(
     terminal_cost: ca.Function,
     nodes: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> ReferenceExpansion:
-    """Return the model at `nodes`: states (ns, N + 1), inputs (nu, N) and data (ntheta, N + 1)."""
+    """Return the quadratic model along a trajectory.
+
+    Args:
+        dynamics: (s, u, theta) -> s_next.
+        stage_cost: (s, u, theta) -> (l, terms).
+        terminal_cost: (s, theta) -> T.
+        nodes: states (ns, N + 1), inputs (nu, N) and data (ntheta, N + 1).
+    """
     states, inputs, data = nodes
     stages = inputs.shape[1]
     linearised = _linearised(dynamics, stage_cost)
-    found = [[np.asarray(v.full()) for v in linearised(states[:, i], inputs[:, i], data[:, i])] for i in range(stages)]
+    derivatives = [
+        [np.asarray(v.full()) for v in linearised(states[:, i], inputs[:, i], data[:, i])] for i in range(stages)
+    ]
     final = np.asarray(_final(terminal_cost)(states[:, stages], data[:, stages]).full())
-    a, b, q, s, r = (np.array([stage[k] for stage in found]) for k in range(5))
+    a, b, q, s, r = (np.array([stage[k] for stage in derivatives]) for k in range(5))
     return ReferenceExpansion(a, b, q, s, r, final)
 
 
 def input_curvature(along: ReferenceExpansion, step: float) -> np.ndarray:
     """Return c (nu,), positive.
 
-    An input along which the cost is flat there gets the largest curvature of the others, or 1 when all are flat.
+    An input without curvature gets the largest curvature of the others, or 1 where no input has one.
     """
-    moved, total = along.b[0], along.r[0].diagonal().copy()
+    slope, total = along.b[0], along.r[0].diagonal().copy()
     for a, q in zip(along.a[1:], along.q[1:], strict=True):
-        total += np.einsum("ik,ij,jk->k", moved, q, moved)
-        moved = a @ moved
-    total = np.abs(total + np.einsum("ik,ij,jk->k", moved, along.final, moved)) / step
+        total += np.einsum("ik,ij,jk->k", slope, q, slope)
+        slope = a @ slope
+    total = np.abs(total + np.einsum("ik,ij,jk->k", slope, along.final, slope)) / step
     usable = np.isfinite(total) & (total > 0)
     return np.where(usable, total, total[usable].max() if usable.any() else 1.0)
 
@@ -110,10 +128,10 @@ def steepest_curvature(along: ReferenceExpansion, scale: np.ndarray) -> float:
 def _linearised(dynamics: ca.Function, stage_cost: ca.Function) -> ca.Function:
     """Function (s, u, theta) -> (dF/ds, dF/du, d2l/ds2, d2l/duds, d2l/du2)."""
     s, u, theta = (ca.SX.sym(n, dynamics.size1_in(k)) for k, n in enumerate(("s", "u", "theta")))
-    following, cost = dynamics(s, u, theta), stage_cost(s, u, theta)[0]
+    next_state, cost = dynamics(s, u, theta), stage_cost(s, u, theta)[0]
     slope = ca.gradient(cost, u)
-    bends = [ca.hessian(cost, s)[0], ca.jacobian(slope, s), ca.jacobian(slope, u)]
-    results = [ca.jacobian(following, s), ca.jacobian(following, u), *bends]
+    second = [ca.hessian(cost, s)[0], ca.jacobian(slope, s), ca.jacobian(slope, u)]
+    results = [ca.jacobian(next_state, s), ca.jacobian(next_state, u), *second]
     return ca.Function("fpirhc_linearised", [s, u, theta], [ca.densify(r) for r in results])
 
 

@@ -6,7 +6,7 @@ Forward, s_{i+1} = F(s_i, u_i). Backward, with the costates lambda_N = dT/ds,
 
 g is the reduced gradient dV/dU: the gradient of the auxiliary function with respect to the inputs once its multipliers
 make its gradient with respect to the states vanish. Both sweeps are accumulated calls of one stage Function, so the
-generated C has one copy of it however long the horizon is.
+generated C has one copy of it for every length of the horizon.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""What a mismatch of P percent means, wherever it is an option or an argument: the range of every exact parameter.
+"""The mismatch of P percent, as an option or an argument: the range of every exact parameter.
 
     |p - p_exact| <= P/100 |p_exact|,        0 <= P < 100,        p_exact the exact value in the problem file.
 
-So a parameter keeps its sign, and one that is zero stays zero. A study of scenarios draws from this range. A review looks at all of
-it, and at the values between it and the approximate parameter.
+So a parameter keeps its sign, and a parameter that is zero stays zero. A study of scenarios draws from this range. A review covers
+the whole range, and the values between it and the approximate parameter.
 """
 
 from __future__ import annotations
@@ -13,11 +13,15 @@ from fpirhc.plant.plant import Parameter, Plant
 
 
 def exact_ranges(plant: Plant, mismatch: float) -> dict[str, tuple[float, float]]:
-    """Return the least and the largest value of every exact parameter; `mismatch` in percent.
+    """Return the least and the largest value of every exact parameter.
+
+    Args:
+        plant: the plant with its parameters.
+        mismatch: percent.
 
     Raises:
         InvalidValue: `mismatch` outside [0, 100).
-        InvalidProblem: a range that leaves a parameter's physical bounds, with the largest mismatch that stays inside.
+        InvalidProblem: a range leaves a parameter's physical bounds; the message names the largest mismatch inside them.
     """
     if not 0 <= mismatch < 100:
         raise InvalidValue(

@@ -2,14 +2,14 @@
 
     Q = Y(q, q', q'') theta + Q0(q, q', q''),     M = dQ/dq'',     C = (M' + E - E^T) / 2,  E = d(M q')/dq,
 
-where theta are parameters of the plant, or combinations of them that the user names, and Q0 is what does not depend on them.
+where theta are parameters of the plant, or combinations of them that the user names, and Q0 is the part without them.
 C is the Coriolis matrix of Christoffel's symbols, linear in a velocity of its own, so that M' - 2 C is skew-symmetric; with it
 
     Q = M v' + C v + (Q(q, q', 0) - C q') = Y_s(q, q', v, v') theta + Q0_s
 
 splits a second velocity v from the actual one. All of it comes from the plant's symbols. With dQ/dp = Y dtheta/dp at one or more
-fixed p, Y = [dQ/dp ...] [dtheta/dp ...]^+; that Y theta + Q0 is the inverse dynamics for every p is then tried at random points,
-where an identity that does not hold fails with probability one.
+fixed p, Y = [dQ/dp ...] [dtheta/dp ...]^+. The identity Q = Y theta + Q0 is then tested at random points; a false identity fails
+there with probability one.
 
 References: J. J. Craig, P. Hsu, S. S. Sastry, Int. J. Robotics Research 6(2), 1987. J.-J. E. Slotine, W. Li, Int. J. Robotics
 Research 6(3), 1987.
@@ -30,12 +30,17 @@ from fpirhc.symbolic.layout import Expression, Named, Signal, vector
 
 _TRIES = 12  # random points
 _TOLERANCE = 1e-7  # relative error at which an identity holds
-_SPREAD = 0.3  # share by which parameters are varied
+_SPREAD = 0.3  # relative range of random parameters
 
 
 @dataclass(frozen=True, eq=False)
 class Combination:
-    """An expression of the plant's parameters that enters linearly as a whole: Combination(lambda p: p.m * p.l**2, "kg m^2")."""
+    """An expression of parameters that enters linearly as a whole: Combination(lambda p: p.m * p.l**2, "kg m^2").
+
+    Args:
+        expression: function of the plant's parameters by name.
+        unit: of the expression.
+    """
 
     expression: Callable[[Named], Expression]
     unit: str
@@ -45,16 +50,16 @@ class Combination:
 class Regressor:
     """Q = Y theta + Q0 of a plant for the parameters theta.
 
-    Parameters:
+    Args:
         plant: as many inputs as coordinates, all of them controlled, with an inverse response made of symbols.
-        names: of theta: parameters of the plant, or keys of `combinations`. Parameters that neither name stay what the model
-            believes them to be.
+        names: names of theta, each a parameter of the plant or a key of `combinations`. All other parameters keep the model's
+            approximate values.
         combinations: expressions of parameters that enter linearly as a whole.
 
     Raises:
         NotSupported: the plant is not fully actuated, or its inverse response needs a root finder.
         InvalidName: a name that is neither a parameter nor a combination.
-        InvalidValue: the inverse dynamics is not linear in theta; says which parameters make it so, and what to do.
+        InvalidValue: the inverse dynamics is not linear in theta; the message names the parameters and a remedy.
     """
 
     plant: Plant
@@ -88,7 +93,7 @@ class Regressor:
 
     @cached_property
     def covered(self) -> tuple[int, ...]:
-        """Places, among the plant's parameters, of those that theta depends on."""
+        """Places of the plant's parameters on which theta depends."""
         _, _, p = self.plant._symbols()
         pattern = ca.DM(ca.jacobian_sparsity(self.theta_function(p), p), 1).full()
         return tuple(int(k) for k in np.flatnonzero(pattern.any(axis=0)))
@@ -99,8 +104,8 @@ class Regressor:
         x, r, p = self._symbols()
         inverse, points = self.plant.inverse_function, self._points
         slope = ca.Function("fpirhc_slope", [x, r, p], [ca.jacobian(inverse(x, r, p), p)])
-        given = [slope(x, r, self._placed(p, point))[:, list(self.covered)] for point in points]
-        y = ca.mtimes(ca.horzcat(*given), ca.DM(np.linalg.pinv(self._slopes(points))))
+        slopes = [slope(x, r, self._placed(p, point))[:, list(self.covered)] for point in points]
+        y = ca.mtimes(ca.horzcat(*slopes), ca.DM(np.linalg.pinv(self._slopes(points))))
         first = self._placed(p, points[0])
         rest = inverse(x, r, first) - ca.mtimes(y, self.theta_function(first))
         return ca.Function("fpirhc_regressor", [x, r, p], ca.cse([ca.densify(y), ca.densify(rest)]))
@@ -130,7 +135,7 @@ class Regressor:
         mass = self.mass_function(x, theta, p)
         q, v = x[list(self.plant.indices(0))], x[list(self.plant.indices(1))]
         change = ca.jtimes(ca.reshape(mass, -1, 1), q, v).reshape(mass.shape)
-        # M does not depend on q': the velocity in M q' is the only one that is not differentiated.
+        # M does not depend on q', so v is a constant in this derivative.
         slope = ca.jacobian(ca.mtimes(mass, v), q)
         return ca.Function("fpirhc_coriolis", [x, theta, p], [ca.cse(ca.densify((change + slope - slope.T) / 2))])
 
@@ -148,28 +153,8 @@ class Regressor:
 
     @cached_property
     def believed(self) -> Plant:
-        """The plant with theta, and the parameters that theta does not cover, in place of its parameters."""
-        plant = self.plant
-        every = list(plant.parameters)
-        others = {n: q for k, (n, q) in enumerate(plant.parameters.items()) if k not in self.covered}
-
-        def split(p: Named) -> tuple[Expression, Expression]:
-            known = ca.vertcat(*(p[n] if n in others else plant.approximate[every.index(n)] for n in every))
-            return p.vector[: len(self.names)], known
-
-        def response(q: Named, v: Named, u: Named, p: Named) -> dict[str, Expression]:
-            theta, known = split(p)
-            x, still = ca.vertcat(q.vector, v.vector), ca.SX.zeros(len(plant.names))
-            free = self.force_function(x, still, theta, known)
-            found = ca.solve(self.mass_function(x, theta, known), u.vector - free)
-            return dict(zip(plant.names, ca.vertsplit(found), strict=True))
-
-        def inverse(q: Named, v: Named, r: Named, p: Named) -> dict[str, Expression]:
-            theta, known = split(p)
-            found = self.force_function(ca.vertcat(q.vector, v.vector), r.vector, theta, known)
-            return dict(zip(plant.inputs, ca.vertsplit(found), strict=True))
-
-        return Plant(plant.coordinates, plant.inputs, {**self._own, **others}, response, inverse=inverse)
+        """The plant whose parameters are theta and those that theta does not cover."""
+        return _with_theta(self)
 
     @cached_property
     def _own(self) -> dict[str, Parameter]:
@@ -183,13 +168,13 @@ class Regressor:
 
     @cached_property
     def _points(self) -> list[np.ndarray]:
-        """Parameters at which the dtheta/dp, side by side, have full rank: one point where theta are parameters themselves."""
+        """Parameters at which the dtheta/dp, side by side, have full rank: one point where every theta is a parameter."""
         random, points = np.random.default_rng(0), [self.plant.approximate]
         while np.linalg.matrix_rank(self._slopes(points)) < len(self.names):
             if len(points) > len(self.names):
                 raise InvalidValue(
                     f"Regressor(names={tuple(self.names)}): the combinations depend on each other (one is a sum of multiples "
-                    "of others), so they cannot be told apart; leave one out"
+                    "of others), so no data can distinguish them; leave one out"
                 )
             points.append(_varied(self.plant, random))
         return points
@@ -210,14 +195,39 @@ class Regressor:
 def linear_parameters(plant: Plant) -> tuple[str, ...]:
     """Return the parameters in which the inverse dynamics is linear, jointly with every other one.
 
-    Those whose second derivatives, mixed ones included, vanish at random points. A Regressor of all of them exists.
+    Their second derivatives, mixed ones included, vanish at random points. A Regressor of all of them exists.
 
     Raises:
         NotSupported: the plant is not fully actuated, or its inverse response needs a root finder.
     """
     _check_plant(plant)
-    bent = _bent(plant)
-    return tuple(name for k, name in enumerate(plant.parameters) if not bent[k].any())
+    nonlinear = _nonlinear_pairs(plant)
+    return tuple(name for k, name in enumerate(plant.parameters) if not nonlinear[k].any())
+
+
+def _with_theta(regressor: Regressor) -> Plant:
+    """The plant whose parameters are theta and those that theta does not cover."""
+    plant, covered, size = regressor.plant, regressor.covered, len(regressor.names)
+    every = list(plant.parameters)
+    others = {n: parameter for k, (n, parameter) in enumerate(plant.parameters.items()) if k not in covered}
+
+    def split(p: Named) -> tuple[Expression, Expression]:
+        known = ca.vertcat(*(p[n] if n in others else plant.approximate[every.index(n)] for n in every))
+        return p.vector[:size], known
+
+    def response(q: Named, v: Named, u: Named, p: Named) -> dict[str, Expression]:
+        theta, known = split(p)
+        x, still = ca.vertcat(q.vector, v.vector), ca.SX.zeros(len(plant.names))
+        free = regressor.force_function(x, still, theta, known)
+        accelerations = ca.solve(regressor.mass_function(x, theta, known), u.vector - free)
+        return dict(zip(plant.names, ca.vertsplit(accelerations), strict=True))
+
+    def inverse(q: Named, v: Named, r: Named, p: Named) -> dict[str, Expression]:
+        theta, known = split(p)
+        forces = regressor.force_function(ca.vertcat(q.vector, v.vector), r.vector, theta, known)
+        return dict(zip(plant.inputs, ca.vertsplit(forces), strict=True))
+
+    return Plant(plant.coordinates, plant.inputs, {**regressor._own, **others}, response, inverse=inverse)
 
 
 def _check_plant(plant: Plant) -> None:
@@ -234,7 +244,7 @@ def _check_plant(plant: Plant) -> None:
 
 
 def _check_linear(regressor: Regressor) -> None:
-    """Compare Y theta + Q0 with the inverse dynamics where all covered parameters are others."""
+    """Compare Y theta + Q0 with the inverse dynamics at random points with other values of the covered parameters."""
     plant, random = regressor.plant, np.random.default_rng(1)
     worst, entering, tried = 0.0, np.zeros(len(regressor.names), dtype=bool), 0
     for _ in range(_TRIES):
@@ -259,32 +269,32 @@ def _check_linear(regressor: Regressor) -> None:
 
 def _not_linear(regressor: Regressor, worst: float) -> str:
     plant, every = regressor.plant, list(regressor.plant.parameters)
-    bent = _bent(plant)
+    nonlinear = _nonlinear_pairs(plant)
     covered = [k for k in range(len(every)) if k in regressor.covered]
-    alone = [f"'{every[k]}'" for k in covered if bent[k, k]]
-    pairs = [f"'{every[j]}' with '{every[k]}'" for j in covered for k in covered if j < k and bent[j, k]]
-    found = []
+    alone = [f"'{every[k]}'" for k in covered if nonlinear[k, k]]
+    pairs = [f"'{every[j]}' with '{every[k]}'" for j in covered for k in covered if j < k and nonlinear[j, k]]
+    reasons = []
     if alone:
-        found.append(f"{', '.join(alone)} enter(s) nonlinearly")
+        reasons.append(f"{', '.join(alone)} enter(s) nonlinearly")
     if pairs:
-        found.append(f"in products: {', '.join(pairs)}")
-    good = [every[k] for k in range(len(every)) if not bent[k].any()]
+        reasons.append(f"in products: {', '.join(pairs)}")
+    good = [every[k] for k in range(len(every)) if not nonlinear[k].any()]
     return (
         f"the inverse dynamics is not linear in {', '.join(regressor.names)} (relative error {worst:.1e}): "
-        f"{'; '.join(found) or 'the combinations leave something out'}. Learn others, which leaves these at the model's values "
+        f"{'; '.join(reasons) or 'the combinations leave something out'}. Learn others, which leaves these at the model's values "
         f"(linear jointly with all: {', '.join(good) or 'none'}), or name what enters as a whole, as in "
         "combinations={'inertia': Combination(lambda p: p.m * p.l**2, 'kg m^2')}"
     )
 
 
-def _bent(plant: Plant) -> np.ndarray:
-    """Which pairs of parameters have a second derivative of the inverse dynamics, shape (np, np), found at random points."""
+def _nonlinear_pairs(plant: Plant) -> np.ndarray:
+    """Pairs of parameters by which the inverse dynamics has a second derivative, shape (np, np), tested at random points."""
     x, _, p = plant._symbols()
     r, count = ca.SX.sym("r", len(plant.names)), len(plant.parameters)
     force = plant.inverse_function(x, r, p)
     slope = ca.jacobian(force, p)
     second = ca.Function("fpirhc_second", [x, r, p], [force, slope, ca.jacobian(ca.vec(slope), p)])
-    random, found = np.random.default_rng(2), np.zeros((count, count), dtype=bool)
+    random, nonlinear = np.random.default_rng(2), np.zeros((count, count), dtype=bool)
     for _ in range(_TRIES):
         point = _point(plant, random)
         value, first, curved = (np.asarray(m.full()) for m in second(*point))
@@ -292,8 +302,8 @@ def _bent(plant: Plant) -> np.ndarray:
             continue
         sizes = np.abs(point[2]) + 1e-3
         terms = np.abs(curved.reshape((count, len(plant.names), count))).max(axis=1) * np.outer(sizes, sizes)
-        found |= terms > _TOLERANCE * (1 + np.abs(value).max() + np.abs(first * sizes).max())
-    return found
+        nonlinear |= terms > _TOLERANCE * (1 + np.abs(value).max() + np.abs(first * sizes).max())
+    return nonlinear
 
 
 def _point(plant: Plant, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,11 +1,11 @@
-"""The derivatives of one coordinate up to the one that an input reaches, by Lie derivatives of the model.
+"""The derivatives of one coordinate up to the first that depends on an input, by Lie derivatives of the model.
 
 With x' = f(x, u, p) and y one entry of x the chain is
 
     y^(0) = y,    y^(k) = d y^(k-1)/dx f(x, u, p),    k = 1 ... r,
 
-and the relative order r is the first k for which y^(k) holds the input. The pattern of dependence decides, not a number, so
-a gain that vanishes in one state does not change the order.
+and the relative order r is the first k for which y^(k) depends on the input. The pattern of dependence decides, not a value, so a
+gain that vanishes in one state does not change the order.
 """
 
 from __future__ import annotations
@@ -16,15 +16,19 @@ from functools import cached_property
 import casadi as ca
 
 from fpirhc.errors import InvalidName, NotInvertible, nearest
-from fpirhc.plant.plant import Plant, derivative_unit, structural_order
+from fpirhc.plant.plant import Plant, derivative_unit
+from fpirhc.plant.structural_order import structural_order
 
 
 @dataclass(frozen=True, eq=False)
 class OutputChain:
     """One coordinate's derivatives up to its relative order.
 
-    Parameters:
-        coordinate, input: their names. unit: of the coordinate. order: the relative order r.
+    Args:
+        coordinate: its name.
+        input: name of the input.
+        unit: of the coordinate.
+        order: the relative order r.
         states: Function (state, parameters) -> (y, y', ..., y^(r-1)), shape (r,).
         response: Function (state, input, parameters, forcing) -> y^(r), scalar; `forcing` adds to the plant's responses.
         gain: Function (state, input, parameters) -> d y^(r) / d input, scalar.
@@ -51,28 +55,28 @@ class OutputChain:
 
 
 def output_chain(plant: Plant, coordinate: str, input_name: str | None = None) -> OutputChain:
-    """Return the chain from a coordinate to an input; the input may be left out where there is only one.
+    """Return the chain from a coordinate to an input; `input_name` may be None where the plant has one input.
 
     Raises:
-        InvalidName: an unknown coordinate or input, or no choice among several inputs.
+        InvalidName: an unknown coordinate or input, or no name although there are several inputs.
         NotInvertible: the input reaches no derivative of the coordinate, or another input reaches an earlier one.
     """
     name = _input(plant, coordinate, input_name)
     x, u, p = plant._symbols()
     w = ca.SX.sym("w", len(plant.names))
     rate = plant.forced_derivative_function(x, u, p, w)
-    chosen = u[plant.input.elements.index(name)]
+    command = u[plant.input.elements.index(name)]
     derivatives = [x[plant.state.elements.index(coordinate)]]
     for order in range(1, plant.state.size + 1):
-        following = ca.jtimes(derivatives[-1], x, rate)
-        if ca.jacobian_sparsity(following, chosen).nnz():
-            return _chain(plant, coordinate, name, derivatives, following, (x, u, p, w))
-        if ca.depends_on(following, u):
-            others = [e for k, e in enumerate(plant.inputs) if ca.jacobian_sparsity(following, u[k]).nnz()]
+        derivative = ca.jtimes(derivatives[-1], x, rate)
+        if ca.jacobian_sparsity(derivative, command).nnz():
+            return _chain(plant, coordinate, name, derivatives, derivative, (x, u, p, w))
+        if ca.depends_on(derivative, u):
+            others = [e for k, e in enumerate(plant.inputs) if ca.jacobian_sparsity(derivative, u[k]).nnz()]
             raise NotInvertible(
                 f"derivative {order} of '{coordinate}' is reached by another input than '{name}'; choose input='{others[0]}'"
             )
-        derivatives.append(following)
+        derivatives.append(derivative)
     orders = ", ".join(f"{c} {structural_order(plant, c) or 'none'}" for c in plant.names)
     raise NotInvertible(
         f"input '{name}' does not reach coordinate '{coordinate}', however often it is differentiated "
@@ -102,15 +106,15 @@ def _chain(
 ) -> OutputChain:
     x, u, p, w = symbols
     place = plant.input.elements.index(name)
-    # What a model knows of y ... y^(r-1) and of the gain is without disturbances.
-    calm = [ca.densify(ca.substitute(v, w, ca.SX.zeros(*w.shape))) for v in (ca.vertcat(*derivatives), response)]
-    gain = ca.densify(ca.jacobian(calm[1], u[place]))
+    # A model gives y ... y^(r-1) and the gain without disturbances.
+    undisturbed = [ca.densify(ca.substitute(v, w, ca.SX.zeros(*w.shape))) for v in (ca.vertcat(*derivatives), response)]
+    gain = ca.densify(ca.jacobian(undisturbed[1], u[place]))
     return OutputChain(
         coordinate,
         name,
         plant.coordinates[coordinate],
         len(derivatives),
-        ca.Function("fpirhc_chain", [x, p], [calm[0]]),
+        ca.Function("fpirhc_chain", [x, p], [undisturbed[0]]),
         ca.Function("fpirhc_chain_response", [x, u, p, w], [ca.densify(response)]),
         ca.Function("fpirhc_chain_gain", [x, u, p], [gain]),
     )

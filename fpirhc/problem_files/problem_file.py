@@ -1,10 +1,11 @@
-"""Finds and loads a problem: a shipped one by name, or a user's Python file by path.
+"""Problem files: a shipped one is found by its name, a user's one by its path.
 
-A problem file defines `problem` (a Problem) and `controllers` ({name: Controller}); its docstring's first line is its
-title. Optional: `headline`, a pair (controller without adaptation, controller with) that the verdict is about; `tuning`,
-{controller: {path of a setting: Span or LogSpan}}, where `fpirhc tune` looks for better settings; `metrics`, a sequence of
-`Metric`, which every table, file and baseline of the problem then has beside the shipped ones; `pictures`, those that the
-report has beyond the usual ones.
+A problem file defines `problem` (a Problem) and `controllers` ({name: Controller}). The first line of its docstring is its title.
+It may also define
+- `headline`, a pair (controller without adaptation, controller with adaptation) for the verdict,
+- `tuning`, {controller: {path of a setting: Span or LogSpan}}, the ranges in which `fpirhc tune` searches,
+- `metrics`, a sequence of `Metric` for all tables, files and baselines of the problem, in addition to the shipped ones,
+- `pictures`, a sequence of pictures for the report, in addition to the usual ones.
 """
 
 from __future__ import annotations
@@ -28,7 +29,20 @@ from fpirhc.task.problem import Problem
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A loaded problem file; its problem has its name. metrics: all that its runs are measured by."""
+    """A loaded problem file.
+
+    Args:
+        name: of the file, without the suffix; the problem has the same name.
+        path: of the file.
+        title: first line of the file's docstring.
+        description: the other lines.
+        problem: the file's problem.
+        controllers: by name.
+        headline: names of the controllers without and with adaptation that the verdict compares.
+        tuning: ranges of settings by controller.
+        metrics: all metrics of the problem's runs.
+        pictures: further pictures for the report.
+    """
 
     name: str
     path: Path
@@ -47,7 +61,7 @@ class Task:
 
 
 def shipped_folders() -> list[Path]:
-    """Folders that shipped problems may be in: inside the installed package or beside it in a checkout, each with its gallery."""
+    """Folders of shipped problems, inside the installed package or beside it in a checkout, each with its gallery."""
     package = Path(__file__).resolve().parents[1]
     places = (package / "_problems", package.parent / "problems")
     return [f for place in places for f in (place, place / "gallery") if f.is_dir()]
@@ -55,12 +69,12 @@ def shipped_folders() -> list[Path]:
 
 def shipped_problems() -> dict[str, Path]:
     """Return the shipped problems: name -> path."""
-    found: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     for folder in shipped_folders():
         for path in sorted(folder.glob("*.py")):
             if not path.name.startswith("_"):
-                found.setdefault(path.stem, path)
-    return found
+                paths.setdefault(path.stem, path)
+    return paths
 
 
 def title_of(path: Path) -> str:
@@ -76,7 +90,7 @@ def find_problem(name_or_path: str) -> Path:
     """Return the path of a shipped problem or of a user's file.
 
     Raises:
-        ProblemFileError: nothing is there; the nearest shipped name is offered.
+        ProblemFileError: there is no such file or problem; the nearest shipped name is offered.
     """
     path = Path(name_or_path)
     if path.suffix == ".py" or path.parent != Path():
@@ -92,10 +106,10 @@ def find_problem(name_or_path: str) -> Path:
 
 
 def load_problem(name_or_path: str) -> Task:
-    """Import a problem file and check what it defines.
+    """Import a problem file and check its definitions.
 
     Raises:
-        ProblemFileError: the file raises on import (its own line is shown) or lacks what a problem file defines.
+        ProblemFileError: the file raises an error on import (the message shows the line), or a definition is missing or wrong.
     """
     path = find_problem(name_or_path)
     module = _import(path)
@@ -147,13 +161,13 @@ def _import(path: Path) -> ModuleType:
         raise ProblemFileError(
             f"{path.name}, line {error.lineno}: {error.msg}\n    {(error.text or '').strip()}"
         ) from None
-    except Exception as error:  # noqa: BLE001 -- whatever a user's file raises is shown with its own line
+    except Exception as error:  # noqa: BLE001 -- every error of a user's file is shown with its line
         raise ProblemFileError(f"{_own_line(path, error)}\n    {type(error).__name__}: {error}") from None
     return module
 
 
 def _own_line(path: Path, error: BaseException) -> str:
-    """The last line of the user's own file in the traceback."""
+    """The last line of the user's file in the traceback."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).resolve() == path.resolve()]
     if not frames:
         return path.name

@@ -1,4 +1,4 @@
-"""Settings of a controller by dotted path: what tuning changes."""
+"""Settings of a controller by dotted path."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ Values = Mapping[str, float]
 
 
 def with_settings(controller: Controller, values: Values) -> Controller:
-    """Return the controller with these settings changed.
+    """Return the controller with other values of some settings.
 
-    Parameters: `values`: path -> number. A path leads through fields, keys of mappings and places of tuples, with dots
-    in between: 'deformation.gain', 'cost.states.q1'.
+    Args:
+        controller: the controller; it stays as it is.
+        values: path -> number. A path leads through fields, keys of mappings and places of tuples, with dots in between:
+            'deformation.gain', 'cost.states.q1'.
 
     Raises:
-        InvalidName: no such setting; the nearest one is offered. InvalidValue: it is not a number, or refuses this one.
+        InvalidName: no such setting; the nearest one is offered.
+        InvalidValue: the setting is not a number, or does not accept this one.
     """
     changed: Any = controller
     for path, value in values.items():
@@ -33,7 +36,8 @@ def current_setting(controller: Controller, path: str) -> float:
     """Return the number at a path.
 
     Raises:
-        InvalidName: no such setting. InvalidValue: it is not a number.
+        InvalidName: no such setting; the nearest one is offered.
+        InvalidValue: the setting is not a number.
     """
     value: Any = controller
     done: list[str] = []

@@ -1,4 +1,4 @@
-"""Where tuning looks for a setting: ranges of numbers, linear or logarithmic, as a problem file states them."""
+"""Ranges in which tuning searches for a setting, linear or logarithmic, as a problem file states them."""
 
 from __future__ import annotations
 
@@ -11,15 +11,19 @@ from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
 from fpirhc.problem_files.settings import current_setting
 
-DIGITS = 4  # of every number that is tried, so that what is written down is what was tried
+DIGITS = 4  # of every number that is tried, so that a written number is exactly the tried one
 
 
 @dataclass(frozen=True)
 class Span:
     """Numbers from `low` to `high`, all equally likely at first.
 
+    Args:
+        low: the smallest number.
+        high: the largest number.
+
     Raises:
-        InvalidValue: not two finite numbers, the smaller one first.
+        InvalidValue: an end that is not finite, or a low end that is not below the high end.
     """
 
     low: float
@@ -35,10 +39,14 @@ class Span:
 
 @dataclass(frozen=True)
 class LogSpan:
-    """Numbers from `low` to `high` of one sign, their logarithms equally likely at first: for what may be 0.01, 0.1 or 1.
+    """Numbers of one sign whose logarithms are equally likely at first, for settings such as 0.01, 0.1 or 1.
+
+    Args:
+        low: the smallest number.
+        high: the largest number.
 
     Raises:
-        InvalidValue: not two finite numbers of the same sign, the smaller one first.
+        InvalidValue: an end that is not finite, a low end that is not below the high end, or ends of different sign.
     """
 
     low: float
@@ -53,10 +61,10 @@ class LogSpan:
 
     def number(self, share: float) -> float:
         """Return the number at `share` (0 to 1) of the way from low to high."""
-        found = math.copysign(
+        value = math.copysign(
             math.exp(math.log(abs(self.low)) * (1 - share) + math.log(abs(self.high)) * share), self.low
         )
-        return _rounded(found, self.low, self.high)
+        return _rounded(value, self.low, self.high)
 
 
 TuningSpans = Mapping[str, Span | LogSpan]

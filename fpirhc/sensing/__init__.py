@@ -1,4 +1,4 @@
-"""Sensing: what a controller is given of the plant, through imperfect sensors and an estimator of what is not measured."""
+"""Sensing: the way from the plant to the controller, through sensors and an estimator of unmeasured quantities."""
 
 from fpirhc.sensing.base import DerivativeEstimator
 from fpirhc.sensing.measured import Measured

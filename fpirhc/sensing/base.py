@@ -1,15 +1,16 @@
-"""The contract of estimators: how state and response follow from what the sensors show.
+"""The contract of derivative estimators: state and response from the measured quantities.
 
-A request r_{k-1} is held from t_{k-1} to t_k, so every linear estimate of the response is a weighted sum of past requests,
+A request r_{k-1}, the deformed response, is held from t_{k-1} to t_k, so every linear estimate of the response is
+a weighted sum of past requests,
 
     f_k = lambda sum_j w_j r_{k-j},     sum_j w_j = 1,
 
 and is later than the ideal pair (r_{k-1}, f_k), for which w_1 = 1, by the weights' centre: sum_j (j - 1) w_j cycles. A
-deformation that compares f_k with r_{k-1} all the same needs a smaller gain; one that is told the delay, Paired(map,
-cycles=...), does not.
+deformation that compares f_k with r_{k-1} needs a smaller gain. A deformation that is given the delay, Paired(map, cycles=...),
+keeps its gain.
 
 An n-th difference of positions over T^n answers requests held over T with the weights of a B-spline, A(n, j) / n! (A:
-Eulerian numbers): 1; 1/2, 1/2; 1/6, 4/6, 1/6; ... . Any other formula for the n-th derivative is an average of such
+Eulerian numbers): 1; 1/2, 1/2; 1/6, 4/6, 1/6; ... . Every other formula for the n-th derivative is an average of such
 differences.
 """
 
@@ -34,20 +35,27 @@ class DerivativeEstimator(ABC):
 
     @property
     def measures_all(self) -> bool:
-        """Whether state and response are measured as they are, so that nothing is estimated."""
+        """Whether state and response are both measured, so that nothing is estimated."""
         return False
 
     @abstractmethod
     def measures(self, plant: Plant) -> tuple[str, ...]:
-        """Names of the quantities that need a sensor: state elements, and highest derivatives of controlled coordinates."""
+        """Names of the measured quantities: state elements, and highest derivatives of controlled coordinates."""
 
     @abstractmethod
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
-        """Block (seen) -> (state, realised); `seen` holds the entries of `measures`, `start` (nx,) is the problem's."""
+        """Block (seen) -> (state, realised).
+
+        Args:
+            plant: the plant that is measured.
+            period: control cycle, s.
+            start: first state of the problem, shape (nx,).
+            seen: signal of the quantities in `measures`.
+        """
 
     @property
     def shows_response(self) -> bool:
-        """Whether the response itself is measured, so that it is that of this instant; estimated unless it says otherwise."""
+        """Whether the response itself is measured, and so belongs to this instant; False by default."""
         return False
 
     @abstractmethod
@@ -60,10 +68,14 @@ class DerivativeEstimator(ABC):
 
     @abstractmethod
     def fills(self, order: int) -> int:
-        """Number of the first cycle (from 0) whose response is made of this run's samples alone."""
+        """Number of the first cycle (from 0) whose response depends on this run's samples alone."""
 
     def check(self, plant: Plant) -> None:  # noqa: B027 -- most estimators serve every plant
-        """Raise InvalidValue where the estimator cannot serve the plant."""
+        """Raise if the estimator cannot serve the plant.
+
+        Raises:
+            InvalidValue: with a remedy.
+        """
 
 
 def response_names(plant: Plant) -> tuple[str, ...]:
@@ -86,5 +98,5 @@ def backward_difference(degree: int) -> Array:
 
 
 def combine(coefficients: Array, samples: Sequence[Expression]) -> Expression:
-    """Return the sum of samples (newest first) times coefficients; zeros cost nothing."""
+    """Return the sum of samples (newest first) times coefficients; terms with a zero coefficient are left out."""
     return sum(c * s for c, s in zip(coefficients, samples, strict=True) if c != 0)

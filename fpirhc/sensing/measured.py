@@ -1,4 +1,4 @@
-"""Everything is measured: the state, and the response by an accelerometer or its like."""
+"""Measurement of the whole state, and of the response by an accelerometer or a similar sensor."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 @dataclass(frozen=True)
 class Measured(DerivativeEstimator):
-    """State and response as the sensors show them: no delay."""
+    """State and response as the sensors show them, without delay."""
 
     @property
     def measures_all(self) -> bool:
-        """It does."""
+        """Whether state and response are both measured: they are."""
         return True
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
@@ -48,12 +48,12 @@ class Measured(DerivativeEstimator):
         return np.ones(1)
 
     def delay(self, order: int, period: float) -> float:
-        """None."""
+        """Zero."""
         del order, period
         return 0.0
 
     def fills(self, order: int) -> int:
-        """One: in the first cycle nothing was asked yet."""
+        """One: no command acted before the first cycle."""
         del order
         return 1
 

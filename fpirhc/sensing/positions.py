@@ -2,7 +2,7 @@
 
     y^(s)_k = sum_i c_{s,i} y_{k-i} / T^s,     s = 0 ... n.
 
-The samples before the first are the start's motion continued backwards, so the first estimates are those of the start.
+The start's motion, continued backwards, fills the samples before the first one, so the first estimates are those of the start.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
-LONGEST = 1001  # samples: what is remembered is static
+LONGEST = 1001  # samples: the memory has a fixed size
 
 
 class _Finite(DerivativeEstimator):
-    """What the formulas have in common."""
+    """Common part of the formulas."""
 
     @abstractmethod
     def coefficients(self, order: int) -> Array:
@@ -41,7 +41,7 @@ class _Finite(DerivativeEstimator):
         average = self.coefficients(order)[-1]
         for _ in range(order):
             average = np.cumsum(average)
-        # Division by (1 - 1/z)^n leaves nothing: an n-th derivative ignores polynomials below degree n.
+        # Division by (1 - 1/z)^n leaves no remainder: an n-th derivative ignores polynomials below degree n.
         return np.convolve(average[: average.size - order], spline_weights(order))
 
     def fills(self, order: int) -> int:
@@ -57,18 +57,18 @@ class _Finite(DerivativeEstimator):
         def step(s: Signals) -> dict[str, Expression]:
             newest, past, at = getattr(s, seen.name), s.estimate_past, 0
             known: dict[str, Expression] = {}
-            kept: list[Expression] = []
+            past_next: list[Expression] = []
             responses: list[Expression] = []
             for k, (name, row) in enumerate(zip(plant.names, rows, strict=True)):
                 count = row.shape[1] - 1
                 samples = [newest[k], *(past[at + i] for i in range(count))]
                 at += count
-                kept += samples[:count]
+                past_next += samples[:count]
                 known |= {name + "'" * d: combine(row[d], samples) for d in range(plant.orders[k])}
                 responses.append(combine(row[-1], samples))
             state = ca.vertcat(*(known[e] for e in plant.state.elements))
             realised = ca.vertcat(*(responses[k] for k in plant.controlled_indices))
-            return {"state": state, "realised": realised, "estimate_past_next": ca.vertcat(*kept)}
+            return {"state": state, "realised": realised, "estimate_past_next": ca.vertcat(*past_next)}
 
         return Block("estimate", Layout((seen,)), Layout((plant.state, realised)), step, Layout((queue,)))
 
@@ -85,7 +85,7 @@ def _queue(plant: Plant, period: float, start: Array, counts: list[int]) -> Sign
 
 @dataclass(frozen=True)
 class PositionDifference(_Finite):
-    """The s-th backward difference over T^s for every derivative; it is late by s T / 2.
+    """The s-th backward difference over T^s for every derivative, which is late by s T / 2.
 
     The response averages the last n requests, so its delay beyond the ideal pair is (n - 1) / 2 cycles. White noise of
     deviation sigma becomes sigma sqrt(binomial(2 n, n)) / T^n: 2.4 sigma / T^2 for n = 2, 8.4 sigma / T^4 for n = 4.
@@ -108,11 +108,12 @@ class PositionDifference(_Finite):
 class SavitzkyGolay(_Finite):
     """A polynomial fitted to the window by least squares: the response at its centre, the state at its newest sample.
 
-    At the centre a derivative has the least noise and a known delay, (window - 1) / 2 - 1 / 2 cycles beyond the ideal pair;
-    the state is wanted now, and at the window's end it is noisier but not late on polynomials up to the degree.
+    At the centre a derivative has the least noise and a known delay, (window - 1) / 2 - 1 / 2 cycles beyond the ideal pair. The
+    state is needed now; at the window's end it is noisier, and has no delay on polynomials up to the degree.
 
-    Parameters:
-        window: number of samples, odd. degree: of the polynomial, at least the plant's order.
+    Args:
+        window: number of samples, odd.
+        degree: of the polynomial, at least the plant's order.
 
     Raises:
         InvalidValue: a window that is even, not longer than the degree, or longer than 1001 samples.
@@ -143,7 +144,7 @@ class SavitzkyGolay(_Finite):
             )
 
     def check(self, plant: Plant) -> None:
-        """Raise if the polynomial has no n-th derivative.
+        """Raise if the polynomial has too low a degree.
 
         Raises:
             InvalidValue: a degree below the plant's order.
@@ -156,9 +157,9 @@ class SavitzkyGolay(_Finite):
             )
 
     def coefficients(self, order: int) -> Array:
-        """Rows of the pseudo-inverse of the Vandermonde matrix, moved to where they are wanted."""
+        """Rows of the pseudo-inverse of the Vandermonde matrix, shifted to the centre or to the newest sample."""
         half = (self.window - 1) // 2
-        # Time in half windows, 0 at the centre: the powers stay of size one.
+        # Time counts in half windows from the centre, so that the powers stay of size one.
         unit = max(half, 1)
         fit = np.linalg.pinv(np.vander(-np.arange(-half, half + 1) / unit, self.degree + 1, increasing=True))
         rows = [self._derivative(fit, s, half / unit) / float(unit) ** s for s in range(order)]

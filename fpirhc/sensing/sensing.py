@@ -1,13 +1,14 @@
-"""The way from the plant to the controller: sensors, their dead time, and an estimator of what is not measured.
+"""The way from the plant to the controller: sensors, their dead time, and an estimator of unmeasured quantities.
 
     true plant -> sensors -> measurement dead time -> estimator -> controller
 
-With anything but ideal sensing the controller's `state` and `realised` are what it is given; the true ones are in the run as
-`plant_state` and `plant_realised`, the sensors' output is `measured`, and a run is judged by `true_error`. Random series are
+Where sensing is not ideal, a run's `state` and `realised` are the estimates that the controller receives. The true signals are
+`plant_state` and `plant_realised`, the sensors' output is `measured`, and `true_error` counts in the metrics. Random series are
 drawn before the run, so the loop itself stays a function.
 
-A response that is estimated from samples before the run would deform by what never happened. So the deformation waits:
-`blind` cycles pass, in which the request is the desired response, until the estimator's window holds this run's samples alone.
+Before the run there are no samples, so the first estimates of the response are not measured ones. The deformation therefore waits
+for `warm_up_cycles`, until the estimator's window holds samples of this run alone; until then the deformed response is the desired
+one.
 """
 
 from __future__ import annotations
@@ -29,18 +30,18 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
 from fpirhc.task.dead_time import delay_block
 
-_STREAM = 1  # keeps the sensors' random series apart from those of disturbances
+_STREAM = 1  # separates the sensors' random series from the series of disturbances
 
 
 @dataclass(frozen=True, eq=False)
 class Sensing:
-    """What stands between plant and controller; ideal unless something is given.
+    """Sensors and estimator between plant and controller; ideal by default.
 
-    Parameters:
-        sensors: by the measured quantity: a state element ("q1", "q1'"), or the highest derivative of a controlled coordinate
-            ("q1''") where the estimator has it measured. Quantities that are not named are measured perfectly.
-        estimator: what makes state and response of them: Measured, VelocityDifference, LowPassDifference, PositionDifference,
-            SavitzkyGolay.
+    Args:
+        sensors: by name of the measured quantity, which is a state element ("q1", "q1'") or, where the estimator measures it, the
+            highest derivative of a controlled coordinate ("q1''"). A quantity that is not named is measured perfectly.
+        estimator: of state and response from the measured quantities: Measured, VelocityDifference, LowPassDifference,
+            PositionDifference, SavitzkyGolay, StateVariableFilter.
     """
 
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
@@ -48,7 +49,7 @@ class Sensing:
 
     @property
     def ideal(self) -> bool:
-        """Whether the controller is given the true state and response."""
+        """Whether the controller receives the true state and response."""
         return not self.sensors and self.estimator.measures_all
 
     def check(self, plant: Plant) -> None:
@@ -79,20 +80,20 @@ class Sensing:
         """Delay of the estimated response in cycles beyond the ideal pair; the largest of the controlled coordinates."""
         return max(self.estimator.delay(plant.orders[k], period) for k in plant.controlled_indices)
 
-    def blind(self, plant: Plant, late: float) -> int:
-        """Number of the first cycle whose response may be used, when samples arrive `late` cycles after they were taken."""
+    def warm_up_cycles(self, plant: Plant, late: float) -> int:
+        """Number of the first cycle whose response may be used; samples arrive `late` cycles after they were taken."""
         if self.estimator.measures_all:
             return 1
         return math.ceil(late) + max(self.estimator.fills(plant.orders[k]) for k in plant.controlled_indices)
 
     @property
     def drawn(self) -> tuple[Signal, ...]:
-        """The signal of all random series, or nothing when there are none."""
+        """The signal of all random series; empty where there is none."""
         columns = self._columns()
         return (Signal("sensing", columns),) if columns else ()
 
     def table(self, times: Array, seed: int) -> Array:
-        """Noise and lost samples (1: lost) of every cycle, shape (cycles, size of `drawn`); each has its own stream."""
+        """Noise and lost samples (1: lost) of every cycle, shape (cycles, size of `drawn`); each column has its own stream."""
         streams = np.random.SeedSequence((seed, _STREAM)).spawn(2 * len(self.sensors))
         columns = []
         for k, sensor in enumerate(self.sensors.values()):
@@ -104,7 +105,15 @@ class Sensing:
     def blocks(
         self, plant: Plant, period: float, start: Array, late: float, true: tuple[Signal, Signal]
     ) -> list[Block]:
-        """Blocks from the true state and response to 'state' and 'realised'; `late` is the measurement's dead time in cycles."""
+        """Blocks from the true state and response to 'state' and 'realised'.
+
+        Args:
+            plant: the plant that is measured.
+            period: control cycle, s.
+            start: first state of the problem, shape (nx,).
+            late: dead time of the measurement, cycles.
+            true: signals of the true state and response.
+        """
         names = self.estimator.measures(plant)
         first = _start(plant, start, names)
         measured = vector("measured", names, [_unit(plant, n) for n in names])
@@ -140,16 +149,16 @@ class Sensing:
                 if sensor.dropout:
                     lost = s.sensing[columns.index(f"{name} lost")] > 0.5
                     seen[name] = ca.if_else(lost, s.sensor_last[lossy.index(name)], seen[name])
-            found = {"measured": ca.vertcat(*(seen[n] for n in measured.elements))}
-            return {**found, "sensor_last_next": ca.vertcat(*(seen[n] for n in lossy))} if lossy else found
+            results = {"measured": ca.vertcat(*(seen[n] for n in measured.elements))}
+            return {**results, "sensor_last_next": ca.vertcat(*(seen[n] for n in lossy))} if lossy else results
 
         return Block("sensors", Layout((*true, *drawn)), Layout((measured,)), step, Layout(memory))
 
 
 def _start(plant: Plant, start: Array, names: tuple[str, ...]) -> Array:
-    """What an ideal sensor shows at the problem's start, at rest with zero inputs."""
-    resting = plant.controlled_response_function(start, np.zeros(plant.input.size), plant.exact).full().ravel()
-    known = dict(zip(plant.state.elements + response_names(plant), np.concatenate([start, resting]), strict=True))
+    """The quantities at the problem's start with zero inputs."""
+    response = plant.controlled_response_function(start, np.zeros(plant.input.size), plant.exact).full().ravel()
+    known = dict(zip(plant.state.elements + response_names(plant), np.concatenate([start, response]), strict=True))
     return np.array([known[n] for n in names])
 
 

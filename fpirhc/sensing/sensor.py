@@ -1,6 +1,6 @@
-"""A sensor: what it makes of one measured quantity.
+"""A sensor of one quantity, with noise, quantisation and lost samples.
 
-seen = Q round((true + noise) / Q);   in a cycle whose sample is lost, what was seen last is seen again.
+seen = Q round((true + noise) / Q);     in a cycle whose sample is lost, the last value seen is repeated.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ from fpirhc.task.disturbance import Disturbance
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """Noise, quantisation and lost samples of one measured quantity; each absent unless given.
+    """Noise, quantisation and lost samples of one measured quantity.
 
-    Parameters:
-        noise: what adds to the true value, in its unit: Noise, ColouredNoise, Sine (hum), Step (bias), Formula (drift).
-        quantum: Q, the distance of two values that the sensor can tell apart (an encoder's), in the quantity's unit.
+    Args:
+        noise: signal that adds to the true value, in its unit: Noise, ColouredNoise, Sine (hum), Step (bias), Formula (drift);
+            None: no noise.
+        quantum: Q, the resolution (of an encoder, for example), in the quantity's unit; None: no quantisation.
         dropout: probability that a cycle's sample is lost.
 
     Raises:
-        InvalidValue: noise that is no disturbance, a quantum that is not positive, a probability outside [0, 1).
+        InvalidValue: noise that is not a Disturbance, a quantum that is not positive, a probability outside [0, 1).
     """
 
     noise: Disturbance | None = None
@@ -34,9 +35,7 @@ class Sensor:
         if self.noise is not None and not isinstance(self.noise, Disturbance):
             wrong.append(f"noise={self.noise!r}: expected a signal such as Noise(deviation=...)")
         if self.quantum is not None and not _within(self.quantum, 0.0, math.inf):
-            wrong.append(
-                f"quantum={self.quantum!r}: expected a positive number in the unit of what is measured, or None"
-            )
+            wrong.append(f"quantum={self.quantum!r}: expected a positive number in the unit of the quantity, or None")
         if self.dropout != 0 and not _within(self.dropout, 0.0, 1.0):
             wrong.append(f"dropout={self.dropout!r}: expected a probability from 0 to below 1")
         if wrong:

@@ -2,9 +2,9 @@
 
     y_0 = q,   y_j' = w (y_{j-1} - y_j),   j = 1 ... n,      q^(s) seen as w^s sum_i (-1)^i C(s, i) y_{n-s+i},
 
-the s-th derivative of the position q through n low-passes of bandwidth w; the position itself is not filtered. Discretised by
-the trapezoidal rule with p = (2 - w T) / (2 + w T), so that derivatives which are constant are seen as they are. It is late by
-about n / w; a count of an encoder makes the response jump by w^n counts: a wide filter is noisy, a narrow one late.
+the s-th derivative of the position q through n low-passes of bandwidth w; the position itself is not filtered. The trapezoidal rule
+discretises the filter, with p = (2 - w T) / (2 + w T), so that constant derivatives are exact. The response is late by about n / w,
+and one count of an encoder makes it jump by w^n counts: a wide filter is noisy, a narrow filter is late.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
-_TAIL = 1e-16  # of a low-pass: what the weights leave out
+_TAIL = 1e-16  # share of a low-pass's weights that is left out
 
 
 @dataclass(frozen=True)
 class StateVariableFilter(DerivativeEstimator):
     """Derivatives of filtered positions.
 
-    The filter begins as if the plant had moved at its first velocities for long.
+    The filter begins in the steady state of a motion at the plant's first velocities.
 
-    Parameters:
+    Args:
         bandwidth: w, rad/s.
 
     Raises:
@@ -56,7 +56,7 @@ class StateVariableFilter(DerivativeEstimator):
         return plant.names
 
     def weights(self, order: int, period: float) -> Array:
-        """The B-spline of an n-th difference through n low-passes (1 - p) / (1 - p / z), as far as they matter."""
+        """The B-spline of an n-th difference through n low-passes (1 - p) / (1 - p / z), without the negligible tail."""
         pole, _ = self._coefficients(period)
         count = math.ceil(math.log(_TAIL) / math.log(abs(pole))) + 10 * order if pole else 1
         after = np.arange(count)
@@ -70,7 +70,7 @@ class StateVariableFilter(DerivativeEstimator):
         return order * pole / (1 - pole) + (order - 1) / 2
 
     def fills(self, order: int) -> int:
-        """One: the filter begins in the start's motion."""
+        """One: the filter begins in the motion of the start."""
         del order
         return 1
 
@@ -106,7 +106,7 @@ class StateVariableFilter(DerivativeEstimator):
         return Block("estimate", Layout((seen,)), writes, step, Layout(memory))
 
     def _coefficients(self, period: float) -> tuple[float, float]:
-        """Of y_j(k) = keep y_j(k-1) + new (y_{j-1}(k) + y_{j-1}(k-1))."""
+        """Coefficients (keep, new) of y_j(k) = keep y_j(k-1) + new (y_{j-1}(k) + y_{j-1}(k-1))."""
         double = 2 / period
         return (double - self.bandwidth) / (double + self.bandwidth), self.bandwidth / (double + self.bandwidth)
 
@@ -115,7 +115,7 @@ class StateVariableFilter(DerivativeEstimator):
         return self.bandwidth**degree * total(terms)
 
     def _memory(self, plant: Plant, period: float, start: Array, kind: str) -> Signal:
-        """The stages, or what came into them, one cycle before the first; stage j is late by j / w."""
+        """The stages (or their inputs) one cycle before the first one; stage j is late by j / w."""
         names, values = [], []
         for name, order in zip(plant.names, plant.orders, strict=True):
             place = start[plant.state.elements.index(name)]

@@ -1,8 +1,8 @@
-"""The response from the highest measured derivative: the state is measured, the response is not.
+"""The response as the difference of the highest measured derivative, where the whole state is measured.
 
-A request is held for one cycle, so the difference of y^(n-1) over the period is the mean response to the last request
-exactly: the ideal pair, without delay. Noise of deviation sigma becomes sqrt(2) sigma / T; a first-order low-pass with the
-time constant tau, pole p = exp(-T / tau), takes (1 - p) / sqrt(1 + p) of that, at the price of a delay of p / (1 - p) cycles,
+A request is held for one cycle, so the difference of y^(n-1) over the period is exactly the mean response to the last request: the
+ideal pair, without delay. Noise of deviation sigma becomes sqrt(2) sigma / T. A first-order low-pass with the time constant tau and
+the pole p = exp(-T / tau) reduces it by the factor (1 - p) / sqrt(1 + p) and adds a delay of p / (1 - p) cycles,
 
     f_k = p f_{k-1} + (1 - p) (y^(n-1)_k - y^(n-1)_{k-1}) / T.
 """
@@ -43,12 +43,12 @@ class VelocityDifference(DerivativeEstimator):
         return np.ones(1)
 
     def delay(self, order: int, period: float) -> float:
-        """None."""
+        """Zero."""
         del order, period
         return 0.0
 
     def fills(self, order: int) -> int:
-        """One: two samples."""
+        """One: the difference needs two samples."""
         del order
         return 1
 
@@ -57,10 +57,10 @@ class VelocityDifference(DerivativeEstimator):
 class LowPassDifference(DerivativeEstimator):
     """The same difference through a first-order low-pass, which begins with the first difference.
 
-    Where the response is filtered and the desired one is not, their difference is late. `Filtered` filters the difference
-    itself; `Paired(cycles=...)` compares with the request that the response belongs to.
+    The filtered response is later than the unfiltered desired response. `Filtered` filters their difference instead, and
+    `Paired(cycles=...)` compares the response with the request that caused it.
 
-    Parameters:
+    Args:
         time_constant: tau, s.
 
     Raises:
@@ -77,7 +77,7 @@ class LowPassDifference(DerivativeEstimator):
             )
 
     def pole(self, period: float) -> float:
-        """P = exp(-T / tau)."""
+        """Pole of the low-pass, exp(-T / tau)."""
         return math.exp(-period / self.time_constant)
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
@@ -89,14 +89,14 @@ class LowPassDifference(DerivativeEstimator):
         return _difference_block(plant, period, start, seen, self.pole(period))
 
     def weights(self, order: int, period: float) -> Array:
-        """(1 - p) p^(j-1), as far as they matter."""
+        """(1 - p) p^(j-1), without the negligible tail."""
         del order
         pole = self.pole(period)
         count = max(1, math.ceil(math.log(_TAIL) / math.log(pole))) if pole > 0 else 1
         return np.asarray((1 - pole) * pole ** np.arange(count))
 
     def delay(self, order: int, period: float) -> float:
-        """P / (1 - p)."""
+        """Delay p / (1 - p) of the low-pass."""
         del order
         return self.pole(period) / (1 - self.pole(period))
 
@@ -119,12 +119,12 @@ def _difference_block(plant: Plant, period: float, start: Array, seen: Signal, p
         state = getattr(s, seen.name)
         newest = state[places]
         response = (newest - s.estimate_before) / period
-        found = {"state": state, "realised": response, "estimate_before_next": newest}
+        results = {"state": state, "realised": response, "estimate_before_next": newest}
         if not pole:
-            return found
+            return results
         response = ca.if_else(s.estimate_cycles < 1.5, response, pole * s.estimate_smooth + (1 - pole) * response)
-        counted = ca.fmin(s.estimate_cycles + 1, 2)
-        return {**found, "realised": response, "estimate_smooth_next": response, "estimate_cycles_next": counted}
+        cycles_next = ca.fmin(s.estimate_cycles + 1, 2)
+        return {**results, "realised": response, "estimate_smooth_next": response, "estimate_cycles_next": cycles_next}
 
     return Block("estimate", Layout((seen,)), Layout((plant.state, realised)), step, Layout(memory))
 

@@ -3,7 +3,7 @@
 A `Block` reads named signals, writes named signals and may remember some: its `step` is written in
 CasADi expressions and has no side effects. `compose` wires blocks by signal name into one `Composite`
 whose Function maps (memory, reads) to (memory, trace). A `Delay` carries a signal to the next cycle, so that
-what a late block writes (the clipped command, say) is what an early block reads one cycle later. Signals whose name
+an early block reads what a late block (the actuator, say) wrote one cycle earlier. Signals whose name
 begins with '_' are wires between blocks and stay out of the trace.
 """
 
@@ -27,9 +27,15 @@ PREFIX = "fpirhc_"  # keeps generated C names away from those of libc
 class Block:
     """A named step: (reads, memory) -> (writes, memory).
 
-    `step` gets one object with every read and remembered signal as an attribute and returns a mapping with every
-    written signal and, for each remembered signal m, 'm_next'. An `opaque` block holds operations that scalar
-    expressions cannot (solver calls, table look-up, short circuits) and is built with MX.
+    Args:
+        name: of the block and of its Function.
+        reads: signals that the step reads.
+        writes: signals that the step writes.
+        step: function of one object that has every read and remembered signal as an attribute. It returns a mapping with every
+            written signal and, for each remembered signal m, 'm_next'.
+        memory: signals that the block remembers.
+        opaque: whether the step holds operations that scalar expressions cannot (solver calls, table look-up, short circuits);
+            the block is then built with MX.
     """
 
     name: str
@@ -44,17 +50,18 @@ class Block:
         """Function of (each read, each remembered) -> (each written, each remembered, one cycle later).
 
         Raises:
-            InvalidName: the step forgot a signal. InvalidShape: a signal has the wrong size.
+            InvalidName: the step leaves out a signal.
+            InvalidShape: a signal has the wrong size.
         """
         matrix = kind(self.opaque)
-        taken = [*self.reads.signals, *self.memory.signals]
-        symbols = {s.name: matrix.sym(s.name, s.size) for s in taken}
-        given = self.step(Signals(symbols))
+        arguments = [*self.reads.signals, *self.memory.signals]
+        symbols = {s.name: matrix.sym(s.name, s.size) for s in arguments}
+        values = self.step(Signals(symbols))
         results = []
         for signal, key in self._results():
-            if key not in given:
-                raise InvalidName(f"block '{self.name}' does not give '{key}'.{nearest(key, given)}")
-            value = matrix(given[key])
+            if key not in values:
+                raise InvalidName(f"block '{self.name}' does not give '{key}'.{nearest(key, values)}")
+            value = matrix(values[key])
             if value.numel() != signal.size:
                 raise InvalidShape(
                     f"block '{self.name}' gives '{key}' with {value.numel()} entries, expected {signal.size}"
@@ -70,7 +77,12 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Delay:
-    """Signal `now` is what `source` was one cycle ago (its start value in the first cycle)."""
+    """A signal carried to the next cycle.
+
+    Args:
+        now: the signal that is read; its value is that of `source` one cycle earlier, and its start value in the first cycle.
+        source: name of the signal that is carried.
+    """
 
     now: Signal
     source: str
@@ -99,24 +111,28 @@ def compose(
 ) -> Composite:
     """Wire `blocks`, in order, by signal name into one step.
 
-    Parameters: `reads` come from outside; `delays` carry signals to the next cycle; `outputs` names traced
-    signals that the Function returns once more by themselves, after (memory, trace).
+    Args:
+        name: of the composite and of its Function.
+        reads: signals that come from outside.
+        blocks: the blocks in the order in which they run.
+        delays: signals that are carried to the next cycle.
+        outputs: names of traced signals that the Function returns once more by themselves, after (memory, trace).
 
     Raises:
-        InvalidName: a block reads what nobody wrote, or two blocks write the same name.
+        InvalidName: a block reads a signal that no earlier block writes, or two blocks write the same signal.
         InvalidShape: a reader and a writer disagree on a size.
     """
     memory = Layout(tuple(d.now for d in delays) + tuple(s for b in blocks for s in b.memory.signals))
     inputs = {s.name: ca.MX.sym(s.name, s.size) for s in reads.signals}
     remembered = ca.MX.sym("memory", memory.size)
     known: dict[str, ca.MX] = {**memory.split(remembered), **inputs}
-    following: dict[str, ca.MX] = {}
+    next_memory: dict[str, ca.MX] = {}
     for block in blocks:
-        _call(block, known, following)
+        _call(block, known, next_memory)
     trace = Layout(tuple(s for b in blocks for s in b.writes.signals if not s.name.startswith("_")))
     for delay in delays:
-        following[delay.now.name] = _lookup(f"delay '{delay.now.name}'", delay.now, delay.source, known)
-    returned = [memory.join(following), trace.join(known), *(known[o] for o in outputs)]
+        next_memory[delay.now.name] = _lookup(f"delay '{delay.now.name}'", delay.now, delay.source, known)
+    returned = [memory.join(next_memory), trace.join(known), *(known[o] for o in outputs)]
     function = ca.Function(
         PREFIX + name,
         [remembered, *inputs.values()],
@@ -132,7 +148,10 @@ def compose(
 def every(block: Block, cycles: int) -> Block:
     """Return a block that runs `block` in every `cycles`-th cycle and holds its writes in between.
 
-    The skipped cycles do not evaluate it (short circuit), so an expensive block costs only when it runs.
+    A skipped cycle does not evaluate the block (short circuit), so an expensive block costs time only when it runs.
+
+    Raises:
+        InvalidValue: `cycles` below 1.
     """
     if cycles < 1:
         raise InvalidValue(f"block '{block.name}' is to run every {cycles} cycles; expected 1 or more")
@@ -146,14 +165,14 @@ def every(block: Block, cycles: int) -> Block:
     run, hold = _branches(block, held)
 
     def step(signals: Signals) -> dict[str, Expression]:
-        taken = [getattr(signals, n) for n in (*held.names, *block.reads.names, *block.memory.names)]
+        arguments = [getattr(signals, n) for n in (*held.names, *block.reads.names, *block.memory.names)]
         choice = ca.Function.if_else(f"{PREFIX}{block.name}_every", run, hold)
         due = getattr(signals, phase.name) < 0.5
-        given = choice(due, *taken)
-        values = dict(zip([key for _, key in block._results()], ca.vertsplit(given, _ends(block)), strict=True))
+        column = choice(due, *arguments)
+        values = dict(zip([key for _, key in block._results()], ca.vertsplit(column, _ends(block)), strict=True))
         values |= {f"{h}_next": values[s] for h, s in zip(held.names, block.writes.names, strict=True)}
-        counted = getattr(signals, phase.name) + 1
-        values[f"{phase.name}_next"] = ca.if_else(counted > cycles - 0.5, 0, counted)
+        next_phase = getattr(signals, phase.name) + 1
+        values[f"{phase.name}_next"] = ca.if_else(next_phase > cycles - 0.5, 0, next_phase)
         return values
 
     return Block(f"{block.name}_every_{cycles}", block.reads, block.writes, step, own, opaque=True)
@@ -168,33 +187,33 @@ def _ends(block: Block) -> list[int]:
 
 def _branches(block: Block, held: Layout) -> tuple[ca.Function, ca.Function]:
     """The two sides of the switch, both (held writes, reads, memory) -> one column of results."""
-    kept = [ca.MX.sym(s.name, s.size) for s in held.signals]
+    last_writes = [ca.MX.sym(s.name, s.size) for s in held.signals]
     reads = [ca.MX.sym(s.name, s.size) for s in block.reads.signals]
     memory = [ca.MX.sym(s.name, s.size) for s in block.memory.signals]
-    given = block.function(*reads, *memory)
-    fresh = ca.vertcat(*given) if isinstance(given, tuple) else given
-    arguments = [*kept, *reads, *memory]
-    run = ca.Function(f"{PREFIX}{block.name}_run", arguments, [fresh])
-    hold = ca.Function(f"{PREFIX}{block.name}_hold", arguments, [ca.vertcat(*kept, *memory)])
+    results = block.function(*reads, *memory)
+    new = ca.vertcat(*results) if isinstance(results, tuple) else results
+    arguments = [*last_writes, *reads, *memory]
+    run = ca.Function(f"{PREFIX}{block.name}_run", arguments, [new])
+    hold = ca.Function(f"{PREFIX}{block.name}_hold", arguments, [ca.vertcat(*last_writes, *memory)])
     return run, hold
 
 
-def _call(block: Block, known: dict[str, ca.MX], following: dict[str, ca.MX]) -> None:
-    taken = [_lookup(f"block '{block.name}'", s, s.name, known) for s in block.reads.signals]
-    given = block.function(*taken, *(known[m] for m in block.memory.names))
+def _call(block: Block, known: dict[str, ca.MX], next_memory: dict[str, ca.MX]) -> None:
+    reads = [_lookup(f"block '{block.name}'", s, s.name, known) for s in block.reads.signals]
+    returned = block.function(*reads, *(known[m] for m in block.memory.names))
     keys = [key for _, key in block._results()]
     # A Function returns a tuple of several results, one bare result, and None for none.
-    values = given if isinstance(given, tuple) else (given,) * len(keys)
+    values = returned if isinstance(returned, tuple) else (returned,) * len(keys)
     results = dict(zip(keys, values, strict=True))
     for name in block.writes.names:
         if name in known:
             raise InvalidName(f"block '{block.name}' writes '{name}', which is already written")
         known[name] = results[name]
-    following.update({m: results[f"{m}_next"] for m in block.memory.names})
+    next_memory.update({m: results[f"{m}_next"] for m in block.memory.names})
 
 
 def _scalar_code(function: ca.Function) -> ca.Function:
-    """Write all calls out as scalar expressions and compute what blocks have in common once."""
+    """Write all calls out as scalar expressions and compute common parts of blocks once."""
     inputs = [ca.SX.sym(function.name_in(k), function.size1_in(k)) for k in range(function.n_in())]
     shared = ca.cse([ca.SX(v) for v in function.call(inputs)])
     return ca.Function(function.name(), inputs, shared, function.name_in(), function.name_out())
@@ -203,7 +222,7 @@ def _scalar_code(function: ca.Function) -> ca.Function:
 def _lookup(reader: str, signal: Signal, source: str, known: Mapping[str, ca.MX]) -> ca.MX:
     if source not in known:
         raise InvalidName(f"{reader} reads '{source}', which no earlier block writes.{nearest(source, known)}")
-    found = known[source]
-    if found.numel() != signal.size:
-        raise InvalidShape(f"{reader} reads '{source}' with {signal.size} entries, but it has {found.numel()}")
-    return found
+    value = known[source]
+    if value.numel() != signal.size:
+        raise InvalidShape(f"{reader} reads '{source}' with {signal.size} entries, but it has {value.numel()}")
+    return value

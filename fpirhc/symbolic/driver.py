@@ -1,6 +1,6 @@
 """Bodies in C for Functions whose composed graph is slow to run as generated code.
 
-A driver is a hand-written loop around generated leaf functions that computes what a composed Function computes. The composed
+A driver is a hand-written loop around generated leaf functions, with the same results as a composed Function. The composed
 Function stays the definition: the virtual machine runs it, and it is compiled where a driver does not fit. When C is generated
 for a Function that calls it, its body is replaced by a call of the driver.
 """
@@ -28,8 +28,11 @@ _drivers: dict[str, str] = {}
 class Driver:
     """The C text of a driver.
 
-    Parameters: `text` defines `int ENTRY(arg, res, iw, w, mem)`, CasADi's C signature, and calls `leaves` by their keys;
-    `constants` become preprocessor definitions. WORK and INTEGERS are defined as the leaves' scratch space.
+    Args:
+        text: C code that defines `int ENTRY(arg, res, iw, w, mem)`, CasADi's C signature, and calls the leaves by their keys.
+            WORK and INTEGERS are defined there as the sizes of the leaves' scratch space.
+        leaves: generated Functions by key.
+        constants: preprocessor definitions by name.
     """
 
     text: str
@@ -37,7 +40,7 @@ class Driver:
     constants: Mapping[str, object]
 
     def source(self) -> str:
-        """Return the whole C file; the name of the entry stands as ENTRY."""
+        """Return the whole C file, in which the entry is called ENTRY."""
         generator = ca.CodeGenerator("fpirhc_leaves", {"with_header": False, "with_mem": False})
         renamed = [_renamed(leaf, f"fpirhc_leaf_{name}") for name, leaf in self.leaves.items()]
         for leaf in renamed:
@@ -73,23 +76,23 @@ def substitute(source: str) -> tuple[str, list[str]]:
         entry = f"{name}_driver"
         source, count = body.subn(rf"\1  return {entry}(arg, res, iw, w, mem);\n}}", source)
         if count:
-            declared = f"int {entry}{_SIGNATURE};\n"
-            source = source.replace(f"/* {name}:(", f"{declared}/* {name}:(", 1)
+            declaration = f"int {entry}{_SIGNATURE};\n"
+            source = source.replace(f"/* {name}:(", f"{declaration}/* {name}:(", 1)
             files.append(f"#define ENTRY {entry}\n{_drivers[name]}")
     return (_without_unused(source) if files else source), files
 
 
 def _without_unused(source: str) -> str:
-    """Drop the static functions that nothing calls any more: compilers would read and then forget them."""
-    found = {m[1]: m[0] for m in _FUNCTION.finditer(source)}
+    """Drop the static functions that nothing calls any more: a compiler would read and then discard them."""
+    definitions = {m[1]: m[0] for m in _FUNCTION.finditer(source)}
     rest = re.sub(r"^#define .*$", "", _FUNCTION.sub("", source), flags=re.MULTILINE)
     called, waiting = set[str](), [rest]
     while waiting:
-        for name in set(_CALL.findall(waiting.pop())) & found.keys() - called:
+        for name in set(_CALL.findall(waiting.pop())) & definitions.keys() - called:
             called.add(name)
-            waiting.append(found[name].partition("{")[2])
-    for name in found.keys() - called:
-        source = source.replace(found[name], "")
+            waiting.append(definitions[name].partition("{")[2])
+    for name in definitions.keys() - called:
+        source = source.replace(definitions[name], "")
     return source
 
 

@@ -4,7 +4,7 @@ An ordinary call of a Function from Python costs tens of microseconds; through f
 `Evaluator` owns numpy arrays for all arguments and results: write into `arguments`, call `evaluate`, read `results`.
 
 CasADi matrices are column-major, so a (rows, columns) matrix appears as an array of shape (columns, rows); a column as (rows,).
-Not for threads: a Function must not run in two threads at once. Use processes, each with an Evaluator of its own.
+A Function must not run in two threads at once. Use processes instead of threads, each with an Evaluator of its own.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from fpirhc.errors import InvalidShape, InvalidValue
 
 
 class _Buffer(Protocol):
-    """What CasADi's FunctionBuffer takes from Python; its stub has the arguments of C++."""
+    """CasADi's FunctionBuffer as Python calls it; its stub has the arguments of C++."""
 
     def set_arg(self, k: int, memory: memoryview) -> None: ...
     def set_res(self, k: int, memory: memoryview) -> None: ...
@@ -43,7 +43,7 @@ class Evaluator:
             self._buffer.set_res(k, array.data)
         self._redirected: dict[int, np.ndarray] = {}
         self.evaluate: Callable[[], object] = partial(handle)
-        # The handle alone points into memory that the buffer and the arrays own: it must keep them alive.
+        # The handle points into memory that the buffer and the arrays own, so it must keep them alive.
         owners = (self._buffer, self.arguments, self.results, self._redirected)
         vars(self.evaluate)["owners"] = owners
 
@@ -61,9 +61,9 @@ class Evaluator:
 
     @property
     def failed(self) -> bool:
-        """Whether the last evaluation failed; `results` then still hold what was there before.
+        """Whether the last evaluation failed; `results` then still hold the values from before it.
 
-        In the virtual machine a failure raises as well; compiled code only says so here.
+        In the virtual machine a failure raises as well; a failure of compiled code shows only here.
         """
         return bool(self._buffer.ret() != 0)
 
@@ -71,13 +71,13 @@ class Evaluator:
         """Evaluate with these arguments and return copies of the results.
 
         Raises:
-            InvalidShape: a wrong number of arguments, or a wrong shape of one.
+            InvalidShape: a wrong number of arguments, or an argument of a wrong shape.
             InvalidValue: an argument that is not made of numbers, or arguments that the Function refuses.
         """
         if len(values) != len(self.arguments):
             names = ", ".join(self.function.name_in())
             raise InvalidShape(f"expected {len(self.arguments)} arguments ({names}), got {len(values)}")
-        # All are looked at before one is written: a refused call leaves the arguments as they were.
+        # All values are checked before one is written, so a refused call leaves the arguments unchanged.
         checked = [self._checked(k, value) for k, value in enumerate(values)]
         for array, value in zip(self.arguments, checked, strict=True):
             array[...] = value
@@ -97,19 +97,21 @@ class Evaluator:
     def _checked(self, k: int, value: npt.ArrayLike) -> np.ndarray:
         array, name = self.arguments[k], self.function.name_in(k)
         try:
-            given = np.asarray(value, dtype=float)
+            entries = np.asarray(value, dtype=float)
         except (TypeError, ValueError) as error:
             raise InvalidValue(f"argument '{name}' is not made of numbers: {error}") from None
-        # The entries of a vector have one order however it lies; a matrix that is not transposed would be scrambled.
+        # A vector's entries have the same order as a row and as a column; a matrix must be transposed.
         is_vector = array.ndim == 1 or 1 in array.shape
-        fits = sum(n != 1 for n in given.shape) <= 1 if is_vector else given.ndim == 1 or given.shape == array.shape
-        if given.size != array.size or not fits:
+        fits = (
+            sum(n != 1 for n in entries.shape) <= 1 if is_vector else entries.ndim == 1 or entries.shape == array.shape
+        )
+        if entries.size != array.size or not fits:
             rows, columns = self.function.size_in(k)
             hint = "" if is_vector else f"; a ({rows}, {columns}) matrix is given transposed"
             raise InvalidShape(
-                f"argument '{name}' has {array.size} entries (shape {array.shape}{hint}), got shape {given.shape}"
+                f"argument '{name}' has {array.size} entries (shape {array.shape}{hint}), got shape {entries.shape}"
             )
-        return given.reshape(array.shape)
+        return entries.reshape(array.shape)
 
 
 def _array(size: tuple[int, int]) -> np.ndarray:

@@ -16,15 +16,15 @@ import casadi as ca
 from fpirhc.errors import nearest
 
 Expression: TypeAlias = ca.SX  # a CasADi SX, MX or DM
-Value: TypeAlias = ca.SX | ca.DM | float  # what a step may write: numbers become expressions
-Matrix = TypeVar("Matrix", ca.SX, ca.MX, ca.DM)  # of functions whose result is of the same kind as their argument
+Value: TypeAlias = ca.SX | ca.DM | float  # a result of a step: numbers become expressions
+Matrix = TypeVar("Matrix", ca.SX, ca.MX, ca.DM)  # for functions whose result is of the same kind as their argument
 
 
 class Signals:
     """The signals that a step reads and remembers, by attribute: `s.desired` is a CasADi column."""
 
     def __init__(self, symbols: Mapping[str, Expression]) -> None:
-        """Take the symbol of every signal by name."""
+        """Store the symbol of every signal under its name."""
         vars(self).update(symbols)
 
     def __getattr__(self, name: str) -> Expression:
@@ -58,6 +58,6 @@ def total(terms: Iterable[Expression]) -> Expression:
 
 
 def pair(results: Expression) -> tuple[Expression, Expression]:
-    """Return the two results of a call; CasADi's stub knows calls with one result only."""
+    """Return the two results of a call; CasADi's stub has calls with one result only."""
     first, second = results
     return first, second

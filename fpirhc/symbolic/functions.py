@@ -1,4 +1,4 @@
-"""Functions that models need often and that must stay smooth for derivatives."""
+"""Smooth functions that models often need."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import casadi as ca
 
 from fpirhc.symbolic.layout import Expression
 
-SMOOTHING = 1e-6  # in the unit of the argument: where the power is rounded off around zero
+SMOOTHING = 1e-6  # half width, in the unit of the argument, within which the power is rounded off around zero
 
 
 def signed_power(d: Expression, exponent: Expression | float) -> Expression:

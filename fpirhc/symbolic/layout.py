@@ -23,7 +23,14 @@ __all__ = ["Expression", "Layout", "Named", "Signal", "scalar", "vector"]
 
 @dataclass(frozen=True, eq=False)
 class Signal:
-    """A named vector: `elements` name its entries (empty: a scalar), `units` theirs, `start` the first value."""
+    """A named vector.
+
+    Args:
+        name: of the signal.
+        elements: names of its entries; empty: a scalar.
+        units: one per entry, or one for all; empty: '1'.
+        start: first value; empty: zeros.
+    """
 
     name: str
     elements: tuple[str, ...] = ()
@@ -42,13 +49,13 @@ class Signal:
 
     @property
     def entry_units(self) -> tuple[str, ...]:
-        """One unit per entry; '1' where none was given."""
+        """One unit per entry; '1' where the signal has none."""
         if not self.units:
             return ("1",) * self.size
         return self.units if len(self.units) == self.size else self.units * self.size
 
     def start_vector(self) -> np.ndarray:
-        """Start value, shape (size,); zeros where none was given."""
+        """Start value, shape (size,); zeros where the signal has none."""
         return np.array(self.start if self.start else (0.0,) * self.size, dtype=float)
 
 
@@ -125,11 +132,11 @@ class Layout:
 
     @cached_property
     def _slices(self) -> dict[str, slice]:
-        places, at = {}, 0
+        slices, at = {}, 0
         for s in self.signals:
-            places[s.name] = slice(at, at + s.size)
+            slices[s.name] = slice(at, at + s.size)
             at += s.size
-        return places
+        return slices
 
     def __getitem__(self, name: str) -> Signal:
         self.slice(name)
@@ -145,7 +152,7 @@ class Layout:
         """Place of one signal in the flat vector.
 
         Raises:
-            InvalidName: with the nearest valid name.
+            InvalidName: an unknown signal; the nearest valid name is offered.
         """
         try:
             return self._slices[name]
@@ -162,10 +169,11 @@ class Layout:
         return Layout(tuple(replace(s, start=parts[s.name]) for s in self.signals))
 
     def pack(self, values: Mapping[str, npt.ArrayLike]) -> np.ndarray:
-        """Numbers by name -> flat vector; signals not named take their start value.
+        """Numbers by name -> flat vector; signals that are not named have their start values.
 
         Raises:
-            InvalidName: an unknown signal. InvalidShape: a wrong number of entries.
+            InvalidName: an unknown signal.
+            InvalidShape: a wrong number of entries.
         """
         flat = self.start()
         for name, value in values.items():

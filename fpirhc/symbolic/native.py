@@ -1,4 +1,4 @@
-"""Compiles Functions to C, once: the compiled library is kept in a content-addressed cache.
+"""Compilation of Functions to C, with a content-addressed cache of the compiled libraries.
 
 The key of a library is a hash of the generated C, the compiler and its version, the flags, the machine and CasADi's version, so
 a library can never be another model's. It is compiled in a folder of its own, its checksum is stored, and both are renamed into
@@ -32,7 +32,7 @@ from fpirhc.errors import CompileError, NotSupported
 from fpirhc.symbolic.driver import substitute
 
 # -ffp-contract=off: no fused multiply-add, so that C and the virtual machine round alike.
-# -z defs: what is missing must fail here and not end the process at the first call.
+# -z defs: a missing symbol must fail here and not end the process at the first call.
 _LINK = ("-Wl,-z,defs",) if sys.platform == "linux" else ()
 _FLAGS = ("-O3", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared", *_LINK)
 _LARGE = 500_000  # bytes of C above which optimising takes longer than it saves: at 1.2 MB -O3 took 52 s and -O1 21 s
@@ -43,7 +43,13 @@ _loaded: dict[str, ca.Function] = {}
 
 @dataclass(frozen=True, eq=False)
 class Native:
-    """A Function and how it runs: compiled, or in the virtual machine for the given reason."""
+    """A Function that runs as compiled code or in the virtual machine.
+
+    Args:
+        function: the Function to call.
+        compiled: whether it is compiled.
+        reason: why it is not compiled; empty otherwise.
+    """
 
     function: ca.Function
     compiled: bool
@@ -51,22 +57,22 @@ class Native:
 
 
 def find_compiler() -> str | None:
-    """Path of the C compiler: FPIRHC_CC, else CC, cc, gcc or clang; None when FPIRHC_CC is 'none' or nothing is found.
+    """Path of the C compiler: FPIRHC_CC, else CC, cc, gcc or clang; None where FPIRHC_CC is 'none' or there is none.
 
-    A compiler asked for by FPIRHC_CC is never replaced by another one.
+    Where FPIRHC_CC names a compiler, no other one replaces it.
     """
-    wished = os.environ.get("FPIRHC_CC", "")
-    if wished:
-        return None if wished.lower() == "none" else shutil.which(wished)
+    setting = os.environ.get("FPIRHC_CC", "")
+    if setting:
+        return None if setting.lower() == "none" else shutil.which(setting)
     for name in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
-        found = shutil.which(name) if name else None
-        if found:
-            return found
+        path = shutil.which(name) if name else None
+        if path:
+            return path
     return None
 
 
 def native(function: ca.Function, flags: Sequence[str] = ()) -> Native:
-    """Return `function` compiled, or itself with the reason why not; `flags` come after the usual ones of the compiler."""
+    """Return `function` compiled, or as it is with the reason why not; `flags` are appended to the usual flags."""
     if function.is_a("External"):
         return Native(function, True, "")
     compiler = find_compiler()
@@ -79,10 +85,10 @@ def native(function: ca.Function, flags: Sequence[str] = ()) -> Native:
 
 
 def generate(function: ca.Function) -> tuple[str, ...]:
-    """Return the C files of `function`: its own, under a fixed name, and those of the drivers that it calls.
+    """Return the C files of `function`: its own under a fixed name, and the files of the drivers that it calls.
 
     Raises:
-        NotSupported: some part of it cannot be written as C.
+        NotSupported: a part of it cannot be written as C.
     """
     if any(f.is_a("External") for f in function.find_functions()):
         raise NotSupported("it calls a Function that is already compiled; compile the whole instead")
@@ -92,7 +98,7 @@ def generate(function: ca.Function) -> tuple[str, ...]:
     wrapped = ca.Function(_NAME, inputs, function.call(inputs, False, True), *names)
     generator = ca.CodeGenerator(_NAME, {"with_header": False})
     try:
-        # CasADi warns on stderr of what it cannot write; the source says it too, and the caller announces it once.
+        # CasADi warns on stderr of parts that it cannot write. The source holds the same text, and the caller announces it once.
         with contextlib.redirect_stderr(io.StringIO()):
             generator.add(wrapped)
             source = str(generator.dump())
@@ -104,10 +110,10 @@ def generate(function: ca.Function) -> tuple[str, ...]:
 
 
 def cache_folder() -> Path:
-    """Folder of compiled libraries: FPIRHC_CACHE, or fpirhc in the user's cache; a temporary one if not writable."""
-    wished = os.environ.get("FPIRHC_CACHE")
+    """Folder of compiled libraries: FPIRHC_CACHE, or fpirhc in the user's cache; a temporary folder if that one is not writable."""
+    setting = os.environ.get("FPIRHC_CACHE")
     try:
-        base = Path(wished) if wished else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fpirhc"
+        base = Path(setting) if setting else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fpirhc"
         base = base.absolute()  # a bare file name would be looked for in the system's library folders
         base.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=base):
@@ -118,45 +124,45 @@ def cache_folder() -> Path:
 
 @cache
 def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
-    """One for this process, removed when it ends."""
+    """A folder for this process, removed when the process ends."""
     return tempfile.TemporaryDirectory(prefix="fpirhc-", ignore_cleanup_errors=True)
 
 
 def _why_no_compiler() -> str:
-    wished = os.environ.get("FPIRHC_CC", "")
-    if wished.lower() == "none":
+    setting = os.environ.get("FPIRHC_CC", "")
+    if setting.lower() == "none":
         return "compilation is turned off (FPIRHC_CC=none)"
-    if wished:
-        return f"the C compiler '{wished}', asked for by FPIRHC_CC, was not found"
+    if setting:
+        return f"the C compiler '{setting}', asked for by FPIRHC_CC, was not found"
     return "no C compiler was found (looked for CC, cc, gcc, clang)"
 
 
 def _check_self_contained(source: str) -> None:
-    unwritten = re.search(r"^\s*#error (?:Code generation not supported for )?(\w+)", source, re.MULTILINE)
-    if unwritten:
-        raise NotSupported(f"it calls '{unwritten[1]}', which CasADi cannot write as C")
-    # Not tried even where the header is installed: its library would have to be found and linked too.
-    foreign = re.search(r"^#include <(.+/.+)>", source, re.MULTILINE)
-    if foreign:
-        raise NotSupported(f"it calls a solver that cannot be written as C: its own library is needed ({foreign[1]})")
+    unsupported = re.search(r"^\s*#error (?:Code generation not supported for )?(\w+)", source, re.MULTILINE)
+    if unsupported:
+        raise NotSupported(f"it calls '{unsupported[1]}', which CasADi cannot write as C")
+    # It is not tried even where the header is installed: its library would have to be found and linked too.
+    header = re.search(r"^#include <(.+/.+)>", source, re.MULTILINE)
+    if header:
+        raise NotSupported(f"it calls a solver that cannot be written as C: its own library is needed ({header[1]})")
 
 
 @cache
 def _version(compiler: str) -> str:
-    done = _run([compiler, "--version"])
-    return done.stdout + done.stderr
+    process = _run([compiler, "--version"])
+    return process.stdout + process.stderr
 
 
 def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    """Run a compiler, whose messages are to be in plain English.
+    """Run a compiler with untranslated messages.
 
     Raises:
         CompileError: it cannot be started.
     """
-    plain = {**os.environ, "LC_ALL": "C"}
+    untranslated = {**os.environ, "LC_ALL": "C"}
     try:
         # A list instead of a shell line: folder names are never read as commands.
-        return subprocess.run(command, capture_output=True, text=True, errors="replace", check=False, env=plain)
+        return subprocess.run(command, capture_output=True, text=True, errors="replace", check=False, env=untranslated)
     except OSError as error:
         raise CompileError(f"the C compiler '{command[0]}' cannot be started: {error}") from None
 
@@ -179,7 +185,7 @@ def _suffix() -> str:
 
 def _load(path: Path, name: str, sources: Sequence[str], command: Sequence[str]) -> ca.Function:
     if _is_intact(path):
-        # One that fits its checksum and still does not load was made on another system: compile it here.
+        # An intact library that does not load was made on another system: it is compiled again here.
         with contextlib.suppress(RuntimeError):
             return ca.external(name, str(path))
     try:
@@ -210,9 +216,9 @@ def _compile(sources: Sequence[str], command: Sequence[str], path: Path) -> None
         texts = [Path(work) / f"model{k or ''}.c" for k in range(len(sources))]
         for text, source in zip(texts, sources, strict=True):
             text.write_text(source, encoding="utf-8")
-        done = _run([*command, "-o", str(library), *map(str, texts), "-lm"])
-        if done.returncode != 0 or not library.is_file():
-            message = _first_error(done.stderr.replace(work + os.sep, "")) or f"exit code {done.returncode}"
+        process = _run([*command, "-o", str(library), *map(str, texts), "-lm"])
+        if process.returncode != 0 or not library.is_file():
+            message = _first_error(process.stderr.replace(work + os.sep, "")) or f"exit code {process.returncode}"
             raise CompileError(f"the C compiler '{command[0]}' failed: {message}")
         checksum.write_text(hashlib.sha256(library.read_bytes()).hexdigest(), encoding="ascii")
         library.replace(path)
@@ -220,6 +226,6 @@ def _compile(sources: Sequence[str], command: Sequence[str], path: Path) -> None
 
 
 def _first_error(messages: str) -> str:
-    """The line that names the error, not the one that says in which function it is."""
+    """The line that names the error, not the line that names the function around it."""
     lines = messages.strip().splitlines()
     return next((line for line in lines if "error" in line or "undefined" in line), lines[0] if lines else "")

@@ -1,1 +1,1 @@
-"""What a controller is asked to do: problem, reference, limits, disturbances, dead time."""
+"""Control tasks: problem, reference, limits, disturbances, dead time."""

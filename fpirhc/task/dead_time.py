@@ -1,6 +1,6 @@
-"""Dead time of a plant: how long commands and measurements are on their way.
+"""Dead time of a plant: the time that commands and measurements take to arrive.
 
-A dead time of (d + phi) control cycles, 0 <= phi < 1, is kept by a queue: the input that acts in a cycle is
+A queue implements a dead time of (d + phi) control cycles, 0 <= phi < 1: the input that acts in a cycle is
 
     (1 - phi) u_{k-d} + phi u_{k-d-1},
 
@@ -22,16 +22,16 @@ from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
-MOST = 1000  # cycles
+MOST = 1000  # cycles of dead time
 
 
 @dataclass(frozen=True, eq=False)
 class DeadTime:
     """Dead time in seconds.
 
-    Parameters:
-        inputs: by input; zero where not named.
-        measurement: of the state and the response. The queue begins with the start.
+    Args:
+        inputs: dead time by input; zero where not named.
+        measurement: dead time of the state and the response. At first the queue holds the start.
         before: commands that are on their way at the start, by input; zero where not named.
     """
 
@@ -66,7 +66,14 @@ class DeadTime:
 
 
 def delay_block(name: str, source: Signal, target: Signal, cycles: Sequence[float]) -> Block:
-    """Block that gives every entry of `source` its own delay in cycles; the target's start value fills the queues."""
+    """Block that delays every entry of `source` by its own number of cycles.
+
+    Args:
+        name: of the block.
+        source: the signal that is delayed.
+        target: the delayed signal; its start value fills the queues.
+        cycles: delay of every entry; it need not be whole.
+    """
     lengths = [math.ceil(c - 1e-9) for c in cycles]
     start = target.start_vector()
     queues = Signal(
@@ -80,13 +87,13 @@ def delay_block(name: str, source: Signal, target: Signal, cycles: Sequence[floa
 
     def step(s: Signals) -> dict[str, Expression]:
         now, queue = getattr(s, source.name), getattr(s, queues.name)
-        seen, kept = [], []
+        delayed, queues_next = [], []
         for k, (delay, n) in enumerate(zip(cycles, lengths, strict=True)):
             past = ca.vertcat(now[k], queue[ends[k] : ends[k + 1]])
             whole = min(math.floor(delay + 1e-9), n)
             share = max(delay - whole, 0.0) if whole < n else 0.0
-            seen.append(past[whole] if share == 0 else (1 - share) * past[whole] + share * past[whole + 1])
-            kept.append(past[:n])
-        return {target.name: ca.vertcat(*seen), f"{queues.name}_next": ca.vertcat(*kept)}
+            delayed.append(past[whole] if share == 0 else (1 - share) * past[whole] + share * past[whole + 1])
+            queues_next.append(past[:n])
+        return {target.name: ca.vertcat(*delayed), f"{queues.name}_next": ca.vertcat(*queues_next)}
 
     return Block(name, Layout((source,)), Layout((target,)), step, Layout((queues,)))

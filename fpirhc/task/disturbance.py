@@ -1,4 +1,4 @@
-"""Disturbances: what acts on the plant and no controller is told.
+"""Disturbances: signals that act on the plant and that no controller receives.
 
 A disturbance is attached by name, to an input (it adds to the clipped command) or to a coordinate (it adds to the
 response). It is sampled once per control cycle and held over the cycle.
@@ -20,26 +20,31 @@ from fpirhc.symbolic.layout import Expression
 
 
 class Disturbance(ABC):
-    """Contract: values at the given times, and how suddenly and how fast they change, as far as that is known."""
+    """Contract: values at given times, and the size and speed of their changes where these are known."""
 
     @property
     def jump(self) -> float:
-        """Size of its largest sudden change, in the unit of what it adds to; zero where it has none or it is not known."""
+        """Size of the largest sudden change, in the unit of the disturbed signal; zero where there is none or it is unknown."""
         return 0.0
 
     @property
     def slew(self) -> float:
-        """How fast it changes otherwise, per second; zero where that is not known, and for noise, which is no motion to follow."""
+        """Speed of its other changes, per second; zero where it is unknown, and for noise, which no controller can follow."""
         return 0.0
 
     @abstractmethod
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:
-        """Return one value per time, shape (m,), in the unit of what it adds to."""
+        """Return one value per time, shape (m,), in the unit of the disturbed signal."""
 
 
 @dataclass(frozen=True)
 class Step(Disturbance):
-    """Zero before time `at` (s), `size` from then on."""
+    """Zero before a time, constant from then on.
+
+    Args:
+        at: time of the step, s.
+        size: value from then on.
+    """
 
     at: float
     size: float
@@ -56,7 +61,13 @@ class Step(Disturbance):
 
 @dataclass(frozen=True)
 class Pulse(Disturbance):
-    """`size` from time `at` for `duration` seconds, zero otherwise."""
+    """Constant for a while, zero otherwise.
+
+    Args:
+        at: first time of the pulse, s.
+        duration: of the pulse, s.
+        size: value during the pulse.
+    """
 
     at: float
     duration: float
@@ -74,7 +85,13 @@ class Pulse(Disturbance):
 
 @dataclass(frozen=True)
 class Sine(Disturbance):
-    """amplitude sin(2 pi frequency t + phase); frequency in Hz, phase in rad."""
+    """amplitude sin(2 pi frequency t + phase).
+
+    Args:
+        amplitude: in the unit of the disturbed signal.
+        frequency: Hz.
+        phase: rad.
+    """
 
     amplitude: float
     frequency: float
@@ -92,7 +109,10 @@ class Sine(Disturbance):
 
 @dataclass(frozen=True)
 class Noise(Disturbance):
-    """White Gaussian noise of the given standard deviation, drawn from the run's seed.
+    """White Gaussian noise, drawn from the run's seed.
+
+    Args:
+        deviation: standard deviation, in the unit of the disturbed signal.
 
     Raises:
         InvalidValue: a deviation that is negative or not finite.
@@ -110,14 +130,18 @@ class Noise(Disturbance):
 
 @dataclass(frozen=True)
 class ColouredNoise(Disturbance):
-    """Gaussian noise of the given standard deviation that forgets: correlation exp(-|t - t'| / correlation_time).
+    """Gaussian noise with the correlation exp(-|t - t'| / correlation_time).
 
         v_k = c v_{k-1} + sqrt(1 - c^2) deviation w_k,     c = exp(-T / correlation_time),
 
     begun in its stationary distribution. It needs equally spaced times.
 
+    Args:
+        deviation: standard deviation, in the unit of the disturbed signal.
+        correlation_time: s.
+
     Raises:
-        InvalidValue: a deviation that is negative or not finite, a correlation time (s) that is not positive.
+        InvalidValue: a deviation that is negative or not finite, a correlation time that is not positive.
     """
 
     deviation: float
@@ -128,7 +152,7 @@ class ColouredNoise(Disturbance):
         if not 0 < self.correlation_time < math.inf:
             raise InvalidValue(
                 f"ColouredNoise(correlation_time={self.correlation_time!r}): expected a positive number of seconds; "
-                "noise that forgets at once is Noise(deviation=...)"
+                "for noise without correlation use Noise(deviation=...)"
             )
 
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -136,14 +160,18 @@ class ColouredNoise(Disturbance):
         white = random.normal(0.0, self.deviation, times.shape)
         if times.size < 2:
             return white
-        kept = math.exp(-float(times[1] - times[0]) / self.correlation_time)
-        white[1:] *= math.sqrt(1 - kept**2)
-        return np.asarray(lfilter([1.0], [1.0, -kept], white))
+        decay = math.exp(-float(times[1] - times[0]) / self.correlation_time)
+        white[1:] *= math.sqrt(1 - decay**2)
+        return np.asarray(lfilter([1.0], [1.0, -decay], white))
 
 
 @dataclass(frozen=True, eq=False)
 class Formula(Disturbance):
-    """Any CasADi expression of time: Formula(lambda t: 3 * ca.tanh(t - 1))."""
+    """A CasADi expression of time: Formula(lambda t: 3 * ca.tanh(t - 1)).
+
+    Args:
+        expression: function of the time in seconds.
+    """
 
     expression: Callable[[Expression], Expression]
 
@@ -151,15 +179,15 @@ class Formula(Disturbance):
         """Return the expression's values.
 
         Raises:
-            InvalidValue: some value is not finite.
+            InvalidValue: a value is not finite.
         """
         t = ca.SX.sym("t")
         function = ca.Function("fpirhc_disturbance", [t], [self.expression(t)])
-        found = np.asarray(function.map(times.size)(times[None, :]).full()).ravel()
-        if not np.all(np.isfinite(found)):
-            where = times[np.argmin(np.isfinite(found))]
+        samples = np.asarray(function.map(times.size)(times[None, :]).full()).ravel()
+        if not np.all(np.isfinite(samples)):
+            where = times[np.argmin(np.isfinite(samples))]
             raise InvalidValue(f"a disturbance expression is not finite at t = {where:g} s")
-        return found
+        return samples
 
 
 def _check_deviation(noise: Noise | ColouredNoise) -> None:

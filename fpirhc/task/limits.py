@@ -1,4 +1,4 @@
-"""Limits of inputs, states, rates and paths by name; whatever is not named is free."""
+"""Limits of inputs, states, rates and paths by name. A quantity that is not named is free."""
 
 from __future__ import annotations
 
@@ -19,9 +19,11 @@ Interval = tuple[float, float]
 class PathConstraint:
     """A limit on any expression of a stage.
 
-    Parameters:
+    Args:
         expression: function of a View (view.state.q1, view.input.Q1, view.parameters.m1, ...) that returns one scalar.
-        lower, upper: the interval; infinite where free. unit: of the expression.
+        lower: lower end of the interval; infinite where free.
+        upper: upper end of the interval; infinite where free.
+        unit: of the expression.
     """
 
     expression: Callable[..., Value]
@@ -32,16 +34,17 @@ class PathConstraint:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Intervals (lower, upper): of inputs by name, and of states by name (q1, q1', ...); limits of rates and of paths.
+    """Limits of a problem.
 
-    Input limits are kept by the plant's actuator (clipping). All others bind an optimiser's plan.
+    The plant's actuator clips the inputs to their limits. All other limits bind an optimiser's plan.
 
-    Parameters:
-        inputs, states: intervals by name.
-        rates: intervals of the change of inputs from stage to stage, per second, by the input's name.
+    Args:
+        inputs: intervals (lower, upper) by name of the input.
+        states: intervals (lower, upper) by name of the state (q1, q1', ...).
+        rates: intervals of the change of inputs from stage to stage, per second, by name of the input.
         paths: named limits on expressions of state and input in stages 0 ... N-1.
-        soft: weights, in cost per second and unit squared, of limits that may be violated at that price; by the name of a state
-            or path, or by the name of an input for its rate. The price stands in the cost as the term 'soft NAME'.
+        soft: weights, in cost per second and unit squared, of limits that may be violated at that price, by name of a state or
+            path, or by name of an input for its rate. The cost then has the term 'soft NAME'.
     """
 
     inputs: Mapping[str, Interval] = field(default_factory=dict)

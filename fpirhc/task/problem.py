@@ -1,4 +1,4 @@
-"""A problem: what is to be controlled, along which motion, within which limits, for how long."""
+"""A problem: a plant, its nominal motion, its limits, and the length of a run."""
 
 from __future__ import annotations
 
@@ -26,19 +26,22 @@ from fpirhc.task.reference import Reference
 class Problem:
     """One control task.
 
-    Parameters:
+    Args:
         plant: the system, with approximate and exact parameters.
         reference: the nominal motion of every coordinate.
-        start: first value of every coordinate by name; derivatives (q1', ...) not named start at zero.
-        period: control cycle, s. duration: length of a run, s.
-        limits: of inputs and states. disturbances: by name of the input or coordinate they add to.
-        horizon, cost: what a receding-horizon controller looks ahead with.
-        dead_time: of inputs and measurement; what a controller believes of it is the controller's.
-        sensing: what the controller is given of the plant; ideal unless something else is given.
-        integrator: how the simulated plant moves within a cycle.
-        measure_from: metrics are taken from this time on, s (the transient before it is left out).
-        judged: coordinates whose errors are logged and measured; None: the plant's controlled ones.
-        name: of the problem in results; a problem file gives its own name.
+        start: first value of every coordinate by name; derivatives (q1', ...) that are not named start at zero.
+        period: control cycle, s.
+        duration: length of a run, s.
+        limits: of inputs, states, rates and paths.
+        disturbances: by name of the input or coordinate to which they add.
+        dead_time: of inputs and measurement. A controller may assume another one.
+        sensing: sensors and estimator between the plant and the controller; ideal by default.
+        horizon: stages over which a receding-horizon controller plans.
+        cost: of such a plan.
+        integrator: of the simulated plant.
+        measure_from: time from which metrics count, s; the transient before it is left out.
+        judged: coordinates whose errors are logged and measured; None: the controlled ones.
+        name: of the problem in results; the problem of a file has the name of the file.
 
     Raises:
         InvalidProblem: all mistakes together.
@@ -94,7 +97,7 @@ class Problem:
 
     @property
     def sees_plant(self) -> bool:
-        """Whether a controller is given the plant's own state and response, at once and as they are."""
+        """Whether a controller receives the plant's own state and response, unchanged and without delay."""
         return not self.dead_time.measurement and self.sensing.ideal
 
     @cached_property
@@ -104,17 +107,17 @@ class Problem:
 
     @property
     def response_delay(self) -> float:
-        """Cycles from a request to its estimated response, beyond the one of every loop: `Paired(map, cycles=...)`.
+        """Cycles from a request to its estimated response, beyond the one cycle of every loop: `Paired(map, cycles=...)`.
 
-        Dead time and estimator together; of several inputs or coordinates the slowest.
+        It is the sum of dead time and estimator, for the slowest input and coordinate.
         """
         waiting = max(self.dead_time.inputs.values(), default=0.0) + self.dead_time.measurement
         return waiting / self.period + self.sensing.delay(self.plant, self.period)
 
     @property
     def warm_up_cycles(self) -> int:
-        """Number of the first cycle whose realised response may be used; before it nothing is deformed."""
-        return self.sensing.blind(self.plant, self.dead_time.measurement / self.period)
+        """Number of the first cycle whose realised response may be used; no deformation acts before it."""
+        return self.sensing.warm_up_cycles(self.plant, self.dead_time.measurement / self.period)
 
 
 def _check_times(problem: Problem, mistakes: Mistakes) -> None:
@@ -162,7 +165,7 @@ def _check_start(problem: Problem, mistakes: Mistakes) -> None:
 
 
 def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
-    """The model's response must be finite at the start and solvable there for the inputs."""
+    """Add a mistake where the response is not finite at the start, or cannot be solved for the inputs there."""
     plant = problem.plant
     if plant.controlled is None and len(plant.inputs) != len(plant.coordinates):
         return

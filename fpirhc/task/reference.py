@@ -1,7 +1,7 @@
 """References: the nominal motion and its derivatives, as a function of time.
 
 Every reference gives one Function t -> (nominal state, nominal response): the coordinates with all derivatives that the
-plant's state has, and the highest derivative of each. Derivatives are found by automatic differentiation.
+plant's state has, and the highest derivative of each. Derivatives come from automatic differentiation.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Reference(ABC):
 
     @property
     def opaque(self) -> bool:
-        """Whether the reference holds operations that scalar expressions cannot (a table's look-up)."""
+        """Whether the reference holds operations that scalar expressions cannot, such as the look-up of a table."""
         return False
 
     @abstractmethod
@@ -39,9 +39,9 @@ class Reference(ABC):
         """
         matrix = kind(self.opaque)
         t = matrix.sym("t")
-        given = {name: matrix(value) for name, value in self.coordinates(t).items()}
-        _check(plant, given)
-        derivatives = {c: _differentiate(given[c], t, r) for c, r in zip(plant.names, plant.orders, strict=True)}
+        motion = {name: matrix(value) for name, value in self.coordinates(t).items()}
+        _check(plant, motion)
+        derivatives = {c: _differentiate(motion[c], t, r) for c, r in zip(plant.names, plant.orders, strict=True)}
         state = [derivatives[e.rstrip("'")][e.count("'")] for e in plant.state.elements]
         response = [derivatives[c][r] for c, r in zip(plant.names, plant.orders, strict=True)]
         results = [ca.densify(ca.vertcat(*state)), ca.densify(ca.vertcat(*response))]
@@ -52,12 +52,16 @@ class Reference(ABC):
         matrix = kind(self.opaque)
         t = matrix.sym("t")
         values = _differentiate(matrix(self.coordinates(t)[coordinate]), t, order)
-        return ca.Function("fpirhc_ladder", [t], [ca.densify(ca.vertcat(*values))])
+        return ca.Function("fpirhc_reference_derivatives", [t], [ca.densify(ca.vertcat(*values))])
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory(Reference):
-    """A nominal motion given as expressions of time: Trajectory(lambda t: {"q1": ca.sin(2 * t)})."""
+    """A nominal motion given as expressions of time: Trajectory(lambda t: {"q1": ca.sin(2 * t)}).
+
+    Args:
+        motion: function of the time in seconds that returns {coordinate: expression}.
+    """
 
     motion: Callable[[Expression], Mapping[str, Expression]]
 
@@ -68,15 +72,16 @@ class Trajectory(Reference):
 
 @dataclass(frozen=True, eq=False)
 class Table(Reference):
-    """A nominal motion given by samples, joined by splines; held constant outside the table.
+    """A nominal motion given by samples and joined by splines; outside the table it is constant.
 
-    Parameters:
+    Args:
         times: increasing sample times, shape (m,), s.
         values: coordinate -> samples, shape (m,).
         degree: degree of the splines; derivatives are continuous up to degree - 1.
 
     Raises:
-        InvalidValue: times not increasing or values not finite. InvalidShape: lengths differ or too few samples.
+        InvalidValue: times that do not increase, or values that are not finite.
+        InvalidShape: lengths that differ, or too few samples.
     """
 
     times: Sequence[float] | np.ndarray
@@ -98,7 +103,7 @@ class Table(Reference):
 
     @property
     def opaque(self) -> bool:
-        """A table is looked up, which scalar expressions cannot."""
+        """Whether a table is looked up: it is."""
         return True
 
     def coordinates(self, t: Expression) -> Mapping[str, Expression]:
@@ -108,7 +113,7 @@ class Table(Reference):
     def _spline(self, name: str, samples: np.ndarray, t: Expression) -> Expression:
         times = np.asarray(self.times, dtype=float)
         spline = ca.interpolant(f"fpirhc_table_{name}", "bspline", [times], samples, {"degree": [self.degree]})
-        # A choice, not a clamped argument: fmin and fmax have half a derivative at the table's own first and last time.
+        # A choice and not a clamped argument: fmin and fmax have half a derivative at the table's first and last time.
         held = ca.if_else(t < times[0], spline(times[0]), spline(times[-1]))
         return ca.if_else(ca.logic_or(t < times[0], t > times[-1]), held, spline(t))
 
@@ -120,12 +125,12 @@ def _differentiate(value: Expression, t: Expression, order: int) -> list[Express
     return derivatives
 
 
-def _check(plant: Plant, given: Mapping[str, Expression]) -> None:
+def _check(plant: Plant, motion: Mapping[str, Expression]) -> None:
     mistakes = Mistakes("reference")
-    mistakes.unknown("coordinate", given, plant.coordinates)
+    mistakes.unknown("coordinate", motion, plant.coordinates)
     for c in plant.names:
-        if c not in given:
+        if c not in motion:
             mistakes.add(f"coordinate '{c}' has no nominal motion; add '{c}' to the reference")
-        elif given[c].numel() != 1:
-            mistakes.add(f"coordinate '{c}' must be one scalar, got shape {given[c].shape}")
+        elif motion[c].numel() != 1:
+            mistakes.add(f"coordinate '{c}' must be one scalar, got shape {motion[c].shape}")
     mistakes.raise_if_any()

@@ -1,4 +1,4 @@
-"""The tracking error of the controlled coordinates and its integral, as tracking laws pass them on."""
+"""The tracking error of the controlled coordinates and its integral: signals and blocks that tracking laws share."""
 
 from __future__ import annotations
 
@@ -8,6 +8,19 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+
+
+def law_signals(plant: Plant) -> tuple[Layout, Layout]:
+    """Signals that the law of an integrating tracking law reads and writes."""
+    reads = (
+        plant.state,
+        Signal("_target", plant.state.elements, plant.state.units),
+        plant.response_signal("nominal"),
+        scalar("warm_up"),
+        integral_signal(plant, "_integral_before"),
+    )
+    writes = (error_signal(plant), plant.response_signal("desired"), integral_signal(plant, "_integral_used"))
+    return Layout(reads), Layout(writes)
 
 
 def integral_update(plant: Plant, period: float) -> Block:
@@ -21,7 +34,7 @@ def integral_update(plant: Plant, period: float) -> Block:
 
 
 def integral_delay(plant: Plant) -> tuple[Delay, ...]:
-    """The integral in the next cycle is what the update made of it."""
+    """Delay that carries the updated integral to the next cycle."""
     return (Delay(integral_signal(plant, "_integral_before"), "integral"),)
 
 

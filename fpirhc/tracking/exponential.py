@@ -4,9 +4,10 @@ With e = q^N - q and e_int its integral the law prescribes (d/dt + rate)^(n+1) e
 
     q^(n),Des = q^(n),N + sum_{s=0}^{n} C(n+1, s) rate^(n+1-s) e_int^(s),   e_int^(s) = e^(s-1) for s >= 1,
 
-and without the integral (d/dt + rate)^n e = 0. Error: nominal minus actual, hence plus signs throughout.
+and without the integral (d/dt + rate)^n e = 0. The error is nominal minus actual, hence the plus signs.
 
-References: J. K. Tar, J. F. Bito, I. Rudas, Acta Polytechnica Hungarica 13(1), 2016.
+References:
+    J. K. Tar, J. F. Bito, I. Rudas, Acta Polytechnica Hungarica 13(1), 2016.
 """
 
 from __future__ import annotations
@@ -20,22 +21,22 @@ from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, total
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression
 from fpirhc.tracking.base import Feedback, Tracking
-from fpirhc.tracking.error import error_chains, error_signal, integral_delay, integral_signal, integral_update
+from fpirhc.tracking.error import error_chains, integral_delay, integral_update, law_signals
 
 
 @dataclass(frozen=True)
 class Exponential(Tracking):
     """All error modes decay as exp(-rate t).
 
-    Parameters:
+    Args:
         rate: Lambda, 1/s. The digital loop needs rate x period well below 0.667 for n = 2 (0.412 for n = 4).
-        integral: include the integral of the error (removes constant offsets, adds an undershoot).
-        bumpless: start the integral so that the first desired response is the nominal one.
+        integral: whether the integral of the error is fed back (it removes constant offsets and adds an undershoot).
+        bumpless: whether the integral starts so that the first desired response is the nominal one.
 
     Raises:
-        InvalidValue: rate not positive.
+        InvalidValue: a rate that is not positive.
     """
 
     rate: float
@@ -57,40 +58,33 @@ class Exponential(Tracking):
         return self.rate
 
     def feedback(self, order: int) -> Feedback:
-        """Its gains for that order."""
+        """The gains for that order."""
         return Feedback(self.gains(order), self.integral, self.bumpless, self.rate)
 
     def law(self, plant: Plant, period: float) -> Block:
-        """Block (state, target, nominal, started, integral) -> (error to the target, desired, integral in use)."""
+        """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
         del period
-        reads = (
-            plant.state,
-            Signal("_target", plant.state.elements, plant.state.units),
-            plant.response_signal("nominal"),
-            scalar("warm_up"),
-            integral_signal(plant, "_integral_before"),
-        )
-        writes = (error_signal(plant), plant.response_signal("desired"), integral_signal(plant, "_integral_used"))
+        reads, writes = law_signals(plant)
 
         def step(s: Signals) -> dict[str, Expression]:
             errors = error_chains(plant, s._target - s.state)
-            begin = ca.vertcat(*(self._first_integral(chain) for chain in errors))
-            used = ca.if_else(s.warm_up > 0.5, s._integral_before, begin)
-            feedback = [self._feedback(used[k], chain) for k, chain in enumerate(errors)]
+            first_integral = ca.vertcat(*(self._first_integral(chain) for chain in errors))
+            integral = ca.if_else(s.warm_up > 0.5, s._integral_before, first_integral)
+            feedback = [self._feedback(integral[k], chain) for k, chain in enumerate(errors)]
             return {
                 "_target_error": ca.vertcat(*(chain[0] for chain in errors)),
                 "desired": s.nominal + ca.vertcat(*feedback),
-                "_integral_used": used,
+                "_integral_used": integral,
             }
 
-        return Block("tracking", Layout(reads), Layout(writes), step)
+        return Block("tracking", reads, writes, step)
 
     def update(self, plant: Plant, period: float) -> Block:
         """Block that integrates the error, except while the command is clipped."""
         return integral_update(plant, period)
 
     def delays(self, plant: Plant) -> tuple[Delay, ...]:
-        """The integral of the error is remembered."""
+        """The delay of the integral of the error."""
         return integral_delay(plant)
 
     def _feedback(self, integral: Expression, chain: list[Expression]) -> Expression:

@@ -12,13 +12,14 @@ cycles it is the sum of Gruenwald and Letnikov over the last L cycles, solved fo
     sum_{j=0}^{L} w_j (S - S_0)_{k+1-j} = -(rate period)^beta S_{k+1},     w_0 = 1,  w_j = w_{j-1} (1 - (beta + 1) / j),
     q^(n),Des = q^(n),N + sum_{s<n} C(n, s) rate^(n-s) e^(s) - (S_{k+1} - S_k) / period.
 
-What it costs: L multiplications and L remembered numbers per coordinate in every cycle, L = memory / period. What it asks of the
-loop: for beta < 1 a change of the measured S is answered with the gain (1 - beta) / period in the very next cycle, many times
-`rate`, and the first desired response is large. So a constant response error h leaves S = period^(1-beta) h / rate^beta, less than
-the h / rate of the exponential law, while measurement noise and dead time weigh more; for beta > 1 it is the other way round.
+The law needs L multiplications and L remembered numbers per coordinate in every cycle, L = memory / period. For beta < 1 it answers
+a change of the measured S with the gain (1 - beta) / period, many times `rate`, in the next cycle, and the first desired response
+is large. So a constant response error h leaves S = period^(1-beta) h / rate^beta, less than the h / rate of the exponential law,
+while measurement noise and dead time matter more. For beta > 1 both effects are reversed.
 
-References: I. Podlubny, Fractional Differential Equations, Academic Press 1999, ch. 2 and 7 (sum, short memory).
-D. Matignon, Stability results for fractional differential equations, CESA 1996 (stable for beta < 2).
+References:
+    I. Podlubny, Fractional Differential Equations, Academic Press 1999, ch. 2 and 7 (sum, short memory).
+    D. Matignon, Stability results for fractional differential equations, CESA 1996 (stable for beta < 2).
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.tracking.base import Tracking
-from fpirhc.tracking.error import error_chains, error_signal, integral_delay, integral_signal, integral_update
+from fpirhc.tracking.error import error_chains, integral_delay, integral_update, law_signals
 
-MOST = 20_000  # cycles of memory: what is remembered is static
+MOST = 20_000  # cycles of memory: the memory has a fixed size
 _REACH = 20.0  # memory x rate by default
 
 
@@ -45,13 +46,13 @@ _REACH = 20.0  # memory x rate by default
 class Fractional(Tracking):
     """S decays as the Mittag-Leffler function E_beta(-(rate t)^beta).
 
-    The integral of the error begins at zero with a run; S_0 is what S is then. Beyond the memory S stops decaying, at about
-    S_0 / (1 + gamma(1 - beta) (rate memory)^beta); that offset is one of e_int, and e itself goes on to zero.
+    At the start of a run the integral of the error is zero, and S_0 is the value of S. Beyond the memory S stops decaying, at about
+    S_0 / (1 + gamma(1 - beta) (rate memory)^beta). That is an offset of e_int; e itself decays to zero.
 
-    Parameters:
+    Args:
         rate: Lambda, 1/s.
         order: beta, between 0 and 2, both excluded.
-        memory: how far back the sum reaches, s; at least 1 / rate. By default 20 / rate.
+        memory: length of the sum, s; at least 1 / rate. None: 20 / rate.
 
     Raises:
         InvalidValue: a rate, order or memory outside its range; when the loop is built, a memory of more than 20 000 cycles.
@@ -103,47 +104,40 @@ class Fractional(Tracking):
         return self.rate
 
     def law(self, plant: Plant, period: float) -> Block:
-        """Block (state, target, nominal, started, integral) -> (error to the target, desired, integral in use)."""
+        """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
         cycles, size = self.cycles(period), len(plant.controlled_names)
         past = tuple(f"{c}@{j}" for c in plant.controlled_names for j in range(1, cycles + 1))
         memory = Layout((Signal("decay_past", past), Signal("decay_first", plant.controlled_names)))
-        reads = (
-            plant.state,
-            Signal("_target", plant.state.elements, plant.state.units),
-            plant.response_signal("nominal"),
-            scalar("warm_up"),
-            integral_signal(plant, "_integral_before"),
-        )
-        writes = (error_signal(plant), plant.response_signal("desired"), integral_signal(plant, "_integral_used"))
+        reads, writes = law_signals(plant)
         weights, stiffness = ca.DM(self.weights(cycles)), (self.rate * period) ** self.order
 
         def step(s: Signals) -> dict[str, Expression]:
             errors = error_chains(plant, s._target - s.state)
             running = s.warm_up > 0.5
-            used = ca.if_else(running, s._integral_before, 0)
-            decaying, drift = self._decaying(used, errors)
+            integral = ca.if_else(running, s._integral_before, 0)
+            decaying, drift = self._decaying(integral, errors)
             first = ca.if_else(running, s.decay_first, decaying)
-            begun = ca.if_else(running, s.decay_past, 0)
-            kept = [_pushed(begun[cycles * k : cycles * (k + 1)], decaying[k] - first[k]) for k in range(size)]
-            # One product each, so that a long memory stays a short loop in generated code.
-            summed = ca.vertcat(*(ca.dot(weights, queue) for queue in kept))
-            following = -(summed + stiffness * first) / (1 + stiffness)
+            past_now = ca.if_else(running, s.decay_past, 0)
+            queues = [_pushed(past_now[cycles * k : cycles * (k + 1)], decaying[k] - first[k]) for k in range(size)]
+            # One product per coordinate, so that a long memory becomes a short loop in generated code.
+            summed = ca.vertcat(*(ca.dot(weights, queue) for queue in queues))
+            next_decaying = -(summed + stiffness * first) / (1 + stiffness)
             return {
                 "_target_error": ca.vertcat(*(chain[0] for chain in errors)),
-                "desired": s.nominal + drift - (following - (decaying - first)) / period,
-                "_integral_used": used,
-                "decay_past_next": ca.vertcat(*kept),
+                "desired": s.nominal + drift - (next_decaying - (decaying - first)) / period,
+                "_integral_used": integral,
+                "decay_past_next": ca.vertcat(*queues),
                 "decay_first_next": first,
             }
 
-        return Block("tracking", Layout(reads), Layout(writes), step, memory, opaque=True)
+        return Block("tracking", reads, writes, step, memory, opaque=True)
 
     def update(self, plant: Plant, period: float) -> Block:
         """Block that integrates the error, except while the command is clipped."""
         return integral_update(plant, period)
 
     def delays(self, plant: Plant) -> tuple[Delay, ...]:
-        """The integral of the error is remembered; what else is, the law keeps itself."""
+        """The delay of the integral of the error; the block of the law holds the rest of the memory."""
         return integral_delay(plant)
 
     def _decaying(self, integral: Expression, errors: list[list[Expression]]) -> tuple[Expression, Expression]:
@@ -157,8 +151,8 @@ class Fractional(Tracking):
 
 
 def _pushed(queue: Expression, newest: Expression) -> Expression:
-    """The queue with a newest entry and without its oldest."""
-    # Not an empty slice: CasADi's [:0] of one entry is that entry.
+    """The queue with a new first entry and without its last entry."""
+    # CasADi's slice [:0] of one entry is that entry and not empty.
     return ca.vertcat(newest, queue[:-1]) if queue.numel() > 1 else newest
 
 

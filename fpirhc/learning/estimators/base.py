@@ -1,8 +1,7 @@
-"""The contract of estimators: a change of the model's parameters from what was commanded and measured.
+"""The contract of estimators: a change of the model's parameters from commands and measurements.
 
-At t_k an estimator sees the state, and the response that the plant gave just before t_k to the command held since t_{k-1}.
-It returns what is to be added to the parameters that it learns; everything else about the model stays as it was given. A
-disturbance is a parameter too: see `disturbed`.
+At t_k an estimator receives the state, and the response just before t_k to the command held since t_{k-1}. It returns a change of
+the parameters that it learns; the rest of the model stays as it is. A disturbance is a parameter too: see `disturbed`.
 """
 
 from __future__ import annotations
@@ -18,10 +17,14 @@ from fpirhc.task.problem import Problem
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What an estimator is shown in a cycle.
+    """Data of an estimator in one cycle.
 
-    `command` acted until now and caused `response` at `state`; `parameters` are those that the model was given, before any
-    change of the estimator; `valid` is 0 in the first cycle, when nothing has been commanded yet, and 1 from then on.
+    Args:
+        state: the measured state.
+        command: it acted until now and caused `response` at `state`.
+        response: the measured response.
+        parameters: those of the model without the estimator's change.
+        valid: 0 in the first cycle, before the first command, and 1 from then on.
     """
 
     state: Expression
@@ -38,12 +41,12 @@ class Estimator(ABC):
     """Contract: a frozen value that becomes a step for a given problem."""
 
     def model(self, plant: Plant) -> Plant:
-        """The model whose parameters are learned: the plant's own unless some are added after them."""
+        """The model whose parameters are learned: the plant, or the plant with further parameters after its own."""
         return plant
 
     @abstractmethod
     def learned(self) -> tuple[str, ...]:
-        """Names of the parameters of the model that are corrected."""
+        """Names of the parameters of the model that are learned."""
 
     @abstractmethod
     def check(self, problem: Problem) -> None:
@@ -51,7 +54,7 @@ class Estimator(ABC):
 
     @abstractmethod
     def memory(self, problem: Problem) -> Layout:
-        """What is remembered from cycle to cycle."""
+        """Signals that are remembered from cycle to cycle."""
 
     @abstractmethod
     def step(self, problem: Problem) -> Correct:

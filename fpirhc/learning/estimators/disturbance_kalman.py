@@ -1,20 +1,20 @@
 """A disturbance model with a Kalman filter: the estimator of offset-free predictive control.
 
-The model's responses are believed to have unknown disturbances that drift as random walks, seen through measured states,
+The model's responses have unknown disturbances that drift as random walks, and some states are measured,
 
     q_i^(r_i) = f^_i(q, ..., u) + w_i + n_i,      w_i' = white noise,      y = C x + white noise.
 
-The state and the disturbances are estimated together: the nonlinear model predicts over one period, the stationary gain of
-the Kalman filter of the model linearised on the reference at t = 0 corrects,
+The state and the disturbances are estimated together. The nonlinear model predicts over one period. The stationary gain of the
+Kalman filter, for the model linearised on the reference at t = 0, corrects,
 
     x- = F(x^, u, w^),      x^ = x- + K_x (y - C x-),      w^ <- w^ + K_w (y - C x-).
 
-A constant disturbance is found without error, whatever the tuning, if [A - I, B; C, 0] has full column rank (B: what the
-disturbances do to the state), which needs at least as many measured states as disturbances; otherwise the filter is
-refused.
+A constant disturbance is estimated without error, whatever the tuning, if [A - I, B; C, 0] has full column rank (B: effect of the
+disturbances on the state), which needs at least as many measured states as disturbances. Otherwise `check` refuses the filter.
 
-References: G. Pannocchia and J. B. Rawlings, Disturbance models for offset-free model-predictive control, AIChE Journal
-49(2), 2003. M. Morari and U. Maeder, Nonlinear offset-free model predictive control, Automatica 48(9), 2012.
+References:
+    G. Pannocchia and J. B. Rawlings, Disturbance models for offset-free model-predictive control, AIChE Journal 49(2), 2003.
+    M. Morari and U. Maeder, Nonlinear offset-free model predictive control, Automatica 48(9), 2012.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
 
-_SLOWEST = 1e-9  # a mode of the filter that decays by less per cycle does not decay
+_SLOWEST = 1e-9  # decay per cycle below which a mode of the filter counts as undamped
 
 
 @dataclass(frozen=True, eq=False)
 class DisturbanceKalman(Estimator):
     """Estimate constant or slowly drifting disturbances of responses.
 
-    Only ratios of the deviations matter. Those of the measurement are a tuning where the controller is given exact states:
-    the larger the drift, the faster and the noisier the estimate.
+    Only ratios of the deviations matter. Where the controller receives exact states, the measurement's deviations are a tuning: the
+    larger the drift, the faster and the noisier the estimate.
 
-    Parameters:
-        drift: coordinate -> by how much the disturbance of its response wanders in one second, response unit / s^0.5.
+    Args:
+        drift: coordinate -> deviation of the change of its disturbance in one second, response unit / s^0.5.
         measured: state (q1, q1', ...) -> deviation of its measurement noise, in its unit.
-        noise: coordinate -> deviation of the white noise of its response, drawn in every cycle; none where not named.
+        noise: coordinate -> deviation of the white noise of its response in every cycle; zero where not named.
 
     Raises:
-        InvalidValue: no disturbance, nothing measured, or a deviation that is not positive.
+        InvalidValue: no disturbance, no measured state, or a deviation that is not positive.
     """
 
     drift: Mapping[str, float]
@@ -73,10 +73,11 @@ class DisturbanceKalman(Estimator):
         return tuple(disturbance_name(c) for c in self.drift)
 
     def check(self, problem: Problem) -> None:
-        """Raise if names do not fit the plant, or the disturbances cannot be told from what is measured.
+        """Raise if names do not fit the plant, or the measured states do not determine the disturbances.
 
         Raises:
-            InvalidProblem: unknown names. NotSupported: the rank condition is not met, or no stationary gain exists.
+            InvalidProblem: unknown names.
+            NotSupported: the rank condition is not met, or no stationary gain exists.
         """
         mistakes = Mistakes("DisturbanceKalman")
         mistakes.unknown("measured: state", self.measured, problem.plant.state.elements)
@@ -93,25 +94,26 @@ class DisturbanceKalman(Estimator):
         """
         import scipy.linalg
 
-        a, agitation, c = self._matrices(problem)
+        a, noise_input, c = self._matrices(problem)
         model, size = problem.plant, len(self.drift)
-        unrest = np.array([self.noise.get(n, 0.0) for n in model.names])
+        noise = np.array([self.noise.get(n, 0.0) for n in model.names])
         walk = problem.period * np.array(list(self.drift.values())) ** 2
-        q = scipy.linalg.block_diag((agitation * unrest**2) @ agitation.T, np.diag(walk))
+        q = scipy.linalg.block_diag((noise_input * noise**2) @ noise_input.T, np.diag(walk))
         r = np.diag(np.array(list(self.measured.values())) ** 2)
         try:
             p = scipy.linalg.solve_discrete_are(a.T, c.T, q, r)
-            found = np.linalg.solve(c @ p @ c.T + r, c @ p).T
+            gain = np.linalg.solve(c @ p @ c.T + r, c @ p).T
         except np.linalg.LinAlgError:
-            found = np.full((model.state.size + size, len(self.measured)), np.nan)
+            gain = np.full((model.state.size + size, len(self.measured)), np.nan)
         if not (
-            np.isfinite(found).all()
-            and np.abs(np.linalg.eigvals((np.eye(len(a)) - found @ c) @ a)).max() < 1 - _SLOWEST
+            np.isfinite(gain).all() and np.abs(np.linalg.eigvals((np.eye(len(a)) - gain @ c) @ a)).max() < 1 - _SLOWEST
         ):
-            still = [n for n in model.names if n not in self.drift and n not in self.noise]
-            hint = f"give noise={{{still[0]!r}: ...}}, or measure more states" if still else "measure more states"
+            noiseless = [n for n in model.names if n not in self.drift and n not in self.noise]
+            hint = (
+                f"give noise={{{noiseless[0]!r}: ...}}, or measure more states" if noiseless else "measure more states"
+            )
             raise NotSupported(f"DisturbanceKalman: no stationary gain makes the filter stable; {hint}")
-        return np.asarray(found)
+        return np.asarray(gain)
 
     def memory(self, problem: Problem) -> Layout:
         """The estimated state and disturbances."""
@@ -125,37 +127,37 @@ class DisturbanceKalman(Estimator):
         )
 
     def step(self, problem: Problem) -> Correct:
-        """Predict and correct."""
+        """Prediction by the model, and the correction by the gain."""
         model = problem.plant
-        advance, calm = RungeKutta4().step(model, problem.period), ca.DM.zeros(len(model.names))
+        advance, no_forcing = RungeKutta4().step(model, problem.period), ca.DM.zeros(len(model.names))
         gain = self.gain(problem)
         on_state, on_disturbance = ca.DM(gain[: model.state.size]), ca.DM(gain[model.state.size :])
         seen_places = [model.state.elements.index(e) for e in self.measured]
         places = [model.parameter.elements.index(n) for n in self.learned()]
 
         def correct(seen: Seen, memory: Mapping[str, Expression]) -> tuple[Expression, dict[str, Expression]]:
-            believed = seen.parameters + 0
-            believed[places] += memory["observed_disturbance"]
-            ahead = advance(memory["observed_state"], seen.command, believed, calm)
-            surprise = (seen.state - ahead)[seen_places]
-            begun = seen.valid > 0.5
-            state = ca.if_else(begun, ahead + on_state @ surprise, seen.state)
-            disturbance = ca.if_else(begun, memory["observed_disturbance"] + on_disturbance @ surprise, 0)
+            parameters = seen.parameters + 0
+            parameters[places] += memory["observed_disturbance"]
+            predicted = advance(memory["observed_state"], seen.command, parameters, no_forcing)
+            innovation = (seen.state - predicted)[seen_places]
+            running = seen.valid > 0.5
+            state = ca.if_else(running, predicted + on_state @ innovation, seen.state)
+            disturbance = ca.if_else(running, memory["observed_disturbance"] + on_disturbance @ innovation, 0)
             return disturbance, {"observed_state": state, "observed_disturbance": disturbance}
 
         return correct
 
     def _matrices(self, problem: Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """A of state and disturbances over one period, what response noise does to the state, and C."""
+        """A of state and disturbances over one period, the effect of response noise on the state, and C."""
         model = problem.plant
         x, u, p = model._symbols()
         w = ca.SX.sym("w", len(model.names))
-        following = RungeKutta4().step(model, problem.period)(x, u, p, w)
-        function = ca.Function("fpirhc_linear", [x, u, p, w], [ca.jacobian(following, x), ca.jacobian(following, w)])
+        x_next = RungeKutta4().step(model, problem.period)(x, u, p, w)
+        function = ca.Function("fpirhc_linear", [x, u, p, w], [ca.jacobian(x_next, x), ca.jacobian(x_next, w)])
         a, b = (np.asarray(m.full()) for m in function(*_operating_point(problem), np.zeros(len(model.names))))
-        disturbs = b[:, [model.names.index(c) for c in self.drift]]
+        disturbance_input = b[:, [model.names.index(c) for c in self.drift]]
         size = len(self.drift)
-        augmented = np.block([[a, disturbs], [np.zeros((size, a.shape[1])), np.eye(size)]])
+        augmented = np.block([[a, disturbance_input], [np.zeros((size, a.shape[1])), np.eye(size)]])
         c = np.zeros((len(self.measured), augmented.shape[1]))
         c[np.arange(len(c)), [model.state.elements.index(e) for e in self.measured]] = 1
         return augmented, b, c
@@ -173,9 +175,9 @@ class DisturbanceKalman(Estimator):
         rank = int(np.linalg.matrix_rank(stacked[rows] / np.abs(stacked[rows]).max(axis=1, keepdims=True), tol=1e-9))
         if rank < len(a):
             raise NotSupported(
-                f"DisturbanceKalman: a constant {disturbances} cannot be told from {measured}: [A - I, B; C, 0] has rank "
+                f"DisturbanceKalman: a constant {disturbances} cannot be determined from {measured}: [A - I, B; C, 0] has rank "
                 f"{rank} and needs {len(a)} (Pannocchia and Rawlings 2003); measure another state, or disturb the response "
-                "of a coordinate that acts on what is measured"
+                "of a coordinate that acts on a measured state"
             )
 
 

@@ -2,7 +2,7 @@
 
     q_i^(r_i) = f_i(q, q', ..., u, p) + w_i
 
-Everything that takes the model's parameters as data (a horizon, an inverse) then takes a disturbance as well.
+A horizon or an inverse, which takes the model's parameters as data, then takes the disturbances as well.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def disturbed(plant: Plant, coordinates: Sequence[str]) -> Plant:
     """Return the plant with a disturbance w_i of the response of each named coordinate, a parameter 'w_<name>' of value 0.
 
     Raises:
-        InvalidProblem: a coordinate that the plant does not have, no coordinate, or a parameter that has the name already.
+        InvalidProblem: an unknown coordinate, no coordinate, or a parameter that already has the name.
     """
     mistakes = Mistakes("disturbed")
     mistakes.unknown("coordinate", coordinates, plant.coordinates)
@@ -48,10 +48,10 @@ def disturbance_name(coordinate: str) -> str:
 
 
 def _response(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping[str, Expression]]:
-    def response(*given: Named) -> Mapping[str, Expression]:
-        *before, p = given
-        found = plant.response(*before, _own(plant, p))
-        return {c: v + p[disturbance_name(c)] if c in coordinates else v for c, v in found.items()}
+    def response(*arguments: Named) -> Mapping[str, Expression]:
+        *others, p = arguments
+        responses = plant.response(*others, _own(plant, p))
+        return {c: v + p[disturbance_name(c)] if c in coordinates else v for c, v in responses.items()}
 
     vars(response)["__signature__"] = inspect.signature(plant.response)
     return response
@@ -60,14 +60,14 @@ def _response(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping
 def _inverse(
     plant: Plant, inverse: Callable[..., Mapping[str, Expression]], coordinates: Sequence[str]
 ) -> Callable[..., Mapping[str, Expression]]:
-    def undisturbed(*given: Named) -> Mapping[str, Expression]:
-        *before, r, p = given
+    def undisturbed(*arguments: Named) -> Mapping[str, Expression]:
+        *others, r, p = arguments
         entries = [r[c] - p[disturbance_name(c)] if c in coordinates else r[c] for c in plant.controlled_names]
-        return inverse(*before, Named(plant.controlled_names, ca.vertcat(*entries), "coordinate"), _own(plant, p))
+        return inverse(*others, Named(plant.controlled_names, ca.vertcat(*entries), "coordinate"), _own(plant, p))
 
     return undisturbed
 
 
 def _own(plant: Plant, p: Named) -> Named:
-    """The parameters that the plant had before."""
+    """The parameters of the plant without disturbances."""
     return Named(tuple(plant.parameters), p.vector[: len(plant.parameters)], "parameter")

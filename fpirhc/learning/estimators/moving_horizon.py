@@ -1,19 +1,20 @@
-"""Moving-horizon estimation of parameters: least squares over the last W pairs and a prior for all that came before.
+"""Moving-horizon estimation of parameters: least squares over the last W pairs and a prior for all earlier pairs.
 
     minimise  |z - z_a|^2_M + sum_{last W} |e_i(z)|^2      within bounds,
 
-by Gauss-Newton steps, a fixed number per cycle, from the last estimate. Components at a bound towards which the gradient
-points stay there and the others are solved for, because a clipped Newton step does not stop at the constrained optimum
+by a fixed number of Gauss-Newton steps per cycle, from the last estimate. A component stays at its bound where the gradient points
+beyond it, and the step is solved for the other components: a clipped Newton step does not stop at the constrained optimum
 (Bertsekas 1982). A pair that leaves the window is linearised once more and joins the prior (arrival cost),
 
     M <- lambda M + (1 - lambda) I + H'H,     z_a <- z_a + M^-1 H' (e + H (z - z_a)),     lambda = exp(-period / time),
 
-so that with a response linear in its parameters and lambda = 1 nothing is lost: the estimate is that of all pairs since the
-start.
+so that, with a response linear in its parameters and lambda = 1, the estimate is that of all pairs since the start.
 
-References: C. V. Rao, J. B. Rawlings and D. Q. Mayne, Constrained state estimation for nonlinear discrete-time systems,
-IEEE Trans. Automatic Control 48(2), 2003. D. P. Bertsekas, Projected Newton methods for optimization problems with simple
-constraints, SIAM J. Control and Optimization 20(2), 1982.
+References:
+    C. V. Rao, J. B. Rawlings and D. Q. Mayne, Constrained state estimation for nonlinear discrete-time systems, IEEE Trans.
+    Automatic Control 48(2), 2003.
+    D. P. Bertsekas, Projected Newton methods for optimization problems with simple constraints, SIAM J. Control and Optimization
+    20(2), 1982.
 """
 
 from __future__ import annotations
@@ -39,22 +40,22 @@ from fpirhc.learning.estimators.uncertain import (
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
 
-MOST = 2000  # pairs in a window: what is remembered is static
+MOST = 2000  # pairs in a window: the memory has a fixed size
 
 
 @dataclass(frozen=True, eq=False)
 class MovingHorizon(Estimator):
     """Learn parameters from a window of pairs of command and response.
 
-    Parameters:
-        parameters: name -> Uncertain(lower, upper, deviation) of what is learned.
-        noise: controlled coordinate -> deviation of what the response has besides the model, in the response's unit.
+    Args:
+        parameters: name -> Uncertain(lower, upper, deviation) of every learned parameter.
+        noise: controlled coordinate -> deviation of the part of its response that the model lacks, in the response's unit.
         window: number W of pairs.
-        time: time constant with which the prior forgets what left the window, s; math.inf: nothing is forgotten.
+        time: time constant with which the prior forgets pairs that left the window, s; math.inf: it forgets none.
         iterations: Gauss-Newton steps per cycle.
 
     Raises:
-        InvalidValue: nothing to learn; a noise or time that is not positive; a window or iterations outside their range.
+        InvalidValue: no parameter; a noise or time that is not positive; a window or iterations outside their range.
     """
 
     parameters: Mapping[str, Uncertain]
@@ -101,32 +102,32 @@ class MovingHorizon(Estimator):
         )
 
     def step(self, problem: Problem) -> Correct:
-        """One pair in, one pair out, and the Gauss-Newton steps."""
+        """Exchange of one pair in the window, and the Gauss-Newton steps."""
         plant, size, row = problem.plant, len(self.parameters), _row_size(problem)
         residual = residual_function(plant, self.parameters, [self.noise[c] for c in plant.controlled_names])
         pair = _pair_function(problem, residual)
         newton, absorb = _newton_function(size), _absorb_function(size, forgetting_factor(self.time, problem.period))
 
         def correct(seen: Seen, memory: Mapping[str, Expression]) -> tuple[Expression, dict[str, Expression]]:
-            z, given = memory["window_estimate"], seen.parameters
+            z, parameters = memory["window_estimate"], seen.parameters
             newest = ca.vertcat(seen.valid, seen.state, seen.command, seen.response)
             oldest, rest = memory["window_pairs"][-row:], memory["window_pairs"][:-row]
             window = ca.vertcat(newest, rest)
             prior, information = absorb(
-                memory["window_prior"], memory["window_information"], z, *pair(z, oldest, given), oldest[0]
+                memory["window_prior"], memory["window_information"], z, *pair(z, oldest, parameters), oldest[0]
             )
-            lower, upper = bounds_of(problem, self.parameters, given)
-            table, same = ca.reshape(window, row, self.window), ca.repmat(given, 1, self.window)
+            lower, upper = bounds_of(problem, self.parameters, parameters)
+            table, same = ca.reshape(window, row, self.window), ca.repmat(parameters, 1, self.window)
             for _ in range(self.iterations):
                 squares, slopes = pair.map(self.window)(ca.repmat(z, 1, self.window), table, same)
                 z = newton(z, prior, information, ca.sum2(squares), ca.sum2(slopes), lower, upper)
-            kept = {
+            next_memory = {
                 "window_estimate": z,
                 "window_prior": prior,
                 "window_information": information,
                 "window_pairs": window,
             }
-            return deviations(self.parameters) * z, kept
+            return deviations(self.parameters) * z, next_memory
 
         return correct
 
@@ -137,17 +138,17 @@ def _row_size(problem: Problem) -> int:
 
 
 def _pair_function(problem: Problem, residual: ca.Function) -> ca.Function:
-    """Function (z, pair, given parameters) -> (H'H as a column, H'e), zero for a pair that is not valid."""
+    """Function (z, pair, model's parameters) -> (H'H as a column, H'e), zero for a pair that is not valid."""
     plant = problem.plant
     z, row = ca.SX.sym("z", residual.size1_in(0)), ca.SX.sym("row", _row_size(problem))
-    given = ca.SX.sym("p", plant.parameter.size)
+    p = ca.SX.sym("p", plant.parameter.size)
     x_end, u_end = 1 + plant.state.size, 1 + plant.state.size + plant.input.size
-    error, slope = residual(z, row[1:x_end], row[x_end:u_end], row[u_end:], given)
+    error, slope = residual(z, row[1:x_end], row[x_end:u_end], row[u_end:], p)
     valid = row[0] > 0.5
-    # A choice and not a product: the model may be infinite at the zeros that fill an empty window.
+    # A choice and not a product: the model may be infinite at the zeros of an empty window.
     squares = ca.if_else(valid, ca.vec(slope.T @ slope), 0)
     slopes = ca.if_else(valid, slope.T @ error, 0)
-    return ca.Function("fpirhc_pair", [z, row, given], [ca.densify(squares), ca.densify(slopes)])
+    return ca.Function("fpirhc_pair", [z, row, p], [ca.densify(squares), ca.densify(slopes)])
 
 
 def _newton_function(size: int) -> ca.Function:
@@ -155,14 +156,14 @@ def _newton_function(size: int) -> ca.Function:
     z, prior, lower, upper = (ca.SX.sym(n, size) for n in ("z", "prior", "lower", "upper"))
     information, squares = ca.SX.sym("information", size * size), ca.SX.sym("squares", size * size)
     slopes = ca.SX.sym("slopes", size)
-    before = ca.reshape(information, size, size)
-    downhill = slopes - before @ (z - prior)
-    stuck = ca.logic_or(ca.logic_and(z <= lower, downhill < 0), ca.logic_and(z >= upper, downhill > 0))
-    free = ca.diag(1 - stuck)
-    matrix = free @ (before + ca.reshape(squares, size, size)) @ free + ca.diag(stuck)
+    prior_matrix = ca.reshape(information, size, size)
+    downhill = slopes - prior_matrix @ (z - prior)
+    at_bound = ca.logic_or(ca.logic_and(z <= lower, downhill < 0), ca.logic_and(z >= upper, downhill > 0))
+    free = ca.diag(1 - at_bound)
+    matrix = free @ (prior_matrix + ca.reshape(squares, size, size)) @ free + ca.diag(at_bound)
     step = ca.solve(ca.densify(matrix), free @ downhill)
-    moved = between(z + step, lower, upper)
-    return ca.Function("fpirhc_newton", [z, prior, information, squares, slopes, lower, upper], [ca.densify(moved)])
+    z_next = between(z + step, lower, upper)
+    return ca.Function("fpirhc_newton", [z, prior, information, squares, slopes, lower, upper], [ca.densify(z_next)])
 
 
 def _absorb_function(size: int, factor: float) -> ca.Function:
@@ -170,11 +171,10 @@ def _absorb_function(size: int, factor: float) -> ca.Function:
     prior, z, slopes = (ca.SX.sym(n, size) for n in ("prior", "z", "slopes"))
     information, squares, valid = (ca.SX.sym("i", size * size), ca.SX.sym("s", size * size), ca.SX.sym("valid"))
     square = ca.reshape(squares, size, size)
-    left = ca.reshape(information, size, size)
-    joined = factor * left + (1 - factor) * ca.SX.eye(size) + square
-    moved = prior + ca.solve(ca.densify(joined), slopes + square @ (z - prior))
-    found = [ca.if_else(valid > 0.5, moved, prior), ca.if_else(valid > 0.5, ca.vec(joined), information)]
-    return ca.Function("fpirhc_absorb", [prior, information, z, squares, slopes, valid], [ca.densify(v) for v in found])
+    joined = factor * ca.reshape(information, size, size) + (1 - factor) * ca.SX.eye(size) + square
+    mean = prior + ca.solve(ca.densify(joined), slopes + square @ (z - prior))
+    results = [ca.if_else(valid > 0.5, mean, prior), ca.if_else(valid > 0.5, ca.vec(joined), information)]
+    return ca.Function("fpirhc_absorb", [prior, information, z, squares, slopes, valid], list(map(ca.densify, results)))
 
 
 EXAMPLES = (MovingHorizon({"m": Uncertain(0.5, 3.0, 0.5)}, noise={"a": 0.1, "b": 0.1}, window=5, time=1.0),)

@@ -2,16 +2,16 @@
 
     S = lambda I + H P H',    K = P H' S^-1,    z <- z + K e,    P <- (P - K H P) / lambda,    lambda = exp(-period / time),
 
-with e and H of the last pair at the current estimate, so that a response that is not linear in its parameters is followed
-by an extended filter. For a linear one, z minimises
+with e and H of the last pair at the current estimate: for a response that is not linear in its parameters this is an extended
+filter. For a linear one, z minimises
 
     lambda^k |z|^2 + sum_i lambda^(k-i) |e_i - H_i z|^2.
 
-Without excitation forgetting would let P grow for ever and the first disturbance would be blamed on parameters (wind-up): P
-is scaled back where its trace exceeds that of the prior. Estimates are clipped to their bounds.
+Without excitation, forgetting would let P grow for ever, and the first disturbance would change the estimate (wind-up). So P is
+scaled down where its trace exceeds that of the prior. Estimates are clipped to their bounds.
 
-References: K. J. Astrom and B. Wittenmark, Adaptive Control, 2nd ed., Addison-Wesley 1995, ch. 2 and 11 (forgetting,
-wind-up).
+References:
+    K. J. Astrom and B. Wittenmark, Adaptive Control, 2nd ed., Addison-Wesley 1995, ch. 2 and 11 (forgetting, wind-up).
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from fpirhc.task.problem import Problem
 class RecursiveLeastSquares(Estimator):
     """Learn parameters from every pair of command and response.
 
-    Parameters:
-        parameters: name -> Uncertain(lower, upper, deviation) of what is learned.
-        noise: controlled coordinate -> deviation of what the response has besides the model, in the response's unit.
-        time: time constant of forgetting, s; math.inf: nothing is forgotten.
+    Args:
+        parameters: name -> Uncertain(lower, upper, deviation) of every learned parameter.
+        noise: controlled coordinate -> deviation of the part of its response that the model lacks, in the response's unit.
+        time: time constant of forgetting, s; math.inf: no pair is forgotten.
 
     Raises:
-        InvalidValue: nothing to learn, or a noise or time that is not positive.
+        InvalidValue: no parameter, or a noise or time that is not positive.
     """
 
     parameters: Mapping[str, Uncertain]
@@ -82,7 +82,7 @@ class RecursiveLeastSquares(Estimator):
         return Layout((_estimate(self.learned()), _covariance(size)))
 
     def step(self, problem: Problem) -> Correct:
-        """One update."""
+        """One update of the estimate and its covariance."""
         plant, size = problem.plant, len(self.parameters)
         residual = residual_function(plant, self.parameters, [self.noise[c] for c in plant.controlled_names])
         factor = forgetting_factor(self.time, problem.period)
@@ -94,11 +94,11 @@ class RecursiveLeastSquares(Estimator):
             innovation = factor * ca.DM.eye(error.numel()) + slope @ p @ slope.T
             gain = ca.solve(innovation, slope @ p).T
             lower, upper = bounds_of(problem, self.parameters, seen.parameters)
-            found = between(z + gain @ error, lower, upper)
-            left = (p - gain @ slope @ p) / factor
-            left = (left + left.T) / 2 * ca.fmin(1, size / ca.trace(left))
-            kept = {"least_squares_estimate": found, "least_squares_covariance": ca.vec(left)}
-            return deviations(self.parameters) * found, kept
+            estimate = between(z + gain @ error, lower, upper)
+            covariance = (p - gain @ slope @ p) / factor
+            covariance = (covariance + covariance.T) / 2 * ca.fmin(1, size / ca.trace(covariance))
+            next_memory = {"least_squares_estimate": estimate, "least_squares_covariance": ca.vec(covariance)}
+            return deviations(self.parameters) * estimate, next_memory
 
         return correct
 

@@ -1,7 +1,7 @@
-"""What is known beforehand of a parameter that is to be learned, and the response equation around the estimate.
+"""Prior of a learned parameter, and the response equation around the estimate.
 
-With z_i = (p_i - p_i given) / deviation_i, so that all unknowns are of the order of one, and residuals divided by the
-deviation of their noise, every learner here minimises a sum of |e - H dz|^2 with
+With z_i = (p_i - p_i,0) / deviation_i, p_i,0 the model's value, all unknowns are of the order of one. Every estimator here
+minimises a sum of |e - H dz|^2 with residuals in units of their noise,
 
     e = (f - f^(x, u, p)) / sigma,      H = (1 / sigma) df^/dp diag(deviation).
 """
@@ -23,11 +23,12 @@ from fpirhc.task.problem import Problem
 
 @dataclass(frozen=True)
 class Uncertain:
-    """A parameter to be learned.
+    """Prior of a learned parameter.
 
-    Parameters:
-        lower, upper: what it cannot be below and above (physics: a mass is positive), in its own unit.
-        deviation: how far from the approximate value it may well be, in its own unit.
+    Args:
+        lower: least possible value (of a mass: above zero), in its unit.
+        upper: largest possible value, in its unit.
+        deviation: usual distance from the approximate value, in its unit.
 
     Raises:
         InvalidValue: bounds or a deviation that are not finite, swapped, or not positive.
@@ -48,7 +49,7 @@ def require_positive(owner: str, values: Mapping[str, float]) -> None:
     """Check that every value is a finite positive number.
 
     Raises:
-        InvalidValue: naming every value that is not.
+        InvalidValue: with a list of all other values.
     """
     wrong = [f"{n}={v!r}" for n, v in values.items() if not (isinstance(v, int | float) and 0 < v < math.inf)]
     if wrong:
@@ -63,11 +64,11 @@ def check_learner(owner: str, plant: Plant, parameters: Mapping[str, Uncertain],
     """
     mistakes = Mistakes(owner)
     mistakes.unknown("parameters:", parameters, plant.parameters)
-    for name, known in parameters.items():
-        given = plant.parameters.get(name)
-        if given is not None and not known.lower <= given.approximate <= known.upper:
+    for name, prior in parameters.items():
+        parameter = plant.parameters.get(name)
+        if parameter is not None and not prior.lower <= parameter.approximate <= prior.upper:
             mistakes.add(
-                f"parameters: '{name}' is {given.approximate:g} in the model, outside [{known.lower:g}, {known.upper:g}]; "
+                f"parameters: '{name}' is {parameter.approximate:g} in the model, outside [{prior.lower:g}, {prior.upper:g}]; "
                 "widen its bounds or correct the approximate value"
             )
     mistakes.unknown("noise: controlled coordinate", noise, plant.controlled_names)
@@ -78,7 +79,7 @@ def check_learner(owner: str, plant: Plant, parameters: Mapping[str, Uncertain],
 
 
 def residual_function(plant: Plant, parameters: Mapping[str, Uncertain], noise: Sequence[float]) -> ca.Function:
-    """Return Function (z, state, input, response, given parameters) -> (e, H) of one pair."""
+    """Return Function (z, state, input, response, model's parameters) -> (e, H) of one pair."""
     x, u, p = plant._symbols()
     z, f = ca.SX.sym("z", len(parameters)), ca.SX.sym("f", len(plant.controlled_names))
     believed = ca.SX(p)
@@ -89,26 +90,26 @@ def residual_function(plant: Plant, parameters: Mapping[str, Uncertain], noise: 
 
 
 def bounds_of(
-    problem: Problem, parameters: Mapping[str, Uncertain], given: Expression
+    problem: Problem, parameters: Mapping[str, Uncertain], values: Expression
 ) -> tuple[Expression, Expression]:
-    """Lower and upper bounds of z for the given parameters."""
+    """Lower and upper bounds of z around the model's `values` of all parameters."""
     places = [problem.plant.parameter.elements.index(name) for name in parameters]
     deviation = deviations(parameters)
-    lower = (ca.DM([known.lower for known in parameters.values()]) - given[places]) / deviation
-    upper = (ca.DM([known.upper for known in parameters.values()]) - given[places]) / deviation
+    lower = (ca.DM([prior.lower for prior in parameters.values()]) - values[places]) / deviation
+    upper = (ca.DM([prior.upper for prior in parameters.values()]) - values[places]) / deviation
     return lower, upper
 
 
 def between(value: Expression, lower: Expression, upper: Expression) -> Expression:
-    """The value within its bounds; NaN stays NaN, which fmin and fmax would turn into a bound."""
+    """The value clipped to its bounds; NaN stays NaN, which fmin and fmax would turn into a bound."""
     return ca.if_else(value < lower, lower, ca.if_else(value > upper, upper, value))
 
 
 def deviations(parameters: Mapping[str, Uncertain]) -> ca.DM:
-    """Deviations of the learned parameters, a column."""
-    return ca.DM(np.array([known.deviation for known in parameters.values()]))
+    """Column of the deviations of the learned parameters."""
+    return ca.DM(np.array([prior.deviation for prior in parameters.values()]))
 
 
 def forgetting_factor(time: float, period: float) -> float:
-    """Weight that a pair keeps from one cycle to the next, exp(-period / time)."""
+    """Factor of a pair's weight from one cycle to the next, exp(-period / time)."""
     return math.exp(-period / time)

@@ -1,1 +1,1 @@
-"""Rules by which an adaptive controller moves its parameters."""
+"""Rules by which an adaptive controller changes its parameters."""

@@ -1,4 +1,4 @@
-"""The contract of adaptation rules: how far the estimated parameters move in one cycle."""
+"""The contract of adaptation rules: the change of the estimated parameters in one cycle."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Bounds = Mapping[str, tuple[float, float]]
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What a controller offers a rule in one cycle; a rule asks for the pair that it uses, and only that is computed.
+    """Data of a rule in one cycle; a rule calls the function of the pair that it uses, so that only this pair is computed.
 
-    Parameters:
+    Args:
         gradient: the controller's Lyapunov function falls along p' = Gamma G^T w: returns (G (n x m), w (n)).
         equation: the model error h = G (p - p_hat) of the response, exact without disturbances: returns (G (n x m), h (n)).
-        clipped: 1 where the last command was clipped, so that the gradient does not hold.
+        clipped: 1 where the last command was clipped, so that the gradient is wrong.
     """
 
     gradient: Callable[[], Pair]
@@ -28,12 +28,12 @@ class Evidence:
 
 
 class Rule(ABC):
-    """Contract: a frozen value that moves the estimate."""
+    """Contract: a frozen value that changes the estimate."""
 
     @property
     @abstractmethod
     def reads_response(self) -> bool:
-        """Whether the rule asks for the equation, which needs the measured response."""
+        """Whether the rule uses the equation, which needs the measured response."""
 
     @abstractmethod
     def check(self, bounds: Bounds) -> None:
@@ -45,4 +45,4 @@ class Rule(ABC):
 
     @abstractmethod
     def change(self, evidence: Evidence, bounds: Bounds, period: float) -> Expression:
-        """Return the change of the estimate (m) in one cycle, before it is kept inside the bounds."""
+        """Return the change of the estimate (m) in one cycle, before the estimate is clipped to its bounds."""

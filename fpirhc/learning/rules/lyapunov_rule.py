@@ -1,4 +1,4 @@
-"""The classical rule: down the gradient that makes the controller's Lyapunov function fall."""
+"""The classical rule: along the gradient that makes the controller's Lyapunov function fall."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from fpirhc.symbolic.layout import Expression
 class LyapunovRule(Rule):
     """p_hat' = Gamma G^T w with the G and w of the controller, Gamma diagonal; Euler's step once per cycle.
 
-    It waits while the command is clipped, because the plant then does not get what the gradient assumes.
+    It does not act while the command is clipped, because the gradient assumes the unclipped command.
 
-    Parameters:
+    Args:
         gains: diagonal of Gamma by parameter, squared unit of the parameter per unit of w^T G p and second.
 
     Raises:
@@ -35,7 +35,7 @@ class LyapunovRule(Rule):
 
     @property
     def reads_response(self) -> bool:
-        """The gradient is the controller's own."""
+        """Whether the rule uses the equation: it uses the gradient instead."""
         return False
 
     def check(self, bounds: Bounds) -> None:

@@ -1,4 +1,4 @@
-"""Learning driven by the fixed-point iteration's own equation: projection onto what the last response says."""
+"""Learning from the equation of the fixed-point iteration: projection onto the parameters that explain the last response."""
 
 from __future__ import annotations
 
@@ -11,21 +11,22 @@ from fpirhc.errors import InvalidValue
 from fpirhc.learning.rules.base import Bounds, Evidence, Rule
 from fpirhc.symbolic.layout import Expression
 
-_RELATIVE, _FLOOR = 1e-9, 1e-12  # of the matrix that is inverted: where a response says nothing, nothing moves
+_RELATIVE, _FLOOR = 1e-9, 1e-12  # of the matrix that is inverted: a response without information changes nothing
 
 
 @dataclass(frozen=True)
 class Projection(Rule):
     """p_hat+ = p_hat + gamma W G^T (G W G^T + eps I)^-1 h, gated; h = G (p - p_hat) is the response error of the model.
 
-    With exact data every step shrinks |W^(-1/2) (p - p_hat)|, for 0 < gamma < 2 and excited or not (Kaczmarz; normalised least mean
-    squares). W is diagonal, the squared widths of the parameters' bounds, so that units do not matter. Unlike a gradient of
-    tracking errors it learns while a deformation keeps those small, and while the command is clipped. A moving estimate is itself a
-    disturbance, and noise of the response is taken for a wrong model: gamma well below 1, and a dead zone above the noise.
+    With exact data every step shrinks |W^(-1/2) (p - p_hat)| for 0 < gamma < 2, with or without excitation (Kaczmarz; normalised
+    least mean squares). W is diagonal, the squared widths of the parameters' bounds, so that units do not matter. Unlike a gradient
+    of tracking errors it also learns while a deformation keeps these errors small, and while the command is clipped. A changing
+    estimate is itself a disturbance, and noise of the response acts like a wrong model: choose gamma well below 1, and a dead zone
+    above the noise.
 
-    Parameters:
+    Args:
         gain: gamma, between 0 and 2.
-        dead_zone: |h| below which nothing moves, in units of the response; beyond it the step grows as (|h| - dead_zone) / |h|.
+        dead_zone: |h| below which the estimate stays, in units of the response; above it the step grows as (|h| - dead_zone) / |h|.
 
     Raises:
         InvalidValue: a gain outside (0, 2), a negative dead zone; when the loop is built, bounds that are not finite.
@@ -45,14 +46,14 @@ class Projection(Rule):
 
     @property
     def reads_response(self) -> bool:
-        """The equation is about the measured response."""
+        """Whether the rule uses the equation: it does."""
         return True
 
     def check(self, bounds: Bounds) -> None:
-        """Raise if some bound is infinite.
+        """Raise if a bound is infinite.
 
         Raises:
-            InvalidValue: naming the parameter.
+            InvalidValue: with the name of the parameter.
         """
         for name, (lower, upper) in bounds.items():
             if not math.isfinite(upper - lower):

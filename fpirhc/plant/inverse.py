@@ -1,0 +1,53 @@
+"""The inverse response of a plant: the inputs for a wanted response of the controlled coordinates.
+
+A user's own inverse comes first. A response that is affine in the inputs, r = f_0 + G u, is solved by u = G^-1 (r - f_0). Any other
+one is solved by Newton's method, and an input that Newton's method does not find is NaN.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+import casadi as ca
+
+from fpirhc.symbolic.layout import Expression, Named
+
+if TYPE_CHECKING:
+    from fpirhc.plant.plant import Plant
+
+INVERSE_TOLERANCE = 1e-8  # relative response error beyond which an input of Newton's method is NaN
+
+
+def inverse_by_user(plant: Plant, inverse: Callable[..., Mapping[str, Expression]]) -> ca.Function:
+    """Function (state, response, parameters) -> input, made of the user's `inverse`."""
+    x, _, p = plant._symbols()
+    r = ca.SX.sym("r", len(plant.controlled_names))
+    commands = inverse(*plant._derivatives(x), Named(plant.controlled_names, r, "coordinate"), plant._parameters(p))
+    column = ca.vertcat(*(ca.SX(commands[i]) for i in plant.inputs))
+    return ca.Function("fpirhc_inverse", [x, r, p], [ca.densify(column)], ["x", "r", "p"], ["u"])
+
+
+def inverse_of_affine(plant: Plant) -> ca.Function:
+    """Function (state, response, parameters) -> input, for a response that is affine in the inputs."""
+    x, u, p = plant._symbols()
+    r = ca.SX.sym("r", len(plant.controlled_names))
+    response = plant.controlled_response_function(x, u, p)
+    gain = ca.jacobian(response, u)
+    free = plant.controlled_response_function(x, ca.SX.zeros(len(plant.inputs)), p)
+    column = ca.densify(ca.solve(gain, r - free))
+    return ca.Function("fpirhc_inverse", [x, r, p], [column], ["x", "r", "p"], ["u"])
+
+
+def inverse_by_newton(plant: Plant) -> ca.Function:
+    """Function (state, response, parameters) -> input, found from zero inputs by Newton's method."""
+    x, u, p = plant._symbols()
+    r = ca.SX.sym("r", len(plant.controlled_names))
+    error = ca.Function("fpirhc_inversion", [u, x, r, p], [plant.controlled_response_function(x, u, p) - r])
+    finder = ca.rootfinder("fpirhc_newton", "fast_newton", error, {"error_on_fail": False})
+    xm, rm, pm = (ca.MX.sym(n, s) for n, s in (("x", x.numel()), ("r", r.numel()), ("p", p.numel())))
+    root = finder(ca.DM.zeros(len(plant.inputs)), xm, rm, pm)
+    residual = ca.norm_inf(error(root, xm, rm, pm))
+    solved = residual <= INVERSE_TOLERANCE * (1 + ca.norm_inf(rm))
+    return ca.Function("fpirhc_inverse", [xm, rm, pm], [ca.if_else(solved, root, math.nan)], ["x", "r", "p"], ["u"])

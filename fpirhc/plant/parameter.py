@@ -1,0 +1,56 @@
+"""Parameters of a plant, each with an approximate and an exact value."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from fpirhc.errors import Mistakes
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a plant.
+
+    Args:
+        approximate: value in the controller's model.
+        exact: value in the simulated plant.
+        unit: of both values.
+        bounds: least and largest physically possible value, in the same unit.
+    """
+
+    approximate: float
+    exact: float
+    unit: str
+    bounds: tuple[float, float] = (-math.inf, math.inf)
+
+
+def check_parameters(parameters: Mapping[str, Parameter], mistakes: Mistakes) -> None:
+    """Add every mistake of the parameters to `mistakes`."""
+    for name, parameter in parameters.items():
+        if not isinstance(parameter, Parameter):
+            mistakes.add(f"parameter '{name}' must be Parameter(approximate=..., exact=..., unit=...)")
+            continue
+        numbers = True
+        for which in ("approximate", "exact"):
+            value = getattr(parameter, which)
+            if not isinstance(value, int | float) or not math.isfinite(value):
+                mistakes.add(f"parameter '{name}': {which} must be a finite number, got {value!r}")
+                numbers = False
+        mistake = _bounds_mistake(parameter) if numbers else ""
+        if mistake:
+            mistakes.add(f"parameter '{name}': {mistake}")
+        if not isinstance(parameter.unit, str) or not parameter.unit:
+            mistakes.add(f"parameter '{name}' has no unit; write unit='kg' (or '1' for none)")
+
+
+def _bounds_mistake(parameter: Parameter) -> str:
+    try:
+        low, high = map(float, parameter.bounds)
+    except (TypeError, ValueError):
+        return f"bounds must be a pair of numbers (lowest, highest), got {parameter.bounds!r}"
+    if not low < high:
+        return f"bounds must be (lowest, highest), got {parameter.bounds!r}"
+    outside = [w for w in ("approximate", "exact") if not low <= getattr(parameter, w) <= high]
+    return f"{outside[0]} is outside its bounds {parameter.bounds!r}" if outside else ""

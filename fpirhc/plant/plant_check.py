@@ -1,0 +1,96 @@
+"""Checks of a plant's settings: names, units, orders and the response."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import casadi as ca
+
+from fpirhc.errors import FpirhcError, Mistakes
+from fpirhc.plant.structural_order import structural_order
+from fpirhc.symbolic.layout import Named
+
+if TYPE_CHECKING:
+    from fpirhc.plant.plant import Plant
+
+
+def check_names(plant: Plant, mistakes: Mistakes) -> None:
+    """Add every mistake in names, units, orders and the choice of controlled coordinates to `mistakes`."""
+    for what, group in (("coordinates", plant.coordinates), ("inputs", plant.inputs)):
+        if not group:
+            mistakes.add(f"{what} are empty; name at least one, with its unit")
+        for name, unit in group.items():
+            if not isinstance(unit, str) or not unit:
+                mistakes.add(f"{what}: '{name}' has no unit; write {{'{name}': 'm'}} (or '1' for none)")
+            if not str(name).isidentifier():
+                mistakes.add(f"{what}: '{name}' is not an identifier; use letters, digits and underscores")
+    every = [*plant.coordinates, *plant.inputs]
+    for name in sorted({n for n in every if every.count(n) > 1}):
+        mistakes.add(f"'{name}' names both a coordinate and an input; rename one")
+    _check_order_numbers(plant, mistakes)
+    if plant.controlled is not None:
+        mistakes.unknown("controlled: coordinate", plant.controlled, plant.coordinates)
+        if len(plant.controlled) != len(plant.inputs):
+            mistakes.add(
+                f"controlled names {len(plant.controlled)} coordinate(s), but {len(plant.inputs)} input(s) "
+                "can prescribe exactly as many"
+            )
+
+
+def check_response(plant: Plant, mistakes: Mistakes) -> None:
+    """Add every mistake of the response and of the orders to `mistakes`."""
+    expected = max(plant.orders) + 2
+    arguments = len(inspect.signature(plant.response).parameters)
+    if arguments != expected:
+        lower = ["q", "v", "a"] + [f"d{k}" for k in range(3, 12)]
+        mistakes.add(
+            f"response takes {arguments} argument(s); with order {max(plant.orders)} it is called as "
+            f"response({', '.join([*lower[: expected - 2], 'u', 'p'])})"
+        )
+        return
+    x, u, p = plant._symbols()
+    try:
+        response = plant.response(*plant._derivatives(x), Named(plant.input.elements, u, "input"), plant._parameters(p))
+    except FpirhcError as error:
+        mistakes.add(f"response: {error}")
+        return
+    if not isinstance(response, Mapping):
+        mistakes.add(f"response must return {{coordinate: expression}}, got {type(response).__name__}")
+        return
+    mistakes.unknown("response: coordinate", response, plant.coordinates)
+    for c, r in zip(plant.names, plant.orders, strict=True):
+        if c not in response:
+            mistakes.add(f"response does not give the derivative {c}{chr(39) * r} of coordinate '{c}'; return it too")
+        elif ca.SX(response[c]).numel() != 1:
+            mistakes.add(f"response of '{c}' must be one scalar, got shape {ca.SX(response[c]).shape}")
+    if all(c in response and ca.SX(response[c]).numel() == 1 for c in plant.names):
+        _check_orders(plant, mistakes)
+
+
+def _check_order_numbers(plant: Plant, mistakes: Mistakes) -> None:
+    if isinstance(plant.order, Mapping):
+        mistakes.unknown("order: coordinate", plant.order, plant.coordinates)
+        for c in plant.coordinates:
+            if c not in plant.order:
+                mistakes.add(f"order: coordinate '{c}' has none; add '{c}': 2 (the derivative that the response gives)")
+    orders = plant.order.values() if isinstance(plant.order, Mapping) else [plant.order]
+    for order in orders:
+        if not isinstance(order, int) or isinstance(order, bool) or order < 1:
+            mistakes.add(f"order must be a whole number of at least 1, got {order!r}")
+
+
+def _check_orders(plant: Plant, mistakes: Mistakes) -> None:
+    if plant.controlled is None and len(plant.inputs) != len(plant.coordinates):
+        return
+    for k in plant.controlled_indices:
+        name, stated = plant.names[k], plant.orders[k]
+        order = structural_order(plant, name)
+        if order is None:
+            mistakes.add(f"no input reaches coordinate '{name}', however often it is differentiated")
+        elif order != stated:
+            mistakes.add(
+                f"order of '{name}' is given as {stated}, but its response has no input: the first derivative that an "
+                f"input reaches is number {order}. Write the response of order {order}, or control another coordinate"
+            )
