@@ -1,8 +1,8 @@
 """Gain and filter pole for a budget of chatter: as much adaptation as the noise of the measured response allows.
 
 The largest gain is sought with which noise alone moves no input by more than its budget per cycle, at any of some
-points of the reference (`contraction.noise`), the filter's pole following the gain so that the iteration keeps its
-damping. What noise leaves of tracking is independent of both, as long as the iteration is fast against the tracking
+points of the reference (`contraction.noise`). The filter's pole follows the gain, so that the iteration keeps its
+damping. The tracking error that noise causes depends on neither, as long as the iteration is fast against the tracking
 law: the plant then realises d - n, which acts as -n at its response in the loop with the right model.
 """
 
@@ -37,14 +37,17 @@ _SMALLEST = 1e-6  # of the deadbeat gain
 
 @dataclass(frozen=True, eq=False)
 class Suggestion:
-    """Gain and pole, and what noise does with them.
+    """A gain and a pole, and the effect of noise with them.
 
-    Parameters:
-        deformation: the controller's own with gain and pole; put it in with `dataclasses.replace`.
-        effective_gain, pole: of it. gain: the map's own gain, `gain_name` its field.
+    Args:
+        deformation: the controller's own with this gain and pole; put it in with `dataclasses.replace`.
+        effective_gain: effective gain of the deformation.
+        pole: pole of its filter.
+        gain_name: name of the map's own gain.
+        gain: value of the map's own gain.
         chatter: by input, predicted rms of the command's step per cycle that noise causes, in the input's unit.
-        floor: by controlled coordinate, predicted rms tracking error that noise causes, in the coordinate's unit; NaN where no
-            linear loop is known.
+        floor: by controlled coordinate, predicted rms tracking error that noise causes, in the coordinate's unit; NaN
+            where no linear loop is known.
     """
 
     deformation: Deformation
@@ -79,82 +82,94 @@ def suggest(
     """Return the largest gain, with the pole of a filter of its error, whose chatter is within a budget.
 
     The gain ends at the deadbeat one, the inverse of the largest eigenvalue of the response Jacobian along the reference. The
-    wrappers of the deformation stay, a `Filtered` among them is replaced.
+    wrappers of the deformation stay; a `Filtered` among them is replaced.
 
-    Parameters: `chatter`: rms step of the command per cycle that noise may cause, in the input's unit, by input or one for all;
-    `noise`: standard deviation of the measured response by controlled coordinate, by default that of the problem's sensors;
-    `ringing` kappa = a lambda / (1 - p), 0 for no filter.
+    Args:
+        problem: the problem.
+        controller: the controller with its deformation.
+        chatter: rms step of the command per cycle that noise may cause, in the input's unit, by input or one for all.
+        noise: standard deviation of the measured response by controlled coordinate; None: that of the problem's sensors.
+        ringing: kappa = a lambda / (1 - p); 0 for no filter.
 
     Raises:
-        InvalidValue: a budget that is not positive, a negative noise or ringing, no noise. InvalidName: unknown input
-        or coordinate. NotSupported: a controller without adaptation; a response that is estimated, whose noise must
-        be given. NotInvertible: see `review`. NotContractive: eigenvalues that no gain suits.
+        InvalidValue: a budget that is not positive, a negative noise or ringing, no noise.
+        InvalidName: unknown input or coordinate.
+        NotSupported: a controller without adaptation; a response that is estimated, whose noise must be given.
+        NotInvertible: see `review`.
+        NotContractive: eigenvalues that no gain suits.
     """
-    chosen = resolved(problem, controller)
-    if chosen.deformation.effective_gain() == 0:
-        raise NotSupported(
-            f"{type(controller).__name__} has no deformation to choose a gain for; give it Sigmoid(gain=...)"
-        )
+    adapting = _adapting(problem, controller)
     if not (math.isfinite(ringing) and ringing >= 0):
         raise InvalidValue(
             f"suggest(ringing={ringing!r}): expected a number of at least 0; 4 to 8 is usual, 0 is no filter"
         )
     budget, deviations = _budget(problem, chatter), _deviations(problem, noise)
     grid = review_grid(problem, 0.0, 0)
-    jacobians, inverses = _along_the_reference(grid, chosen.parameters(problem.plant))
+    jacobians, inverses = _along_the_reference(grid, adapting.parameters(problem.plant))
     sign, largest = _largest_eigenvalue(jacobians)
     covariance = np.diag(deviations**2)
 
     def steps(size: float) -> np.ndarray:
-        """Rms step of every input, the largest of all points."""
-        gain, pole = sign * size, filter_pole(size * largest, ringing)
-        spreads = [noise_spread(j, covariance, gain, pole).step for j in jacobians]
-        moved = [b @ s @ b.T for b, s in zip(inverses, spreads, strict=True)]
-        return np.asarray(np.sqrt(np.max([np.diag(m) for m in moved], axis=0)))
+        return _steps(jacobians, inverses, covariance, sign * size, filter_pole(size * largest, ringing))
 
     size = _largest_within(lambda one: bool((steps(one) <= budget).all()), 1 / largest)
     pole = filter_pole(size * largest, ringing)
-    deformation = _with(chosen.deformation, sign * size, pole)
+    deformation = _with(adapting.deformation, sign * size, pole)
     own = getattr(deformation, deformation.gain_name, None)
     name, value = ("effective gain", sign * size) if own is None else (deformation.gain_name, float(own))
     predicted = dict(zip(problem.plant.inputs, map(float, steps(size)), strict=True))
-    floor = _floor(grid, loops_along(grid, chosen).ideal, inverses[0], covariance)
+    floor = _floor(grid, loops_along(grid, adapting).ideal, inverses[0], covariance)
     return Suggestion(deformation, sign * size, pole, name, value, predicted, floor)
+
+
+def _adapting(problem: Problem, controller: Controller) -> Controller:
+    """The controller with its automatic settings, if it has a deformation whose gain can be chosen."""
+    ready = resolved(problem, controller)
+    if ready.deformation.effective_gain() == 0:
+        raise NotSupported(
+            f"{type(controller).__name__} has no deformation to choose a gain for; give it Sigmoid(gain=...)"
+        )
+    return ready
+
+
+def _steps(jacobians: np.ndarray, inverses: np.ndarray, covariance: np.ndarray, gain: float, pole: float) -> np.ndarray:
+    """Rms step of every input per cycle, the largest of all points."""
+    spreads = [noise_spread(j, covariance, gain, pole).step for j in jacobians]
+    input_spreads = [b @ s @ b.T for b, s in zip(inverses, spreads, strict=True)]
+    return np.asarray(np.sqrt(np.max([np.diag(m) for m in input_spreads], axis=0)))
 
 
 def _budget(problem: Problem, chatter: float | Mapping[str, float]) -> np.ndarray:
     inputs = tuple(problem.plant.inputs)
-    given = chatter if isinstance(chatter, Mapping) else dict.fromkeys(inputs, chatter)
-    for name, value in given.items():
+    budgets = chatter if isinstance(chatter, Mapping) else dict.fromkeys(inputs, chatter)
+    for name, value in budgets.items():
         if name not in inputs:
             raise InvalidName(f"suggest(chatter=...): input '{name}' is unknown.{nearest(name, inputs)}")
         if not value > 0:
             raise InvalidValue(
                 f"suggest(chatter=...): {value!r} for '{name}'; expected a positive rms step per cycle, in the unit of the input"
             )
-    return np.array([float(given.get(name, math.inf)) for name in inputs])
+    return np.array([float(budgets.get(name, math.inf)) for name in inputs])
 
 
 def _deviations(problem: Problem, noise: Mapping[str, float] | None) -> np.ndarray:
     """Standard deviation of every controlled coordinate's measured response."""
     names = problem.plant.controlled_names
-    given = _of_sensors(problem) if noise is None else noise
-    for name, value in given.items():
+    deviations = _of_sensors(problem) if noise is None else noise
+    for name, value in deviations.items():
         if name not in names:
             raise InvalidName(f"suggest(noise=...): coordinate '{name}' is not controlled.{nearest(name, names)}")
         if not 0 <= value < math.inf:
             raise InvalidValue(
                 f"suggest(noise=...): {value!r} for '{name}'; expected a standard deviation of at least 0"
             )
-    found = np.array([float(given.get(name, 0.0)) for name in names])
-    if not found.any():
+    vector = np.array([float(deviations.get(name, 0.0)) for name in names])
+    if not vector.any():
         raise InvalidValue(
-            "suggest: no response has noise, so no gain chatters; give noise={'"
-            + names[0]
-            + "': ...}, the standard deviation of "
-            "the measured response"
+            f"suggest: no response has noise, so no gain chatters; give noise={{'{names[0]}': ...}}, the standard deviation "
+            "of the measured response"
         )
-    return found
+    return vector
 
 
 def _of_sensors(problem: Problem) -> dict[str, float]:
@@ -178,8 +193,8 @@ def _along_the_reference(grid: ReviewGrid, believed: np.ndarray) -> tuple[np.nda
     places = np.unique(np.linspace(0, len(grid.times) - 1, _POINTS).astype(int))
     exact = np.tile(grid.draws[0], (len(places), 1))
     jacobians = response_jacobians(plant, grid.states[places], grid.requests(believed)[places], exact, believed)
-    slopes, chosen = response_slopes(plant), list(plant.controlled_indices)
-    gains = [np.asarray(slopes(grid.states[k], grid.commands[0, k], believed)[1].full())[chosen] for k in places]
+    slopes, controlled = response_slopes(plant), list(plant.controlled_indices)
+    gains = [np.asarray(slopes(grid.states[k], grid.commands[0, k], believed)[1].full())[controlled] for k in places]
     usable = [k for k in range(len(places)) if np.isfinite(jacobians[k]).all() and np.isfinite(gains[k]).all()]
     if not usable:
         raise NotContractive(
