@@ -1,4 +1,4 @@
-"""A three-link arm that sees itself through encoders of 4096 counts: where Slotine and Li do better than fixed-point iteration.
+"""A three-link arm with encoders of 4096 counts: where Slotine and Li do better than fixed-point iteration.
 
 The arm hangs in a vertical plane and has the size of a human one. Lengths (0.186, 0.146, 0.108 of the height), masses (0.028,
 0.016, 0.006 of the body's), centres of mass and radii of gyration are those of D. A. Winter, Biomechanics and Motor Control of

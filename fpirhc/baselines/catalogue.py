@@ -23,7 +23,7 @@ KINDS = (EXACT, TIGHT, BANDED)
 
 @dataclass(frozen=True)
 class Family:
-    """How all numbers 'family.element' are compared.
+    """The comparison of all numbers 'family.element'.
 
     Args:
         kind: the class, unless the spread makes it wider.

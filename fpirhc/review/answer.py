@@ -36,7 +36,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Review:
-    """What is known before a run.
+    """All answers about a problem and its controllers.
 
     Args:
         problem: answers about the problem.
@@ -55,7 +55,7 @@ class Review:
 
     @property
     def ready(self) -> bool:
-        """Whether no answer is a no."""
+        """Whether every answer is yes or unknown."""
         return all(a.verdict != Verdict.NO for a in self.answers)
 
 

@@ -37,7 +37,7 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
         grid: points of the reference and draws of the parameters.
         controller: the controller with its deformation.
         loops: its linear loops.
-        doubts: what other answers say against convergence.
+        doubts: reasons against convergence from other answers.
     """
     if not loops.loops:
         return Answer(QUESTION, Verdict.UNKNOWN, f"no linear loop: {loops.reason}", "Run it and look at the factor.")
@@ -79,7 +79,7 @@ def box_converges(loops: Loops) -> Answer:
     numbers = {"share": share, "radius": worst}
     if share == 1:
         return Answer(question, Verdict.YES, text, "", numbers)
-    return Answer(question, Verdict.UNKNOWN, text, "Lower the gain, or know the parameters better.", numbers)
+    return Answer(question, Verdict.UNKNOWN, text, "Lower the gain, or narrow the box of the parameters.", numbers)
 
 
 def _mend(loops: Loops) -> str:
@@ -87,7 +87,7 @@ def _mend(loops: Loops) -> str:
         return (
             "The outer loop does not converge even with the right model: lower its rate, or predict over the dead time."
         )
-    return "Change the gain as the question about it says; under dead time pair the deformation."
+    return "Change the gain to the recommended one; under dead time pair the deformation."
 
 
 def _steep(grid: ReviewGrid, controller: Controller) -> list[str]:

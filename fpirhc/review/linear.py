@@ -121,6 +121,13 @@ def response_slopes(plant: Plant) -> ca.Function:
     return ca.Function("fpirhc_slopes", [x, u, p], slopes)
 
 
+def controlled_gain(
+    plant: Plant, slopes: ca.Function, state: np.ndarray, command: np.ndarray, parameters: np.ndarray
+) -> np.ndarray:
+    """Return B (n, nu) of the controlled coordinates at a point; `slopes` are those of `response_slopes`."""
+    return np.asarray(slopes(state, command, parameters)[1].full())[list(plant.controlled_indices)]
+
+
 def linear_parameters(
     slopes: ca.Function, state: np.ndarray, command: np.ndarray, parameters: np.ndarray, feedback: np.ndarray
 ) -> np.ndarray:

@@ -11,7 +11,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import Planner, without_deformation
 from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.linear import LinearLoop, linear_parameters, loop_matrices, response_slopes
+from fpirhc.review.linear import LinearLoop, controlled_gain, linear_parameters, loop_matrices, response_slopes
 from fpirhc.review.plan_feedback import plan_gains
 from fpirhc.review.stand_in import linear_stand_in
 from fpirhc.task.problem import Problem
@@ -121,11 +121,11 @@ def ideal_loops(grid: ReviewGrid, controller: Controller, count: int) -> list[tu
     places = _thinned(usable, count)
     feedbacks = _gains(problem, plan, [float(grid.times[k]) for k in places], believed)
     matrices = loop_matrices(problem, without_deformation(stand_in))
-    slopes, controlled = response_slopes(plant), list(plant.controlled_indices)
+    slopes = response_slopes(plant)
     loops = []
     for k, feedback in zip(places, feedbacks, strict=True):
         model = linear_parameters(slopes, grid.states[k], needed[k], believed, feedback)
-        gain = np.asarray(slopes(grid.states[k], needed[k], believed)[1].full())[controlled]
+        gain = controlled_gain(plant, slopes, grid.states[k], needed[k], believed)
         loops.append((matrices.at(model, model), gain))
     return loops
 

@@ -1,4 +1,4 @@
-"""How robust is the linear loop? Poles, and gain, phase and delay margin of each input's loop, opened where it enters the plant.
+"""How robust is the linear loop? By its poles, and the margins of gain, phase and delay of each input's loop, opened at the plant.
 
 With z+ = F z + G w and v = C z (commands that arrive) the loop of input i is opened by w_i = w_i' - v_i:
 

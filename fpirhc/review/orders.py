@@ -1,4 +1,4 @@
-"""What are the relative orders? The number of derivatives until an input appears, from the pattern of the symbols."""
+"""What are the relative orders? They are the numbers of derivatives until an input appears, from the pattern of the symbols."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class NominalRun:
 
 @dataclass(frozen=True, eq=False)
 class ResponseErrors:
-    """What the recursion predicts along a nominal run, in units of the response.
+    """Predictions of the recursion along a nominal run, in units of the response.
 
     Args:
         error: response errors e_k just after each update, shape (cycles, n).

@@ -34,7 +34,7 @@ from fpirhc.task.problem import Problem
 
 
 def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch: float, seed: int) -> Review:
-    """Return the answers to all questions that can be asked before a run.
+    """Return the answers to all questions that can be answered before a run.
 
     Args:
         problem: the problem.

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 
-import casadi as ca
 import numpy as np
 
 from fpirhc.deformation.base import Deformation
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.linear import LinearLoop
+from fpirhc.review.linear import LinearLoop, controlled_gain, response_slopes
 
 QUESTION = "Is the map fast enough for reference and disturbances?"
 _SPARE = 2.0  # how many times faster than the reference the map should be
@@ -74,10 +73,8 @@ def _speed_after_start(grid: ReviewGrid, believed: np.ndarray, ideal: LinearLoop
     for k in range(_CYCLES):
         commands[k] = ideal.arriving @ z
         z = ideal.dynamics @ z
-    x, u, p = plant._symbols()
-    slope = ca.jacobian(plant.controlled_response_function(x, u, p), u)
-    function = ca.Function("fpirhc_input_gain", [x, u, p], [slope])
-    gain = np.asarray(function(grid.states[0], np.nan_to_num(grid.commands[0, 0]), believed).full())
+    command = np.nan_to_num(grid.commands[0, 0])
+    gain = controlled_gain(plant, response_slopes(plant), grid.states[0], command, believed)
     changes = np.linalg.norm(np.diff(commands, axis=0) @ gain.T, axis=1)
     return float(changes.max() / grid.problem.period)
 

@@ -8,7 +8,7 @@ from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 
 FAST = "Does the iteration keep up with its tracking law?"
-LAG = "Does it bear a small lag that nobody has modelled?"
+LAG = "Does it bear a small lag that is not in the model?"
 _SPARE = 3.0
 _DAMPING = 0.3
 _CYCLES = 3.0  # of lag that it should bear

@@ -22,7 +22,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import InvalidName, InvalidValue, NotContractive, NotSupported, nearest
 from fpirhc.review.grid import ReviewGrid, review_grid
-from fpirhc.review.linear import LinearLoop, response_slopes
+from fpirhc.review.linear import LinearLoop, controlled_gain, response_slopes
 from fpirhc.review.loops import loops_along
 from fpirhc.sensing.base import response_names
 from fpirhc.summary import line, number, table
@@ -193,8 +193,8 @@ def _along_the_reference(grid: ReviewGrid, believed: np.ndarray) -> tuple[np.nda
     places = np.unique(np.linspace(0, len(grid.times) - 1, _POINTS).astype(int))
     exact = np.tile(grid.draws[0], (len(places), 1))
     jacobians = response_jacobians(plant, grid.states[places], grid.requests(believed)[places], exact, believed)
-    slopes, controlled = response_slopes(plant), list(plant.controlled_indices)
-    gains = [np.asarray(slopes(grid.states[k], grid.commands[0, k], believed)[1].full())[controlled] for k in places]
+    slopes = response_slopes(plant)
+    gains = [controlled_gain(plant, slopes, grid.states[k], grid.commands[0, k], believed) for k in places]
     usable = [k for k in range(len(places)) if np.isfinite(jacobians[k]).all() and np.isfinite(gains[k]).all()]
     if not usable:
         raise NotContractive(

@@ -1,4 +1,4 @@
-"""How far the plant's run can be from the model's: a tube around the nominal run, to first order.
+"""A tube around the nominal run, to first order: a bound of the distance between the plant's run and the model's.
 
 Over cycle k, w_k acts on the deviation (`prediction.ResponseErrors`). It is bounded by
 

@@ -37,7 +37,7 @@ class CycleTime:
 def measure_cycle(problem: Problem, controller: Controller, run: Run, *, compiled: bool = True) -> CycleTime | None:
     """Replay the run's measurements through the controller, one call per cycle, and return the times.
 
-    The replay computes what the run computed: the controller's memory starts afresh and sees the same measurements.
+    The replay repeats the computations of the run: the controller starts afresh and has the same measurements.
     The result is None for a run of fewer than two cycles.
     """
     cycles = min(run.cycles, REPLAYED)
