@@ -111,7 +111,7 @@ def response_is_pure(trial: _Trial, generator: np.random.Generator) -> None:
     again = replace(trial.plant)
     for x, u in trial.points(generator):
         one, other = (_numbers(p.response_function, x, u, p.exact) for p in (trial.plant, again))
-        hold(np.array_equal(one, other), f"two builds give {one} and {other} {trial.where(x, u)}")
+        hold(np.array_equal(one, other), f"built twice, it gives {one} and then {other} {trial.where(x, u)}")
 
 
 def derivative_is_the_chain(trial: _Trial, generator: np.random.Generator) -> None:
