@@ -1,7 +1,8 @@
 """Cart-pole: swing-up and stabilisation of a pole with one input, with a model of the cart that is too heavy.
 
 The model and its exact masses and length are those of the cart-pole example of acados (BSD licence), here with friction of
-the cart (b) and of the joint (c). The cart is at x, the angle is zero upright and unwrapped, and the tip is at x - l sin(angle):
+the cart (b) and of the joint (c). The cart is at x, the angle is zero upright and unwrapped, and the tip is at
+x - l sin(angle):
 
     (M + m - m cos^2) x'' = F - b x' - m l sin angle'^2 + m g sin cos - (c / l) angle' cos
     l angle''             = g sin + x'' cos - c angle' / (m l).
@@ -12,13 +13,13 @@ acceleration that was planned, the pole moves as planned, whatever the masses an
 and the small joint friction stay uncorrected.
 
 The reference is a slow sway of the cart with the tilt that it needs (of the linearised pole), from 0 s on; the pole starts
-hanging. Effort is counted relative to the feedforward along that sway.
+hanging. The cost weighs the effort relative to the feedforward along that sway.
 
 Measured (rms error of the cart from 5 s on; time until the pole stays within 0.2 rad of its reference): RHC 8.5e-3 m,
 2.6 s; RHC+FPI 1.8e-4 m, 1.2 s; exact model 2.0e-5 m, 1.1 s. The force is at a limit in 3 to 5 % of the cycles, all before
-1.7 s. Near the limit, whether and when a swing-up succeeds depends on details: with 20 N, RHC never gets the pole up and
-RHC+FPI does in 3.0 s, before the exact model (5.0 s). With a model that is too light (M = 0.7 kg, m = 0.07 kg) and 30 N it is
-the other way round: RHC is up after 1.1 s and RHC+FPI only after 12.7 s.
+1.7 s. Near the limit, whether and when a swing-up succeeds depends on details: with 20 N, RHC never swings the pole up,
+RHC+FPI does so in 3.0 s, and the exact model in 5.0 s. With a model that is too light (M = 0.7 kg, m = 0.07 kg) and 30 N it is
+the other way round: RHC needs 1.1 s and RHC+FPI 12.7 s.
 """
 
 import casadi as ca

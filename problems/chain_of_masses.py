@@ -1,26 +1,27 @@
 """A chain of masses hanging between a wall and a driven end: a common benchmark of optimisers, with a drive that yields.
 
-The chain of L. Wirsching, H. G. Bock and M. Diehl in the form of acados (BSD licence): equal masses joined by springs, the first
-one held in the wall at the origin, the last one moved with the velocity u, |u| <= 1 m/s along each axis,
+The chain of L. Wirsching, H. G. Bock and M. Diehl in the form of acados (BSD licence): equal masses joined by springs, the
+first one held in the wall at the origin, the last one moved with the velocity u, |u| <= 1 m/s along each axis,
 
     m x_k'' = F(x_{k+1} - x_k) - F(x_k - x_{k-1}) - m g e_z,    F(d) = D (1 - L / |d|) d,
     x_end'  = u - droop F(x_end - x_before).
 
-m, D, L, the limits, 40 stages of 0.2 s, and the push at the start are those of acados: from rest the end is moved with
-u = (-1, 1, 1) for one second. Here the end is to return to (1, 0, 0) (there to 6 L per spring), and the second wall and the random
-disturbances are left out. `chain(masses)` counts the wall and the end as acados does: 3, 5 and 7 masses have 9, 21 and 33 states.
-The free masses have order 2, the end has order 1, and the end is what is prescribed and deformed.
+m, D, L, the limits, 40 stages of 0.2 s, and the push at the start are those of acados: from rest the end is moved with u =
+(-1, 1, 1) for one second. Here the end is to return to (1, 0, 0) (in acados to 6 L per spring), and the second wall and the
+random disturbances are left out. `chain(masses)` counts the wall and the end as acados does: 3, 5 and 7 masses have 9, 21
+and 33 states. The free masses have order 2, the end has order 1, and the response of the end is prescribed and deformed.
 
-`droop` is ours: the chain's pull slows the drive, and the model does not know. chain(3, droop=0) is the plant of acados, whose
-drive does exactly what it is told; there adaptation has nothing to correct and only adds its own lag. Two weights differ from
-acados too: positions of free masses are not weighed, and velocities a tenth as much, because where the chain rests is what
-the model has wrong.
+`droop` is ours: the chain's pull slows the drive, and the model has no droop. chain(3, droop=0) is the plant of acados, whose
+drive follows its command exactly; adaptation has nothing to correct there and only adds its own lag. Two weights differ from
+acados too: positions of free masses are not weighed, and velocities a tenth as much, because the model is wrong about the
+position in which the chain rests.
 
-Measured (3 masses, rms error of the end from 4 s on): RHC 2.9e-2 m in x and 2.8e-2 m in z; RHC+FPI 1.2e-4 and 4.0e-2 m; exact model
-1.2e-5 and 7.6e-6 m. Adaptation removes what the drive does wrong, all of the error in x. It makes z worse: the model hangs
-lower than the chain does and would rather hold the end higher, which a yielding drive happened to hinder. With adaptation the
-drive obeys, and the error is the one that RHC has with droop=0 (4.0e-2 m). No deformation of the end's velocity can
-mend a wrong weight of the masses in between. A velocity is at its limit in the first second (9 to 10 % of the cycles).
+Measured (3 masses, rms error of the end from 4 s on): RHC 2.9e-2 m in x and 2.8e-2 m in z; RHC+FPI 1.2e-4 and 4.0e-2 m;
+exact model 1.2e-5 and 7.6e-6 m. Adaptation removes the error of the drive, which is all of the error in x. It makes z
+worse: the model hangs lower than the chain does, so the plan holds the end higher, and a yielding drive happens to prevent
+this. With adaptation the drive follows the plan, and the error is that of RHC with droop=0 (4.0e-2 m). No deformation of
+the end's velocity can correct a wrong weight of the masses in between. A velocity is at its limit in the first second (9 to
+10 % of the cycles).
 """
 
 import itertools
@@ -75,7 +76,7 @@ def plant_of(masses, droop):
 
 
 def rest(plant):
-    """The exact plant's state at rest with its end held at END, found by a root finder."""
+    """The exact plant's state at rest with its end held at END, by a root finder."""
     size = len(plant.coordinates)
     free = ca.SX.sym("free", size - 3)
     still = ca.vertcat(free, ca.DM(END), ca.SX.zeros(size - 3))

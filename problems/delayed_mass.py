@@ -2,11 +2,11 @@
 
     m q'' = Q(t - tau) - b q' - k q - l q^3,        nominal motion  q^N = 0.5 sin 2t,   tau = 60 ms = 60 cycles.
 
-The product of tracking rate and dead time is 0.36: near the 0.407 at which the tracking law alone becomes unstable. A deformation
-that pairs each response with the request of the last cycle sees the answer to a request of 60 cycles before; it cycles between
-its limits. Pairing alone does not help the outer loop. The increment form passes a change of the desired response at once, and
-with a prediction of the state over the dead time it tracks. It leaks, so that the believed dead time may be wrong by 10 % (6
-cycles), and so may take the whole gain 1 / lambda_max at once. All parameters are chosen here.
+The product of tracking rate and dead time is 0.36: near the 0.407 at which the tracking law alone becomes unstable. A
+deformation that pairs each response with the request of the last cycle uses the response to a request of 60 cycles before;
+it cycles between its limits. Pairing alone does not help the outer loop. The increment form passes a change of the desired
+response at once, and with a prediction of the state over the dead time it tracks. It leaks, so that the believed dead time
+may be wrong by 10 % (6 cycles), and it can therefore use the whole gain 1 / lambda_max. All parameters are chosen here.
 """
 
 import casadi as ca

@@ -2,14 +2,14 @@
 
     A h1' = u - s1 sqrt(2 g h1),     A h2' = s1 sqrt(2 g h1) - s2 sqrt(2 g h2) - leak,     h2 is to follow its reference.
 
-The model is wrong in the valve between the tanks and knows of no leak. The pump acts on h1, so a deformation makes h1' what
-the model would do; the error of h2' it does not see, and the plan goes on believing that the lower tank fills as the model
-says. A disturbance model with one unknown per level explains both errors, and the plan takes them into account:
+The model is wrong in the valve between the tanks and has no leak. The pump acts on h1, so a deformation makes h1' that of
+the model. It does not correct the error of h2', and the plan still assumes that the lower tank fills as in the model.
+A disturbance model with one unknown per level explains both errors, and the plan takes them into account:
 
     rms error of h2, mm      RHC 29.1    RHC+FPI 32.3    offset-free RHC 0.30    exact model 0.26        (seed 0)
 
-ConstraintState in h2 with relative order two, as the tanks behind a long pipe are, the error would be where the input acts; but the
-response is then h2'', which holds the differences of the noisy flows of neighbouring cycles. That was not tried here.
+Written in h2 with relative order two, as for the tanks behind a long pipe, the error would be where the input acts. The
+response is then h2'', which contains the differences of the noisy flows of neighbouring cycles. That was not tried here.
 
 How the controllers were tuned, on this very task: drifts of 1e-5, 3e-5, 1e-4, 3e-4, 1e-3 m/s/s^0.5 by noises of the flows
 of 1e-5, 2e-4 (the true one), 1e-3 m/s, for measured levels of 1e-4 m, give 0.296 to 10 mm, and the best is used; with seeds

@@ -2,14 +2,14 @@
 
     m1 q1'' = k2 (q2 - q1) - k1 q1 - b1 q1',        m2 q2'' = F - k2 (q2 - q1) - b2 q2'
 
-The force reaches q2 in its second derivative and q1 in its fourth. A slot for q2 is quick and leaves q1 to swing on its springs,
-almost undamped (-0.1 1/s); a slot for q1 has no zero dynamics. Its derivatives q1'' and q1''' are computed by the model from
-the measured state, and the model takes both springs too stiff by the same factor, so that it is right about where q1'' is zero;
-with another ratio the slot of q1 ends at a constant error, with or without deformation.
+The force reaches q2 in its second derivative and q1 in its fourth. A slot for q2 is quick and leaves q1 to swing on its
+springs, almost undamped (-0.1 1/s); a slot for q1 has no zero dynamics. Its derivatives q1'' and q1''' are computed by the
+model from the measured state, and both springs of the model are too stiff by the same factor, so that q1'' of the model is
+zero at the right place; with another ratio the slot of q1 ends at a constant error, with or without deformation.
 
 Measured from 8 s on (rms error of q1 and q2): slots 5.3e-3 m, 8.0e-3 m; slots+FPI 1.2e-7 m, 1.9e-7 m; slots with the exact
-model 1.2e-9 m, 2.8e-9 m; RHC 1.6e-3 m, 2.4e-3 m; RHC+FPI 4.6e-7 m, 6.8e-7 m. The Floquet radius is 7.8e-5 per period of 4 s; with
-the deformation the state shrinks by 1.1e-3 per period, because the law of q1 works on derivatives by the wrong model.
+model 1.2e-9 m, 2.8e-9 m; RHC 1.6e-3 m, 2.4e-3 m; RHC+FPI 4.6e-7 m, 6.8e-7 m. The Floquet radius is 7.8e-5 per period of 4
+s; with the deformation the state shrinks by 1.1e-3 per period, because the law of q1 uses derivatives of the wrong model.
 """
 
 import fpirhc as fp

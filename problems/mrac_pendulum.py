@@ -4,15 +4,15 @@ A pendulum on a motor, the angle measured from upright,
 
     m l^2 angle'' = m g l sin(angle) - c angle' - f tanh(angle' / 0.05 rad/s) + torque,
 
-with friction that the model does not know and a reference model that is twice as heavy as the plant (m_r = 2 kg, m = 1 kg);
-from 8 s to 11 s a load of 1 N m pulls. The motion swings through upright, and the pendulum starts 0.3 rad beside it. Every
-law prescribes the same rate of 6 1/s, so that they differ by what they do about the wrong model; without noise and dead time
-any of them could buy precision with a higher gain.
+with friction that the model lacks and a reference model that is twice as heavy as the plant (m_r = 2 kg, m = 1 kg); from 8
+s to 11 s a load of 1 N m pulls. The motion swings through upright, and the pendulum starts 0.3 rad beside it. Every law
+prescribes the same rate of 6 1/s, so that they differ only in their treatment of the wrong model; without noise and dead
+time a higher gain would make any of them more precise.
 
 Measured (rms error of the angle from 3 s on, rad): PID 4.0e-2, computed torque 3.3e-2, acceleration rate 3.4e-2, acceleration
 feedback 5.7e-3, Lyapunov MRAC 2.2e-3, sliding mode 1.8e-3, backstepping MRAC 1.0e-3 (0.12 without the iteration), computed
-torque with FPI and force MRAC 2.7e-4. The backstepping pair follows a reference model and has no integral. Lyapunov's rule is
-given the best of the adaptations 1, 5, 20, 100 and 300; its leakage hardly matters here.
+torque with FPI and force MRAC 2.7e-4. The backstepping pair follows a reference model and has no integral. Lyapunov's rule has
+the best of the adaptations 1, 5, 20, 100 and 300; its leakage has little effect here.
 """
 
 import casadi as ca

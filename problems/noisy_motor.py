@@ -6,20 +6,22 @@ second derivative of the speed answers the voltage,
 
     T_e tau' = tau_stall u - tau,     J speed' = tau - B speed - tau_c tanh(speed / soft) - tau_finger.
 
-What is not in the data sheet (time constants, Coulomb friction, the finger's 0.08 N m for 1.5 s every 4 s, jitter) is chosen here.
+The values that the data sheet lacks (time constants, Coulomb friction, the finger's 0.08 N m for 1.5 s every 4 s, jitter)
+are chosen here.
 
 The coordinate is the speed. The encoder times the edges of every cycle (2.7 at 60 rpm) with a clock of 4 us: the mean
 speed of the last cycle, 5 ms late, with a jitter of 2 % of an edge's period, 0.74 % of the speed, and a quantum of 0.04 %.
 With the angle as the coordinate a third derivative would be left to differences of whole pulses: a rounding of 0.0067 rad
-becomes 30 000 rad/s^3, where the finger is worth 2 400.
+becomes 30 000 rad/s^3, and the finger makes 2 400.
 
-Speed and its derivatives are fitted to five samples; the response is late by two cycles, dead time included. True speed from
-4 s to 24 s, seed 0, mean and standard deviation in rpm: RHC 59.79, 5.64; with a deformation that is told of the delay 59.99,
-1.09, and with eq. (3) in it 59.99, 1.11; filtering the error (59.996, 1.13) takes 40 % off the voltage's jumps. Not told of the
-delay a gain of -0.25 oscillates (59.05, 21.3), and -0.5 is refused before the run. With ideal sensing: 60.00, 0.39.
+Speed and its derivatives are fitted to five samples; the response is late by two cycles, dead time included. True speed
+from 4 s to 24 s, seed 0, mean and standard deviation in rpm: RHC 59.79, 5.64; with a deformation that is given the delay
+59.99, 1.09, and with eq. (3) in it 59.99, 1.11; a filter of the error (59.996, 1.13) makes the voltage's jumps 40 %
+smaller. Without the delay a gain of -0.25 oscillates (59.05, 21.3), and -0.5 is refused before the run. With ideal sensing:
+60.00, 0.39.
 
-RHC with the exact parameters is no bound here (54.74, 7.12): it knows as little of the finger as the wrong model does, whose
-weak motor happens to ask for the voltage that the finger takes.
+RHC with the exact parameters is no bound here (54.74, 7.12): it has no finger in its model, and the weak motor of the wrong
+model happens to need the additional voltage that the finger needs.
 """
 
 import casadi as ca
@@ -42,7 +44,7 @@ def response(w, a, u, p):
 
 
 def finger(t):
-    """What a braking torque with ramps of 0.15 s adds to the second derivative of the speed: -(tau / T_e + tau') / J."""
+    """The effect of a braking torque with ramps of 0.15 s on the second derivative of the speed: -(tau / T_e + tau') / J."""
     since = ca.fmod(t, 4.0) - 1.0
     share = ca.fmax(0, ca.fmin(1, ca.fmin(since, 1.5 - since) / 0.15))
     slope = ca.if_else(ca.logic_and(share > 0, share < 1), ca.if_else(since < 0.75, 1, -1) / 0.15, 0)

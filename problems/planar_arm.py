@@ -5,16 +5,17 @@ The arm moves in a vertical plane, q1 from the horizontal, q2 relative to the fi
     M(q) q'' + C(q, q') q' + g(q) + friction = tau,
     friction = b v + (c + s exp(-(v / vs)^2)) tanh(v / 0.02)     in each joint (viscous, Coulomb, Stribeck).
 
-Lengths and centres of mass are known. J1 is the inertia of the first link about its joint, k1 its mass times the distance of its
-centre, I2 the second link's inertia about its centre, `load` the mass held at its end. All these and b, c, s enter linearly, and
-every positive value of them gives a positive definite M; the Stribeck velocity vs does not enter linearly and stays wrong in the
-model. The numbers are chosen here. The model knows a quarter of the load. At 6 s the arm drops 1.5 of its 2 kg: the torque that
-the lost part would need on the nominal motion is taken away from then on, as a disturbance.
+Lengths and centres of mass are known. J1 is the inertia of the first link about its joint, k1 its mass times the distance
+of its centre, I2 the second link's inertia about its centre, `load` the mass held at its end. All these and b, c, s enter
+linearly, and every positive value of them gives a positive definite M; the Stribeck velocity vs does not enter linearly and
+stays wrong in the model. The numbers are chosen here. The model has a quarter of the load. At 6 s the arm drops 1.5 of its
+2 kg: from then on, a disturbance removes the torque that the lost part needs on the nominal motion.
 
-Measured, rms error of q1, q2 from 1 s on (rad): computed torque 6.4e-2, 2.1e-1; with FPI 7.1e-4, 2.4e-3; adaptive inverse dynamics
-8.7e-3, 4.4e-3 (2.3e-2 to 4.5e-2 in the first second); Slotine-Li 5.4e-4, 1.8e-3 (4e-3 to 1e-2 in the first second). FPI with
-projection: 1.4e-4, 5.2e-4 on inverse dynamics, 8.1e-5, 8.9e-5 on Slotine-Li. FPI is precise from the start and learns nothing;
-Slotine-Li has caught up within 3 s and must learn again after the drop; both together are the best of all.
+Measured, rms error of q1, q2 from 1 s on (rad): computed torque 6.4e-2, 2.1e-1; with FPI 7.1e-4, 2.4e-3; adaptive inverse
+dynamics 8.7e-3, 4.4e-3 (2.3e-2 to 4.5e-2 in the first second); Slotine-Li 5.4e-4, 1.8e-3 (4e-3 to 1e-2 in the first
+second). FPI with projection: 1.4e-4, 5.2e-4 on inverse dynamics, 8.1e-5, 8.9e-5 on Slotine-Li. FPI is precise from the
+start and learns nothing; Slotine-Li is as precise after 3 s and must learn again after the drop; both together are the best
+of all.
 """
 
 from types import SimpleNamespace
@@ -89,7 +90,7 @@ def motion(t):
 
 
 def relief(joint):
-    """The torque that the dropped part of the load would need on the nominal motion: it is not needed any more."""
+    """The torque that the dropped part of the load would need on the nominal motion, from the drop on."""
 
     def torque(t):
         q = ca.vertcat(*motion(t).values())

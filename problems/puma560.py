@@ -4,14 +4,15 @@ Kinematics, masses, inertias, gears, rotors and friction are those of P. I. Cork
 consensus among model parameters reported for the PUMA 560 robot, IEEE ICRA 1994, in standard Denavit-Hartenberg frames, as
 distributed with P. Corke's Robotics Toolbox (MIT licence). Coulomb friction is the mean of both directions, smoothed over
 0.05 rad/s. Torque limits are those of B. Armstrong, O. Khatib, J. Burdick, IEEE ICRA 1986 (from memory). The inverse
-dynamics is a recursive Newton-Euler one, its mass matrix the derivative by the accelerations; both agree with the toolbox's
-printed inertia and gravity load at the 'nominal' posture (those from memory). A load of 1.5 kg, 0.1 m beyond the wrist, is
-added here. The model has links 2 and 3 a fifth too light, half the viscous and none of the Coulomb friction, and no load;
-15 parameters are learned.
+dynamics is a recursive Newton-Euler one, and its mass matrix is its derivative by the accelerations; both agree with the
+toolbox's printed inertia and gravity load at the 'nominal' posture (those from memory). A load of 1.5 kg, 0.1 m beyond the
+wrist, is added here. The model has links 2 and 3 a fifth too light, half the viscous and none of the Coulomb friction, and
+no load; 15 parameters are learned.
 
 Measured, rms errors of the joints from 2 s on: computed torque 5 to 25 mrad; with FPI 0.08 to 0.27;
-adaptive inverse dynamics 0.4 to 3.5; with FPI and projection 0.02 to 0.05, the load found as 1.48 kg; Slotine-Li 0.06 to 2.9, the
-load found as 1.52 kg. The arm starts at rest while the motion does not, so the first second shows that transient in all of them.
+adaptive inverse dynamics 0.4 to 3.5; with FPI and projection 0.02 to 0.05, with an estimated load of 1.48 kg;
+Slotine-Li 0.06 to 2.9, with an estimated load of 1.52 kg. The arm starts at rest while the motion does not, so the first second
+shows that transient in all of them.
 """
 
 import casadi as ca

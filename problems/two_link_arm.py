@@ -11,11 +11,11 @@ angle delta) is rigidly held by the second link; the friction b of the joints is
 The model's parameters are physical ones on purpose: wrong values of the sums in H would not always give a positive definite
 matrix.
 
-The arm starts 0.5 and 0.8 rad off the motion. Measured (rms error of q1, q2 from 2 s on): RHC 5.5e-2 and 3.4e-2 rad; RHC+FPI
-1.6e-3 and 8.1e-4 rad; exact model 1.5e-3 and 5.9e-4 rad, which is what holding the torque over a stage of 10 ms costs. A torque is
-at its limit during the first 0.15 to 0.2 s (3 % of the cycles). With less torque than the motion needs, a model that is too light
-plans what the arm cannot do: with limits of 150 and 70 N m the errors of q1 are 0.6 rad without adaptation and 0.7 rad with it,
-and 1.6e-2 rad with the exact model.
+The arm starts 0.5 and 0.8 rad off the motion. Measured (rms error of q1, q2 from 2 s on): RHC 5.5e-2 and 3.4e-2 rad;
+RHC+FPI 1.6e-3 and 8.1e-4 rad; exact model 1.5e-3 and 5.9e-4 rad, which comes from a constant torque over a stage of 10 ms.
+A torque is at its limit during the first 0.15 to 0.2 s (3 % of the cycles). With less torque than the motion needs, a model
+that is too light plans a motion that the arm cannot make: with limits of 150 and 70 N m the errors of q1 are 0.6 rad
+without adaptation and 0.7 rad with it, and 1.6e-2 rad with the exact model.
 """
 
 import casadi as ca

@@ -8,10 +8,10 @@ derivative h2' is the model's, whose valves are wrong by different factors: with
 beside its reference even with the deformation; with the integral, which starts anew in every slot, the deformation removes the
 error.
 
-Measured from 240 s on (rms error of h1 and h2): slots 0.039 dm, 0.020 dm; slots+FPI 9.2e-5 dm, 7.6e-5 dm; slots with the exact
-model 2.2e-5 dm, 1.9e-5 dm; RHC 0.087 dm, 0.13 dm; RHC+FPI 0.035 dm, 0.053 dm. Here slots with adaptation end far closer than RHC
-with it: by the wrong model the two references are not at rest together, so RHC's plan settles between them, and no integral
-says so. The Floquet radius is 3.5e-3 per period of 120 s, and slots+FPI shrink the error by 7.4e-3.
+Measured from 240 s on (rms error of h1 and h2): slots 0.039 dm, 0.020 dm; slots+FPI 9.2e-5 dm, 7.6e-5 dm; slots with the
+exact model 2.2e-5 dm, 1.9e-5 dm; RHC 0.087 dm, 0.13 dm; RHC+FPI 0.035 dm, 0.053 dm. Here slots with adaptation end far
+closer than RHC with it: by the wrong model the two references are not at rest together, so RHC's plan settles between them,
+and there is no integral. The Floquet radius is 3.5e-3 per period of 120 s, and slots+FPI shrink the error by 7.4e-3.
 
 References: two coupled tanks are a plant of J. K. Tar's group as well (Computation 8, 96, 2020); numbers and schedule are our
 own.

@@ -7,7 +7,7 @@ krisztiankosi/Control (MIT licence),
 
 The cubic term is Duffing's, the velocity term van der Pol's: it feeds energy in for |q| < 1 and takes it out beyond. The
 published file prints the last term without its argument; q^5 is our reading. The limits and the start are chosen here so
-that the first second needs more force than there is.
+that the first second needs more force than the limits allow.
 """
 
 import casadi as ca

@@ -1,1 +1,1 @@
-"""Baselines: fresh results are compared with committed ones, and every change of a baseline is asked for with a reason."""
+"""Baselines: fresh results are compared with committed ones, and every change of a baseline needs a reason."""

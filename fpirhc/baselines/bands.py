@@ -1,9 +1,9 @@
-"""Bands from spreads: how far a metric may move before it has changed.
+"""Bands from spreads: the change of a metric that counts as no change.
 
     half-width = max(3 (max_i v_i - min_i v_i), 1e-6 |v|, floor),        v nominal, v_i under the variants of one source, and v.
 
-Three: of a normal value and eight seeds, another draw leaves the band about once in 10 000 times (with five seeds 30 times as
-often). A count that is the same under all variants is exact.
+The factor is three, because another draw of a normal value then leaves a band from eight seeds about once in 10 000 times (30
+times as often with five seeds). A count that is the same under all variants is exact.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from fpirhc.simulation import metrics as run_metrics
 
 FACTOR = 3.0
 RELATIVE = 1e-6  # also what 'tight' means
-_LOOSE = 0.5  # share of the value beyond which a band hardly holds anything
+_LOOSE = 0.5  # share of the value above which a band shows few changes
 _QUANTA = 1.5  # of a metric that counts cycles: one cycle more or less is no change
 
 
@@ -27,8 +27,11 @@ _QUANTA = 1.5  # of a metric that counts cycles: one cycle more or less is no ch
 class Metric:
     """One metric of a baseline.
 
-    kind: exact, tight or banded. value: a number, a word, or None where the run has none (it never settles). band: half-width,
-    0 for an exact one. spread: from the least to the largest value by source; what the band was made of.
+    Args:
+        kind: `EXACT`, `TIGHT` or `BANDED`.
+        value: a number, a word, or None where the run has none (it never settles).
+        band: half-width; 0 for an exact metric.
+        spread: distance from the least to the largest value, by source; the band comes from the largest spread.
     """
 
     kind: str
@@ -38,7 +41,7 @@ class Metric:
 
     @property
     def loose(self) -> bool:
-        """Whether the spread is so wide that the band hardly holds anything."""
+        """Whether the spread is so wide that the band shows few changes."""
         return isinstance(self.value, int | float) and FACTOR * self.widest > _LOOSE * abs(self.value)
 
     @property
@@ -49,10 +52,12 @@ class Metric:
 
 @dataclass(frozen=True)
 class Expected:
-    """What a baseline expects of one controller.
+    """Expected results of one controller.
 
-    outcomes: classes that the run may end in; without 'finished' nothing else is compared. metrics: by name. not_compared:
-    metrics that cannot be, with the reason.
+    Args:
+        outcomes: classes of outcomes that are expected; without 'finished' nothing else is compared.
+        metrics: metrics by name.
+        not_compared: reasons why metrics are not compared, by name.
     """
 
     outcomes: tuple[str, ...]
@@ -66,7 +71,14 @@ def expected(
     period: float,
     metrics: Sequence[run_metrics.Metric] | None = None,
 ) -> Expected:
-    """Return what to expect from the results under every variant, the nominal one first; `metrics` are the problem's."""
+    """Return the expectations from the results under every variant.
+
+    Args:
+        variants: the variants, the nominal one first.
+        results: the results under these variants.
+        period: control period, s.
+        metrics: metrics of the problem's runs; None: the shipped and the installed ones.
+    """
     outcomes = tuple(dict.fromkeys(r.outcome for r in results))
     if outcomes != (FINISHED,):
         return Expected(outcomes, {}, {})
@@ -74,12 +86,12 @@ def expected(
     not_compared: dict[str, str] = {}
     names = dict.fromkeys(name for r in results for name in r.numbers)
     for name in names:
-        found = [(v.source, r.numbers[name]) for v, r in zip(variants, results, strict=True) if name in r.numbers]
-        if found[0][0] != NOMINAL:
+        measured = [(v.source, r.numbers[name]) for v, r in zip(variants, results, strict=True) if name in r.numbers]
+        if measured[0][0] != NOMINAL:
             not_compared[name] = "only some variants have it"
             continue
         family = family_of(name, metrics)
-        metric = _metric(family, found, _quantum(family, results[0], period))
+        metric = _metric(family, measured, _quantum(family, results[0], period))
         if metric is None:
             not_compared[name] = "some variants have a value and some have none, or words that differ"
         else:
@@ -87,8 +99,8 @@ def expected(
     return Expected(outcomes, compared, not_compared)
 
 
-def _metric(family: Family, found: Sequence[tuple[str, Number]], quantum: float) -> Metric | None:
-    values = [value for _, value in found]
+def _metric(family: Family, measured: Sequence[tuple[str, Number]], quantum: float) -> Metric | None:
+    values = [value for _, value in measured]
     if any(isinstance(v, str) for v in values):
         return Metric(EXACT, values[0], 0.0, {}) if len(set(values)) == 1 else None
     numbers = [float(v) for v in values]
@@ -97,15 +109,15 @@ def _metric(family: Family, found: Sequence[tuple[str, Number]], quantum: float)
         return Metric(EXACT, None, 0.0, {})
     if not all(finite):
         return None
-    value, spread = values[0], _spread([(source, float(v)) for source, v in found])
+    value, spread = values[0], _spread([(source, float(v)) for source, v in measured])
     largest = FACTOR * max(spread.values(), default=0.0)
     if family.kind == EXACT and largest == 0:
         return Metric(EXACT, value, 0.0, {})
-    told = {source: float(f"{width:.2g}") for source, width in spread.items()}
+    rounded = {source: float(f"{width:.2g}") for source, width in spread.items()}
     tight = RELATIVE * abs(float(value))
     if family.kind == TIGHT and largest <= tight:
-        return Metric(TIGHT, value, _readable(max(tight, family.floor)), told)
-    return Metric(BANDED, value, _readable(max(largest, tight, family.floor, _QUANTA * quantum)), told)
+        return Metric(TIGHT, value, _readable(max(tight, family.floor)), rounded)
+    return Metric(BANDED, value, _readable(max(largest, tight, family.floor, _QUANTA * quantum)), rounded)
 
 
 def _readable(band: float) -> float:
@@ -113,10 +125,10 @@ def _readable(band: float) -> float:
     return float(f"{1.005 * band:.3g}")
 
 
-def _spread(found: Sequence[tuple[str, float]]) -> dict[str, float]:
+def _spread(measured: Sequence[tuple[str, float]]) -> dict[str, float]:
     by_source: dict[str, list[float]] = {}
-    for source, value in found[1:]:
-        by_source.setdefault(source, [found[0][1]]).append(value)
+    for source, value in measured[1:]:
+        by_source.setdefault(source, [measured[0][1]]).append(value)
     widths = {source: max(values) - min(values) for source, values in by_source.items()}
     return {source: width for source, width in widths.items() if width}
 

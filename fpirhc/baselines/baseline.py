@@ -23,10 +23,18 @@ _WIDTH = 118  # of a line that holds a whole object
 
 @dataclass(frozen=True)
 class Baseline:
-    """What is expected of a problem, why, and what it was measured with.
+    """The expected results of a problem, and how they were measured.
 
-    reason: why this baseline was accepted. date: when, in UTC. seed: of the nominal run. varied: variants in words by source.
-    renamed: names of an older version that the file has, and what they are called now; no file that is written has any.
+    Args:
+        problem: name of the problem.
+        reason: why this baseline was accepted.
+        date: time of its acceptance, UTC.
+        seed: seed of the nominal run.
+        versions: versions of fpirhc and of what its numbers depend on.
+        varied: variants in words, by source.
+        settings: settings of the problem and its controllers.
+        controllers: expectations by controller.
+        renamed: new names by old names of the file; a file that is written has no old names.
     """
 
     problem: str
@@ -41,7 +49,7 @@ class Baseline:
 
 
 def to_text(baseline: Baseline) -> str:
-    """Return the file's text; controllers by name, so that the order in which they were measured does not show."""
+    """Return the file's text; its controllers are sorted by name, whatever the order of the measurements."""
     settings = asdict(baseline.settings)
     settings["controllers"] = dict(sorted(settings["controllers"].items()))
     facts = {
@@ -60,7 +68,7 @@ def to_text(baseline: Baseline) -> str:
 
 
 def settings_hash(settings: Settings) -> str:
-    """Hash of all settings."""
+    """Return the hash of all settings."""
     return fingerprint(asdict(settings))
 
 
@@ -75,7 +83,7 @@ def _metric_facts(facts: dict[str, Any]) -> dict[str, Any]:
 
 
 def _written(value: Any, indent: str, *, keep_open: bool = False) -> str:
-    """JSON in which what fits on a line stands on one."""
+    """JSON in which every object that fits on a line stands on one."""
     line = json.dumps(value, ensure_ascii=True, allow_nan=False)
     if not isinstance(value, dict) or not value or (len(indent) + len(line) <= _WIDTH and not keep_open):
         return line

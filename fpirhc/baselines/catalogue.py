@@ -1,11 +1,11 @@
-"""The numbers that a baseline may hold, and how each is compared. There are three classes:
+"""The numbers of a baseline, and how each is compared. There are three classes:
 
     exact   counts, statuses, sizes: equal or changed
     tight   optimal costs of open-loop plans: equal to 1e-6
-    banded  what a closed loop achieved: inside a band that `bands` computes
+    banded  results of a closed loop: inside a band that `bands` computes
 
-A class is the least that is asked for: `bands` widens it where the variants disagree. Metrics of a run say themselves how they
-are compared; numbers of the first horizon's open-loop plan stand here.
+`bands` widens a class where the variants disagree. Metrics of a run have their class in their own definition; the classes of the
+first horizon's open-loop plan stand here.
 """
 
 from __future__ import annotations
@@ -23,10 +23,14 @@ KINDS = (EXACT, TIGHT, BANDED)
 
 @dataclass(frozen=True)
 class Family:
-    """How all numbers 'family.element' are compared.
+    """The comparison of all numbers 'family.element'.
 
-    kind: the class, where the spread does not say otherwise. better: the direction in which leaving the band is an improvement.
-    finite: whether a finished run must have it. floor: differences of this size mean nothing, in its unit. step: see `Metric`.
+    Args:
+        kind: the class, unless the spread makes it wider.
+        better: direction in which leaving the band is an improvement.
+        finite: whether a finished run must have the number.
+        floor: difference that counts as none, in the unit of the number.
+        step: see `Metric`.
     """
 
     kind: str
@@ -47,10 +51,14 @@ PLANS = {
 
 
 def family_of(key: str, metrics: Sequence[Metric] | None = None) -> Family:
-    """Return how a number is compared; `metrics` are the problem's, None: the shipped and the installed ones.
+    """Return how a number is compared.
+
+    Args:
+        key: name of the number, 'family.element'.
+        metrics: metrics of the problem's runs; None: the shipped and the installed ones.
 
     Raises:
-        InvalidName: a metric that neither fpirhc nor the problem knows, with the nearest that they do.
+        InvalidName: neither fpirhc nor the problem has such a metric.
     """
     if key in PLANS:
         return PLANS[key]

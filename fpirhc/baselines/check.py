@@ -33,25 +33,30 @@ def check_baseline(
 ) -> Judgement:
     """Measure a problem's controllers and compare them with its baseline; nothing is written.
 
-    Parameters: `controllers` to compare, all when not given; `baselines` folder instead of the one beside the problem file;
-    `processes` at once, each of which loads the problem file anew.
+    Args:
+        task: the loaded problem file.
+        controllers: names of controllers; None: all.
+        baselines: folder of the baselines; None: the one beside the problem file.
+        compiled: whether runs use compiled C.
+        processes: number of processes, each of which loads the problem file anew.
+        progress: function of (problem, runs done, runs in all) that is called after every run.
 
     Raises:
         InvalidProblem: unknown controllers.
     """
-    chosen = list(select(task, controllers))
+    names = list(select(task, controllers))
     try:
         baseline = read_baseline(baseline_path(task.path, baselines), task.metrics)
     except BaselineError as error:
         return Judgement(task.name, unusable=(str(error),))
-    jobs = [Job(name, nominal(baseline.seed, compiled)) for name in chosen]
+    jobs = [Job(name, nominal(baseline.seed, compiled)) for name in names]
     results = measure_all(task, jobs, processes=processes, progress=progress)
-    judgement = judge(baseline, settings_of(task), dict(zip(chosen, results, strict=True)), task.metrics)
+    judgement = judge(baseline, settings_of(task), dict(zip(names, results, strict=True)), task.metrics)
     return judgement if judgement.holds else replace(judgement, notes=(*judgement.notes, *_other_versions(baseline)))
 
 
 def _other_versions(baseline: Baseline) -> list[str]:
-    """What the baseline was measured with, where that is something else now."""
+    """Versions with which the baseline was measured, where they differ from those of now."""
     now = versions()
     other = [f"{name} {was} (now {now.get(name)})" for name, was in baseline.versions.items() if now.get(name) != was]
     return [f"the baseline was measured with {', '.join(other)}"] if other else []
@@ -65,7 +70,7 @@ def check_file(
     processes: int = 1,
     progress: Progress | None = None,
 ) -> Judgement:
-    """Return what becomes of a problem by name or path; one that cannot be loaded has that as its judgement."""
+    """Return the judgement of a problem by name or path; a problem that cannot be loaded is `broken`."""
     try:
         task = load_problem(path)
     except FpirhcError as error:
@@ -83,25 +88,41 @@ def measure_expected(
     processes: int = 1,
     progress: Progress | None = None,
 ) -> dict[str, Expected]:
-    """Run controllers under every variant and return what a baseline expects of them from now on."""
-    chosen = variants(task.problem, seed=seed, seeds=seeds, compiled=compiled)
-    jobs = [Job(name, variant) for name in controllers for variant in chosen]
+    """Run controllers under every variant and return the expectations of their baseline."""
+    all_variants = variants(task.problem, seed=seed, seeds=seeds, compiled=compiled)
+    jobs = [Job(name, variant) for name in controllers for variant in all_variants]
     results = measure_all(task, jobs, processes=processes, progress=progress)
-    found, count = {}, len(chosen)
+    expectations, count = {}, len(all_variants)
     for k, name in enumerate(controllers):
-        found[name] = expected(chosen, results[k * count : (k + 1) * count], task.problem.period, task.metrics)
-    return found
+        expectations[name] = expected(
+            all_variants, results[k * count : (k + 1) * count], task.problem.period, task.metrics
+        )
+    return expectations
 
 
 def compose_baseline(
-    task: Task, found: Mapping[str, Expected], reason: str, *, seed: int = 0, seeds: int = 8, compiled: bool = True
+    task: Task,
+    expectations: Mapping[str, Expected],
+    reason: str,
+    *,
+    seed: int = 0,
+    seeds: int = 8,
+    compiled: bool = True,
 ) -> Baseline:
-    """Return the baseline of what was measured; controllers that were not are left out.
+    """Return the baseline of the controllers that were measured.
+
+    Args:
+        task: the loaded problem file.
+        expectations: expectations by controller.
+        reason: why the new numbers are right.
+        seed: seed of the nominal run.
+        seeds: number of seeds for the bands.
+        compiled: whether runs use compiled C.
 
     Raises:
-        BaselineError: it would compare nothing.
+        BaselineError: the baseline would compare nothing.
     """
-    if all(outcome.startswith(REFUSED) for one in found.values() for outcome in one.outcomes):
+    if all(outcome.startswith(REFUSED) for one in expectations.values() for outcome in one.outcomes):
         raise BaselineError(
             f"no controller of '{task.name}' can run, so a baseline would hold nothing: see fpirhc compare"
         )
@@ -114,8 +135,8 @@ def compose_baseline(
         seed=seed,
         versions=versions(),
         varied=varied,
-        settings=settings.without(set(settings.controllers) - set(found)),
-        controllers=dict(found),
+        settings=settings.without(set(settings.controllers) - set(expectations)),
+        controllers=dict(expectations),
     )
 
 
@@ -123,7 +144,7 @@ def require_reason(reason: str) -> str:
     """Return the reason on one line.
 
     Raises:
-        InvalidValue: there is none.
+        InvalidValue: the reason is empty.
     """
     line = " ".join(reason.split())
     if not line:
@@ -132,10 +153,10 @@ def require_reason(reason: str) -> str:
 
 
 def write_baseline(task: Task, baseline: Baseline, baselines: Path | None, working: Path) -> Path:
-    """Write a baseline and return where.
+    """Write a baseline and return its path.
 
     Raises:
-        OutputError: the place is outside of the project that `working` is in, or cannot be written.
+        OutputError: the path is outside of the project of `working`, or cannot be written.
     """
     path = baseline_path(task.path, baselines)
     check_inside(path, working)
@@ -155,27 +176,37 @@ def accept(
     working: Path | None = None,
     progress: Progress | None = None,
 ) -> tuple[Baseline, Path]:
-    """Measure every controller under all variants, write the baseline, and return it and where it is.
+    """Measure every controller under all variants, write the baseline, and return it with its path.
 
-    Parameters: `reason` why the new numbers are right; `seed` of the nominal run and how many `seeds` the bands are made of;
-    `working` a folder of the project that may be written to, the current one when not given.
+    Args:
+        task: the loaded problem file.
+        reason: why the new numbers are right.
+        seed: seed of the nominal run.
+        seeds: number of seeds for the bands.
+        baselines: folder of the baselines; None: the one beside the problem file.
+        compiled: whether runs use compiled C.
+        processes: number of processes.
+        working: a folder of the project, outside of which nothing is written; None: the current folder.
+        progress: function of (problem, runs done, runs in all) that is called after every run.
 
     Raises:
-        InvalidValue: no reason. BaselineError: it would hold nothing. OutputError: it cannot be written there.
+        InvalidValue: no reason, or too few seeds.
+        BaselineError: the baseline would compare nothing.
+        OutputError: the file cannot be written, or lies outside of the project.
     """
     require_reason(reason)
     if seeds < 2 or seed < 0:
         raise InvalidValue(f"seed {seed} with {seeds} seeds: expected at least 0 and at least 2; 8 seeds are usual")
     project = working or Path.cwd()
     check_inside(baseline_path(task.path, baselines), project)
-    found = measure_expected(
+    expectations = measure_expected(
         task, list(task.controllers), seed=seed, seeds=seeds, compiled=compiled, processes=processes, progress=progress
     )
-    baseline = compose_baseline(task, found, reason, seed=seed, seeds=seeds, compiled=compiled)
+    baseline = compose_baseline(task, expectations, reason, seed=seed, seeds=seeds, compiled=compiled)
     return baseline, write_baseline(task, baseline, baselines, project)
 
 
 def bless(task: Task, reason: str, **settings: Any) -> tuple[Baseline, Path]:
-    """Return what `accept` returns: the earlier name, which goes with the next version."""
+    """Call `accept`: the earlier name, which the next version removes."""
     warnings.warn("fpirhc.bless is now fpirhc.accept", DeprecationWarning, stacklevel=2)
     return accept(task, reason, **settings)

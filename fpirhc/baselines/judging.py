@@ -1,4 +1,4 @@
-"""The comparison: every metric of a baseline against fresh results, and what follows for the problem."""
+"""The comparison: every metric of a baseline against fresh results, and the judgement of the problem."""
 
 from __future__ import annotations
 
@@ -19,7 +19,16 @@ OUTCOME = "outcome"
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison; `band` is the half-width, None where equality is asked for."""
+    """One comparison.
+
+    Args:
+        controller: name of the controller.
+        metric: name of the metric.
+        old: value of the baseline.
+        new: fresh value.
+        band: half-width of the band; None where the values must be equal.
+        verdict: `HOLDS`, `BETTER`, `WORSE`, `CHANGED`, `GONE` or `NEW`.
+    """
 
     controller: str
     metric: str
@@ -30,16 +39,22 @@ class Row:
 
     @property
     def holds(self) -> bool:
-        """Whether the metric is as the baseline says."""
+        """Whether the fresh value is inside the band."""
         return self.verdict == HOLDS
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What became of one problem.
+    """The judgement of one problem.
 
-    unusable: why nothing can be concluded from the baseline (missing, damaged, stale); empty when it can. broken: why the problem
-    itself could not be loaded. reason, date: of the baseline.
+    Args:
+        problem: name of the problem.
+        rows: the comparisons.
+        unusable: reasons why nothing can be concluded from the baseline (missing, damaged, stale); empty for a usable one.
+        broken: reason why the problem itself could not be loaded; else empty.
+        reason: reason of the baseline.
+        date: date of the baseline.
+        notes: further sentences.
     """
 
     problem: str
@@ -57,7 +72,7 @@ class Judgement:
 
     @property
     def holds(self) -> bool:
-        """Whether there was something to compare and all of it holds."""
+        """Whether there is a comparison and all comparisons hold."""
         return bool(self.rows) and not (self.changed or self.unusable or self.broken)
 
 
@@ -69,8 +84,11 @@ def judge(
 ) -> Judgement:
     """Compare the fresh results of a problem with its baseline.
 
-    Parameters: `settings` of the problem as it is now; `fresh` results under the nominal variant by controller: all of the
-    problem's, or those asked for; `metrics` that the problem's runs are measured by.
+    Args:
+        baseline: the baseline.
+        settings: settings of the problem as it is now.
+        fresh: results under the nominal variant, of all controllers or of some.
+        metrics: metrics of the problem's runs; None: the shipped and the installed ones.
     """
     whole = set(fresh) == set(settings.controllers)
     names = dict.fromkeys([*fresh, *(baseline.controllers if whole else ())])
@@ -96,12 +114,12 @@ def _old_names(baseline: Baseline) -> list[str]:
 
 
 def _stale(baseline: Baseline, settings: Settings, names: Sequence[str]) -> tuple[str, ...]:
-    said = differences("problem", baseline.settings.problem, settings.problem)
+    sentences = differences("problem", baseline.settings.problem, settings.problem)
     for name in names:
         before = baseline.settings.controllers.get(name)
         if before is not None:
-            said += differences(f"controller '{name}'", before, settings.controllers[name])
-    return tuple(f"stale: {text}" for text in said)
+            sentences += differences(f"controller '{name}'", before, settings.controllers[name])
+    return tuple(f"stale: {text}" for text in sentences)
 
 
 def _rows(
@@ -126,27 +144,27 @@ def _row(
     controller: str,
     name: str,
     metric: Metric | None,
-    found: Number | None,
+    fresh: Number | None,
     metrics: Sequence[run_metrics.Metric] | None,
 ) -> Row:
     if metric is None:
-        return Row(controller, name, None, found, None, NEW)
+        return Row(controller, name, None, fresh, None, NEW)
     band = None if metric.kind == EXACT else metric.band
-    if found is None:
+    if fresh is None:
         return Row(controller, name, metric.value, None, band, GONE)
-    value = found if isinstance(found, str) or math.isfinite(found) else None
+    value = fresh if isinstance(fresh, str) or math.isfinite(fresh) else None
     return Row(controller, name, metric.value, value, band, _verdict(family_of(name, metrics).better, metric, value))
 
 
-def _verdict(better: run_metrics.Better, metric: Metric, found: Number | None) -> str:
+def _verdict(better: run_metrics.Better, metric: Metric, fresh: Number | None) -> str:
     old = metric.value
-    if not isinstance(old, int | float) or not isinstance(found, int | float):
-        return HOLDS if type(old) is type(found) and old == found else CHANGED
+    if not isinstance(old, int | float) or not isinstance(fresh, int | float):
+        return HOLDS if type(old) is type(fresh) and old == fresh else CHANGED
     if metric.kind == EXACT:
-        return HOLDS if found == old else CHANGED
-    # Asked as "inside", so that no comparison with a number that is not finite can hold.
-    if abs(found - old) <= metric.band:
+        return HOLDS if fresh == old else CHANGED
+    # Written as "inside", so that no comparison with a number that is not finite holds.
+    if abs(fresh - old) <= metric.band:
         return HOLDS
     if better == "neither":
         return CHANGED
-    return BETTER if (found < old) == (better == "smaller") else WORSE
+    return BETTER if (fresh < old) == (better == "smaller") else WORSE

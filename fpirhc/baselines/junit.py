@@ -1,4 +1,4 @@
-"""A check as JUnit XML: a suite per problem, a case per controller."""
+"""The output of a check as JUnit XML: a suite per problem, a case per controller."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A check as Markdown, for the summary of a pull request."""
+"""The output of a check as Markdown, for the summary of a pull request."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _PLAIN = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789 .,+
 
 
 def to_markdown(outline: Outline) -> str:
-    """Return the page: what changed in full, what holds in one line per problem."""
+    """Return the page: all metrics that changed, and one line for every problem that holds."""
     good = sum(section.holds for section in outline.sections)
     parts = [MARK, f"### fpirhc check: {good} of {len(outline.sections)} problems hold", ""]
     for section in outline.sections:
@@ -36,7 +36,7 @@ def _table(lines: Sequence[Line]) -> list[str]:
 
 
 def _code(text: str) -> str:
-    """A name from elsewhere: as code, in which nobody is mentioned."""
+    """A name as code, in which an @ mentions nobody."""
     return f"<code>{_escaped(text)}</code>"
 
 

@@ -32,7 +32,13 @@ _CONVERGED = 1e-8  # of the input's range: tolerance of open-loop plans
 
 @dataclass(frozen=True)
 class Measurement:
-    """What one run achieved: the class of its outcome, why, and its numbers by metric (NaN: there is none)."""
+    """The result of one run.
+
+    Args:
+        outcome: class of its outcome.
+        why: reason for an outcome other than `FINISHED`.
+        numbers: its numbers by metric; NaN where there is none.
+    """
 
     outcome: str
     why: str
@@ -41,7 +47,12 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Job:
-    """One controller under one variant."""
+    """One controller under one variant.
+
+    Args:
+        controller: name of the controller.
+        variant: the variant.
+    """
 
     controller: str
     variant: Variant
@@ -50,10 +61,10 @@ class Job:
 def measure_all(
     task: Task, jobs: Sequence[Job], *, processes: int = 1, progress: Progress | None = None
 ) -> list[Measurement]:
-    """Return the results of all jobs in their order, whatever the number of processes."""
+    """Return the results of all jobs in their order, which does not depend on the number of processes."""
     if processes <= 1 or len(jobs) < 2:
         return _collected(task.name, (measure_job(task, job) for job in jobs), len(jobs), progress)
-    # Started afresh: a process that forked shares CasADi's state with its parent.
+    # Spawned, because a forked process shares CasADi's state with its parent.
     fresh = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=fresh) as pool:
         results = pool.map(_measure_by_path, [(str(task.path.resolve()), job) for job in jobs])
@@ -65,16 +76,16 @@ def measure_all(
 
 
 def _collected(name: str, results: Iterable[Measurement], total: int, progress: Progress | None) -> list[Measurement]:
-    found: list[Measurement] = []
+    measurements: list[Measurement] = []
     for one in results:
-        found.append(one)
+        measurements.append(one)
         if progress:
-            progress(name, len(found), total)
-    return found
+            progress(name, len(measurements), total)
+    return measurements
 
 
-def _measure_by_path(asked: tuple[str, Job]) -> Measurement:
-    path, job = asked
+def _measure_by_path(path_and_job: tuple[str, Job]) -> Measurement:
+    path, job = path_and_job
     return measure_job(_loaded(path), job)
 
 
@@ -84,19 +95,19 @@ def _loaded(path: str) -> Task:
 
 
 def measure_job(task: Task, job: Job) -> Measurement:
-    """Run one controller under one variant; one that fpirhc refuses has that as its outcome."""
+    """Run one controller under one variant; a refusal by fpirhc is an outcome too."""
     variant, controller = job.variant, task.controllers[job.controller]
     problem = variant.applied(task.problem)
     try:
-        chosen = resolved(problem, controller)
-        run = simulate(problem, chosen, seed=variant.seed, compiled=variant.compiled, flags=variant.flags)
+        ready = resolved(problem, controller)
+        run = simulate(problem, ready, seed=variant.seed, compiled=variant.compiled, flags=variant.flags)
         if run.stop is not None:
             return Measurement(DIVERGED, run.stop, {})
         numbers = _numbers(task, problem, run)
         for metric, value in numbers.items():
             if family_of(metric, task.metrics).finite and isinstance(value, float) and not math.isfinite(value):
                 return Measurement(DIVERGED, f"{metric} is not finite", {})
-        plan = first_plan(task, problem, chosen) if variant.plans else {}
+        plan = first_plan(task, problem, ready) if variant.plans else {}
     except FpirhcError as error:
         return Measurement(f"{REFUSED} ({type(error).__name__})", str(error), {})
     return Measurement(FINISHED, "", {**numbers, **plan})
@@ -108,16 +119,16 @@ def _numbers(task: Task, problem: Problem, run: Run) -> dict[str, Number]:
 
 
 def first_plan(task: Task, problem: Problem, controller: Controller) -> dict[str, Number]:
-    """Solve the first horizon with the controller's cost to convergence; empty for one that does not plan."""
+    """Solve the first horizon with the controller's cost to convergence; empty for a controller that does not plan."""
     planning = controller.planner
     cost = (planning.cost or problem.cost) if planning else None
     if cost is None or problem.horizon is None:
         return {}
     lower, upper = problem.limits.input_bounds(problem.plant)
     reach = np.append((upper - lower)[np.isfinite(upper - lower)], 0.0).max() or 1.0
-    asked = replace(task, problem=replace(problem, cost=cost))
+    with_cost = replace(task, problem=replace(problem, cost=cost))
     try:
-        solved = solve_first(asked, ["fixed-point"], _CONVERGED * float(reach))[0]
+        solved = solve_first(with_cost, ["fixed-point"], _CONVERGED * float(reach))[0]
     except FpirhcError as error:
         return {"plan.status": f"{REFUSED} ({type(error).__name__})"}
     return {

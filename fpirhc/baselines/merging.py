@@ -1,4 +1,4 @@
-"""Joins baselines of single controllers, as tests measure them, with the file that is there."""
+"""Joins baselines of single controllers, which tests measure, with the file of the problem."""
 
 from __future__ import annotations
 
@@ -14,11 +14,16 @@ from fpirhc.errors import BaselineError
 
 
 def write_merged(problem: Path, parts: Sequence[str], working: Path) -> Path:
-    """Write the baseline that holds all parts, and of the file that is there every controller that no part has.
+    """Write the baseline of all parts, with those controllers of the earlier file that no part has.
+
+    Args:
+        problem: path of the problem file.
+        parts: texts of baselines.
+        working: a folder of the project, outside of which nothing is written.
 
     Raises:
-        BaselineError: the problem's settings changed, and the file has controllers that were not measured. OutputError: the file
-            cannot be written.
+        BaselineError: the problem's settings changed, and the file has controllers that were not measured.
+        OutputError: the file cannot be written.
     """
     path = baseline_path(problem)
     check_inside(path, working)
@@ -26,13 +31,15 @@ def write_merged(problem: Path, parts: Sequence[str], working: Path) -> Path:
     for text in parts[1:]:
         merged = _joined(merged, read_text(text, path))
     if path.exists():
-        merged = _joined(_kept(read_baseline(path), merged), merged)
+        earlier = read_baseline(path)
+        _check_mergeable(earlier, merged)
+        merged = _joined(earlier, merged)
     write_whole(to_text(merged), path, "baseline")
     return path
 
 
-def _kept(before: Baseline, merged: Baseline) -> Baseline:
-    """What was there, if it can stay."""
+def _check_mergeable(before: Baseline, merged: Baseline) -> None:
+    """Raise if controllers of the earlier baseline were not measured, although problem or seed changed."""
     others = [name for name in before.controllers if name not in merged.controllers]
     if others and (
         fingerprint(before.settings.problem) != fingerprint(merged.settings.problem) or before.seed != merged.seed
@@ -41,10 +48,9 @@ def _kept(before: Baseline, merged: Baseline) -> Baseline:
             f"problem '{before.problem}' changed, and {', '.join(others)} were not measured; its baseline is left as it "
             "is: run the tests of all its controllers, or fpirhc accept"
         )
-    return before
 
 
 def _joined(first: Baseline, second: Baseline) -> Baseline:
-    """The second, and of the first what it has beyond."""
+    """The second baseline with those controllers of the first that it lacks."""
     settings = Settings(second.settings.problem, {**first.settings.controllers, **second.settings.controllers})
     return replace(second, settings=settings, controllers={**first.controllers, **second.controllers})

@@ -1,6 +1,7 @@
-"""What a check says, in the order in which every output says it: the walk over judgements that terminal, JUnit and Markdown share.
+"""The contents of a check in the order of every output: the walk over judgements that terminal, JUnit and Markdown share.
 
-All texts in an outline are on one line and free of control characters; a form only lays them out and escapes what its format reads.
+All texts in an outline are on one line and free of control characters.
+An output lays them out and escapes the characters that its format reads.
 """
 
 from __future__ import annotations
@@ -16,7 +17,15 @@ _ALWAYS = "rms_error."  # metrics that a summary shows also where they hold
 
 @dataclass(frozen=True)
 class Line:
-    """One metric: its texts in the order of HEADS, whether it holds, whether a summary shows it, and all of it as a sentence."""
+    """One metric.
+
+    Args:
+        cells: its texts in the order of HEADS.
+        verdict: its verdict.
+        holds: whether it holds.
+        in_summary: whether a summary shows it.
+        sentence: the metric in one sentence.
+    """
 
     cells: tuple[str, ...]
     verdict: str
@@ -27,7 +36,12 @@ class Line:
 
 @dataclass(frozen=True)
 class Case:
-    """One controller and its metrics."""
+    """One controller and its metrics.
+
+    Args:
+        controller: name of the controller.
+        lines: its metrics.
+    """
 
     controller: str
     lines: tuple[Line, ...]
@@ -40,7 +54,16 @@ class Case:
 
 @dataclass(frozen=True)
 class Section:
-    """One problem: its headline, its controllers, and remarks; `unclear` where nothing can be concluded."""
+    """One problem.
+
+    Args:
+        problem: name of the problem.
+        headline: one sentence about it.
+        cases: its controllers.
+        remarks: everything about it that is no metric.
+        holds: whether all metrics hold.
+        unclear: whether nothing can be concluded.
+    """
 
     problem: str
     headline: str
@@ -57,14 +80,19 @@ class Section:
 
 @dataclass(frozen=True)
 class Outline:
-    """A whole check: its problems, and (name, reason) of those that are not checked."""
+    """A whole check.
+
+    Args:
+        sections: the problems.
+        unchecked: (name, reason) of every problem that is not checked.
+    """
 
     sections: tuple[Section, ...]
     unchecked: tuple[tuple[str, str], ...]
 
 
 def outline(judgements: Sequence[Judgement], unchecked: Sequence[tuple[str, str]] = ()) -> Outline:
-    """Return what to say about the judgements."""
+    """Return the outline of the judgements; `unchecked` are (name, reason) of problems that are not checked."""
     left_out = tuple((clean(name), clean(reason)) for name, reason in unchecked)
     return Outline(tuple(_section(judgement) for judgement in judgements), left_out)
 

@@ -1,7 +1,7 @@
-"""Where baselines are: `baselines/NAME.json` beside the problem file NAME.py, and which problems need one.
+"""Paths of baselines: `baselines/NAME.json` beside the problem file NAME.py, and the problems that need one.
 
-Beside the problem, so that a change of either shows in the same review and both move together. A folder's `unchecked.toml` in
-`baselines` names the problems that have none, each with the reason: `chain_of_masses = "takes a minute"`.
+They stand beside the problem, so that both change in the same review and move together. The file `unchecked.toml` in a folder
+`baselines` names the problems without a baseline, each with the reason: `chain_of_masses = "takes a minute"`.
 """
 
 from __future__ import annotations
@@ -18,37 +18,37 @@ FOLDER, UNCHECKED = "baselines", "unchecked.toml"
 
 
 def baseline_path(problem: Path, folder: Path | None = None) -> Path:
-    """Return where the baseline of a problem file is; `folder` instead of `baselines` beside it."""
+    """Return the path of the baseline of a problem file; `folder` replaces the folder `baselines` beside it."""
     return (folder or problem.parent / FOLDER) / f"{problem.stem}.json"
 
 
 def problems_here(folder: Path, baselines: Path | None = None) -> tuple[list[Path], dict[str, str]]:
-    """Return the problem files to check, and the names of those deliberately not, with their reasons.
+    """Return the problem files to check, and the names of those that are left out on purpose, with their reasons.
 
-    They are those of `folder/problems` and of the folders in it if there is such a folder, else of `folder` itself: files that
-    define `problem` and `controllers`, and every name that a baseline has, so that a problem that vanished is noticed.
+    The files are those of `folder/problems` and of the folders in it if there is such a folder, else of `folder` itself. A file
+    that defines `problem` and `controllers` counts, and every name of a baseline, so that a problem that vanished is noticed.
 
     Raises:
-        BaselineError: nothing is there to check, or an `unchecked.toml` is wrong.
+        BaselineError: there is nothing to check, or an `unchecked.toml` is wrong.
     """
     place = folder / "problems" if (folder / "problems").is_dir() else folder
     places = [place, *(_inner(place) if place != folder else ())]
-    held = [baselines] if baselines else [p / FOLDER for p in places]
+    folders = [baselines] if baselines else [p / FOLDER for p in places]
     named: dict[str, Path] = {}
     for path in (f for p in places for f in sorted(p.glob("*.py")) if _is_problem(f)):
         named.setdefault(path.stem, path)
-    for path in (f for h in held for f in sorted(h.glob("*.json"))):
+    for path in (f for h in folders for f in sorted(h.glob("*.json"))):
         named.setdefault(path.stem, (place if baselines else path.parents[1]) / f"{path.stem}.py")
-    unchecked = {name: reason for h in held for name, reason in _unchecked(h / UNCHECKED).items()}
+    unchecked = {name: reason for h in folders for name, reason in _unchecked(h / UNCHECKED).items()}
     for name in unchecked:
         if name not in named:
             raise BaselineError(f"{UNCHECKED} names '{name}', which is no problem in '{place}'; take it out")
         if baseline_path(named[name], baselines).exists():
             raise BaselineError(f"{UNCHECKED} names '{name}', which has a baseline; take it out")
-    chosen = [path for name, path in sorted(named.items()) if name not in unchecked]
-    if not chosen:
+    to_check = [path for name, path in sorted(named.items()) if name not in unchecked]
+    if not to_check:
         raise BaselineError(f"no problem to check in '{place}'; name one, or go to the folder that has 'problems'")
-    return chosen, unchecked
+    return to_check, unchecked
 
 
 def _inner(place: Path) -> list[Path]:
@@ -57,7 +57,7 @@ def _inner(place: Path) -> list[Path]:
 
 
 def _is_problem(path: Path) -> bool:
-    """Whether the file defines problem and controllers, seen without running it; one with a mistake in it counts."""
+    """Whether the file defines problem and controllers, judged without running it; a file with a mistake counts."""
     try:
         body = ast.parse(path.read_text(encoding="utf-8")).body
     except (OSError, SyntaxError, ValueError):
@@ -86,7 +86,7 @@ def check_inside(path: Path, working: Path) -> None:
     """Raise unless `path` lies in the project: the nearest folder above `working` with .git or pyproject.toml, or `working`.
 
     Raises:
-        OutputError: it does not, links resolved.
+        OutputError: the path lies elsewhere, after links are resolved.
     """
     working = working.resolve()
     marks = (".git", "pyproject.toml")
@@ -99,10 +99,10 @@ def check_inside(path: Path, working: Path) -> None:
 
 
 def write_whole(text: str, path: Path, what: str) -> None:
-    """Write a text file that is complete or not there.
+    """Write a text file, atomically: the file is complete or not there.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

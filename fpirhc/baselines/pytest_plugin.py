@@ -1,9 +1,9 @@
-"""Baselines in a test suite of one's own: the fixture `fpirhc_check` and the option `--fpirhc-accept REASON`.
+"""Baselines in the test suite of a user: the fixture `fpirhc_check` and the option `--fpirhc-accept REASON`.
 
     def test_arm(fpirhc_check):
         fpirhc_check("problems/arm.py", "RHC+FPI")
 
-With the option the same tests measure anew; one process writes the files when all of them are done, also under pytest-xdist.
+With the option the same tests measure anew. One process writes the files when all tests are done, also under pytest-xdist.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import pytest
 if TYPE_CHECKING:
     from fpirhc.baselines.judging import Judgement
 
-_found = pytest.StashKey[list[tuple[str, str]]]()
-_told = pytest.StashKey[list[str]]()
+_measured = pytest.StashKey[list[tuple[str, str]]]()
+_messages = pytest.StashKey[list[str]]()
 _OUTPUT = "fpirhc_accepted"
 
 
@@ -31,12 +31,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Refuse an empty reason at once."""
-    config.stash[_found] = []
-    config.stash[_told] = []
+    """Refuse an empty reason before any test runs."""
+    config.stash[_measured] = []
+    config.stash[_messages] = []
     if config.option.fpirhc_bless is not None:
-        config.stash[_told].append(
-            "the option --fpirhc-bless is now --fpirhc-accept; the old name goes with the next version"
+        config.stash[_messages].append(
+            "the option --fpirhc-bless is now --fpirhc-accept; the next version removes the old name"
         )
         config.option.fpirhc_accept = config.option.fpirhc_bless
     reason = config.getoption("--fpirhc-accept")
@@ -46,9 +46,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def fpirhc_check(request: pytest.FixtureRequest) -> Callable[..., Judgement | None]:
-    """Function (problem, controller) that compares a controller with its baseline, or all of them when none is named.
+    """Function (problem, controller) that compares a controller with its baseline, or all controllers when none is named.
 
-    `problem` is a shipped name, or a path, relative to pytest's root folder. It fails the test with what changed.
+    `problem` is a shipped name, or a path relative to pytest's root folder. The test fails with the metrics that changed.
     """
     config = request.config
 
@@ -75,49 +75,49 @@ def fpirhc_check(request: pytest.FixtureRequest) -> Callable[..., Judgement | No
 
 
 def _measure(config: pytest.Config, task: Any, names: list[str] | None, compiled: bool) -> None:
-    """Measure and keep the result, as text, for the process that writes."""
+    """Measure, and store the result as text for the process that writes."""
     from fpirhc.baselines.baseline import to_text
     from fpirhc.baselines.check import compose_baseline, measure_expected
     from fpirhc.studies.comparison.compare import select
 
-    found = measure_expected(task, list(select(task, names)), compiled=compiled)
-    baseline = compose_baseline(task, found, config.getoption("--fpirhc-accept"), compiled=compiled)
-    config.stash[_found].append((str(task.path.resolve()), to_text(baseline)))
+    expectations = measure_expected(task, list(select(task, names)), compiled=compiled)
+    baseline = compose_baseline(task, expectations, config.getoption("--fpirhc-accept"), compiled=compiled)
+    config.stash[_measured].append((str(task.path.resolve()), to_text(baseline)))
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node: Any) -> None:
-    """Collect what a worker of pytest-xdist measured."""
+    """Collect the measurements of a worker of pytest-xdist."""
     for path, text in getattr(node, "workeroutput", {}).get(_OUTPUT, []):
-        node.config.stash[_found].append((path, text))
+        node.config.stash[_measured].append((path, text))
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Hand over what this worker measured; or write everything that was."""
+    """Hand over the measurements of this worker; the main process writes those of all workers."""
     config = session.config
     if hasattr(config, "workeroutput"):
-        config.workeroutput[_OUTPUT] = config.stash[_found]
+        config.workeroutput[_OUTPUT] = config.stash[_measured]
         return
-    found = config.stash[_found]
-    if not found:
+    measured = config.stash[_measured]
+    if not measured:
         return
     from fpirhc.baselines.merging import write_merged
     from fpirhc.errors import FpirhcError
 
     texts: dict[str, list[str]] = {}
-    for path, text in sorted(found):
+    for path, text in sorted(measured):
         texts.setdefault(path, []).append(text)
     for path, parts in texts.items():
         try:
             written = write_merged(Path(path), parts, config.rootpath)
-            config.stash[_told].append(f"wrote {written}")
+            config.stash[_messages].append(f"wrote {written}")
         except FpirhcError as error:
-            config.stash[_told].append(str(error))
+            config.stash[_messages].append(str(error))
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
-    """Say which baselines were written."""
-    for line in config.stash[_told]:
+    """Print which baselines were written."""
+    for line in config.stash[_messages]:
         terminalreporter.write_line(f"fpirhc: {line}")

@@ -1,4 +1,4 @@
-"""Reads a baseline and refuses everything that is not one: truncated, edited by hand, newer, incomplete."""
+"""Reads a baseline and refuses files that are truncated, edited by hand, newer or incomplete."""
 
 from __future__ import annotations
 
@@ -22,10 +22,15 @@ _LARGEST = 20_000_000  # bytes; a baseline has some tens of thousands
 
 
 def read_baseline(path: Path, metrics: Sequence[run_metrics.Metric] | None = None) -> Baseline:
-    """Return the baseline in a file; `metrics` that the problem's runs are measured by, None: names are not checked.
+    """Return the baseline in a file.
+
+    Args:
+        path: path of the file.
+        metrics: metrics of the problem's runs; None: names are not checked.
 
     Raises:
-        BaselineError: it is missing, damaged, edited by hand, of a newer format, of another problem, or compares nothing.
+        BaselineError: the file is missing, damaged, edited by hand, of a newer format, of another problem, or compares
+            nothing.
     """
     try:
         if path.stat().st_size > _LARGEST:
@@ -44,16 +49,16 @@ def read_text(text: str, path: Path, metrics: Sequence[run_metrics.Metric] | Non
     """Return the baseline in a text that is, or will be, in the file at `path`.
 
     Raises:
-        BaselineError: as `read_baseline`.
+        BaselineError: see `read_baseline`.
     """
     facts = _parsed(text, path)
-    found = facts.get("format")
-    if isinstance(found, int) and not isinstance(found, bool) and found > FORMAT:
+    file_format = facts.get("format")
+    if isinstance(file_format, int) and not isinstance(file_format, bool) and file_format > FORMAT:
         raise BaselineError(
-            f"'{path.name}' has format {found}, this version reads {FORMAT}: it was written by a newer fpirhc; upgrade"
+            f"'{path.name}' has format {file_format}, this version reads {FORMAT}: it was written by a newer fpirhc; upgrade"
         )
     checksum = facts.pop("checksum", None)
-    if found != FORMAT or checksum is None:
+    if file_format != FORMAT or checksum is None:
         raise BaselineError(f"'{path.name}' is not a baseline of format {FORMAT}; {_ACCEPT}")
     if checksum != fingerprint(facts):
         raise BaselineError(f"'{path.name}' was edited by hand, its checksum does not fit; restore it, or {_ACCEPT}")
@@ -62,8 +67,8 @@ def read_text(text: str, path: Path, metrics: Sequence[run_metrics.Metric] | Non
         for key in {key for one in baseline.controllers.values() for key in one.metrics} if metrics is not None else ():
             family_of(key, metrics)
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
-        said = error if isinstance(error, BaselineError | InvalidName) else f"it lacks or misshapes {error}"
-        raise BaselineError(f"'{path.name}': {said}; {_ACCEPT}") from None
+        reason = error if isinstance(error, BaselineError | InvalidName) else f"it lacks or misshapes {error}"
+        raise BaselineError(f"'{path.name}': {reason}; {_ACCEPT}") from None
     if baseline.problem != path.stem:
         raise BaselineError(f"'{path.name}' is the baseline of '{baseline.problem}', not of '{path.stem}'; {_ACCEPT}")
     return baseline
@@ -83,10 +88,10 @@ def _parsed(text: str, path: Path) -> dict[str, Any]:
 
 
 def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) != len(pairs):
+    entries = dict(pairs)
+    if len(entries) != len(pairs):
         raise ValueError("a key stands in it twice")
-    return found
+    return entries
 
 
 def _no_constant(name: str) -> float:

@@ -1,6 +1,6 @@
-"""Names of older versions that a baseline may hold, and what they are called now.
+"""Names of older versions that a baseline may hold, with the names of today.
 
-Only names change here, never a number: a baseline whose names are old is compared as it is, and the reader says so.
+Only names change here, never a number: a baseline with old names is compared with its own numbers, and a note lists the names.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ _SETTINGS = {
 
 
 def new_settings(settings: Settings) -> tuple[Settings, dict[str, str]]:
-    """Return the settings with the names of today, and what each old name has become."""
+    """Return the settings with the names of today, and the new name of each old one."""
     changed: dict[str, str] = {}
     problem = _flat(settings.problem, changed)
     return Settings(problem, {name: _flat(one, changed) for name, one in settings.controllers.items()}), changed
 
 
 def new_metrics(expected: Expected) -> tuple[Expected, dict[str, str]]:
-    """Return what is expected of a controller with the names of today, and what each old name has become."""
+    """Return the expectations of a controller with the names of today, and the new name of each old one."""
     changed = {k: METRICS[k] for k in (*expected.metrics, *expected.not_compared) if k in METRICS}
     metrics = {METRICS.get(k, k): one for k, one in expected.metrics.items()}
     skipped = {METRICS.get(k, k): why for k, why in expected.not_compared.items()}
@@ -70,7 +70,7 @@ def _flat(flat: Mapping[str, Any], changed: dict[str, str]) -> dict[str, Any]:
 
 
 def _without_entry(key: str) -> str:
-    """The setting without the entry inside it, so that one rename is told once: 'cost.correction'."""
+    """The setting without the entry inside it, so that one rename is reported once: 'cost.correction'."""
     parts = key.split(".")
     old = {"nominal", "replanning", "bend", "hessian", "correction", "deviation", "terminal_cost", "terminal"}
     last = max(k for k, part in enumerate(parts) if part in old)

@@ -1,4 +1,4 @@
-"""A check on the terminal."""
+"""The output of a check on the terminal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,12 @@ _STYLES = {"holds": "", "better": "bold green", "worse": "bold red"}
 
 
 def show_check(outline: Outline, every: bool) -> None:
-    """Print a table and a sentence for every problem; of the metrics that hold the rms errors, or `every` one."""
+    """Print a table and a sentence for every problem.
+
+    Args:
+        outline: the check.
+        every: whether to print every metric, and not only those that changed and the rms errors.
+    """
     console = Console()
     for section in outline.sections:
         lines = [line for line in section.lines if every or line.in_summary]
@@ -34,7 +39,7 @@ def show_check(outline: Outline, every: bool) -> None:
 
 
 def show_baseline(baseline: Baseline, path: str) -> None:
-    """Print what was accepted and how wide its bands are."""
+    """Print the metrics of an accepted baseline with their bands; only rms errors and metrics with loose bands."""
     console = Console()
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=Text(f"{clean(baseline.problem)}, baseline"))
     for head in ("controller", "metric", "value", "band", "made of"):
@@ -53,12 +58,12 @@ def show_baseline(baseline: Baseline, path: str) -> None:
             _say(console, f"not compared: {clean(name)}, {clean(metric)} ({clean(why)})")
     console.print(table)
     if loose:
-        _say(console, f"{len(loose)} bands are wider than half their value and hardly notice a change")
+        _say(console, f"{len(loose)} bands are wider than half their value, so that most changes stay inside")
     _say(console, f"wrote {clean(path)}")
 
 
 def _source(metric: Metric) -> str:
-    """What the band is made of, where that is more than the least width."""
+    """The source of variants with the largest spread, or that the band has its least width."""
     if FACTOR * metric.widest < _MOSTLY * metric.band:
         return "least width"
     return max(metric.spread, key=lambda s: metric.spread[s])

@@ -1,8 +1,8 @@
-"""What a result may depend on without having changed: seed, rounding, and the steps of the simulated plant.
+"""Variants, under which a result counts as the same: seed, rounding, and the steps of the simulated plant.
 
-`accept` measures every controller under all of these; the spread of the results is what bands are made of. C compiled at
-two levels may agree to the last digit, which says nothing about another machine, so rounding is also tried directly: the first
-state and the exact parameters move by 1e-14 of themselves.
+`accept` measures every controller under all variants; the bands come from the spread of the results. C compiled at two levels
+may agree to the last digit on this machine and not on another one. Rounding is therefore also tried directly: the first state and
+the exact parameters change by the factor 1 + 1e-14.
 """
 
 from __future__ import annotations
@@ -25,8 +25,14 @@ _NUDGE = 1e-14  # some tens of rounding errors
 class Variant:
     """One way to run a problem that leaves its settings alone.
 
-    source: which kind of spread it belongs to. name: in words. nudge: relative change of first state and exact parameters.
-    finer: how many times more integrator steps.
+    Args:
+        source: source of spread to which it belongs.
+        name: its name in words.
+        seed: seed of the run.
+        compiled: whether the run uses compiled C.
+        flags: flags of the compiler.
+        nudge: relative change of the first state and the exact parameters.
+        finer: factor of the number of integrator steps.
     """
 
     source: str
@@ -39,7 +45,7 @@ class Variant:
 
     @property
     def plans(self) -> bool:
-        """Whether open-loop plans can differ here: they are solved in the virtual machine, without noise."""
+        """Whether open-loop plans can differ in this variant: they are solved in the virtual machine, without noise."""
         return self.source == NOMINAL or self.nudge > 0
 
     def applied(self, problem: Problem) -> Problem:
@@ -56,27 +62,29 @@ class Variant:
 
 
 def nominal(seed: int, compiled: bool) -> Variant:
-    """The variant that `check` measures."""
+    """Return the variant that `check` measures."""
     return Variant(NOMINAL, "nominal", seed, compiled)
 
 
 def variants(problem: Problem, *, seed: int, seeds: int, compiled: bool) -> list[Variant]:
     """Return the nominal variant and all others that can differ from it; without noise there is one seed only."""
-    found = [nominal(seed, compiled)]
+    all_variants = [nominal(seed, compiled)]
     if _is_random(problem):
-        found += [Variant(SEEDS, f"seed {seed + k}", seed + k, compiled) for k in range(1, seeds)]
+        all_variants += [Variant(SEEDS, f"seed {seed + k}", seed + k, compiled) for k in range(1, seeds)]
     if compiled and find_compiler():
-        found.append(Variant(ROUNDING, "virtual machine", seed, False))
-        found.append(Variant(ROUNDING, "compiled -O0", seed, True, flags=("-O0",)))
-    found.append(Variant(ROUNDING, f"start and exact parameters moved by {_NUDGE:g}", seed, compiled, nudge=_NUDGE))
+        all_variants.append(Variant(ROUNDING, "virtual machine", seed, False))
+        all_variants.append(Variant(ROUNDING, "compiled -O0", seed, True, flags=("-O0",)))
+    all_variants.append(
+        Variant(ROUNDING, f"start and exact parameters moved by {_NUDGE:g}", seed, compiled, nudge=_NUDGE)
+    )
     if problem.integrator.finer(2):
-        found.append(Variant(INTEGRATOR, "twice the integrator steps", seed, compiled, finer=2))
-    return found
+        all_variants.append(Variant(INTEGRATOR, "twice the integrator steps", seed, compiled, finer=2))
+    return all_variants
 
 
-def names_by_source(chosen: Sequence[Variant]) -> dict[str, list[str]]:
-    """Return what was varied, in words."""
-    return {source: [v.name for v in chosen if v.source == source] for source in SOURCES}
+def names_by_source(all_variants: Sequence[Variant]) -> dict[str, list[str]]:
+    """Return the names of the variants by their source."""
+    return {source: [v.name for v in all_variants if v.source == source] for source in SOURCES}
 
 
 def _is_random(problem: Problem) -> bool:

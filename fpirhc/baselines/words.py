@@ -1,4 +1,4 @@
-"""Texts that all outputs of a check share: numbers, verdicts, and names that nobody can hide commands in."""
+"""Texts that all outputs of a check share: numbers, verdicts, and names that cannot hide commands."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ _UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")  # control, format, surroga
 
 
 def clean(text: str) -> str:
-    """The text on one line without control characters; a '::' could be read as a command by a hosted CI."""
+    """Return the text on one line without control characters and without '::', which a hosted CI could read as a command."""
     seen = "".join("\ufffd" if unicodedata.category(c) in _UNSEEN else c for c in text.replace("\n", " "))
     return seen.replace("::", ": :")
 
 
 def number(value: Number | None) -> str:
-    """A value as it stands in a table."""
+    """Return a value as text for a table."""
     if value is None:
         return "-"
     return clean(value) if isinstance(value, str) else f"{value:.7g}"
 
 
 def cells(row: Row) -> tuple[str, ...]:
-    """The entries of one row, in the order of HEADS."""
+    """Return the entries of one row, in the order of HEADS."""
     band = "exact" if row.band is None else f"\u00b1 {row.band:.2g}"
     return clean(row.controller), clean(row.metric), number(row.old), number(row.new), band, row.verdict
 
 
 def headline(judgement: Judgement) -> str:
-    """One sentence about a problem."""
+    """Return one sentence about a problem."""
     name = clean(judgement.problem)
     if judgement.broken:
         return f"{name}: cannot be run"
@@ -47,18 +47,18 @@ def headline(judgement: Judgement) -> str:
 
 
 def remarks(judgement: Judgement) -> list[str]:
-    """Everything about a problem that is no row: why it cannot be judged, why runs ended, and what to do."""
-    said = [clean(text) for text in (judgement.broken, *judgement.unusable, *judgement.notes) if text]
+    """Return everything about a problem that is no row: why it cannot be judged, why runs ended, and what to do."""
+    texts = [clean(text) for text in (judgement.broken, *judgement.unusable, *judgement.notes) if text]
     if judgement.changed or any(text.startswith("stale") for text in judgement.unusable):
-        said.append(
+        texts.append(
             f"baseline of {clean(judgement.date)}: {clean(judgement.reason)}. If the new numbers are right: "
             "fpirhc accept PROBLEM --reason '...'"
         )
-    return said
+    return texts
 
 
 def sentence(row: Row) -> str:
-    """One comparison as a line of plain text."""
+    """Return one comparison as a line of plain text."""
     controller, metric, old, new, band, verdict = cells(row)
     within = "" if row.metric == OUTCOME else f" ({band})"
     return f"{controller}: {metric} was {old}, is {new}{within}: {verdict}"
@@ -68,7 +68,7 @@ def check_replaceable(path: Path, mark: str) -> None:
     """Raise unless `path` is free or holds an earlier report: a check overwrites nothing else.
 
     Raises:
-        OutputError: something else is there, or the folder is not.
+        OutputError: the path holds something else, or its folder does not exist.
     """
     if not path.parent.is_dir():
         raise OutputError(f"cannot write to '{path}': there is no folder '{path.parent}'")

@@ -1,4 +1,4 @@
-"""Finds the commands: every module of `fpirhc.cli.verbs`, and entry points `fpirhc.verbs` of other packages."""
+"""The commands: every module of `fpirhc.cli.verbs`, and entry points `fpirhc.verbs` of other packages."""
 
 from __future__ import annotations
 
@@ -18,7 +18,13 @@ GROUP = "fpirhc.verbs"
 
 @dataclass(frozen=True)
 class Known:
-    """A command that exists: its name, its line in `fpirhc --help`, and a function that loads it."""
+    """A command that exists.
+
+    Args:
+        name: its name.
+        summary: its line in `fpirhc --help`.
+        load: function that loads it.
+    """
 
     name: str
     summary: str
@@ -27,13 +33,13 @@ class Known:
 
 @cache
 def shipped() -> dict[str, Verb]:
-    """Return the commands of this package by name; a module of the package `verbs` is one, in its value `VERB`."""
+    """Return the commands of this package by name: the value `VERB` of every module of the package `verbs`."""
     verbs = [import_module(f"{package.__name__}.{m.name}").VERB for m in iter_modules(package.__path__)]
     return {verb.name: verb for verb in sorted(verbs, key=lambda verb: verb.name)}
 
 
 def known() -> dict[str, Known]:
-    """Return all commands by name. One of another package is not loaded before it is used, and replaces none of ours."""
+    """Return all commands by name; those of other packages are loaded at their first use and replace none of this package."""
     verbs = {verb.name: Known(verb.name, verb.summary, partial(_itself, verb)) for verb in shipped().values()}
     for point in entry_points(group=GROUP):
         if point.name in verbs:

@@ -1,4 +1,4 @@
-"""The exit codes of the command line: what the code returns, and what every `--help`, README and the docs print."""
+"""The exit codes of the command line, with the texts of every `--help`, README and the docs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 
 class ExitCode(IntEnum):
-    """What a command returns to the shell; `meaning` says it in words."""
+    """The code that a command returns to the shell; `meaning` is its meaning in words."""
 
     meaning: str
 

@@ -38,7 +38,7 @@ def _run(words: list[str]) -> ExitCode:
     name, *rest = words
     if name in former_names():
         new = former_names()[name]
-        print(f"fpirhc: the command '{name}' is now '{new}'; the old name goes with the next version", file=sys.stderr)
+        print(f"fpirhc: the command '{name}' is now '{new}'; the next version removes the old name", file=sys.stderr)
         name = new
     if name not in verbs:
         from fpirhc.errors import InvalidName, nearest

@@ -27,7 +27,7 @@ def add_controllers(parser: Parser, default: str = "all") -> None:
 
 
 def add_optimisers(parser: Parser) -> None:
-    """--optimisers NAME ...; the names are those that the study knows."""
+    """--optimisers NAME ...; the names are those of `optimiser_choices`."""
     from fpirhc.studies.comparison.optimiser_choices import optimiser_choices
 
     names = f"{', '.join(optimiser_choices())}, or all"
@@ -87,7 +87,7 @@ class Former(argparse.Action):
         values: Any,
         option: str | None = None,
     ) -> None:
-        """Store the value where the new option does."""
-        notice = f"fpirhc: the option {option} is now {self.new}; the old name goes with the next version"
+        """Store the value as the new option does."""
+        notice = f"fpirhc: the option {option} is now {self.new}; the next version removes the old name"
         print(notice, file=sys.stderr)
         setattr(namespace, self.dest, values)

@@ -1,15 +1,22 @@
-"""Where a command writes its results."""
+"""The folders to which commands write their results."""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
 def results_folder(wanted: str | None, *default: str) -> Path:
-    """Return the folder for results, `results/DEFAULT...` when none is wanted, made before anything runs.
+    """Return the folder for results, created before anything runs.
+
+    Args:
+        wanted: path of the folder; None: `results/DEFAULT...`.
+        default: parts of the default path.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the folder cannot be written.
     """
     return output_folder(Path(wanted) if wanted else Path("results", *default))
 
@@ -18,7 +25,7 @@ def output_folder(folder: Path) -> Path:
     """Create a folder for results before anything runs, so that a wrong path fails at once.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the folder cannot be written.
     """
     from fpirhc.errors import OutputError
 
@@ -32,3 +39,13 @@ def output_folder(folder: Path) -> Path:
             f"cannot write to the folder '{folder}': {error.strerror}; choose another with --out"
         ) from None
     return folder
+
+
+@contextmanager
+def resumable(ledger: Path) -> Iterator[None]:
+    """Print, after an interruption from the keyboard, where the finished results are."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print(f"fpirhc: finished results are kept in {ledger}; the same command continues from them", file=sys.stderr)
+        raise

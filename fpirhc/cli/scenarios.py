@@ -1,18 +1,26 @@
-"""Paired scenarios: the part of `fpirhc compare` that `--scenarios N` asks for."""
+"""Paired scenarios: the part of `fpirhc compare` for `--scenarios N`."""
 
 from __future__ import annotations
 
 import argparse
 import shlex
-import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fpirhc.cli.exit_codes import ExitCode
 from fpirhc.cli.options import add_mismatch, add_processes, add_scenarios
-from fpirhc.cli.output import results_folder
+from fpirhc.cli.output import results_folder, resumable
+
+if TYPE_CHECKING:
+    from fpirhc.problem_files.problem_file import Task
+    from fpirhc.studies.scenarios.scenario_study import ScenarioComparison
 
 EXAMPLES = (
     ("fpirhc compare two_mass --scenarios 100 --mismatch 20", "exact parameters within 20 % of the problem's"),
-    ("fpirhc compare two_mass --scenarios 400 --mismatch 20 --processes 2", "goes on from the 100 that are there"),
+    (
+        "fpirhc compare two_mass --scenarios 400 --mismatch 20 --processes 2",
+        "continues after the 100 that are finished",
+    ),
     (
         "fpirhc compare my_arm.py --scenarios 50 --mismatch 30 --controllers RHC RHC+FPI --baseline RHC --out results/arm",
         "two controllers, compared with the first",
@@ -21,7 +29,7 @@ EXAMPLES = (
 NOTES = """
 Scenario k of a seed is the same for every controller, whatever the number of scenarios and processes. Every exact parameter
 is multiplied by a factor of its own, log-uniform between 1 - PERCENT/100 and 1 + PERCENT/100. Finished scenarios are kept in
-scenarios.jsonl in the output folder; after an interruption or a crash the same command goes on from there. A folder that
+scenarios.jsonl in the output folder; after an interruption or a crash the same command continues from them. A folder that
 holds results of another problem, seed, mismatch or version is refused (exit code 3).
 """
 
@@ -37,10 +45,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def check_options(options: argparse.Namespace) -> None:
-    """Raise if options of scenarios are given without scenarios, or with what they cannot be combined with.
+    """Check that options of scenarios stand beside `--scenarios`, and not beside `--optimisers`.
 
     Raises:
-        InvalidValue: with what to give instead.
+        InvalidValue: options that cannot be combined; the message names the remedy.
     """
     from fpirhc.errors import InvalidValue
 
@@ -59,46 +67,46 @@ def run(options: argparse.Namespace) -> ExitCode:
     """Run the scenarios, write report.html, mismatch.png and scenarios.jsonl, and print the comparison."""
     from fpirhc.problem_files.problem_file import load_problem
     from fpirhc.report.figures import save_figure
-    from fpirhc.report.scenarios import mismatch_figure, show_scenarios, write_scenarios
+    from fpirhc.report.scenarios import mismatch_figure, scenarios_json, show_scenarios, write_scenarios
+
+    task = load_problem(options.problem)
+    kind = "tuned_scenarios" if options.tuned else "scenarios"
+    name = f"{kind}_{options.mismatch or 0:g}percent_seed{options.seed}"
+    folder = results_folder(options.out, task.name, name)
+    comparison = _compared(options, task, folder)
+    report = folder / "report.html"
+    write_scenarios(comparison, report)
+    if comparison.summaries:
+        save_figure(mismatch_figure(comparison), folder / "mismatch.png")
+    if options.json:
+        print(scenarios_json(comparison))
+    else:
+        show_scenarios(comparison, report)
+    return ExitCode.FINISHED if comparison.summaries else ExitCode.BAD_INPUT
+
+
+def _compared(options: argparse.Namespace, task: Task, folder: Path) -> ScenarioComparison:
     from fpirhc.report.terminal import progress_bars
     from fpirhc.studies.scenarios.scenario_study import LEDGER, compare_scenarios
     from fpirhc.studies.tuning.tuned_file import read_tuned
 
-    task = load_problem(options.problem)
     tuned = read_tuned(options.tuned, task) if options.tuned else None
-    percent = options.mismatch or 0.0
-    kind = "tuned_scenarios" if tuned else "scenarios"
-    folder = results_folder(options.out, task.name, f"{kind}_{percent:g}percent_seed{options.seed}")
-    try:
-        with progress_bars() as progress:
-            comparison = compare_scenarios(
-                task,
-                count=options.scenarios,
-                percent=percent,
-                seed=options.seed,
-                folder=folder,
-                controllers=options.controllers,
-                baseline=options.baseline,
-                processes=options.processes,
-                tuned=tuned.values if tuned else None,
-                tuning=tuned.notes if tuned else None,
-                compiled=not options.no_compile,
-                command=_command(options),
-                progress=progress,
-            )
-    except KeyboardInterrupt:
-        print(f"fpirhc: what is finished is kept in {folder / LEDGER}; the same command goes on", file=sys.stderr)
-        raise
-    write_scenarios(comparison, folder / "report.html")
-    if comparison.summaries:
-        save_figure(mismatch_figure(comparison), folder / "mismatch.png")
-    if options.json:
-        from fpirhc.report.scenarios import scenarios_json
-
-        print(scenarios_json(comparison))
-    else:
-        show_scenarios(comparison, folder / "report.html")
-    return ExitCode.FINISHED if comparison.summaries else ExitCode.BAD_INPUT
+    with resumable(folder / LEDGER), progress_bars() as progress:
+        return compare_scenarios(
+            task,
+            count=options.scenarios,
+            percent=options.mismatch or 0.0,
+            seed=options.seed,
+            folder=folder,
+            controllers=options.controllers,
+            baseline=options.baseline,
+            processes=options.processes,
+            tuned=tuned.values if tuned else None,
+            tuning=tuned.notes if tuned else None,
+            compiled=not options.no_compile,
+            command=_command(options),
+            progress=progress,
+        )
 
 
 def _command(options: argparse.Namespace) -> str:

@@ -13,13 +13,15 @@ from fpirhc.cli.exit_codes import OF_EVERY_VERB, ExitCode, table
 class Verb:
     """One command of the command line.
 
-    Parameters:
-        name: word after `fpirhc`. summary: one line for `fpirhc --help`.
-        add: adds arguments and options to a parser; it may import what the choices are discovered in.
+    Args:
+        name: word after `fpirhc`.
+        summary: one line for `fpirhc --help`.
+        add: adds arguments and options to a parser; it may import modules that it needs for their choices.
         run: does the work with the options and returns an exit code; heavy libraries are imported here.
-        codes: exit codes that this command returns, in its own words; `OF_EVERY_VERB` need not be repeated.
+        codes: exit codes that this command returns, with their meanings; those of `OF_EVERY_VERB` are added.
         examples: pairs of a command line and a remark; the first one also stands in `fpirhc --help`.
-        notes: paragraphs below the examples. former: earlier names, accepted for one version with a notice.
+        notes: paragraphs below the examples.
+        former: earlier names, accepted for one version with a notice.
     """
 
     name: str
@@ -51,7 +53,7 @@ class Verb:
 
 
 def aligned(examples: tuple[tuple[str, str], ...]) -> str:
-    """Return examples one per line, the remarks below each other; a remark that finds no room has a line of its own."""
+    """Return examples one per line, with aligned remarks; the remark of a long example has a line of its own."""
     room = max((len(line) for line, _ in examples if len(line) <= _WIDEST), default=0)
     lines = []
     for line, remark in examples:

@@ -1,4 +1,4 @@
-"""Laws that every member of a family keeps, to be tried on a class of one's own in one line.
+"""Laws that every member of a family keeps; one line tries them on a user's class.
 
     check_deformation(MyMap(gain=-0.5), seed=1)
     check_tracking(MyLaw(rate=6.0), seed=1)
@@ -6,8 +6,8 @@
     check_controller(MyController(...), seed=1)
     check_plant(my_plant, seed=1)
 
-Each raises one AssertionError for the first law that is broken, with the numbers; nothing is returned. The laws themselves are
-the tuples `LAWS` of the modules, one module per family.
+Each raises one AssertionError for the first law that is broken, with the numbers, and returns nothing. The laws are the tuples
+`LAWS` of the modules, one module per family.
 """
 
 from fpirhc.conformance.controller import check_controller

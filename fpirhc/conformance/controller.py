@@ -29,7 +29,7 @@ from fpirhc.task.reference import Trajectory
 Array = npt.NDArray[Any]
 
 _SAME = 1e-9  # relative difference of commands that counts as none
-_TIGHT = 0.5  # share of the largest command that is left by the limits of the law on limits
+_TIGHT = 0.5  # limits in the law on limits, as a share of the largest command
 _STEPS = 8  # cycles before a bad measurement, and after it
 
 
@@ -38,11 +38,13 @@ def check_controller(
 ) -> None:
     """Check every law on a controller.
 
-    Parameters:
-        seed: of the noise, and of what is drawn.
-        problem: what it controls; None: two masses between springs, with limits, a horizon and a cost, for 2 s.
+    Args:
+        controller: the controller.
+        seed: of the noise and of all draws.
+        problem: the problem that it controls; None: two masses between springs, with limits, a horizon and a cost, for 2 s.
         left: share of the largest first error that may be left in the last quarter of a run with the exact model.
-        compiled: also compare with compiled C, which costs a second or more the first time; without a compiler it is skipped.
+        compiled: whether to compare with compiled C too, which costs a second or more the first time; skipped without a
+            compiler.
 
     Raises:
         AssertionError: the first law that does not hold, in one sentence.
@@ -52,7 +54,7 @@ def check_controller(
 
 
 def two_masses() -> Problem:
-    """Two masses between springs with a model that is wrong in mass and stiffness, for 2 s."""
+    """Return two masses between springs with a model that is wrong in mass and stiffness, for 2 s."""
     plant = Plant(
         coordinates={"a": "m", "b": "m"},
         inputs={"Fa": "N", "Fb": "N"},
@@ -109,23 +111,23 @@ def frozen_value(trial: _Trial, generator: np.random.Generator) -> None:  # noqa
 
 
 def facts_hold(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """What it tells of itself is so: what it wraps can be exchanged, no automatic setting is left, a planner plans."""
+    """The facts of a controller hold: its inner controller can be exchanged, no automatic setting is left, a planner plans."""
     ready = checked(trial.problem, trial.controller)
     hold(
         not ready.deformation.automatic,
-        f"resolved, its deformation still has {ready.deformation.automatic} to be chosen",
+        f"after resolved() its deformation still has the automatic settings {ready.deformation.automatic}",
     )
     if ready.inner is not None:
         same = ready.around(ready.inner)
-        hold(describe(same) == describe(ready), "around its own inner controller it is described otherwise")
+        hold(describe(same) == describe(ready), "around its own inner controller it has another description")
     planner = ready.planner
     hold(
         (planner is not None) == ("solve" in trial.stepper.signals),
-        f"its planner is {planner}, but its cycle says otherwise",
+        f"its planner is {planner}, and its cycle has {'a' if planner is None else 'no'} signal 'solve'",
     )
     if planner is not None:
         same = ready.with_optimiser(planner.optimiser)
-        hold(describe(same) == describe(ready), "with its own optimiser it is described otherwise")
+        hold(describe(same) == describe(ready), "with its own optimiser it has another description")
     for read, name in ready.feeds.items():
         seen = name.startswith("_") or name in trial.stepper.signals
         hold(seen, f"its inner controller reads '{name}' for '{read}', which is no signal of the run")
@@ -145,13 +147,13 @@ def writes_a_command_and_a_status(trial: _Trial, generator: np.random.Generator)
 
 
 def exact_model_tracks(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """With an exact model, ideal sensors and nothing that disturbs, the error of every judged coordinate goes to zero."""
+    """With an exact model, ideal sensors and no disturbance, the error of every judged coordinate goes to zero."""
     problem = _exact(trial.problem)
     run = trial.simulated(problem)
     hold(run.stop is None, f"with the exact model the run ends early: {run.stop}")
     errors = np.abs(run["true_error"])
     first, late = float(errors[0].max()), errors[-run.cycles // 4 :].max(axis=0)
-    hold(first > 0, "the problem starts on its reference, so nothing can be told; start elsewhere")
+    hold(first > 0, "the problem starts on its reference, so there is no error to decay; start elsewhere")
     for name, rest in zip(problem.judged_names, late, strict=True):
         hold(
             within(rest, trial.left * first),
@@ -196,31 +198,31 @@ def _replayed(stepper: Stepper, run: Run) -> Array:
 
 
 def same_arguments_same_command(trial: _Trial, generator: np.random.Generator) -> None:
-    """A cycle depends on its arguments alone: called twice with them, it answers the same."""
+    """A cycle depends on its arguments alone: two calls with the same arguments give the same result."""
     run, stepper = trial.run, trial.stepper
     memory = stepper.start()
     for k in generator.integers(0, run.cycles, size=5):
         arguments = float(run.time[k]), run["state"][k], run["realised"][k]
-        one, following = stepper.step(*arguments, memory)
-        other, again = stepper.step(*arguments, memory)
+        one, next_memory = stepper.step(*arguments, memory)
+        other, other_memory = stepper.step(*arguments, memory)
         hold(
-            np.array_equal(one, other, equal_nan=True) and np.array_equal(following, again, equal_nan=True),
-            f"called twice with the same arguments it answers {one} and then {other}",
+            np.array_equal(one, other, equal_nan=True) and np.array_equal(next_memory, other_memory, equal_nan=True),
+            f"two calls with the same arguments give {one} and {other}",
         )
-        memory = following
+        memory = next_memory
 
 
 def command_keeps_the_limits(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """No command leaves the limits of the inputs, also where they leave it half of what it would like."""
-    plant, wished = trial.problem.plant, trial.run["command"]
-    middle, most = 0.5 * (wished.max(axis=0) + wished.min(axis=0)), 0.5 * np.ptp(wished, axis=0)
+    """No command leaves the limits of the inputs, also where they are half of the commands without limits."""
+    plant, commands = trial.problem.plant, trial.run["command"]
+    middle, most = 0.5 * (commands.max(axis=0) + commands.min(axis=0)), 0.5 * np.ptp(commands, axis=0)
     inputs = {
         name: (float(middle[k] - _TIGHT * most[k]), float(middle[k] + _TIGHT * most[k]))
         for k, name in enumerate(plant.inputs)
     }
     for problem in (trial.problem, replace(trial.problem, limits=replace(trial.problem.limits, inputs=inputs))):
         lower, upper = problem.limits.input_bounds(plant)
-        # A weak actuator may lose the plant: what counts is every command up to there.
+        # A weak actuator may lose the plant: every command up to there counts.
         run = trial.simulated(problem)
         outside = np.maximum(lower - run["command"], run["command"] - upper)
         worst = np.unravel_index(int(np.argmax(outside)), outside.shape)
@@ -231,13 +233,13 @@ def command_keeps_the_limits(trial: _Trial, generator: np.random.Generator) -> N
             f"({lower[worst[1]]:g}, {upper[worst[1]]:g})",
         )
         clipped = np.isclose(run["command"], lower).any(axis=1) | np.isclose(run["command"], upper).any(axis=1)
-        silent = clipped & (run["clipped"][:, 0] < 0.5) & ("command_unclipped" in run.layout)
-        if silent.any():
-            at = int(np.argmax(silent))
+        unreported = clipped & (run["clipped"][:, 0] < 0.5) & ("command_unclipped" in run.layout)
+        if unreported.any():
+            at = int(np.argmax(unreported))
             excess = np.abs(run["command_unclipped"][at] - run["command"][at]).max()
             hold(
                 within(excess, _SAME * (1 + np.abs(run["command"][at]).max())),
-                f"it clips at t = {run.time[at]:g} s without saying so",
+                f"it clips at t = {run.time[at]:g} s, and its signal 'clipped' is 0",
             )
 
 

@@ -25,10 +25,14 @@ _TRIALS = 5
 def check_deformation(
     deformation: Deformation, *, elements: Sequence[str] = ("q1", "q2"), seed: int, amplitude: float = 1.0
 ) -> None:
-    """Check every law on a deformation that iterates (Identity, which does not, is no candidate).
+    """Check every law on a deformation that iterates; Identity does not iterate.
 
-    Parameters: `elements` names the coordinates, `seed` draws the vectors, `amplitude` is the size of typical responses
-    in their unit (the effective gain is exact near zero request, so laws about it use requests far below it).
+    Args:
+        deformation: the deformation.
+        elements: names of the coordinates.
+        seed: of all draws.
+        amplitude: size of typical responses in their unit. The effective gain is exact near zero request, so that laws
+            about it use much smaller requests.
 
     Raises:
         AssertionError: the first law that does not hold, in one sentence.
@@ -65,14 +69,14 @@ class _Trial:
     def _function(self, kind: Any) -> ca.Function:
         request, response, desired = (kind.sym(name, self.size) for name in ("request", "response", "desired"))
         memory = kind.sym("memory", self.layout.size)
-        deformed, following = self.deformation.step(request, response, desired, self.layout.split(memory))
+        deformed, next_memory = self.deformation.step(request, response, desired, self.layout.split(memory))
         hold(
-            set(following) == set(self.layout.names),
-            f"step remembers {sorted(following)} but memory() lays out {sorted(self.layout.names)}",
+            set(next_memory) == set(self.layout.names),
+            f"step remembers {sorted(next_memory)} but memory() lays out {sorted(self.layout.names)}",
         )
         column = kind(deformed)
         hold(column.shape == (self.size, 1), f"step gives a request of shape {column.shape}, expected ({self.size}, 1)")
-        outputs = [ca.densify(column), ca.densify(kind(self.layout.join(following)))]
+        outputs = [ca.densify(column), ca.densify(kind(self.layout.join(next_memory)))]
         hold(outputs[1].numel() == self.layout.size, "step remembers vectors of another size than memory() lays out")
         return ca.Function("map", [request, response, desired, memory], outputs)
 
@@ -92,8 +96,8 @@ def fixed_point_stays(trial: _Trial, generator: np.random.Generator) -> None:
     """A response that is the desired one leaves the request alone, to rounding."""
     for _ in range(_TRIALS):
         request, desired = trial.vector(generator), trial.vector(generator)
-        moved = np.abs(trial(request, desired, desired) - request).max()
-        hold(moved <= 1e-12 * trial.amplitude, f"at response = desired the request moved by {moved:.3g} instead of 0")
+        step = np.abs(trial(request, desired, desired) - request).max()
+        hold(step <= 1e-12 * trial.amplitude, f"at response = desired the request moved by {step:.3g} instead of 0")
 
 
 def derivatives_are_finite(trial: _Trial, generator: np.random.Generator) -> None:
@@ -132,7 +136,7 @@ def gain_can_be_set(trial: _Trial, generator: np.random.Generator) -> None:
 
 
 def contraction_is_predicted(trial: _Trial, generator: np.random.Generator) -> None:
-    """On linear plants with J similar to a positive definite matrix the error shrinks as max|1 - a lambda| says."""
+    """On linear plants with J similar to a positive definite matrix the error shrinks by max|1 - a lambda|."""
     for _ in range(_TRIALS):
         mass, model = (_positive_definite(generator, trial.size) for _ in range(2))
         plant = np.linalg.solve(mass, model)
@@ -169,8 +173,8 @@ def step_is_bounded(trial: _Trial, generator: np.random.Generator) -> None:
     for size in np.logspace(-3, 6, 50):
         request, desired = trial.vector(generator), trial.vector(generator)
         response = desired + size * trial.vector(generator)
-        moved = float(np.linalg.norm(trial(request, response, desired) - request))
-        hold(moved <= bound * (1 + 1e-9), f"the request moved by {moved:.6g}, above largest_step() = {bound:.6g}")
+        step = float(np.linalg.norm(trial(request, response, desired) - request))
+        hold(step <= bound * (1 + 1e-9), f"the request moved by {step:.6g}, above largest_step() = {bound:.6g}")
 
 
 def graphs_agree(trial: _Trial, generator: np.random.Generator) -> None:
@@ -185,7 +189,7 @@ def graphs_agree(trial: _Trial, generator: np.random.Generator) -> None:
 
 
 def nan_shows(trial: _Trial, generator: np.random.Generator) -> None:
-    """A response that is not a number gives a request that is not one either, so that nobody acts on it."""
+    """A response that is not a number gives a request that is not one either, so that it never acts."""
     for place in range(trial.size):
         response = trial.vector(generator)
         response[place] = np.nan
@@ -219,9 +223,9 @@ def _measured_factor(trial: _Trial, plant: Array, mass: Array, generator: np.ran
     request, logarithms = trial.vector(generator), []
     for _ in range(400):
         request *= small / np.sqrt(request @ mass @ request)
-        following = trial(request, plant @ request, zero)
-        logarithms.append(0.5 * np.log(following @ mass @ following) - np.log(small))
-        request = following
+        next_request = trial(request, plant @ request, zero)
+        logarithms.append(0.5 * np.log(next_request @ mass @ next_request) - np.log(small))
+        request = next_request
     later = logarithms[200:]
     hold(all(b >= a - 1e-6 for a, b in pairwise(later)), "the shrinking per cycle does not settle on a linear plant")
     return float(np.exp(np.mean(later)))

@@ -1,8 +1,8 @@
-"""Laws about what a deformation tells of itself: the facts are compared with what the map does.
+"""Laws about the facts of a deformation: they are compared with the map itself.
 
-The map is run without a plant: desired response zero, and response errors as they are given, so that everything it remembers
-goes through many cycles. An impulse of the error, in one of two runs that are otherwise the same, shows the gain, the filter and
-the pairing that the map has at that time.
+The map runs without a plant, with zero desired response and prescribed response errors, so that its memory goes through many
+cycles. An impulse of the error in one of two runs that are otherwise the same shows the gain, the filter and the pairing of the
+map at that time.
 """
 
 from __future__ import annotations
@@ -29,9 +29,12 @@ _SAME = 1e-2  # relative
 
 
 def check_deformation_facts(deformation: Deformation, *, seed: int, amplitude: float = 1.0) -> None:
-    """Check what a deformation tells of itself; maps that pair with earlier requests keep these laws too.
+    """Check the facts of a deformation; maps that pair with earlier requests keep these laws too.
 
-    Parameters: `seed` draws the vectors, `amplitude` is the size of typical responses in their unit.
+    Args:
+        deformation: the deformation.
+        seed: of all draws.
+        amplitude: size of typical responses in their unit.
 
     Raises:
         AssertionError: the first law that does not hold, in one sentence.
@@ -56,9 +59,9 @@ class _Cycles:
         settled = self.deformation.suited(Demand(self.amplitude, sudden=True))
         request, response, desired = (ca.SX.sym(name) for name in ("request", "response", "desired"))
         memory = ca.SX.sym("memory", self.layout.size)
-        deformed, following = settled.step(request, response, desired, self.layout.split(memory))
+        deformed, next_memory = settled.step(request, response, desired, self.layout.split(memory))
         return ca.Function(
-            "map", [request, response, desired, memory], [deformed, ca.densify(self.layout.join(following))]
+            "map", [request, response, desired, memory], [deformed, ca.densify(self.layout.join(next_memory))]
         )
 
     @cached_property
@@ -71,14 +74,14 @@ class _Cycles:
 
     def __call__(self, errors: Array) -> Array:
         """Requests after every cycle with these response errors; the first is zero."""
-        request, memory, found = 0.0, self.layout.start(), np.empty(len(errors))
+        request, memory, requests = 0.0, self.layout.start(), np.empty(len(errors))
         for k, error in enumerate(errors):
             request, memory = (v.full() for v in self.function(request, error, 0.0, memory))
-            found[k] = request.item()
-        return found
+            requests[k] = request.item()
+        return requests
 
     def impulse_response(self, history: Array) -> Array:
-        """What one error after a history of errors changes in the requests, per unit of the error."""
+        """Change of the requests by one error after a history of errors, per unit of the error."""
         size = _SMALL * self.amplitude
         calm = np.concatenate([history, np.zeros(_SHOWN + self.wait)])
         struck = calm.copy()
@@ -90,7 +93,7 @@ class _Cycles:
 
 
 def inner_can_be_exchanged(trial: _Cycles, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """`around` puts another map where `inner` is: around its own inner map a wrapper is what it was."""
+    """`around` replaces the inner map: around its own inner map a wrapper stays the same."""
     deformation = trial.deformation
     if deformation.inner is not None:
         same = deformation.around(deformation.inner)
@@ -102,17 +105,17 @@ def automatic_settings_are_chosen(trial: _Cycles, generator: np.random.Generator
     deformation = trial.deformation
     for sudden in (False, True):
         change = float(generator.uniform(2.0, 20.0))
-        chosen = deformation.suited(Demand(change, sudden))
-        hold(not chosen.automatic, f"suited() leaves {chosen.automatic} open")
+        ready = deformation.suited(Demand(change, sudden))
+        hold(not ready.automatic, f"suited() leaves {ready.automatic} open")
         if not deformation.automatic:
-            hold(describe(chosen) == describe(deformation), f"no setting is automatic, but suited() gives {chosen}")
+            hold(describe(ready) == describe(deformation), f"no setting is automatic, but suited() gives {ready}")
         else:
-            step = chosen.largest_step()
+            step = ready.largest_step()
             hold(step >= 0.99 * change, f"suited to changes of {change:.3g} its largest step is {step:.3g}")
 
 
 def constant_map_keeps_its_gain(trial: _Cycles, generator: np.random.Generator) -> None:
-    """A map that calls itself constant answers an error the same, whatever the errors before were."""
+    """A map whose fact `constant` is true responds to an error in the same way after every history of errors."""
     if not trial.deformation.constant or not trial.deformation.adapts:
         return
     cycles = _WARM + 2 * trial.wait
@@ -124,12 +127,12 @@ def constant_map_keeps_its_gain(trial: _Cycles, generator: np.random.Generator) 
         missed = float(np.abs(other - first).max() / max(np.abs(first).max(), 1e-300))
         hold(
             missed <= _SAME,
-            f"`constant` is true, but its answer to an error changes by the share {missed:.3g} with what was before",
+            f"`constant` is true, but its response to an error changes by the share {missed:.3g} with earlier errors",
         )
 
 
 def filter_and_pairing_are_told(trial: _Cycles, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """An error changes the request at once and for good, unless `error_pole` spreads it or `pairing` repeats it."""
+    """An error changes the request at once and permanently, unless `error_pole` spreads it or `pairing` repeats it."""
     deformation = trial.deformation
     if not deformation.constant or not deformation.adapts:
         return
@@ -137,17 +140,17 @@ def filter_and_pairing_are_told(trial: _Cycles, generator: np.random.Generator) 
     pairing, pole = deformation.pairing, deformation.error_pole
     if pairing is None:
         expected = -gain * (1 - pole ** np.arange(1, answer.size + 1))
-        told = f"the pole {pole:g} and no pairing"
+        facts = f"the pole {pole:g} and no pairing"
     elif pole == 0 and pairing.uncertainty == 0 and pairing.cycles is not None and float(pairing.cycles).is_integer():
         expected = -gain * (np.arange(answer.size) % (int(pairing.cycles) + 1) == 0)
-        told = f"pairs {pairing.cycles:g} cycles apart"
+        facts = f"pairs {pairing.cycles:g} cycles apart"
     else:
         return
     missed = np.abs(answer - expected) / abs(gain)
     worst = int(np.argmax(missed))
     hold(
         bool(missed[worst] <= _SAME),
-        f"it tells {told}, but {worst} cycles after an error of one the request has changed by {answer[worst]:.4g}, not by "
+        f"its facts are {facts}, but {worst} cycles after an error of one the request has changed by {answer[worst]:.4g}, not by "
         f"{expected[worst]:.4g}",
     )
 
@@ -161,9 +164,9 @@ def reach_is_told(trial: _Cycles, generator: np.random.Generator) -> None:
     largest = 1e3 * trial.amplitude if reach is None else 1e-3 * reach.size
     for share in generator.uniform(-1, 1, size=5):
         request = float(share * largest)
-        moved = float(trial.function(request, error, 0.0, trial.layout.start())[0]) - request
-        missed = abs(moved + gain * error) / abs(gain * error)
-        what = "it tells no reach" if reach is None else f"its reach is {reach.size:.3g}"
+        step = float(trial.function(request, error, 0.0, trial.layout.start())[0]) - request
+        missed = abs(step + gain * error) / abs(gain * error)
+        what = "its reach is None" if reach is None else f"its reach is {reach.size:.3g}"
         hold(
             missed <= _SAME,
             f"{what}, but at the request {request:.3g} the step misses the gain by the share {missed:.3g}",

@@ -1,4 +1,4 @@
-"""Small horizons whose answers are known by other means, for the laws of optimisers."""
+"""Small horizons whose solutions are known by other means, for the laws of optimisers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from fpirhc.task.reference import Trajectory
 Array = npt.NDArray[Any]
 
 STAGES, STEP = 6, 0.3  # s; a short horizon of a mild cost, so that plain gradient methods converge too
-BOUND = 0.4  # N; the free plans ask for about twice as much
+BOUND = 0.4  # N; plans without bounds need about twice as much
 CORRIDOR = 0.2  # m, of the state
 _WEIGHTS = {"y": 2.0, "y'": 0.5}
 _EFFORT = 1.0
@@ -32,7 +32,13 @@ _EFFORT = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """An optimiser with the horizons that it is tried on."""
+    """An optimiser with the horizons of its laws.
+
+    Args:
+        optimiser: the optimiser.
+        tolerance: stationarity below which it calls a plan OK.
+        calls: calls within which it must solve a small problem.
+    """
 
     optimiser: Optimiser
     tolerance: float
@@ -49,7 +55,7 @@ class Trial:
         return self._task(0.0, Limits(inputs={"u": (-BOUND, BOUND)}))
 
     @cached_property
-    def bent(self) -> TrialHorizon:
+    def nonlinear(self) -> TrialHorizon:
         """A nonlinear model without limits."""
         return self._task(1.0, Limits())
 
@@ -58,13 +64,21 @@ class Trial:
         """A limit that no input can keep in the first stages."""
         return self._task(0.0, Limits(inputs={"u": (-BOUND, BOUND)}, states={"y": (-CORRIDOR, CORRIDOR)}))
 
-    def _task(self, bent: float, limits: Limits) -> TrialHorizon:
-        return TrialHorizon(self.optimiser, self.calls, _oscillator(bent), limits)
+    def _task(self, nonlinearity: float, limits: Limits) -> TrialHorizon:
+        return TrialHorizon(self.optimiser, self.calls, _oscillator(nonlinearity), limits)
 
 
 @dataclass(frozen=True, eq=False)
 class TrialPlan:
-    """What the last of some calls gave."""
+    """The result of the last of some calls.
+
+    Args:
+        state: first state.
+        inputs: inputs of the plan.
+        diagnostics: the five numbers of the optimiser.
+        memory: memory after the call.
+        calls: number of calls.
+    """
 
     state: Array
     inputs: Array
@@ -74,23 +88,30 @@ class TrialPlan:
 
     @property
     def cost(self) -> float:
-        """What was said of the plan's cost."""
+        """Cost of the plan, by the optimiser."""
         return float(self.diagnostics[0])
 
     @property
     def stationarity(self) -> float:
-        """What was said of the plan's stationarity."""
+        """Stationarity of the plan, by the optimiser."""
         return float(self.diagnostics[1])
 
     @property
     def status(self) -> Status:
-        """What was said of the plan."""
+        """Status of the plan, by the optimiser."""
         return Status(int(self.diagnostics[4]))
 
 
 @dataclass(frozen=True, eq=False)
 class TrialHorizon:
-    """One horizon with its data, what an optimiser makes of it, and what is known about it."""
+    """One horizon with its data, the functions of an optimiser for it, and its solution by other means.
+
+    Args:
+        optimiser: the optimiser.
+        calls: calls within which it must solve the horizon.
+        plant: the plant.
+        limits: the limits.
+    """
 
     optimiser: Optimiser
     calls: int
@@ -99,7 +120,7 @@ class TrialHorizon:
 
     @cached_property
     def served(self) -> bool:
-        """Whether the optimiser takes the problem; to refuse one is honest."""
+        """Whether the optimiser can serve the problem; it may refuse one."""
         try:
             self.optimiser.check(self.ocp)
         except NotSupported:
@@ -108,7 +129,7 @@ class TrialHorizon:
 
     @cached_property
     def layout(self) -> Layout:
-        """What the optimiser remembers."""
+        """Memory of the optimiser."""
         return self.optimiser.memory(self.ocp)
 
     @cached_property
@@ -138,16 +159,16 @@ class TrialHorizon:
         return self._answer(self.step, state, memory, self.data if data is None else data, 1)
 
     def solved(self, state: Array, memory: Array | None = None, most: int | None = None) -> TrialPlan:
-        """Calls of the converging step until the status is OK, at most `most` where that is given."""
+        """Calls of the converging step until the status is OK, at most `most` or else `calls` of them."""
         answer = self._answer(self.converging, state, self.layout.start() if memory is None else memory, self.data, 1)
         while answer.status in (Status.NOT_CONVERGED, Status.INFEASIBLE) and answer.calls < (most or self.calls):
             answer = self._answer(self.converging, state, answer.memory, self.data, answer.calls + 1)
         return answer
 
     def _answer(self, step: ca.Function, state: Array, memory: Array, data: Array, calls: int) -> TrialPlan:
-        given = step(state, data, self.ocp.input_lower, self.ocp.input_upper, memory)
-        inputs, said, following = (np.asarray(v.full()) for v in given)
-        return TrialPlan(state, inputs, said[:, 0], following[:, 0], calls)
+        results = step(state, data, self.ocp.input_lower, self.ocp.input_upper, memory)
+        inputs, diagnostics, next_memory = (np.asarray(v.full()) for v in results)
+        return TrialPlan(state, inputs, diagnostics[:, 0], next_memory[:, 0], calls)
 
     @cached_property
     def cost(self) -> Quadratic:
@@ -161,16 +182,16 @@ class TrialHorizon:
 
     @cached_property
     def data(self) -> Array:
-        """What its stages are given."""
-        found = stage_data(self.plant, _REST, Horizon(STAGES, STEP), self.cost)(0.0, self.plant.approximate)
-        return np.asarray(found.full())
+        """Data of the stages."""
+        data = stage_data(self.plant, _REST, Horizon(STAGES, STEP), self.cost)(0.0, self.plant.approximate)
+        return np.asarray(data.full())
 
     @cached_property
     def model(self) -> tuple[Array, Array]:
         """A and B of one stage around rest."""
         s, u = ca.SX.sym("s", 2), ca.SX.sym("u")
-        following = self.ocp.dynamics(s, u, self.data[:, 0])
-        slopes = ca.Function("slopes", [s, u], [ca.jacobian(following, s), ca.jacobian(following, u)])
+        next_state = self.ocp.dynamics(s, u, self.data[:, 0])
+        slopes = ca.Function("slopes", [s, u], [ca.jacobian(next_state, s), ca.jacobian(next_state, u)])
         a, b = slopes(np.zeros(2), 0.0)
         return np.asarray(a.full()), np.asarray(b.full())
 
@@ -196,18 +217,18 @@ class TrialHorizon:
 
     @cached_property
     def reach(self) -> float:
-        """By how much an input may be off, at most, per unit of stationarity: |H^-1 D^-1| in the largest row sum."""
+        """Largest error of an input per unit of stationarity: |H^-1 D^-1| in the largest row sum."""
         hessian = 2 * self.squares[0].T @ self.squares[0]
         scale = STEP * self.ocp.curvature[0]
         return float(np.abs(np.linalg.inv(hessian)).sum(axis=1).max() * scale)
 
     def states(self, state: Array, inputs: Array) -> list[Array]:
-        """s_0 ... s_N by rolling the model out in numbers, stage by stage."""
-        found = [state]
+        """s_0 ... s_N by simulation of the model, stage by stage."""
+        states = [state]
         for stage in range(STAGES):
-            following = self.ocp.dynamics(found[-1], inputs[:, stage], self.data[:, stage])
-            found.append(np.asarray(following.full())[:, 0])
-        return found
+            next_state = self.ocp.dynamics(states[-1], inputs[:, stage], self.data[:, stage])
+            states.append(np.asarray(next_state.full())[:, 0])
+        return states
 
     def value(self, state: Array, inputs: Array) -> float:
         """V of these inputs."""
@@ -228,11 +249,11 @@ class TrialHorizon:
 _REST = Trajectory(lambda t: {"y": 0 * t})
 
 
-def _oscillator(bent: float) -> Plant:
-    """The plant y'' = u - y / 2 - y' / 10 - bent sin(2 y) / 2."""
+def _oscillator(nonlinearity: float) -> Plant:
+    """The plant y'' = u - y / 2 - y' / 10 - nonlinearity sin(2 y) / 2."""
     return Plant(
         coordinates={"y": "m"},
         inputs={"u": "N"},
-        parameters={"k": Parameter(0.5, 0.5, "1/s^2"), "bent": Parameter(bent, bent, "m/s^2")},
-        response=lambda q, v, u, p: {"y": u.u - p.k * q.y - 0.1 * v.y - 0.5 * p.bent * ca.sin(2 * q.y)},
+        parameters={"k": Parameter(0.5, 0.5, "1/s^2"), "nonlinearity": Parameter(nonlinearity, nonlinearity, "m/s^2")},
+        response=lambda q, v, u, p: {"y": u.u - p.k * q.y - 0.1 * v.y - 0.5 * p.nonlinearity * ca.sin(2 * q.y)},
     )

@@ -1,4 +1,4 @@
-"""What the conformance laws of every kind share: how a law is kept, broken and told, and what every value must be."""
+"""The shared parts of the conformance laws: trying a law, reporting a broken one, and the laws of every value."""
 
 from __future__ import annotations
 
@@ -19,18 +19,24 @@ Law = Callable[[Any, np.random.Generator], None]
 def keep(subject: object, trial: Any, laws: Sequence[Law], seed: int) -> None:
     """Try the laws one after the other, each with a generator of its own.
 
+    Args:
+        subject: the value that the laws are about.
+        trial: first argument of the laws.
+        laws: the laws.
+        seed: of the generators.
+
     Raises:
-        AssertionError: the first law that is broken: whose, which, what it says, and the numbers.
-        FpirhcError: what the subject raises on purpose, because it cannot be used at all.
+        AssertionError: the first law that is broken, with the class, the law's text, and the numbers.
+        FpirhcError: an error of the subject itself, which cannot be used at all.
     """
     for law in laws:
         name = law.__name__.replace("_", " ")
         try:
             law(trial, np.random.default_rng(seed))
         except AssertionError as error:
-            said = (law.__doc__ or name).strip().splitlines()[0]
+            text = (law.__doc__ or name).strip().splitlines()[0]
             raise AssertionError(
-                f"{type(subject).__name__} breaks the law '{name}': {error}. The law: {said}"
+                f"{type(subject).__name__} breaks the law '{name}': {error}. The law: {text}"
             ) from None
         except FpirhcError:
             raise
@@ -46,7 +52,7 @@ def hold(law: bool, sentence: str) -> None:
 
 
 def within(value: Any, bound: float) -> bool:
-    """Whether every entry is at most `bound` in size; NaN never is."""
+    """Return whether every entry is at most `bound` in size; NaN is not."""
     return bool(np.all(np.abs(np.asarray(value, dtype=float)) <= bound))
 
 
@@ -69,7 +75,7 @@ def is_a_frozen_value(subject: Any) -> None:
         hold(False, f"it cannot be hashed ({error}); use tuples for its settings, or @dataclass(frozen=True, eq=False)")
     hold(same, "its hash changes from call to call")
     described = describe(subject)
-    hold(describe(deepcopy(subject)) == described, "a copy of it is described otherwise than itself")
+    hold(describe(deepcopy(subject)) == described, "a copy of it has another description")
     try:
         json.dumps(described)
     except (TypeError, ValueError) as error:

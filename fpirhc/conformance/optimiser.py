@@ -1,4 +1,4 @@
-"""Laws that every optimiser keeps, tried on small horizons whose answers are known by other means."""
+"""Laws that every optimiser keeps, tried on small horizons whose solutions are known by other means."""
 
 from __future__ import annotations
 
@@ -11,22 +11,24 @@ from fpirhc.errors import InvalidValue
 from fpirhc.optimisers.base import FEASIBLE, Optimiser
 from fpirhc.status import Status
 
-_SLACK = 2.0  # times the tolerance that a claimed stationarity may be off
+_SLACK = 2.0  # allowed error of a stationarity, in tolerances
 _DIFFERENCE = 1e-6  # relative error of central differences of a cost
 _TRIALS = 3
-_FEW = 5  # calls that a problem without solution is given
+_FEW = 5  # calls on a problem without solution
 
 
 def check_optimiser(optimiser: Optimiser, *, tolerance: float, seed: int, calls: int = 50) -> None:
     """Check every law on an optimiser.
 
-    Parameters:
-        tolerance: of the stationarity, in the unit of the inputs, below which it calls a plan OK.
-        seed: draws first states and plans. calls: of its step, within which it must solve a small convex problem.
+    Args:
+        optimiser: the optimiser.
+        tolerance: stationarity, in the unit of the inputs, below which it calls a plan OK.
+        seed: of first states and plans.
+        calls: calls of its step within which it must solve a small convex problem.
 
     Raises:
         AssertionError: the first law that does not hold, in one sentence.
-        InvalidValue: a tolerance that is not positive, or above 1e-3: too coarse to tell a solution by.
+        InvalidValue: a tolerance that is not positive, or above 1e-3, which is too coarse to recognise a solution.
     """
     if not 0 < tolerance <= 1e-3:
         raise InvalidValue(f"check_optimiser(tolerance={tolerance!r}): expected a number above 0 and up to 1e-3")
@@ -58,17 +60,17 @@ def linear_plan_is_riccati(trial: Trial, generator: np.random.Generator) -> None
     (a, b), (_, r, p) = task.model, task.weights
     gain = np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
     for _ in range(_TRIALS):
-        found = task.solved(generator.normal(size=2))
+        plan = task.solved(generator.normal(size=2))
         hold(
-            found.status == Status.OK,
-            f"on {STAGES} stages of a linear model its status after {found.calls} calls is {found.status.name}, stationarity "
-            f"{found.stationarity:.3g}; give more iterations or calls",
+            plan.status == Status.OK,
+            f"on {STAGES} stages of a linear model its status after {plan.calls} calls is {plan.status.name}, stationarity "
+            f"{plan.stationarity:.3g}; give more iterations or calls",
         )
-        s, expected = found.state, []
+        s, expected = plan.state, []
         for _ in range(STAGES):
             expected.append(-float((gain @ s)[0]))
             s = a @ s + b[:, 0] * expected[-1]
-        missed = float(np.abs(found.inputs[0] - expected).max())
+        missed = float(np.abs(plan.inputs[0] - expected).max())
         allowed = _SLACK * task.reach * trial.tolerance + 1e-9
         hold(
             within(missed, allowed), f"an input of its plan is off by {missed:.3g}, the tolerance allows {allowed:.3g}"
@@ -76,41 +78,41 @@ def linear_plan_is_riccati(trial: Trial, generator: np.random.Generator) -> None
 
 
 def plan_is_stationary(trial: Trial, generator: np.random.Generator) -> None:
-    """On a nonlinear model a plan called OK is stationary by central differences, and costs what it says."""
+    """On a nonlinear model a plan called OK is stationary by central differences, and its reported cost is true."""
     for _ in range(_TRIALS):
-        found = trial.bent.solved(generator.normal(size=2))
-        _judged(trial, trial.bent, found)
-        hold(found.status == Status.OK, f"after {found.calls} calls its status is {found.status.name}")
+        plan = trial.nonlinear.solved(generator.normal(size=2))
+        _judged(trial, trial.nonlinear, plan)
+        hold(plan.status == Status.OK, f"after {plan.calls} calls its status is {plan.status.name}")
 
 
-def _judged(trial: Trial, task: TrialHorizon, found: TrialPlan) -> None:
-    """Compare what is said about a plan with what it is."""
-    cost, residual = task.value(found.state, found.inputs), task.residual(found.state, found.inputs)
+def _judged(trial: Trial, task: TrialHorizon, plan: TrialPlan) -> None:
+    """Compare the reported numbers of a plan with its true ones."""
+    cost, residual = task.value(plan.state, plan.inputs), task.residual(plan.state, plan.inputs)
     hold(
-        within(found.cost - cost, 1e-9 * (1 + abs(cost))),
-        f"it says the plan costs {found.cost:.9g}, rolled out it costs {cost:.9g}",
+        within(plan.cost - cost, 1e-9 * (1 + abs(cost))),
+        f"it reports the cost {plan.cost:.9g} of the plan, simulation gives {cost:.9g}",
     )
     allowed = _SLACK * trial.tolerance + _DIFFERENCE * (1 + cost)
     hold(
-        found.status != Status.OK or residual <= allowed,
+        plan.status != Status.OK or residual <= allowed,
         f"it calls a plan OK whose stationarity by central differences is {residual:.3g}, above {trial.tolerance:g}",
     )
     hold(
-        within(found.stationarity - residual, allowed + 0.01 * residual),
-        f"it says stationarity {found.stationarity:.3g}, central differences give {residual:.3g}",
+        within(plan.stationarity - residual, allowed + 0.01 * residual),
+        f"it reports the stationarity {plan.stationarity:.3g}, central differences give {residual:.3g}",
     )
 
 
 def status_is_honest(trial: Trial, generator: np.random.Generator) -> None:
-    """One call from a bad first plan says OK only if the plan is converged, and the truth about it otherwise."""
-    task = trial.bent
+    """One call from a bad first plan reports OK only for a converged plan, and true numbers for every plan."""
+    task = trial.nonlinear
     for _ in range(_TRIALS):
-        found = task.called(3 * generator.normal(size=2), task.begun(3 * generator.normal(size=STAGES)))
-        if found.status in (Status.OK, Status.NOT_CONVERGED):
-            _judged(trial, task, found)
+        plan = task.called(3 * generator.normal(size=2), task.begun(3 * generator.normal(size=STAGES)))
+        if plan.status in (Status.OK, Status.NOT_CONVERGED):
+            _judged(trial, task, plan)
         hold(
-            found.status != Status.NOT_CONVERGED or found.stationarity > trial.tolerance * (1 - 1e-9),
-            f"it says not converged at stationarity {found.stationarity:.3g}, which is within {trial.tolerance:g}",
+            plan.status != Status.NOT_CONVERGED or plan.stationarity > trial.tolerance * (1 - 1e-9),
+            f"it reports NOT_CONVERGED at the stationarity {plan.stationarity:.3g}, which is within {trial.tolerance:g}",
         )
 
 
@@ -121,20 +123,20 @@ def bounds_of_inputs_are_kept(trial: Trial, generator: np.random.Generator) -> N
         return
     by_u, by_s = task.squares
     for size in (1.0, 3.0, 10.0):
-        found = task.solved(size * generator.normal(size=2))
-        outside = float(np.abs(found.inputs).max()) - BOUND
+        plan = task.solved(size * generator.normal(size=2))
+        outside = float(np.abs(plan.inputs).max()) - BOUND
         hold(outside <= 1e-9, f"an input is {outside:.3g} outside its bounds of {BOUND:g}")
-        said = f"{found.status.name} after {found.calls} calls"
-        hold(found.status == Status.OK, f"with active bounds its status is {said}")
-        best = lsq_linear(by_u, -by_s @ found.state, (-BOUND, BOUND), tol=1e-14, method="bvls").x
-        missed = float(np.abs(found.inputs[0] - best).max())
+        words = f"{plan.status.name} after {plan.calls} calls"
+        hold(plan.status == Status.OK, f"with active bounds its status is {words}")
+        best = lsq_linear(by_u, -by_s @ plan.state, (-BOUND, BOUND), tol=1e-14, method="bvls").x
+        missed = float(np.abs(plan.inputs[0] - best).max())
         # Inputs at a bound leave fewer free ones, whose Hessian may be worse than the whole.
         allowed = 10 * _SLACK * task.reach * trial.tolerance + 1e-7
         hold(within(missed, allowed), f"with active bounds an input is off by {missed:.3g}, allowed is {allowed:.3g}")
 
 
 def bounds_of_a_call_count(trial: Trial, generator: np.random.Generator) -> None:
-    """The bounds are those given to the call, from the first call on, not those of the problem."""
+    """The bounds of a call hold from the first call on, and not those of the problem."""
     task = trial.bounded
     if not task.served:
         return
@@ -150,18 +152,18 @@ def infeasible_is_told(trial: Trial, generator: np.random.Generator) -> None:
     task = trial.impossible
     if not task.served:
         return
-    found = task.solved(np.array([2.0, float(generator.uniform(1.0, 2.0))]), most=_FEW)
-    worst = max(float(np.abs(s[0])) for s in task.states(found.state, found.inputs)[1:]) - CORRIDOR
-    hold(found.status != Status.OK, f"it calls a plan OK that violates a limit of a state by {worst:.3g}")
-    said = float(found.diagnostics[2])
+    plan = task.solved(np.array([2.0, float(generator.uniform(1.0, 2.0))]), most=_FEW)
+    worst = max(float(np.abs(s[0])) for s in task.states(plan.state, plan.inputs)[1:]) - CORRIDOR
+    hold(plan.status != Status.OK, f"it calls a plan OK that violates a limit of a state by {worst:.3g}")
+    reported = float(plan.diagnostics[2])
     hold(
-        found.status == Status.NON_FINITE or within(said - worst, FEASIBLE),
-        f"it says a limit is violated by {said:.3g}, rolled out it is {worst:.3g}",
+        plan.status == Status.NON_FINITE or within(reported - worst, FEASIBLE),
+        f"it reports a limit violated by {reported:.3g}, simulation gives {worst:.3g}",
     )
 
 
 def nan_is_told(trial: Trial, generator: np.random.Generator) -> None:
-    """A state or data that are no numbers give NON_FINITE and a finite plan, and nothing of it is remembered."""
+    """A state or data that are no numbers give NON_FINITE and a finite plan, and leave the memory finite."""
     task = trial.linear
     state = generator.normal(size=2)
     memory = task.begun(task.solved(state).inputs[0])
@@ -173,37 +175,41 @@ def nan_is_told(trial: Trial, generator: np.random.Generator) -> None:
         "a reference of NaN": (state, spoilt),
     }
     for what, (first, data) in cases.items():
-        found = task.called(first, memory, data)
-        hold(found.status == Status.NON_FINITE, f"given {what}, its status is {found.status.name}, expected NON_FINITE")
-        hold(bool(np.isfinite(found.inputs).all()), f"given {what}, it plans {found.inputs[0]}")
-        hold(bool(np.isfinite(found.memory).all()), f"given {what}, it remembers values that are not finite")
-        after = task.solved(state, found.memory).status
+        plan = task.called(first, memory, data)
+        hold(plan.status == Status.NON_FINITE, f"given {what}, its status is {plan.status.name}, expected NON_FINITE")
+        hold(bool(np.isfinite(plan.inputs).all()), f"given {what}, it plans {plan.inputs[0]}")
+        hold(bool(np.isfinite(plan.memory).all()), f"given {what}, it remembers values that are not finite")
+        after = task.solved(state, plan.memory).status
         hold(after == Status.OK, f"after {what} it does not recover: its status is {after.name}")
 
 
 def poisoned_memory_is_forgotten(trial: Trial, generator: np.random.Generator) -> None:
-    """A memory that is not finite does not stay so: the next calls solve the problem."""
+    """A memory that is not finite becomes finite: the next calls solve the problem."""
     task = trial.linear
     after = task.solved(generator.normal(size=2), np.full(task.layout.size, np.nan))
     hold(after.status == Status.OK, f"from a memory of NaN its status after {after.calls} calls is {after.status.name}")
-    hold(bool(np.isfinite(after.memory).all()), "from a memory of NaN it solves the problem, but remembers NaN still")
+    hold(
+        bool(np.isfinite(after.memory).all()),
+        "from a memory of NaN it solves the problem, but its memory still has NaN",
+    )
 
 
 def solution_stays(trial: Trial, generator: np.random.Generator) -> None:
-    """Called once more at a solution, it stays there and says OK; one stage later the shifted plan serves as well."""
+    """A call at a solution stays there with the status OK; one stage later the shifted plan serves as well."""
     task = trial.linear
     (a, b), state = task.model, generator.normal(size=2)
     solved = task.solved(state)
     again = task.called(state, solved.memory)
-    moved = float(np.abs(again.inputs - solved.inputs).max())
+    change = float(np.abs(again.inputs - solved.inputs).max())
     allowed = 2 * _SLACK * task.reach * trial.tolerance + 1e-9
     hold(
-        within(moved, allowed), f"called again at a solution it moves the plan by {moved:.3g}, allowed is {allowed:.3g}"
+        within(change, allowed),
+        f"called again at a solution it moves the plan by {change:.3g}, allowed is {allowed:.3g}",
     )
     hold(again.status == Status.OK, f"called again at a solution its status is {again.status.name}")
     shifted = np.asarray(task.shifted(again.memory).full())[:, 0]
-    kept = shifted[task.layout.slice("plan_inputs")][:-1]
-    missed = float(np.abs(kept - again.inputs[0, 1:]).max())
+    later_inputs = shifted[task.layout.slice("plan_inputs")][:-1]
+    missed = float(np.abs(later_inputs - again.inputs[0, 1:]).max())
     hold(
         within(missed, allowed),
         f"shifted() changes inputs of the plan by {missed:.3g} besides dropping the first stage",

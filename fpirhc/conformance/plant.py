@@ -22,8 +22,11 @@ _SLOPE = 1e-5  # relative, of central differences
 def check_plant(plant: Plant, *, seed: int, box: Mapping[str, tuple[float, float]] | None = None) -> None:
     """Check every law on a plant at random points.
 
-    Parameters: `seed` draws the points; `box` gives the interval of a state (q1, q1', ...) or input by name from which they
-    are drawn, (-1, 1) where none is given.
+    Args:
+        plant: the plant.
+        seed: of the points.
+        box: intervals of states (q1, q1', ...) and inputs by name, from which the points are drawn; (-1, 1) for every
+            other name.
 
     Raises:
         AssertionError: the first law that does not hold, in one sentence.
@@ -37,7 +40,7 @@ def check_plant(plant: Plant, *, seed: int, box: Mapping[str, tuple[float, float
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A plant with the box that its points are drawn from."""
+    """A plant with the box from which its points are drawn."""
 
     plant: Plant
     box: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -77,8 +80,8 @@ def response_is_finite(trial: _Trial, generator: np.random.Generator) -> None:
     plant = trial.plant
     for x, u in trial.points(generator):
         for which, p in trial.parameters.items():
-            found = _numbers(plant.response_function, x, u, p)
-            for name, value in zip(plant.names, found, strict=True):
+            response = _numbers(plant.response_function, x, u, p)
+            for name, value in zip(plant.names, response, strict=True):
                 hold(
                     bool(np.isfinite(value)),
                     f"the response of '{name}' ({which} parameters) is {value} {trial.where(x, u)}",
@@ -86,7 +89,7 @@ def response_is_finite(trial: _Trial, generator: np.random.Generator) -> None:
 
 
 def both_parameter_sets_enter(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """A parameter whose approximate and exact values differ enters the response, else model and plant are secretly one."""
+    """A parameter whose approximate and exact values differ enters the response, or else model and plant are the same."""
     plant = trial.plant
     size = len(plant.parameters)
     for which, values in trial.parameters.items():
@@ -99,20 +102,20 @@ def both_parameter_sets_enter(trial: _Trial, generator: np.random.Generator) -> 
         hold(
             bool(entering[k]) or approximate == exact,
             f"the response does not depend on parameter '{name}' (approximate {approximate:g}, exact {exact:g}); "
-            f"write p.{name} where a number or another name stands",
+            f"write p.{name} in the response",
         )
 
 
 def response_is_pure(trial: _Trial, generator: np.random.Generator) -> None:
-    """Building the response once more gives the same response: it neither draws numbers nor remembers."""
+    """Building the response once more gives the same response: it has no random numbers and no memory."""
     again = replace(trial.plant)
     for x, u in trial.points(generator):
         one, other = (_numbers(p.response_function, x, u, p.exact) for p in (trial.plant, again))
-        hold(np.array_equal(one, other), f"built twice it answers {one} and then {other} {trial.where(x, u)}")
+        hold(np.array_equal(one, other), f"built twice, it gives {one} and then {other} {trial.where(x, u)}")
 
 
 def derivative_is_the_chain(trial: _Trial, generator: np.random.Generator) -> None:
-    """dx/dt holds the next derivative of every coordinate, in the highest place the response plus what is forced on it."""
+    """dx/dt holds the next derivative of every coordinate, in the highest place the response plus the forcing."""
     plant = trial.plant
     elements = plant.state.elements
     for x, u in trial.points(generator):
@@ -128,7 +131,7 @@ def derivative_is_the_chain(trial: _Trial, generator: np.random.Generator) -> No
 
 
 def slopes_are_true(trial: _Trial, generator: np.random.Generator) -> None:
-    """The derivatives of the response agree with central differences, so that an optimiser may trust them."""
+    """The derivatives of the response agree with central differences, so that an optimiser can use them."""
     plant = trial.plant
     x, u, p = plant._symbols()
     z = ca.vertcat(x, u)
@@ -137,17 +140,17 @@ def slopes_are_true(trial: _Trial, generator: np.random.Generator) -> None:
     names = [*plant.state.elements, *plant.input.elements]
     for x0, u0 in trial.points(generator):
         at = np.concatenate([x0, u0])
-        found = np.asarray(slope(at, plant.exact).full())
+        slopes = np.asarray(slope(at, plant.exact).full())
         for k, name in enumerate(names):
             step = 1e-5 * max(1.0, abs(at[k]))
             ends = [at + side * step * np.eye(at.size)[k] for side in (1, -1)]
             up, down = (_numbers(plant.response_function, end[:split], end[split:], plant.exact) for end in ends)
             expected = (up - down) / (2 * step)
             scale = max(1.0, float(np.abs(expected).max()), float(np.abs(up).max()))
-            missed = float(np.abs(found[:, k] - expected).max())
+            missed = float(np.abs(slopes[:, k] - expected).max())
             hold(
                 within(missed, _SLOPE * scale),
-                f"the derivative of the response by '{name}' is {found[:, k]}, central differences give {expected} "
+                f"the derivative of the response by '{name}' is {slopes[:, k]}, central differences give {expected} "
                 f"{trial.where(x0, u0)}",
             )
 

@@ -29,9 +29,9 @@ Array = npt.NDArray[Any]
 Decay = Callable[[Array, int], Array]
 
 _TRIALS = 5
-_GIVEN = ("state", "_target", "nominal", "warm_up")  # what a law may read besides its own memory
+_OFFERED = ("state", "_target", "nominal", "warm_up")  # what a law may read besides its own memory
 _EXACT = 1e-9  # relative
-_DECAY = 0.01  # of the first error: the held command of a digital loop costs about rate x period
+_DECAY = 0.01  # of the first error: the constant command within a cycle costs about rate x period
 _WIND = 0.01  # relative change of the desired response that counts as winding up
 
 
@@ -47,12 +47,15 @@ def check_tracking(
 ) -> None:
     """Check every law on a tracking law.
 
-    Parameters:
-        seed: draws errors and memories.
-        orders: relative orders of the ideal plants. period: of the control cycle, s.
-        duration, left: after so many seconds at most this share of an error is left.
-        decay: function of (t, order) that gives the share over time which the law promises for a plant that starts at rest;
-            None: it promises none.
+    Args:
+        tracking: the tracking law.
+        seed: of errors and memories.
+        orders: relative orders of the ideal plants.
+        period: of the control cycle, s.
+        duration: time after which an error must have decayed, s.
+        left: share of the error that may be left then.
+        decay: function of (t, order) that gives the promised share of the error over time, for a plant that starts at
+            rest; None: no promise.
 
     Raises:
         AssertionError: the first law that does not hold, in one sentence.
@@ -88,7 +91,7 @@ class _Trial:
 
     @cached_property
     def cycle(self) -> Composite:
-        """The law and its update as one step (memory, state, target, nominal, started, clipped)."""
+        """The law and its update as one step (memory, state, target, nominal, warm_up, clipped)."""
         plant = self.plant
         reads = Layout(
             (
@@ -107,11 +110,11 @@ class _Trial:
         return Evaluator(self.cycle.function)
 
     def __call__(
-        self, memory: Array, state: Array, target: Array, nominal: Array, *, started: float = 1.0, clipped: float = 0.0
+        self, memory: Array, state: Array, target: Array, nominal: Array, *, warm_up: float = 1.0, clipped: float = 0.0
     ) -> tuple[Array, Array, Array]:
         """(memory of the next cycle, desired response, error to the target)."""
-        following, _, desired, error = self.evaluator(memory, state, target, nominal, started, clipped)
-        return following, desired, error
+        next_memory, _, desired, error = self.evaluator(memory, state, target, nominal, warm_up, clipped)
+        return next_memory, desired, error
 
     def start(self) -> Array:
         return self.cycle.memory.start()
@@ -125,12 +128,12 @@ class _Trial:
 def _ideal(orders: tuple[int, ...]) -> Plant:
     names = [f"y{k}" for k in range(len(orders))]
 
-    def response(*given: Named) -> dict[str, Expression]:
-        return {name: given[-2][f"u{k}"] for k, name in enumerate(names)}
+    def response(*arguments: Named) -> dict[str, Expression]:
+        return {name: arguments[-2][f"u{k}"] for k, name in enumerate(names)}
 
-    arguments = [*(f"d{k}" for k in range(max(orders))), "u", "p"]
+    argument_names = [*(f"d{k}" for k in range(max(orders))), "u", "p"]
     kind = inspect.Parameter.POSITIONAL_ONLY
-    vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(n, kind) for n in arguments])
+    vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(n, kind) for n in argument_names])
     inputs = {f"u{k}": "N" for k in range(len(orders))}
     return Plant(dict.fromkeys(names, "m"), inputs, {}, response, dict(zip(names, orders, strict=True)))
 
@@ -141,7 +144,7 @@ def frozen_value(trial: _Trial, generator: np.random.Generator) -> None:  # noqa
 
 
 def only_declared_signals(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """Both blocks read what they are given or remember, and write exactly what they declare."""
+    """Both blocks read signals that are offered or remembered, and write exactly the declared signals."""
     delays = trial.tracking.delays(trial.plant)
     remembered = {d.now.name for d in delays}
     law, update = trial.law, trial.update
@@ -149,8 +152,8 @@ def only_declared_signals(trial: _Trial, generator: np.random.Generator) -> None
         hold(name in law.writes, f"law() writes {list(law.writes.names)}, but not '{name}'")
         size = law.writes[name].size
         hold(size == len(trial.orders), f"law() writes '{name}' with {size} entries, expected {len(trial.orders)}")
-    _reads_only(law, {*_GIVEN, *remembered}, "law()")
-    _reads_only(update, {*_GIVEN, *remembered, *law.writes.names, "clipped"}, "update()")
+    _reads_only(law, {*_OFFERED, *remembered}, "law()")
+    _reads_only(update, {*_OFFERED, *remembered, *law.writes.names, "clipped"}, "update()")
     written = {*law.writes.names, *update.writes.names}
     for delay in delays:
         hold(delay.source in written, f"delays() carries '{delay.source}' on, which neither law() nor update() writes")
@@ -160,7 +163,7 @@ def only_declared_signals(trial: _Trial, generator: np.random.Generator) -> None
 
 def _reads_only(block: Block, allowed: set[str], what: str) -> None:
     foreign = sorted(set(block.reads.names) - allowed)
-    hold(not foreign, f"{what} reads {foreign}, which it is not given; it may read {sorted(allowed)}")
+    hold(not foreign, f"{what} reads {foreign}, which are not offered; it may read {sorted(allowed)}")
 
 
 def _writes_what_it_declares(block: Block, what: str) -> None:
@@ -173,11 +176,11 @@ def _writes_what_it_declares(block: Block, what: str) -> None:
             read.add(name)
             return symbols.get(name, matrix(0))
 
-    given = set(block.step(Reading({})))
+    written = set(block.step(Reading({})))
     unknown = sorted(read - set(symbols))
     hold(not unknown, f"the step of {what} reads {unknown}, which the block does not declare")
     expected = {*block.writes.names, *(f"{m}_next" for m in block.memory.names)}
-    hold(given == expected, f"the step of {what} gives {sorted(given)}, but the block declares {sorted(expected)}")
+    hold(written == expected, f"the step of {what} gives {sorted(written)}, but the block declares {sorted(expected)}")
 
 
 def error_is_target_minus_state(trial: _Trial, generator: np.random.Generator) -> None:
@@ -185,7 +188,7 @@ def error_is_target_minus_state(trial: _Trial, generator: np.random.Generator) -
     for _ in range(_TRIALS):
         state, target, nominal = trial.motion(generator)
         expected = (target - state)[list(trial.plant.indices(0))]
-        _, _, error = trial(trial.start(), state, target, nominal, started=0)
+        _, _, error = trial(trial.start(), state, target, nominal, warm_up=0)
         hold(within(error - expected, _EXACT), f"'_target_error' is {error}, target minus state is {expected}")
 
 
@@ -195,57 +198,58 @@ def zero_error_asks_for_the_nominal_response(trial: _Trial, generator: np.random
         memory = trial.start()
         for cycle in range(_TRIALS):
             state, _, nominal = trial.motion(generator)
-            memory, desired, _ = trial(memory, state, state, nominal, started=float(cycle > 0))
+            memory, desired, _ = trial(memory, state, state, nominal, warm_up=float(cycle > 0))
             hold(
                 within(desired - nominal, _EXACT),
-                f"without any error it asks for {desired} in cycle {cycle}, the nominal response is {nominal}",
+                f"without any error the desired response is {desired} in cycle {cycle}, the nominal response is {nominal}",
             )
 
 
 def feedback_is_what_it_does(trial: _Trial, generator: np.random.Generator) -> None:
-    """A law that tells its gains feeds errors back with them, and its rate is that of all its modes."""
+    """A law whose fact `feedback` has gains feeds errors back with them, and its rate is that of all its modes."""
     for k, order in enumerate(trial.orders):
-        told = trial.tracking.feedback(order)
-        if told is None:
+        feedback = trial.tracking.feedback(order)
+        if feedback is None:
             continue
         for _ in range(_TRIALS):
             state, target, nominal = trial.motion(generator)
             memory, desired, error = trial(trial.start(), state, target, nominal)
             name = trial.plant.names[k]
             places = [trial.plant.state.elements.index(name + "'" * s) for s in range(order)]
-            expected = np.dot(told.gains[-order:], (target - state)[places])
-            scale = 1 + float(np.abs(told.gains).max() * np.abs(target - state).max())
+            expected = np.dot(feedback.gains[-order:], (target - state)[places])
+            scale = 1 + float(np.abs(feedback.gains).max() * np.abs(target - state).max())
             hold(
-                len(told.gains) == order + told.integral and within(desired[k] - nominal[k] - expected, _EXACT * scale),
-                f"with the integral at zero its feedback for order {order} is {desired[k] - nominal[k]:.6g}, told gains "
-                f"{told.gains} give {expected:.6g}",
+                len(feedback.gains) == order + feedback.integral
+                and within(desired[k] - nominal[k] - expected, _EXACT * scale),
+                f"with the integral at zero its feedback for order {order} is {desired[k] - nominal[k]:.6g}, its gains "
+                f"{feedback.gains} give {expected:.6g}",
             )
             _, later, _ = trial(memory, state, state, nominal)
-            summed = told.gains[0] * trial.period * error[k] if told.integral else 0.0
+            summed = feedback.gains[0] * trial.period * error[k] if feedback.integral else 0.0
             hold(
                 within(later[k] - nominal[k] - summed, _EXACT * scale),
                 f"after one cycle of the error {error[k]:.4g} its integral gives {later[k] - nominal[k]:.6g} for order {order}, "
-                f"told gains give {summed:.6g}",
+                f"its gains give {summed:.6g}",
             )
-        if told.rate is not None:
-            degree = len(told.gains)
-            modes = [math.comb(degree, s) * told.rate ** (degree - s) for s in range(degree)]
+        if feedback.rate is not None:
+            degree = len(feedback.gains)
+            modes = [math.comb(degree, s) * feedback.rate ** (degree - s) for s in range(degree)]
             hold(
-                np.allclose(told.gains, modes, rtol=1e-9),
-                f"its gains {told.gains} are not those of the rate {told.rate:g}",
+                np.allclose(feedback.gains, modes, rtol=1e-9),
+                f"its gains {feedback.gains} are not those of the rate {feedback.rate:g}",
             )
 
 
 def start_forgets(trial: _Trial, generator: np.random.Generator) -> None:
-    """In the first cycle of a run, what is remembered from before does not count."""
+    """The first cycle of a run does not depend on the memory of an earlier run."""
     for _ in range(_TRIALS):
         motion = trial.motion(generator)
-        _, fresh, _ = trial(trial.start(), *motion, started=0)
-        _, soiled, _ = trial(generator.normal(size=trial.cycle.memory.size), *motion, started=0)
+        _, fresh, _ = trial(trial.start(), *motion, warm_up=0)
+        _, soiled, _ = trial(generator.normal(size=trial.cycle.memory.size), *motion, warm_up=0)
         scale = 1 + float(np.abs(fresh).max())
         hold(
             within(soiled - fresh, _EXACT * scale),
-            f"with `started` at 0 an earlier run changes the desired response from {fresh} to {soiled}",
+            f"with `warm_up` at 0 an earlier run changes the desired response from {fresh} to {soiled}",
         )
 
 
@@ -286,19 +290,19 @@ def clipping_freezes(trial: _Trial, generator: np.random.Generator) -> None:
     cycles = round(trial.duration / trial.period)
     memory, halfway = trial.start(), np.zeros(0)
     for cycle in range(cycles + 1):
-        memory, desired, _ = trial(memory, state, target, nominal, started=float(cycle > 0), clipped=1)
+        memory, desired, _ = trial(memory, state, target, nominal, warm_up=float(cycle > 0), clipped=1)
         if cycle == cycles // 2:
             halfway = desired
-    moved, size = np.abs(desired - halfway), np.abs(desired - nominal) + _EXACT
+    change, size = np.abs(desired - halfway), np.abs(desired - nominal) + _EXACT
     hold(
-        within(moved / size, _WIND),
+        within(change / size, _WIND),
         f"clipped for {trial.duration:g} s at a constant error, the desired response goes from {halfway} at half time to "
-        f"{desired}; keep what is remembered where `clipped` is 1",
+        f"{desired}; leave the memory unchanged where `clipped` is 1",
     )
 
 
 def nan_shows(trial: _Trial, generator: np.random.Generator) -> None:
-    """A measured coordinate that is not a number gives a desired response that is not one, so that nobody acts on it."""
+    """A measured coordinate that is not a number gives a desired response that is not one, so that it never acts."""
     for k, place in enumerate(trial.plant.indices(0)):
         state, target, nominal = trial.motion(generator)
         state[place] = np.nan

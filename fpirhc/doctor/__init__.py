@@ -1,1 +1,1 @@
-"""What an installation has, and whether it works."""
+"""The parts of an installation, and whether they work."""

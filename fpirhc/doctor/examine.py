@@ -1,4 +1,4 @@
-"""Asks every check and tells what was found, in lines or as JSON."""
+"""Runs every check and returns the findings, as lines or as JSON."""
 
 from __future__ import annotations
 
@@ -12,7 +12,12 @@ from fpirhc.doctor.finding import Finding, Outcome, ask
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Versions, and findings in the order of the checks."""
+    """The results of all checks.
+
+    Args:
+        versions: versions of fpirhc and of what its numbers depend on.
+        findings: findings in the order of the checks.
+    """
 
     versions: dict[str, str]
     findings: Sequence[Finding]
@@ -23,7 +28,7 @@ class Diagnosis:
         return max((f.outcome for f in self.findings), default=Outcome.OK)
 
     def text(self) -> str:
-        """One line per finding, with what to do under each that is not OK."""
+        """Return one line per finding, with the remedy under each that is not OK."""
         lines = [", ".join(f"{name} {number}" for name, number in self.versions.items())]
         for finding in self.findings:
             lines.append(f"{finding.outcome.name.lower():4s}  {finding.name}: {finding.found}")
@@ -33,7 +38,7 @@ class Diagnosis:
         return "\n".join([*lines, f"{counts[0]} ok, {counts[1]} to look at, {counts[2]} failed"])
 
     def json(self) -> str:
-        """One JSON object."""
+        """Return one JSON object."""
         checks = [
             {"name": f.name, "outcome": f.outcome.name.lower(), "found": f.found, "remedy": f.remedy}
             for f in self.findings
@@ -42,5 +47,5 @@ class Diagnosis:
 
 
 def examine() -> Diagnosis:
-    """Return what the installation has, and whether it works."""
+    """Return the versions of the installation and the results of all checks."""
     return Diagnosis(machine.versions(), ask(machine.CHECKS))

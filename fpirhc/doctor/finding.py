@@ -1,4 +1,4 @@
-"""What one check found."""
+"""The result of one check."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from enum import IntEnum
 
 
 class Outcome(IntEnum):
-    """From best to worst."""
+    """Outcomes of a check, from best to worst."""
 
     OK = 0
     WARN = 1
@@ -17,7 +17,14 @@ class Outcome(IntEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """Outcome of one check: its name, what was found, and what to do about it (empty: nothing)."""
+    """The result of one check.
+
+    Args:
+        name: name of the check.
+        outcome: its outcome.
+        found: the facts in a sentence.
+        remedy: what to do; empty: nothing.
+    """
 
     name: str
     outcome: Outcome
@@ -29,24 +36,24 @@ Check = Callable[[], tuple[Outcome, str, str]]
 
 
 def ask(checks: Sequence[Check]) -> list[Finding]:
-    """Run checks one by one; one that raises has failed."""
+    """Run checks one by one; a check that raises has failed."""
     findings = []
     for check in checks:
         name = check.__name__.replace("_", "-")
         try:
             findings.append(Finding(name, *check()))
         except Exception as error:  # noqa: BLE001 -- a broken installation may raise anything, and the other checks count
-            said = str(error).strip().splitlines() or [""]
+            lines = str(error).strip().splitlines() or [""]
             remedy = "install fpirhc and its dependencies again in a fresh environment"
-            findings.append(Finding(name, Outcome.FAIL, f"{type(error).__name__}: {said[0]}", remedy))
+            findings.append(Finding(name, Outcome.FAIL, f"{type(error).__name__}: {lines[0]}", remedy))
     return findings
 
 
-def fine(found: str) -> tuple[Outcome, str, str]:
-    """Nothing to do."""
-    return Outcome.OK, found, ""
+def fine(text: str) -> tuple[Outcome, str, str]:
+    """Return OK, with nothing to do."""
+    return Outcome.OK, text, ""
 
 
-def judged(holds: bool, found: str, remedy: str, otherwise: Outcome = Outcome.FAIL) -> tuple[Outcome, str, str]:
-    """OK where something holds, else `otherwise` with what to do."""
-    return (Outcome.OK, found, "") if holds else (otherwise, found, remedy)
+def judged(holds: bool, text: str, remedy: str, otherwise: Outcome = Outcome.FAIL) -> tuple[Outcome, str, str]:
+    """Return OK where a condition holds, else `otherwise` with the remedy."""
+    return (Outcome.OK, text, "") if holds else (otherwise, text, remedy)

@@ -1,4 +1,4 @@
-"""Checks of what is installed and what may be written."""
+"""Checks of installed parts and of folders that must be writable."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _OTHERS = ("alpaqa", "bonmin", "knitro", "madnlp", "snopt", "worhp")
 
 
 def versions() -> dict[str, str]:
-    """Versions of fpirhc and of what its numbers depend on, the machine, and the cores that this process may use."""
+    """Return versions of fpirhc and of what its numbers depend on, the machine, and the cores that this process may use."""
     packages = {name: version(name) for name in ("fpirhc", "casadi", "numpy", "scipy", "osqp", "control")}
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     machine = f"{platform.system()} {platform.machine()}, {usable} of {os.cpu_count() or usable} cores"
@@ -30,23 +30,23 @@ def versions() -> dict[str, str]:
 
 
 def solver_plugins() -> tuple[Outcome, str, str]:
-    """The solvers that the optimisers call, and others that CasADi could load."""
+    """Check the solvers that the optimisers call, and list others that CasADi can load."""
     needed = {**{n: ca.has_nlpsol(n) for n in _SOLVERS}, **{n: ca.has_conic(n) for n in _QUADRATIC}}
     missing = [name for name, there in needed.items() if not there]
     others = [name for name in _OTHERS if ca.has_nlpsol(name)]
-    found = f"found {', '.join(n for n in needed if n not in missing)}"
-    found += f", also {', '.join(others)}" if others else ""
-    found += f"; missing {', '.join(missing)}" if missing else ""
+    text = f"found {', '.join(n for n in needed if n not in missing)}"
+    text += f", also {', '.join(others)}" if others else ""
+    text += f"; missing {', '.join(missing)}" if missing else ""
     return judged(
-        not missing, found, "install casadi from its wheel: pip install --force-reinstall casadi", Outcome.WARN
+        not missing, text, "install casadi from its wheel: pip install --force-reinstall casadi", Outcome.WARN
     )
 
 
 def c_compiler() -> tuple[Outcome, str, str]:
-    """A small Function is compiled, loaded and evaluated; its name is one of libc on purpose."""
+    """Compile, load and evaluate a small Function, whose name is one of libc on purpose."""
     compiler = find_compiler()
     x = ca.SX.sym("x")
-    # The name of a function of libc, in a library of its own, would be called instead of that one: it must be prefixed.
+    # A function with the name of one of libc would be called in its place: the name must have a prefix.
     built = native(ca.Function("step", [x], [3 * x + 1]))
     if not built.compiled:
         remedy = "install gcc or clang, or name a compiler by FPIRHC_CC; without one loops run several times slower"
@@ -58,42 +58,42 @@ def c_compiler() -> tuple[Outcome, str, str]:
 
 
 def cache() -> tuple[Outcome, str, str]:
-    """Where compiled libraries are kept, how much there is, and who else may write there."""
+    """Check the folder of compiled libraries: its place, its size, and who else may write to it."""
     folder = cache_folder()
     wished = os.environ.get("FPIRHC_CACHE") or os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     files = [f for f in folder.iterdir() if f.is_file()]
     size = sum(f.stat().st_size for f in files)
-    found = f"{folder}: {sum(f.suffix != '.sha256' for f in files)} libraries, {size / 1e6:.1f} MB"
+    text = f"{folder}: {sum(f.suffix != '.sha256' for f in files)} libraries, {size / 1e6:.1f} MB"
     if not folder.is_relative_to(Path(wished).absolute()):
         remedy = f"make '{wished}' writable or name another folder by FPIRHC_CACHE; now every process compiles afresh"
         return Outcome.WARN, f"'{wished}' cannot be written, so a temporary folder is used: {folder}", remedy
     facts = folder.stat()
     foreign = hasattr(os, "getuid") and facts.st_uid != os.getuid()
-    # What is loaded from here is run: whoever may write here may run code as this user.
+    # Libraries from this folder are run: a user who may write to it may run code as this user.
     if foreign or facts.st_mode & stat.S_IWOTH:
         whose = "belongs to another user" if foreign else "can be written by everybody"
         return (
             Outcome.FAIL,
-            f"{found}; it {whose}",
+            f"{text}; it {whose}",
             f"chmod 700 '{folder}', or name a folder of your own by FPIRHC_CACHE",
         )
     remedy = f"remove old libraries from '{folder}'; they are compiled again when needed"
-    return judged(size < _LARGE_CACHE, found, remedy, Outcome.WARN)
+    return judged(size < _LARGE_CACHE, text, remedy, Outcome.WARN)
 
 
 def results_folder() -> tuple[Outcome, str, str]:
-    """Whether results can be written where they go without --out."""
+    """Check that results can be written without --out."""
     folder = next(f for f in (Path("results"), Path()) if f.is_dir())
     try:
         with tempfile.TemporaryFile(dir=folder):
             return fine(f"'{folder.absolute()}' can be written")
     except OSError as error:
-        found = f"'{folder.absolute()}' cannot be written: {error.strerror}"
-        return Outcome.WARN, found, "go to a folder of your own, or give --out to run, compare and solve"
+        text = f"'{folder.absolute()}' cannot be written: {error.strerror}"
+        return Outcome.WARN, text, "go to a folder of your own, or give --out to run, compare and solve"
 
 
 def python_threads() -> tuple[Outcome, str, str]:
-    """A Function shared by two threads ends the process; without a global lock that happens sooner."""
+    """Check the global lock; two threads that share a Function end the process, and sooner without the lock."""
     enabled = getattr(sys, "_is_gil_enabled", lambda: True)()
     remedy = "use a Python with its global lock, and processes instead of threads"
     return judged(

@@ -1,1 +1,1 @@
-"""Reports: what a comparison looks like on a terminal, as JSON, as figures, and as one HTML file."""
+"""Reports: comparisons, scenarios and reviews on a terminal, as JSON, as figures, and as one HTML file."""

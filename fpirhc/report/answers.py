@@ -17,7 +17,7 @@ _COLOURS = {"yes": "green", "no": "red", "unknown": "yellow"}
 
 
 def show_review(title: str, review: Review) -> None:
-    """Print every answer under its controller, and how many there are of each kind."""
+    """Print every answer under its controller, and the number of answers of each kind."""
     console = Console()
     console.print(title, style="bold", markup=False, highlight=False)
     _show(console, review.problem)

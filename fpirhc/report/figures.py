@@ -1,4 +1,4 @@
-"""Figures (matplotlib) of plans and comparisons, and the pairs without | with adaptivity that the method's papers show."""
+"""Figures (matplotlib) of plans and comparisons, and the pairs without | with adaptivity of the method's papers."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
-    """States with their reference and inputs of open-loop plans over the horizon, one line per optimiser."""
+    """Return the figure of states with their reference and inputs of open-loop plans, one line per optimiser."""
     assert problem.horizon is not None
     plant, plan = problem.plant, solved[0].plan
     names = [*plant.state.elements, *plant.input.elements]
@@ -69,7 +69,7 @@ def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
 
 
 def pair_figures(plain: Entry, adaptive: Entry) -> dict[str, Figure]:
-    """The seed papers' pictures as pairs, without adaptivity on the left and with it on the right."""
+    """Return the pictures of the method's papers as pairs, without adaptivity on the left and with it on the right."""
     draws = {
         "Trajectory tracking": _draw_trajectory,
         "Phase trajectories": _draw_phase,
@@ -77,7 +77,7 @@ def pair_figures(plain: Entry, adaptive: Entry) -> dict[str, Figure]:
         "Command": _draw_command,
         "Second derivatives" if _is_second_order(plain.run) else "Highest derivatives": _draw_responses,
     }
-    found = {}
+    figures = {}
     for title, draw in draws.items():
         figure = new_figure(11, 3.6, "")
         axes = figure.subplots(1, 2)
@@ -87,8 +87,8 @@ def pair_figures(plain: Entry, adaptive: Entry) -> dict[str, Figure]:
                 draw_bands(axis, entry.run)
             axis.set_title(literal(entry.name), fontsize=10)
             draw_legend(axis)
-        found[title] = figure
-    return found
+        figures[title] = figure
+    return figures
 
 
 def contraction_figure(comparison: Comparison) -> Figure | None:

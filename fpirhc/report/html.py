@@ -27,7 +27,7 @@ _CAPTIONS = {
     "Tracking error": "Nominal minus realised. Mind the different scales.",
     "Command": "After clipping.",
     "Second derivatives": "With adaptation the realised acceleration lies on the desired one, although the deformed request "
-    "is far from both: the request is what the wrong model must be asked for.",
+    "is far from both: the wrong model needs this request.",
 }
 
 _MISSING, _NONE = "&ndash;", "<span class='none'>none</span>"
@@ -119,7 +119,7 @@ def _row(entry: Entry, shown: Sequence[Column], best: Mapping[Column, float | No
 
 
 def _studied(entry: Entry) -> list[str]:
-    """What was found beyond the run: times of a cycle, and the cost of plans above the optimum."""
+    """Numbers that were measured after the run: times of a cycle, and the cost of plans above the optimum."""
     cycle, excess = entry.cycle, entry.optimality
     times = (cycle.median, cycle.p99, cycle.maximum, cycle.first) if cycle else (None,) * 4
     planning = cycle.planning if cycle and entry.metrics.solve else None
@@ -136,7 +136,7 @@ def _charts(comparison: Comparison) -> str:
 
 
 def _predicted(comparison: Comparison) -> str:
-    """What the bands of predictions are; empty where there is none."""
+    """Sentence about the bands of predictions; empty where there is none."""
     if all(e.prediction is None or e.prediction.tube is None for e in comparison.entries):
         return ""
     return (
@@ -146,7 +146,7 @@ def _predicted(comparison: Comparison) -> str:
 
 
 def _bands(comparison: Comparison) -> str:
-    """Legend of the time slots, one line for controllers whose slots are the same; empty where nobody has slots."""
+    """Legend of the time slots, one line for controllers whose slots are the same; empty where no controller has slots."""
     slotted = [e for e in comparison.entries if e.run.spans()]
     if not slotted:
         return ""
@@ -162,7 +162,7 @@ def _bands(comparison: Comparison) -> str:
         )
         lines.append(f"<li>{swatches} ({_text(', '.join(names))})</li>")
     return (
-        "<p>Pale bands are the time slots of the chart's own controller, else of the first one shown that has some.</p>"
+        "<p>Pale bands are the time slots of the chart's own controller, or else of the first shown controller with time slots.</p>"
         f"<ul id='bands'>{''.join(lines)}</ul>"
     )
 
@@ -184,8 +184,8 @@ def headline_pair(comparison: Comparison) -> tuple[Entry, Entry] | None:
     pairs = [(by_name[e.pair], e) for e in comparison.entries if e.pair in by_name]
     usable = [p for p in pairs if p[0].run.cycles > 1 and p[1].run.cycles > 1]
     named = [p for p in usable if comparison.verdict[0].startswith(p[1].name + " ")]
-    chosen = named or usable
-    return chosen[0] if chosen else None
+    candidates = named or usable
+    return candidates[0] if candidates else None
 
 
 def _contraction(comparison: Comparison) -> str:

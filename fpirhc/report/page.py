@@ -1,4 +1,4 @@
-"""What every HTML report is made of: one self-contained file with its styles, scripts and pictures inside."""
+"""The parts of every HTML report: one self-contained file with its styles, scripts and pictures inside."""
 
 from __future__ import annotations
 
@@ -18,7 +18,14 @@ if TYPE_CHECKING:
 
 
 def page(title: str, styles: Sequence[str], body: str, scripts: str = "") -> str:
-    """Return a page's text; `styles` are names of assets."""
+    """Return a page's text.
+
+    Args:
+        title: title of the page.
+        styles: names of assets with styles.
+        body: body of the page, HTML.
+        scripts: scripts of the page, HTML.
+    """
     head = "\n".join(f"<style>{asset(name)}</style>" for name in styles)
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'

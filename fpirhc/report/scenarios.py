@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,26 +22,26 @@ _GROUPS = 6  # of scenarios with similar mismatch, whose medians are joined by a
 _CAPTION = (
     "One point per scenario and controller; lines join medians of scenarios with similar mismatch, crosses at the upper edge "
     "are runs that ended early. Mismatch: rms over the parameters of the relative distance between the model and the drawn "
-    "plant. Error: rms error over the reference's range, root mean square over the coordinates."
+    "plant. Error: rms error divided by the reference's range, root mean square over the coordinates."
 )
 _MEANING = (
-    "Errors are rms errors over the range of the reference, root mean square over the judged coordinates. Every scenario has the "
-    "same noise, disturbances and drawn parameters for all controllers; differences are taken within scenarios, and their "
+    "Errors are rms errors divided by the range of the reference, root mean square over the judged coordinates. Every scenario "
+    "has the same noise, disturbances and drawn parameters for all controllers; differences are taken within scenarios, and their "
     "intervals are 95 % percentile bootstrap intervals of the median. A run whose error exceeds the reference's range has "
-    "diverged; one that ended early counts as worse than any that did not."
+    "diverged; a run that ended early counts as worse than every other run."
 )
 
 
-def mismatch_figure(found: ScenarioComparison) -> Figure:
-    """Error of every scenario against its mismatch, one colour per controller."""
+def mismatch_figure(comparison: ScenarioComparison) -> Figure:
+    """Return the figure of the error of every scenario against its mismatch, one colour per controller."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 4.8), layout="constrained")
-    figure.suptitle(f"{found.problem}: error against mismatch, {found.count} scenarios", fontsize=11)
+    figure.suptitle(f"{comparison.problem}: error against mismatch, {comparison.count} scenarios", fontsize=11)
     axis = figure.subplots()
-    finite = np.concatenate([s.errors[np.isfinite(s.errors)] for s in found.summaries])
+    finite = np.concatenate([s.errors[np.isfinite(s.errors)] for s in comparison.summaries])
     edge = 200 * float(finite.max(initial=1e-3))
-    for k, one in enumerate(found.summaries):
+    for k, one in enumerate(comparison.summaries):
         colour, ended = PALETTE[k % len(PALETTE)], ~np.isfinite(one.errors)
         x, y = 100 * one.mismatch, 100 * one.errors
         axis.semilogy(x[~ended], y[~ended], "o", color=colour, ms=3, alpha=0.5)
@@ -61,71 +60,71 @@ def _medians(x: np.ndarray, y: np.ndarray) -> tuple[list[float], list[float]]:
     return [float(np.median(x[g])) for g in groups], [float(np.median(y[g])) for g in groups]
 
 
-def write_scenarios(found: ScenarioComparison, path: Path) -> None:
+def write_scenarios(comparison: ScenarioComparison, path: Path) -> None:
     """Write the report, atomically.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    write_page(render_scenarios(found), path)
+    write_page(render_scenarios(comparison), path)
 
 
-def render_scenarios(found: ScenarioComparison) -> str:
+def render_scenarios(comparison: ScenarioComparison) -> str:
     """Return the page's text."""
-    first, *others = found.verdict
+    first, *others = comparison.verdict
     rest = "".join(f"<li>{text(s)}</li>" for s in others)
-    about = f"<p class='about'>{text(found.description)}</p>" if found.description else ""
-    chart = picture(mismatch_figure(found), "Error against mismatch", _CAPTION) if found.summaries else ""
+    about = f"<p class='about'>{text(comparison.description)}</p>" if comparison.description else ""
+    chart = picture(mismatch_figure(comparison), "Error against mismatch", _CAPTION) if comparison.summaries else ""
     parts = [
-        f"<header><h1>{text(found.title)}</h1></header>",
+        f"<header><h1>{text(comparison.title)}</h1></header>",
         f"<section id='verdict'><p class='headline'>{text(first)}</p><ul>{rest}</ul>{about}</section>",
-        _table(found),
+        _table(comparison),
         f"<section><h2>Error against mismatch</h2>{chart}</section>",
-        _tuning(found),
-        _settings(found),
+        _tuning(comparison),
+        _settings(comparison),
     ]
-    return page(found.title, ("report.css",), "\n".join(parts))
+    return page(comparison.title, ("report.css",), "\n".join(parts))
 
 
-def _table(found: ScenarioComparison) -> str:
-    heads = ["controller", *_heads(found), "statuses (cycles)"]
+def _table(comparison: ScenarioComparison) -> str:
+    heads = ["controller", *_heads(comparison), "statuses (cycles)"]
     columns = "".join(f"<th scope='col'>{text(h)}</th>" for h in heads)
     rows = ""
-    for one in found.summaries:
-        cells = "".join(f"<td>{text(c)}</td>" for c in _cells(found, one))
+    for one in comparison.summaries:
+        cells = "".join(f"<td>{text(c)}</td>" for c in _cells(comparison, one))
         statuses = ", ".join(f"{n} {name}" for name, n in sorted(one.statuses.items()))
         rows += f"<tr><th scope='row'>{text(one.name)}</th>{cells}<td class='words'>{text(statuses)}</td></tr>"
-    for name, why in found.skipped.items():
+    for name, why in comparison.skipped.items():
         rows += (
             f"<tr><th scope='row'>{text(name)}</th>"
             f"<td class='words' colspan='{len(heads) - 1}'>not run: {text(why)}</td></tr>"
         )
     return (
-        f"<section><h2>Controllers</h2><p>{text(_conditions(found))} {text(_MEANING)}</p><div class='scroll'><table><thead><tr>"
-        f"{columns}</tr></thead><tbody>{rows}</tbody></table></div></section>"
+        f"<section><h2>Controllers</h2><p>{text(_conditions(comparison))} {text(_MEANING)}</p>"
+        f"<div class='scroll'><table><thead><tr>{columns}</tr></thead><tbody>{rows}</tbody></table></div></section>"
     )
 
 
-def _conditions(found: ScenarioComparison) -> str:
+def _conditions(comparison: ScenarioComparison) -> str:
     return (
-        f"{found.count} scenarios of seed {found.seed}, exact parameters within {found.percent:g} % of the problem's, errors from "
-        f"t = {found.measure_from:g} s on."
+        f"{comparison.count} scenarios of seed {comparison.seed}, exact parameters within {comparison.percent:g} % of the "
+        f"problem's, errors from t = {comparison.measure_from:g} s on."
     )
 
 
-def _heads(found: ScenarioComparison) -> list[str]:
-    medians = [f"median {c.short}" for c in found.columns]
+def _heads(comparison: ScenarioComparison) -> list[str]:
+    medians = [f"median {c.short}" for c in comparison.columns]
     return ["median error", "difference (95 %)", "ratio", "smaller in", *medians, "worst", "in scenario", "failures"]
 
 
-def _cells(found: ScenarioComparison, one: Summary) -> list[str]:
+def _cells(comparison: ScenarioComparison, one: Summary) -> list[str]:
     difference, ratio, better = "baseline", "", ""
     if one.difference is not None:
         d = one.difference
         difference = f"{signed(d.median)} ({signed(d.low)} to {signed(d.high)})"
         ratio, better = f"{one.ratio:.3g}", str(one.better)
     failures = ", ".join(f"{n} {outcome}" for outcome, n in one.outcomes.items() if outcome != "finished")
-    medians = [_median(c, one) for c in found.columns]
+    medians = [_median(c, one) for c in comparison.columns]
     return [
         percent(one.median),
         difference,
@@ -143,66 +142,69 @@ def _median(column: Column, one: Summary) -> str:
     return column.metric.text(value) if value is not None and np.isfinite(value) else "none"
 
 
-def _tuning(found: ScenarioComparison) -> str:
-    if not found.tuning:
-        return (
-            "<section><h2>Tuning</h2><p>No file of tuned settings was given: all are the problem file's.</p></section>"
-        )
-    items = "".join(f"<li><b>{text(name)}</b>: {text(note)}</li>" for name, note in found.tuning.items())
+def _tuning(comparison: ScenarioComparison) -> str:
+    if not comparison.tuning:
+        words = "No file of tuned settings was given: all settings are those of the problem file."
+        return f"<section><h2>Tuning</h2><p>{words}</p></section>"
+    items = "".join(f"<li><b>{text(name)}</b>: {text(note)}</li>" for name, note in comparison.tuning.items())
     return f"<section><h2>Tuning</h2><ul>{items}</ul></section>"
 
 
-def _settings(found: ScenarioComparison) -> str:
+def _settings(comparison: ScenarioComparison) -> str:
     dumps = "".join(
         f"<details><summary>{text(name)}</summary><pre>{text(json.dumps(settings, indent=1))}</pre></details>"
-        for name, settings in found.settings.items()
+        for name, settings in comparison.settings.items()
     )
-    versions = ", ".join(f"{k} {v}" for k, v in found.versions.items())
+    versions = ", ".join(f"{k} {v}" for k, v in comparison.versions.items())
     command = (
-        f"<p>This report is reproduced by</p><pre class='command'>{text(found.command)}</pre>" if found.command else ""
+        f"<p>This report is reproduced by</p><pre class='command'>{text(comparison.command)}</pre>"
+        if comparison.command
+        else ""
     )
-    return f"<section><h2>Settings</h2>{dumps}<p>{text(versions)}; took {found.elapsed:.1f} s.</p>{command}</section>"
+    return (
+        f"<section><h2>Settings</h2>{dumps}<p>{text(versions)}; took {comparison.elapsed:.1f} s.</p>{command}</section>"
+    )
 
 
-def show_scenarios(found: ScenarioComparison, report: Path) -> None:
-    """Print the verdict, the table, and where the report is."""
+def show_scenarios(comparison: ScenarioComparison, report: Path) -> None:
+    """Print the verdict, the table, and the path of the report."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
+    from fpirhc.report.terminal import literal, say
+
     console = Console()
-    _lines(console.print, [found.title, *(f"- {sentence}" for sentence in found.verdict)])
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=f"{found.problem}: {_conditions(found)}")
+    for line in (comparison.title, *(f"- {sentence}" for sentence in comparison.verdict)):
+        say(console, line)
+    title = literal(f"{comparison.problem}: {_conditions(comparison)}")
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title)
     table.add_column("controller", min_width=16)
     for head in ("median", "difference (95 %)", "ratio", "worst", "failed"):
         table.add_column(head, justify="right")
-    for one in found.summaries:
-        cells = _cells(found, one)
-        shown = [*cells[:3], percent(one.worst), str(one.failures)]
-        table.add_row(one.name.replace("[", "\\["), *shown)
+    for one in comparison.summaries:
+        cells = _cells(comparison, one)
+        table.add_row(literal(one.name), *cells[:3], percent(one.worst), str(one.failures))
     console.print(table)
-    _lines(console.print, [f"{name}: {note}" for name, note in found.tuning.items()])
-    _lines(console.print, [f"skipped {name}: {why}" for name, why in found.skipped.items()])
-    console.print(f"report: {report}", markup=False, highlight=False, soft_wrap=True)
+    for name, note in comparison.tuning.items():
+        say(console, f"{name}: {note}")
+    for name, why in comparison.skipped.items():
+        say(console, f"skipped {name}: {why}")
+    say(console, f"report: {report}", wrap=False)
 
 
-def _lines(show, lines: Sequence[str]) -> None:  # type: ignore[no-untyped-def]
-    for line in lines:
-        show(line, markup=False, highlight=False)
-
-
-def scenarios_json(found: ScenarioComparison) -> str:
+def scenarios_json(comparison: ScenarioComparison) -> str:
     """Return the comparison as JSON text; numbers that are not finite become null."""
     facts = {
-        "problem": found.problem,
-        "scenarios": found.count,
-        "seed": found.seed,
-        "mismatch": found.percent,
-        "versions": dict(found.versions),
-        "verdict": list(found.verdict),
-        "controllers": {one.name: _facts(one) for one in found.summaries},
-        "skipped": dict(found.skipped),
-        "tuning": dict(found.tuning),
+        "problem": comparison.problem,
+        "scenarios": comparison.count,
+        "seed": comparison.seed,
+        "mismatch": comparison.percent,
+        "versions": dict(comparison.versions),
+        "verdict": list(comparison.verdict),
+        "controllers": {one.name: _facts(one) for one in comparison.summaries},
+        "skipped": dict(comparison.skipped),
+        "tuning": dict(comparison.tuning),
     }
     return json.dumps(facts, indent=2, allow_nan=False)
 

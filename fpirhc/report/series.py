@@ -17,7 +17,7 @@ _RESPONSES = ("nominal", "desired", "deformed", "realised")
 
 
 def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]:
-    """Return what the page's charts draw: controllers with their colours, and charts with one series per controller."""
+    """Return the data of the page's charts: controllers with their colours, and charts with one series per controller."""
     entries = [e for e in comparison.entries if e.run.cycles > 1]
     if not entries:
         return {"controllers": [], "charts": [], "time": []}
@@ -92,15 +92,15 @@ def _chart(title: str, unit: str, lines: Sequence[tuple[str, Run, str]], edges: 
 
 def _extremes(values: np.ndarray, edges: np.ndarray) -> list[float | None]:
     """Two values per interval: its extremes in the order in which they occur; None where the run had ended."""
-    found: list[float | None] = []
+    extremes: list[float | None] = []
     for begin, end in pairwise(edges):
         part = values[begin:end]
         if part.size == 0:
-            found += [None, None]
+            extremes += [None, None]
             continue
         low, high = int(np.argmin(part)), int(np.argmax(part))
-        found += _round(part[[min(low, high), max(low, high)]])
-    return found
+        extremes += _round(part[[min(low, high), max(low, high)]])
+    return extremes
 
 
 def _round(values: np.ndarray) -> list[float]:

@@ -1,4 +1,4 @@
-"""What a user sees on the terminal: progress bars, the table, the verdict."""
+"""The output on the terminal: progress bars, the table, the verdict."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def progress_bars() -> Iterator[Report]:
 
 
 def announce_backend(runs: Iterable[Run]) -> None:
-    """Print on standard error when loops of a command ran without compiled C, and why."""
+    """Print on standard error why loops of a command ran without compiled C, where they did."""
     reasons = {str(run.settings["why not compiled"]) for run in runs if not run.compiled}
     for reason in sorted(reasons):
         why = "--no-compile was given" if reason == SWITCHED_OFF else reason
@@ -51,76 +51,80 @@ def announce_backend(runs: Iterable[Run]) -> None:
 
 
 def show(comparison: Comparison, report: Path) -> None:
-    """Print the verdict, the table and where the report is."""
+    """Print the verdict, the table and the path of the report."""
     console = Console()
-    _say(console, comparison.title, style="bold")
+    say(console, comparison.title, style="bold")
     for sentence in comparison.verdict:
-        _say(console, f"- {sentence}")
+        say(console, f"- {sentence}")
     console.print(_table(comparison))
     if sum(e.optimality is not None for e in comparison.entries) > 1:
         console.print(_plans(comparison))
     for entry in comparison.entries:
         for note in entry.notes:
-            _say(console, f"{entry.name}: {note}")
+            say(console, f"{entry.name}: {note}")
     for name, why in comparison.skipped.items():
-        _say(console, f"skipped {name}: {why}")
-    _say(console, f"report: {report}", wrap=False)
+        say(console, f"skipped {name}: {why}")
+    say(console, f"report: {report}", wrap=False)
 
 
 def show_run(run: Run, metrics: Metrics, saved: Path) -> None:
-    """Print one run's metrics and where it is saved."""
+    """Print one run's metrics and the path of its file."""
     console = Console()
     for column in columns([metrics]):
-        _say(console, f"{column.heading}: {column.text(column.number(metrics), missing='-', none='none')}")
+        say(console, f"{column.heading}: {column.text(column.number(metrics), missing='-', none='none')}")
     if run.stop:
-        _say(console, f"ended early: {run.stop}")
-    _say(console, f"saved: {saved}", wrap=False)
+        say(console, f"ended early: {run.stop}")
+    say(console, f"saved: {saved}", wrap=False)
 
 
 def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
-    """Print what open-loop solves found."""
+    """Print the plans of open-loop solves."""
     console = Console()
-    caption = "K: contraction factor; du <: error of any input at most; dV <: cost above the optimum at most"
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=_literal(f"{task}, first horizon"), caption=caption)
+    caption = (
+        "K: contraction factor; du <: bound of the error of every input; dV <: bound of the cost above the optimum"
+    )
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=literal(f"{task}, first horizon"), caption=caption)
     table.add_column("optimiser", no_wrap=True)
     for head in ("cost", "residual", "iter", "K", "du <", "dV <", "status"):
         table.add_column(head, justify="right", no_wrap=True)
     for one in solved:
-        plan, known = one.plan, one.certificate
-        bounds = (
-            [f"{known.factor:.3f}", f"{known.input_error:.1e}", f"{known.suboptimality:.1e}"] if known else ["-"] * 3
-        )
-        table.add_row(
-            _literal(one.name),
-            f"{plan.cost:.7g}",
-            f"{plan.stationarity:.0e}",
-            f"{plan.iterations:.0f}" if plan.iterations >= 0 else "-",
-            *bounds,
-            plan.status.name.lower().replace("_", " "),
-        )
+        table.add_row(*_plan_row(one))
     console.print(table)
     for one in solved:
         for text in one.plan.violations():
-            _say(console, f"{one.name}: {text}")
+            say(console, f"{one.name}: {text}")
         for name, price in one.plan.slacks().items():
-            _say(console, f"{one.name}: soft limit '{name}' costs {price:.4g}")
+            say(console, f"{one.name}: soft limit '{name}' costs {price:.4g}")
         if one.plan.overflow():
-            _say(console, f"{one.name}: {one.plan.overflow()}")
+            say(console, f"{one.name}: {one.plan.overflow()}")
         if one.plan.status != Status.OK:
-            _say(console, f"{one.name}: {one.plan.status.remedy}")
-    _say(console, f"picture: {picture}", wrap=False)
+            say(console, f"{one.name}: {one.plan.status.remedy}")
+    say(console, f"picture: {picture}", wrap=False)
+
+
+def _plan_row(solved: Solved) -> list[str | Text]:
+    plan, known = solved.plan, solved.certificate
+    bounds = [f"{known.factor:.3f}", f"{known.input_error:.1e}", f"{known.suboptimality:.1e}"] if known else ["-"] * 3
+    return [
+        literal(solved.name),
+        f"{plan.cost:.7g}",
+        f"{plan.stationarity:.0e}",
+        f"{plan.iterations:.0f}" if plan.iterations >= 0 else "-",
+        *bounds,
+        plan.status.name.lower().replace("_", " "),
+    ]
 
 
 def _table(comparison: Comparison) -> Table:
     table = Table(
         box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
-        title=_literal(f"{comparison.problem}, from t = {comparison.measure_from:g} s, seed {comparison.seed}"),
+        title=literal(f"{comparison.problem}, from t = {comparison.measure_from:g} s, seed {comparison.seed}"),
     )
     table.add_column("controller", min_width=16)
     shown = columns([e.metrics for e in comparison.entries], headline=True)
     for column in shown:
-        table.add_column(_literal(column.short), justify="right")
+        table.add_column(literal(column.short), justify="right")
     table.add_column("cycle us", justify="right")
     table.add_column("status", no_wrap=True)
     for entry in comparison.entries:
@@ -130,14 +134,14 @@ def _table(comparison: Comparison) -> Table:
 
 def _row(entry: Entry, shown: Sequence[Column]) -> list[str | Text]:
     metrics, cycle = entry.metrics, entry.cycle
-    numbers = [_literal(c.text(c.number(metrics), missing="", none="-")) for c in shown]
+    numbers = [literal(c.text(c.number(metrics), missing="", none="-")) for c in shown]
     fine = metrics.statuses.get("OK", 0) / max(sum(metrics.statuses.values()), 1)
     status = "ended early" if entry.run.stop else "ok" if fine == 1 else f"ok {100 * fine:.3g} %"
-    return [_literal(entry.name), *numbers, f"{cycle.median:.2g}" if cycle else "", status]
+    return [literal(entry.name), *numbers, f"{cycle.median:.2g}" if cycle else "", status]
 
 
 def _plans(comparison: Comparison) -> Table:
-    """How the optimisers did: cost above the converged optimum, iterations, time of the cycles that plan."""
+    """Table of the optimisers: cost above the converged optimum, iterations, time of the cycles that plan."""
     caption = "gap: cost above the converged optimum, relative; plan us: the cycles that plan"
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title="plans", caption=caption)
     table.add_column("controller", no_wrap=True)
@@ -149,7 +153,7 @@ def _plans(comparison: Comparison) -> Table:
             continue
         times = [_micro(v) for v in (cycle.planning, cycle.p99, cycle.maximum, cycle.first)] if cycle else [""] * 4
         table.add_row(
-            _literal(entry.name),
+            literal(entry.name),
             *(metrics.text(f"solve.{name}") for name in ("median_iterations", "median_stationarity")),
             f"{excess.median:.0e}" if excess else "-",
             *times,
@@ -157,13 +161,14 @@ def _plans(comparison: Comparison) -> Table:
     return table
 
 
-def _literal(text: str) -> Text:
-    """Text in which nothing is markup, an emoji code or an escape code."""
+def literal(text: str) -> Text:
+    """Return text in which nothing is markup, an emoji code or an escape code."""
     return Text(printable(text))
 
 
-def _say(console: Console, text: str, *, style: str = "", wrap: bool = True) -> None:
-    console.print(_literal(text), style=style, highlight=False, soft_wrap=not wrap)
+def say(console: Console, text: str, *, style: str = "", wrap: bool = True) -> None:
+    """Print text in which nothing is markup; without `wrap` it stays on one line."""
+    console.print(literal(text), style=style, highlight=False, soft_wrap=not wrap)
 
 
 def _micro(value: float) -> str:

@@ -1,4 +1,4 @@
-"""The pictures that a problem wants in its report, drawn from the runs of a comparison."""
+"""The pictures that a problem file lists for its report, drawn from the runs of a comparison."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def wanted_pictures(comparison: Comparison) -> str:
-    """Return the section with the problem's own pictures; empty where it wants none."""
+    """Return the section with the problem's own pictures; empty where there are none."""
     runs = {e.name: e.run for e in comparison.entries if e.run.cycles > 1}
     blocks = [_block(wanted, runs) for wanted in comparison.pictures]
     return f"<section><h2>Pictures of this problem</h2>{''.join(blocks)}</section>" if any(blocks) else ""

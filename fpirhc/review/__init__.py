@@ -1,1 +1,1 @@
-"""Questions asked before a run: what the symbols, the two parameter sets and the settings already tell."""
+"""Questions that the symbols, the two parameter sets and the settings answer before a run."""

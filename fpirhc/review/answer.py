@@ -8,7 +8,7 @@ from enum import StrEnum
 
 
 class Verdict(StrEnum):
-    """Yes is good in every question."""
+    """The verdict of an answer; yes is good in every question."""
 
     YES = "yes"
     NO = "no"
@@ -17,11 +17,13 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Answer:
-    """One answer.
+    """The answer to one question.
 
-    Parameters:
-        question: as a reader would ask it. verdict: yes, no, unknown.
-        found: the facts in a sentence, with the deciding number and its unit. change: what to change; empty after a yes.
+    Args:
+        question: in the words of a reader.
+        verdict: yes, no, unknown.
+        found: the facts in a sentence, with the deciding number and its unit.
+        change: what to change; empty after a yes.
         numbers: the same facts by name.
     """
 
@@ -34,10 +36,11 @@ class Answer:
 
 @dataclass(frozen=True)
 class Review:
-    """What is known before a run.
+    """All answers about a problem and its controllers.
 
-    Parameters:
-        problem: its answers. controllers: each one's answers by name.
+    Args:
+        problem: answers about the problem.
+        controllers: answers about each controller, by name.
         mismatch: range of the exact parameters, percent, see `fpirhc.plant.mismatch`.
     """
 
@@ -52,10 +55,10 @@ class Review:
 
     @property
     def ready(self) -> bool:
-        """Whether no answer is a no."""
+        """Whether every answer is yes or unknown."""
         return all(a.verdict != Verdict.NO for a in self.answers)
 
 
 def decided(good: bool) -> Verdict:
-    """Yes where the condition holds, else no."""
+    """Return yes where the condition holds, else no."""
     return Verdict.YES if good else Verdict.NO

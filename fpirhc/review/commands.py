@@ -39,7 +39,10 @@ def _range(grid: ReviewGrid) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _used(commands: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """How much of the way from the middle to its limit a command needs, 0 or 2 where one side is free; above 1: beyond."""
+    """Share of the way from the middle to its limit that a command needs; above 1 it is outside.
+
+    Where one side has no limit, the share is 0 inside and 2 outside.
+    """
     both = np.isfinite(lower) & np.isfinite(upper)
     middle = np.where(both, 0.5 * (np.where(both, lower, 0) + np.where(both, upper, 0)), 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):

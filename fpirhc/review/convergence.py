@@ -7,10 +7,10 @@ The linear closed loop decides: with rho the largest |pole| at a point of the re
     else                                        unknown.
 
 What linear loops do not show makes a convergence unknown: the steepest secant of the map beyond its limit, on or near the
-reference (large errors may end in a bounded oscillation), a map that is too slow or whose range is too short for the
+reference (large errors may end in a bounded oscillation), a map that is too slow or whose range is too small for the
 requests, commands outside their limits, and a gain or a pairing that changes on line.
 
-The verdict is about the plant with its exact parameters; `box_converges` asks for those of the box.
+The verdict is about the plant with its exact parameters; `box_converges` covers the parameters of the box.
 """
 
 from __future__ import annotations
@@ -31,12 +31,19 @@ _SURE = math.log(100)
 
 
 def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: list[str]) -> Answer:
-    """Return whether the deformation of a controller converges; `doubts` are other answers that speak against it."""
+    """Return whether the deformation of a controller converges.
+
+    Args:
+        grid: points of the reference and draws of the parameters.
+        controller: the controller with its deformation.
+        loops: its linear loops.
+        doubts: reasons against convergence from other answers.
+    """
     if not loops.loops:
         return Answer(QUESTION, Verdict.UNKNOWN, f"no linear loop: {loops.reason}", "Run it and look at the factor.")
     growth = np.log(np.maximum(loops.radii, 1e-300)) * grid.problem.cycles
     worst = float(loops.radii.max())
-    found = f"the slowest mode of the linear loop changes by {worst:.6g} per cycle"
+    text = f"the slowest mode of the linear loop changes by {worst:.6g} per cycle"
     numbers = {"radius": worst, "smallest_radius": float(loops.radii.min())}
     deformation = controller.deformation
     if not deformation.constant or loops.learns:
@@ -45,19 +52,19 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
             if loops.learns
             else f"{type(deformation).__name__} changes its map"
         )
-        change = f"{what} on line; the factor is that of its start."
-        return Answer(QUESTION, Verdict.UNKNOWN, found, change, numbers)
+        change = f"{what} on line; the factor is that of the first cycle."
+        return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
     if growth.min() > _SURE:
-        return Answer(QUESTION, Verdict.NO, f"{found}: it grows all along the reference", _mend(loops), numbers)
+        return Answer(QUESTION, Verdict.NO, f"{text}: it grows all along the reference", _mend(loops), numbers)
     if growth.max() > -_SURE:
         where = f"between {loops.radii.min():.6g} and {worst:.6g} along the reference"
-        return Answer(QUESTION, Verdict.UNKNOWN, f"{found} ({where})", _mend(loops), numbers)
+        return Answer(QUESTION, Verdict.UNKNOWN, f"{text} ({where})", _mend(loops), numbers)
     against = [*_steep(grid, controller), *doubts]
     if against:
         return Answer(
-            QUESTION, Verdict.UNKNOWN, f"{found}, but {'; '.join(against)}", "See the questions named.", numbers
+            QUESTION, Verdict.UNKNOWN, f"{text}, but {'; '.join(against)}", "See the questions named.", numbers
         )
-    return Answer(QUESTION, Verdict.YES, found, "", numbers)
+    return Answer(QUESTION, Verdict.YES, text, "", numbers)
 
 
 def box_converges(loops: Loops) -> Answer:
@@ -72,7 +79,7 @@ def box_converges(loops: Loops) -> Answer:
     numbers = {"share": share, "radius": worst}
     if share == 1:
         return Answer(question, Verdict.YES, text, "", numbers)
-    return Answer(question, Verdict.UNKNOWN, text, "Lower the gain, or know the parameters better.", numbers)
+    return Answer(question, Verdict.UNKNOWN, text, "Lower the gain, or narrow the box of the parameters.", numbers)
 
 
 def _mend(loops: Loops) -> str:
@@ -80,11 +87,11 @@ def _mend(loops: Loops) -> str:
         return (
             "The outer loop does not converge even with the right model: lower its rate, or predict over the dead time."
         )
-    return "Change the gain as the question about it says; under dead time pair the deformation."
+    return "Change the gain to the recommended one; under dead time pair the deformation."
 
 
 def _steep(grid: ReviewGrid, controller: Controller) -> list[str]:
-    """Whether the steepest secant of the map leaves its limit near the reference."""
+    """Reasons why large errors may not converge: the steepest secant of the map leaves its limit near the reference."""
     deformation = controller.deformation
     believed = controller.parameters(grid.problem.plant)
     eigenvalues = eigenvalues_near(grid, believed, grid.draws[:1], near=True).ravel()
@@ -96,4 +103,6 @@ def _steep(grid: ReviewGrid, controller: Controller) -> list[str]:
         return ["near the reference the response Jacobian changes its sign"]
     if reached <= limit:
         return []
-    return [f"its steepest secant makes {reached:.3g} of the {limit:.3g} that converge near the reference"]
+    return [
+        f"near the reference its steepest secant times an eigenvalue reaches {reached:.3g}, and the limit is {limit:.3g}"
+    ]

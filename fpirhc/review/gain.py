@@ -12,7 +12,14 @@ QUESTION = "Is the map's gain admissible?"
 
 
 def gain_admissible(deformation: Deformation, own: Spectrum, boxed: Spectrum, limit: float) -> Answer:
-    """Return the interval and the recommended value; `limit` is that of gain times eigenvalue (2 without dead time)."""
+    """Return the interval of admissible gains and the recommended value.
+
+    Args:
+        deformation: the map.
+        own: eigenvalues of the response Jacobian along the reference, with the exact parameters.
+        boxed: the same over the box of parameters.
+        limit: limit of gain times eigenvalue, 2 without dead time.
+    """
     share = limit / 2
     near, wide = assess_gain(deformation, own), assess_gain(deformation, boxed)
     name = near.gain_name

@@ -1,7 +1,7 @@
-"""Where a review looks: points of the reference, and draws of the exact parameters from their box.
+"""The points of a review: points of the reference, and draws of the exact parameters from their box.
 
 The box of a parameter spans the range of its exact value (see `fpirhc.plant.mismatch`) and its approximate value. At every point
-the input u* that the reference needs and the request r* that means it to the model are known from the symbols:
+the symbols give the input u* that the reference needs and the request r* for which the model computes this input:
 
     u* = inverse(x^N, r^N; exact),        r* = response(x^N, u*; approximate),
 
@@ -27,8 +27,11 @@ _DRAWS = 64
 class ReviewGrid:
     """Points of the reference and draws of the parameters; build it with `review_grid`.
 
-    Parameters:
-        times (m,), s; states (m, nx) and responses (m, n) of the controlled coordinates: the nominal motion.
+    Args:
+        problem: the problem.
+        times: times of the points, s, shape (m,).
+        states: states of the reference, shape (m, nx).
+        responses: responses of the controlled coordinates that the reference needs, shape (m, n).
         draws: exact parameters, shape (draws, np); the first row is the plant's own.
     """
 
@@ -43,15 +46,15 @@ class ReviewGrid:
         """Inputs that the reference needs, per draw and point, shape (draws, m, nu); NaN where there is no inverse."""
         m, k = len(self.times), len(self.draws)
         states, responses = (np.tile(rows, (k, 1)) for rows in (self.states, self.responses))
-        given = each(self.problem.plant.inverse_function, states, responses, np.repeat(self.draws, m, axis=0))
-        return given.reshape(k, m, -1)
+        commands = each(self.problem.plant.inverse_function, states, responses, np.repeat(self.draws, m, axis=0))
+        return commands.reshape(k, m, -1)
 
     def needed(self, parameters: np.ndarray) -> np.ndarray:
         """Inputs that the reference needs with these parameters, shape (m, nu)."""
         return each(self.problem.plant.inverse_function, self.states, self.responses, self._rows(parameters))
 
     def requests(self, believed: np.ndarray) -> np.ndarray:
-        """What a controller with the believed parameters must ask for along the reference, shape (m, n): r*."""
+        """Requests r* of a controller with the believed parameters along the reference, shape (m, n)."""
         function = self.problem.plant.controlled_response_function
         return each(function, self.states, self.commands[0], self._rows(believed))
 
@@ -60,7 +63,12 @@ class ReviewGrid:
 
 
 def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
-    """Return the points and draws of a review; `mismatch` in percent.
+    """Return the points and draws of a review.
+
+    Args:
+        problem: the problem.
+        mismatch: range of the exact parameters, percent, see `fpirhc.plant.mismatch`.
+        seed: of the draws.
 
     Raises:
         NotInvertible: the inputs and the controlled coordinates differ in number.
@@ -68,8 +76,8 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
     plant = problem.plant
     function = problem.reference.function(plant)
     times = np.linspace(0.0, problem.duration, _POINTS)
-    given = function.map(_POINTS)(times[None, :])
-    states, responses = (np.asarray(v.full()).T for v in given)
+    nominal = function.map(_POINTS)(times[None, :])
+    states, responses = (np.asarray(v.full()).T for v in nominal)
     box = parameter_box(problem, mismatch)
     lower, upper = (np.array([box[name][k] for name in plant.parameters]) for k in (0, 1))
     draws = _draws(lower, upper, np.random.default_rng(seed))
@@ -91,7 +99,7 @@ def parameter_box(problem: Problem, mismatch: float) -> dict[str, tuple[float, f
 
 
 def _draws(lower: np.ndarray, upper: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Corners where they are few enough, else random ones; and as many points inside."""
+    """All corners of the box where they are few, else random corners; and as many random points inside."""
     free = np.flatnonzero(upper > lower)
     if not free.size:
         return np.zeros((0, lower.size))
@@ -106,6 +114,6 @@ def _draws(lower: np.ndarray, upper: np.ndarray, random: np.random.Generator) ->
 
 
 def each(function: ca.Function, *arguments: np.ndarray) -> np.ndarray:
-    """Return a Function of columns at every row of its arguments, shape (rows, size)."""
+    """Return the values of a Function of columns at every row of its arguments, shape (rows, size)."""
     table = function.map(len(arguments[0]))(*(rows.T for rows in arguments))
     return np.asarray(table.full()).T

@@ -1,4 +1,4 @@
-"""Is the horizon long enough? It is where looking twice as far hardly changes what the plan does now."""
+"""Is the horizon long enough? It is, where a horizon of twice the length hardly changes the first command of a plan."""
 
 from __future__ import annotations
 
@@ -43,11 +43,9 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
 
 def _slowest(grid: ReviewGrid) -> float:
     """Longest time constant of the model alone, s; infinite where a mode neither decays nor grows."""
-    rates = np.abs(
-        np.linalg.eigvals(
-            _generator(grid, np.zeros((len(grid.problem.plant.inputs), grid.problem.plant.state.size)))
-        ).real
-    )
+    plant = grid.problem.plant
+    without_feedback = _generator(grid, np.zeros((len(plant.inputs), plant.state.size)))
+    rates = np.abs(np.linalg.eigvals(without_feedback).real)
     return float(1 / rates.min()) if rates.min() > 1e-9 else float("inf")
 
 

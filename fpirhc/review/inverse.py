@@ -32,7 +32,7 @@ def inverse_exists(grid: ReviewGrid) -> Answer:
     signs = [np.sign(np.linalg.det(g)) for g in (gains[0], usual)]
     text = f"condition at most {condition:.3g}, the smallest gain is {share:.3g} of its largest"
     if np.unique(signs[0]).size > 1 or not np.linalg.cond(gains[0]).max() < _SINGULAR:
-        return Answer(QUESTION, Verdict.NO, f"{text}; it vanishes on the way", _CHANGE, numbers)
+        return Answer(QUESTION, Verdict.NO, f"{text}; it vanishes along the reference", _CHANGE, numbers)
     if np.unique(signs[1]).size > 1 or bad.any():
         return Answer(
             QUESTION, Verdict.UNKNOWN, f"{text}; it changes sign within the box of the parameters", _CHANGE, numbers
@@ -54,5 +54,5 @@ def _gains(grid: ReviewGrid) -> np.ndarray:
     m, n = len(grid.times), len(plant.inputs)
     sets = np.vstack([grid.draws, plant.approximate])
     commands = np.concatenate([grid.commands, grid.needed(plant.approximate)[None]]).reshape(-1, n)
-    found = each(function, np.tile(grid.states, (len(sets), 1)), commands, np.repeat(sets, m, axis=0))
-    return found.reshape(len(sets), m, n, n).transpose(0, 1, 3, 2)
+    columns = each(function, np.tile(grid.states, (len(sets), 1)), commands, np.repeat(sets, m, axis=0))
+    return columns.reshape(len(sets), m, n, n).transpose(0, 1, 3, 2)

@@ -10,8 +10,8 @@ time and integrator as they are - and differentiated at rest:
 
     z+ = F z + G w,        v = C z,
 
-z all that the loop remembers, w what is added to the plant's inputs, v the commands that arrive there. What only counts, stays what
-it is, or is read by nothing else has been left out of z.
+where z is all that the loop remembers, w is added to the plant's inputs, and v are the commands that arrive there. Entries that
+only count, stay constant, or are read by nothing else have been left out of z.
 """
 
 from __future__ import annotations
@@ -41,7 +41,15 @@ LARGEST = 1500  # entries of the loop's memory, beyond which its eigenvalues tak
 
 @dataclass(frozen=True, eq=False)
 class LinearLoop:
-    """One cycle of the loop, z+ = F z + G w, v = C z; `state` are the places of the plant's state in z."""
+    """One cycle of the loop, z+ = F z + G w, v = C z.
+
+    Args:
+        dynamics: F.
+        entry: G.
+        arriving: C.
+        state: places of the plant's state in z.
+        period: of the control cycle, s.
+    """
 
     dynamics: np.ndarray
     entry: np.ndarray
@@ -62,7 +70,16 @@ class LinearLoop:
 
 @dataclass(frozen=True, eq=False)
 class LoopMatrices:
-    """Turns linearisations of plant and model into the loop's matrices; build it with `loop_matrices`."""
+    """Turns linearisations of plant and model into the loop's matrices; build it with `loop_matrices`.
+
+    Args:
+        function: (memory, disturbance) -> F, G, C over the whole memory.
+        rest: the memory at rest.
+        exact: places of the plant's linearisation in the memory.
+        believed: places of the model's linearisation in the memory.
+        state: places of the plant's state in the memory.
+        period: of the control cycle, s.
+    """
 
     function: ca.Function
     rest: np.ndarray
@@ -72,42 +89,49 @@ class LoopMatrices:
     period: float
 
     def at(self, exact: np.ndarray, believed: np.ndarray) -> LinearLoop:
-        """Return the loop of a plant and a model given by `linear_parameters`."""
+        """Return the loop of a plant and a model, both as `linear_parameters` returns them."""
         memory = self.rest.copy()
         memory[self.exact], memory[self.believed] = exact, believed
         f, g, c = (np.asarray(m.full()) for m in self.function(memory, np.zeros(self.function.size1_in(1))))
         moving = np.any(f != np.eye(len(f)), axis=1)
         moving[self.exact] = moving[self.believed] = False
         moving[self.state] = True
-        kept = _read(f, c, moving)
-        kept[self.state] = True
-        state = np.cumsum(kept)[self.state] - 1
-        return LinearLoop(f[np.ix_(kept, kept)], g[kept], c[:, kept], state, self.period)
+        used = _read(f, c, moving)
+        used[self.state] = True
+        state = np.cumsum(used)[self.state] - 1
+        return LinearLoop(f[np.ix_(used, used)], g[used], c[:, used], state, self.period)
 
 
 def _read(f: np.ndarray, c: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """Those entries that another one or the command depends on: an integral that no law uses is none of the loop's modes."""
-    kept = among.copy()
+    """Entries on which another entry or the command depends: an integral that no law reads is no mode of the loop."""
+    used = among.copy()
     others = (f != 0) & ~np.eye(len(f), dtype=bool)
     while True:
-        used = kept & (others[kept].any(axis=0) | (c != 0).any(axis=0))
-        if (used == kept).all():
-            return kept
-        kept = used
+        still_used = used & (others[used].any(axis=0) | (c != 0).any(axis=0))
+        if (still_used == used).all():
+            return used
+        used = still_used
 
 
 def response_slopes(plant: Plant) -> ca.Function:
-    """Function (state, input, parameters) -> A (n, nx), B (n, nu) of the responses."""
+    """Return the Function (state, input, parameters) -> A (n, nx), B (n, nu) of the responses."""
     x, u, p = plant._symbols()
     response = plant.response_function(x, u, p)
     slopes = [ca.densify(ca.jacobian(response, v)) for v in (x, u)]
     return ca.Function("fpirhc_slopes", [x, u, p], slopes)
 
 
+def controlled_gain(
+    plant: Plant, slopes: ca.Function, state: np.ndarray, command: np.ndarray, parameters: np.ndarray
+) -> np.ndarray:
+    """Return B (n, nu) of the controlled coordinates at a point; `slopes` are those of `response_slopes`."""
+    return np.asarray(slopes(state, command, parameters)[1].full())[list(plant.controlled_indices)]
+
+
 def linear_parameters(
     slopes: ca.Function, state: np.ndarray, command: np.ndarray, parameters: np.ndarray, feedback: np.ndarray
 ) -> np.ndarray:
-    """Return what `linear_plant` takes as parameters: A, B of the responses at a point, and a plan's feedback (nu, nx)."""
+    """Return the parameters of `linear_plant`: A and B of the responses at a point, and a plan's feedback (nu, nx)."""
     a, b = (np.asarray(m.full()) for m in slopes(state, command, parameters))
     return np.concatenate([a.ravel(), b.ravel(), feedback.ravel()])
 
@@ -126,19 +150,19 @@ def linear_plant(plant: Plant, sign: float) -> Plant:
     values = np.concatenate([np.zeros(n * nx), gain.ravel(), np.zeros(nu * nx)])
     parameters = {name: Parameter(v, sign * v, "1") for name, v in zip(names, values, strict=True)}
 
-    def response(*given: Named) -> Mapping[str, Expression]:
-        *derivatives, u, p = given
+    def response(*arguments: Named) -> Mapping[str, Expression]:
+        *derivatives, u, p = arguments
         entries = p.vector
         by_name = {c + "'" * k: d[c] for k, d in enumerate(derivatives) for c in d}
         x = ca.vertcat(*(by_name[e] for e in plant.state.elements))
         a = ca.reshape(entries[: n * nx], nx, n).T
         b = ca.reshape(entries[n * nx : n * (nx + nu)], nu, n).T
-        found = a @ x + b @ u.vector
-        return {c: found[k] for k, c in enumerate(plant.names)}
+        responses = a @ x + b @ u.vector
+        return {c: responses[k] for k, c in enumerate(plant.names)}
 
     kind = inspect.Parameter.POSITIONAL_ONLY
-    arguments = [f"d{k}" for k in range(max(plant.orders))] + ["u", "p"]
-    vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(a, kind) for a in arguments])
+    names = [f"d{k}" for k in range(max(plant.orders))] + ["u", "p"]
+    vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(name, kind) for name in names])
     order = dict(zip(plant.names, plant.orders, strict=True))
     return Plant(plant.coordinates, plant.inputs, parameters, response, order, plant.controlled_names)
 
@@ -147,7 +171,8 @@ def loop_matrices(problem: Problem, controller: Controller) -> LoopMatrices:
     """Return the loop of the problem's plants and the controller, to be evaluated at linearisations.
 
     Raises:
-        what the controller raises about a linear plant. NotSupported: a memory of too many entries.
+        FpirhcError: every error that the controller raises about a linear plant.
+        NotSupported: a memory of too many entries.
     """
     linear = _linear_problem(problem, controller)
     loop = close_loop(linear, controller)
@@ -156,8 +181,8 @@ def loop_matrices(problem: Problem, controller: Controller) -> LoopMatrices:
     names = loop.trace.names
     arriving = loop.trace.slice("arriving" if "arriving" in names else "command")
     z, w = ca.MX.sym("z", loop.memory.size), ca.MX.sym("w", len(problem.plant.inputs))
-    following, trace = loop.function(z, w)
-    results = [ca.jacobian(following, z), ca.jacobian(following, w), ca.jacobian(trace[arriving], z)]
+    next_memory, trace = loop.function(z, w)
+    results = [ca.jacobian(next_memory, z), ca.jacobian(next_memory, w), ca.jacobian(trace[arriving], z)]
     function = ca.Function("fpirhc_loop_matrices", [z, w], [ca.densify(r) for r in results])
     exact, believed, state = (loop.memory.slice(name) for name in ("_exact", "parameters", "_state_before"))
     return LoopMatrices(function, _at_rest(loop.function, loop.memory.start()), exact, believed, state, problem.period)
@@ -183,5 +208,5 @@ def _linear_problem(problem: Problem, controller: Controller) -> Problem:
 def _at_rest(function: ca.Function, start: np.ndarray) -> np.ndarray:
     """The memory after so many cycles at rest that every queue is full."""
     cycles = start.size + 2
-    moved = function.mapaccum("fpirhc_resting", cycles)(start, np.zeros((function.size1_in(1), cycles)))
-    return np.asarray(moved[0].full())[:, -1]
+    memories, _ = function.mapaccum("fpirhc_resting", cycles)(start, np.zeros((function.size1_in(1), cycles)))
+    return np.asarray(memories.full())[:, -1]

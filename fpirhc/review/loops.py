@@ -11,23 +11,27 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import Planner, without_deformation
 from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.linear import LinearLoop, linear_parameters, loop_matrices, response_slopes
+from fpirhc.review.linear import LinearLoop, controlled_gain, linear_parameters, loop_matrices, response_slopes
 from fpirhc.review.plan_feedback import plan_gains
 from fpirhc.review.stand_in import linear_stand_in
 from fpirhc.task.problem import Problem
 
-_WORK = 2e7  # entries^3 of all loops together: eigenvalues of large ones are asked for at fewer points
+_WORK = 2e7  # entries^3 of all loops together: large ones are evaluated at fewer points
 _FEWEST = 3
 _DRAWN = 24  # draws of the parameters, of all points together
 
 
 @dataclass(frozen=True, eq=False)
 class Loops:
-    """Linear loops with the exact parameters at points (indices into the reference's points), or the reason for none.
+    """Linear loops of a controller along the reference, or the reason why there are none.
 
-    `ideal` is the loop of a controller without deformation whose model is the plant: what the outer loop does by itself. `drawn`
-    are loops of plants from the box of parameters. `learns`: the controller changes its model on line, so that the loops are those
-    of the model that it begins with.
+    Args:
+        places: indices of the loops' points among the reference's points.
+        loops: loops of the plant with its exact parameters, one for every place.
+        ideal: loop of the controller without deformation whose model is the plant: the outer loop by itself.
+        drawn: loops of plants from the box of parameters.
+        reason: why there are no loops; else empty.
+        learns: whether the controller changes its model on line; then the loops are those of its first model.
     """
 
     places: tuple[int, ...]
@@ -44,7 +48,7 @@ class Loops:
 
 
 def loops_along(grid: ReviewGrid, controller: Controller) -> Loops:
-    """Return the controller's linear loops along the reference; where there are none, the reason."""
+    """Return the controller's linear loops along the reference, or the reason why there are none."""
     try:
         return replace(_loops(grid, controller), learns=controller.learns)
     except FpirhcError as error:
@@ -82,27 +86,30 @@ def loops_at(grid: ReviewGrid, controller: Controller, places: Sequence[int]) ->
     """Return the controller's linear loops with the exact parameters at some points of the reference.
 
     Raises:
-        NotSupported: no linear loop. And what the controller raises about a linear plant.
+        NotSupported: no linear loop.
+        FpirhcError: every error that the controller raises about a linear plant.
     """
     problem, plant = grid.problem, grid.problem.plant
     believed = controller.parameters(plant)
     stand_in, plan = linear_stand_in(controller)
     feedbacks = _gains(problem, plan, [float(grid.times[k]) for k in places], believed)
     matrices, slopes = loop_matrices(problem, stand_in), response_slopes(plant)
-    found = []
+    loops = []
     for k, feedback in zip(places, feedbacks, strict=True):
         here = (grid.states[k], grid.commands[0, k])
-        found.append(matrices.at(*(linear_parameters(slopes, *here, p, feedback) for p in (grid.draws[0], believed))))
-    return found
+        loops.append(matrices.at(*(linear_parameters(slopes, *here, p, feedback) for p in (grid.draws[0], believed))))
+    return loops
 
 
 def ideal_loops(grid: ReviewGrid, controller: Controller, count: int) -> list[tuple[LinearLoop, np.ndarray]]:
-    """Return the loops of plant = model without deformation at so many points of the reference, and where they are.
+    """Return the loops of plant = model without deformation at `count` points of the reference.
 
-    With each comes the model's gain from inputs to responses of the controlled coordinates there, (n, nu).
+    Returns:
+        Pairs of a loop and the model's gain from inputs to responses of the controlled coordinates there, (n, nu).
 
     Raises:
-        NotSupported: no linear loop, or no point where the model's inverse is finite. And what the controller raises.
+        NotSupported: no linear loop, or no point where the model's inverse is finite.
+        FpirhcError: every error that the controller raises.
     """
     problem, plant = grid.problem, grid.problem.plant
     believed = controller.parameters(plant)
@@ -114,17 +121,17 @@ def ideal_loops(grid: ReviewGrid, controller: Controller, count: int) -> list[tu
     places = _thinned(usable, count)
     feedbacks = _gains(problem, plan, [float(grid.times[k]) for k in places], believed)
     matrices = loop_matrices(problem, without_deformation(stand_in))
-    slopes, chosen = response_slopes(plant), list(plant.controlled_indices)
-    found = []
+    slopes = response_slopes(plant)
+    loops = []
     for k, feedback in zip(places, feedbacks, strict=True):
         model = linear_parameters(slopes, grid.states[k], needed[k], believed, feedback)
-        gain = np.asarray(slopes(grid.states[k], needed[k], believed)[1].full())[chosen]
-        found.append((matrices.at(model, model), gain))
-    return found
+        gain = controlled_gain(plant, slopes, grid.states[k], needed[k], believed)
+        loops.append((matrices.at(model, model), gain))
+    return loops
 
 
 def _pairs(grid: ReviewGrid, places: list[int]) -> list[tuple[int, int]]:
-    """Points and draws, each point with draws of its own; few where the loops are large and the points few."""
+    """Pairs of a point and a draw; every point has draws of its own, and few points have few draws."""
     count = min(len(grid.draws) - 1, _DRAWN, 2 * len(places))
     if count <= 0:
         return []

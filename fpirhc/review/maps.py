@@ -1,4 +1,4 @@
-"""What a deformation is made of, as far as a review needs to know."""
+"""Facts about dead time and deformations that several questions share."""
 
 from __future__ import annotations
 
@@ -16,11 +16,15 @@ def dead_cycles(problem: Problem) -> float:
 
 
 def largest_product(problem: Problem, deformation: Deformation) -> float:
-    """Limit of effective gain times eigenvalue: 2, or less under a dead time or behind an estimator or a filter.
+    """Return the limit of effective gain times eigenvalue: 2, or less under a dead time or behind an estimator or a filter.
 
-    Under a dead time, unpaired: 2 sin(pi / (2 (2 d + 1))), d rounded up. Paired with the true dead time: 2. Leaky and wrong by m
-    cycles: the g of 4 p / (1 - p)^2 = g (2 + g) m^2, the theorem's, if that is below 2. Paired without a leak and wrong, or with a
-    mean of requests: 0.5, up to which the remembered requests decay.
+    With a dead time of d cycles the limit is, for a map
+
+        without pairing                               2 sin(pi / (2 (2 d + 1))), d rounded up
+        paired with the true dead time                2
+        with the leak p, paired wrongly by m cycles   the g of 4 p / (1 - p)^2 = g (2 + g) m^2, at most 2
+        without a leak, paired wrongly                0.5, up to which the remembered requests decay
+        paired with a mean of requests                0.5 without a leak.
     """
     pairs, leak, cycles = deformation.pairing, deformation.leak, dead_cycles(problem)
     averaged, own = pairs is not None and pairs.uncertainty > 0, (pairs.cycles or 0.0) if pairs else 0.0

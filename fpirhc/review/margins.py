@@ -1,4 +1,4 @@
-"""How robust is the linear loop? Poles, and gain, phase and delay margin of each input's loop, opened where it enters the plant.
+"""How robust is the linear loop? By its poles, and the margins of gain, phase and delay of each input's loop, opened at the plant.
 
 With z+ = F z + G w and v = C z (commands that arrive) the loop of input i is opened by w_i = w_i' - v_i:
 
@@ -37,9 +37,9 @@ def margins_enough(problem: Problem, loops: Loops) -> Answer:
         radius = float(loops.radii.max())
         text = f"largest |pole| {radius:.6g}; no margins of a loop of {len(loops.loops[0].dynamics)} states"
         return Answer(QUESTION, Verdict.UNKNOWN, text, "", {"radius": radius})
-    chosen = {0, int(np.argmax(loops.radii))}
-    found = [margins(loops.loops[k], i) for k in sorted(chosen) for i in range(len(problem.plant.inputs))]
-    gain, phase, delay = (min(column) for column in zip(*found, strict=True))
+    places = {0, int(np.argmax(loops.radii))}
+    all_margins = [margins(loops.loops[k], i) for k in sorted(places) for i in range(len(problem.plant.inputs))]
+    gain, phase, delay = (min(column) for column in zip(*all_margins, strict=True))
     radius = float(loops.radii.max())
     numbers = {"radius": radius, "gain_margin": gain, "phase_margin": phase, "delay_margin": delay}
     text = (
@@ -61,7 +61,15 @@ def margins_enough(problem: Problem, loops: Loops) -> Answer:
 
 
 def margins(loop: LinearLoop, place: int) -> tuple[float, float, float]:
-    """Return (gain margin as a factor >= 1 up or down, phase margin in degrees, delay margin in s) of one input's loop."""
+    """Return the margins of one input's loop.
+
+    Args:
+        loop: the linear loop.
+        place: number of the input.
+
+    Returns:
+        Gain margin as a factor of at least 1, up or down; phase margin, degrees; delay margin, s.
+    """
     import control  # slow to import, and only margins need it
 
     nyquist = math.pi / loop.period

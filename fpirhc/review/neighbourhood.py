@@ -1,7 +1,7 @@
 """Eigenvalues of the response Jacobian on the reference and near it.
 
-The deformation works from the first request, r = d, to the fixed point r*, and the state begins where the problem says; so J is
-asked for at requests from d to r* and a little beyond both, and at states that are displaced by the first tracking error.
+The deformation works from the first request, r = d, to the fixed point r*, and the state begins at the start of the problem. J is
+therefore evaluated at requests from d to r* and a little beyond both, and at states that are displaced by the first tracking error.
 """
 
 from __future__ import annotations
@@ -19,9 +19,13 @@ _SAMPLES = 2000
 
 
 def eigenvalues_near(grid: ReviewGrid, believed: np.ndarray, draws: np.ndarray, *, near: bool) -> np.ndarray:
-    """Return eigenvalues of J, shape (samples, n): on the reference at r*, or also near it; rows that are not finite are left out.
+    """Return eigenvalues of J, shape (samples, n); samples that are not finite are left out.
 
-    Parameters: `draws` of the exact parameters, shape (draws, np), of which as many are used as the samples allow.
+    Args:
+        grid: points of the reference.
+        believed: parameters of the model, shape (np,).
+        draws: draws of the exact parameters, shape (draws, np); as many are used as the number of samples allows.
+        near: whether to sample near the reference too, and not only on it at r*.
     """
     states, requests = _near(grid, believed) if near else (grid.states, grid.requests(believed))
     count = max(1, min(len(draws), _SAMPLES // len(states)))
@@ -57,8 +61,8 @@ def _near(grid: ReviewGrid, believed: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def stacked_jacobian(plant: Plant) -> ca.Function:
-    """The response Jacobian as one column."""
+    """Return the response Jacobian as one column."""
     function = response_jacobian(plant)
     matrix = kind(plant.inverse_opaque)
-    given = [matrix.sym(f"v{k}", function.size1_in(k)) for k in range(function.n_in())]
-    return ca.Function("fpirhc_stacked_jacobian", given, [ca.vec(function(*given))])
+    symbols = [matrix.sym(f"v{k}", function.size1_in(k)) for k in range(function.n_in())]
+    return ca.Function("fpirhc_stacked_jacobian", symbols, [ca.vec(function(*symbols))])

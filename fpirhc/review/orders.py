@@ -1,4 +1,4 @@
-"""What are the relative orders? The number of derivatives until an input appears, from the pattern of the symbols."""
+"""What are the relative orders? They are the numbers of derivatives until an input appears, from the pattern of the symbols."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ QUESTION = "Are the relative orders those of the plant?"
 
 
 def relative_orders(grid: ReviewGrid) -> Answer:
-    """Return the structural order of every controlled coordinate; their sum short of the state leaves zero dynamics."""
+    """Return the structural order of every controlled coordinate; a sum below the size of the state leaves zero dynamics."""
     plant = grid.problem.plant
-    found = {c: structural_order(plant, c) for c in plant.controlled_names}
-    given = {c: plant.orders[k] for c, k in zip(plant.controlled_names, plant.controlled_indices, strict=True)}
-    text = ", ".join(f"{c} {r}" for c, r in found.items())
-    inside = plant.state.size - sum(given.values())
+    structural = {c: structural_order(plant, c) for c in plant.controlled_names}
+    declared = {c: plant.orders[k] for c, k in zip(plant.controlled_names, plant.controlled_indices, strict=True)}
+    text = ", ".join(f"{c} {r}" for c, r in structural.items())
+    inside = plant.state.size - sum(declared.values())
     text += (
         f"; {inside} of {plant.state.size} states move by themselves" if inside else "; they make up the whole state"
     )
-    numbers = {**{f"order_{c}": float(r or 0) for c, r in found.items()}, "internal_states": float(inside)}
-    if found != given:
+    numbers = {**{f"order_{c}": float(r or 0) for c, r in structural.items()}, "internal_states": float(inside)}
+    if structural != declared:
         return Answer(
-            QUESTION, Verdict.NO, text, "Write the response of the derivative that the input reaches.", numbers
+            QUESTION, Verdict.NO, text, "Write the response as the derivative that the input acts on.", numbers
         )
     return Answer(QUESTION, Verdict.YES, text, "", numbers)

@@ -19,30 +19,30 @@ _HARM = 0.5  # share of the error without adaptation that adaptation may make of
 
 
 def pays(grid: ReviewGrid, controller: Controller) -> Answer:
-    """Return the rms response errors without, with, and with a right model, where every change does harm."""
+    """Return the rms response errors without adaptation, with it, and with it on a right model, where every change does harm."""
     problem = grid.problem
     shorter = min(problem.duration, _CYCLES * problem.period)
-    looked = replace(problem, duration=shorter, measure_from=min(problem.measure_from, 0.5 * shorter))
+    shortened = replace(problem, duration=shorter, measure_from=min(problem.measure_from, 0.5 * shorter))
     try:
-        nominal = nominal_run(looked, controller, compiled=False)
+        nominal = nominal_run(shortened, controller, compiled=False)
         without = _rms(nominal, response_errors(nominal, deformation=Identity()))
         adapted = _rms(nominal, response_errors(nominal))
         null = _rms(nominal, response_errors(nominal, exact=nominal.believed))
     except FpirhcError as error:
         return Answer(QUESTION, Verdict.UNKNOWN, str(error))
-    text = f"rms response error predicted: without {without:.3g}, with {adapted:.3g}, with a right model {null:.3g}"
+    text = f"predicted rms response error: {without:.3g} without adaptation, {adapted:.3g} with it, {null:.3g} with a right model"
     numbers = {"without": without, "with": adapted, "null": null}
     if not adapted < without:
         change = "Raise the gain, shorten the period, or leave the deformation out: the model is right enough."
         return Answer(QUESTION, Verdict.NO, text, change, numbers)
     if null > _HARM * without:
-        change = "With a slightly better model it would do harm: raise the gain or shorten the period."
+        change = "Adaptation would do harm with a slightly better model: raise the gain or shorten the period."
         return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
     return Answer(QUESTION, Verdict.YES, text, "", numbers)
 
 
 def _rms(nominal: NominalRun, errors: ResponseErrors) -> float:
-    """Over all coordinates, from `measure_from` on; infinite where the errors do not stay finite."""
+    """Rms response error over all coordinates, from `measure_from` on; infinite where the errors do not stay finite."""
     first = min(round(nominal.problem.measure_from / nominal.problem.period), nominal.cycles - 1)
     with np.errstate(over="ignore", invalid="ignore"):
         size = float(np.sqrt(np.mean(np.sum(errors.error[first:] ** 2, axis=1))))

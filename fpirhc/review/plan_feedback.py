@@ -1,4 +1,4 @@
-"""What a plan does near the reference: it feeds the state back, u = u* + K (x - x^N).
+"""A plan near the reference is a feedback of the state, u = u* + K (x - x^N).
 
 K is the first gain of the Riccati recursion over the horizon, with the model linearised along the reference and the cost's own
 second derivatives; bounds are left out. `PlanFeedback` is the tracking law with which a plan that restarts from the measured
@@ -50,7 +50,7 @@ class PlanFeedback(Tracking):
         return Block("tracking", Layout(reads), Layout((plant.response_signal("desired"),)), step)
 
     def update(self, plant: Plant, period: float) -> Block:
-        """Block of no consequence: nothing is remembered."""
+        """Block without effect: nothing is remembered."""
         del plant, period
         writes = Layout((scalar("_plan_followed"),))
         return Block(
@@ -77,19 +77,19 @@ def plan_gains(
         raise NotSupported(
             "a plan that weighs the rate of inputs, or must meet an end, has no feedback of the state alone"
         )
-    given = stage_data(plant, problem.reference, horizon, cost)
-    function, chosen = problem.reference.function(plant), list(plant.controlled_indices)
-    linear, bent, end = linear_stage(ocp), hessian_stage(ocp, GaussNewton()), hessian_end(ocp)
-    found = []
+    data_of = stage_data(plant, problem.reference, horizon, cost)
+    function, controlled = problem.reference.function(plant), list(plant.controlled_indices)
+    linear, curved, end = linear_stage(ocp), hessian_stage(ocp, GaussNewton()), hessian_end(ocp)
+    gains = []
     for time in times:
-        data = np.asarray(given(time, believed).full())
+        data = np.asarray(data_of(time, believed).full())
         states = data[ocp.data.slice("reference")]
         clock = time + horizon.step * np.arange(horizon.stages)
-        wanted = np.asarray(function.map(horizon.stages)(clock[None, :])[1].full())[chosen]
+        wanted = np.asarray(function.map(horizon.stages)(clock[None, :])[1].full())[controlled]
         repeated = np.repeat(believed[:, None], horizon.stages, axis=1)
         inputs = np.asarray(plant.inverse_function.map(horizon.stages)(states[:, :-1], wanted, repeated).full())
-        found.append(_first_gain((linear, bent, end), states, inputs, data))
-    return found
+        gains.append(_first_gain((linear, curved, end), states, inputs, data))
+    return gains
 
 
 def longer(horizon: Horizon) -> Horizon:
@@ -100,13 +100,13 @@ def longer(horizon: Horizon) -> Horizon:
 def _first_gain(
     stages: tuple[ca.Function, ca.Function, ca.Function], states: np.ndarray, inputs: np.ndarray, data: np.ndarray
 ) -> np.ndarray:
-    linear, bent, end = stages
+    linear, curved, end = stages
     value = np.asarray(end(states[:, -1], data[:, -1])[2].full())
     gain = np.zeros((len(inputs), len(states)))
     for k in reversed(range(inputs.shape[1])):
         at = (states[:, k], inputs[:, k], data[:, k])
         a, b = (np.asarray(m.full()) for m in linear(*at)[2:4])
-        q, s, r = (np.asarray(m.full()) for m in bent(*at, np.zeros(len(states))))
+        q, s, r = (np.asarray(m.full()) for m in curved(*at, np.zeros(len(states))))
         coupled = s + b.T @ value @ a
         gain = -np.linalg.solve(r + b.T @ value @ b, coupled)
         value = q + a.T @ value @ a + coupled.T @ gain

@@ -1,8 +1,8 @@
-"""What adaptation will do to the response, before a run of the plant.
+"""The effect of adaptation on the response, predicted before a run of the plant.
 
 The model is run once as its own plant, with the controller but without its deformation: the nominal run, with states
-x_k and desired responses d_k. Along it the deformation alone is iterated with the plant's response, the library's own
-blocks from deformation to limits in it,
+x_k and desired responses d_k. Along it the deformation alone is iterated with the plant's response, by the library's own
+blocks from the deformation to the limits,
 
     f_k = response(x_k, u_{k-1}; exact),    r_k = G(r_{k-1}, f_k, d_k),    u_k = inverse(x_k, r_k; approximate),
     e_k = response(x_k, u_k; exact) - d_k,
@@ -12,7 +12,7 @@ What acts on that deviation over cycle k is the difference of the mean responses
 
     w_k = (response(x_k, u_k) + response(x_{k+1}, u_k)) / 2 - (d_k + the model's response(x_{k+1}, u^_k)) / 2,
 
-u^_k the model's own command. Without adaptation, and with the model for the plant (the null run), the same recursion is used.
+where u^_k is the model's own command. The same recursion serves without adaptation and with the model as the plant (the null run).
 """
 
 from __future__ import annotations
@@ -36,9 +36,14 @@ from fpirhc.task.problem import Problem
 
 @dataclass(frozen=True, eq=False)
 class NominalRun:
-    """The model's own run: what is predicted along; build it with `nominal_run`.
+    """The model's own run, along which responses are predicted; build it with `nominal_run`.
 
-    Parameters: states (cycles + 1, nx), desired (cycles, n), believed parameters (np,).
+    Args:
+        problem: the problem.
+        controller: the controller, with its deformation.
+        states: states of the run, shape (cycles + 1, nx).
+        desired: desired responses, shape (cycles, n).
+        believed: parameters of the model, shape (np,).
     """
 
     problem: Problem
@@ -55,7 +60,12 @@ class NominalRun:
 
 @dataclass(frozen=True, eq=False)
 class ResponseErrors:
-    """Along a nominal run: response errors e (cycles, n) just after each update, and w (cycles, n), response units."""
+    """Predictions of the recursion along a nominal run, in units of the response.
+
+    Args:
+        error: response errors e_k just after each update, shape (cycles, n).
+        force: w_k, which acts on the deviation over each cycle, shape (cycles, n).
+    """
 
     error: np.ndarray
     force: np.ndarray
@@ -65,18 +75,19 @@ def nominal_run(problem: Problem, controller: Controller, *, compiled: bool = Tr
     """Return the run of the controller without its deformation on its own model, without disturbances and noise.
 
     Raises:
-        NotSupported: dead time, estimated responses, a controller that does not track or plan with one model, a
-            model that does not stay finite. And what the controller raises about the problem.
+        NotSupported: dead time, estimated responses, a controller that does not track or plan with one model, a model that
+            does not stay finite.
+        FpirhcError: every error that the controller raises about the problem.
     """
     _check(problem, controller)
-    chosen = resolved(problem, controller)
-    chosen.check(problem)
-    believed = chosen.parameters(problem.plant)
+    ready = resolved(problem, controller)
+    ready.check(problem)
+    believed = ready.parameters(problem.plant)
     model = replace(problem, plant=_exactly(problem.plant, believed), disturbances={}, sensing=Sensing())
-    run = simulate(model, without_deformation(chosen), seed=0, compiled=compiled)
+    run = simulate(model, without_deformation(ready), seed=0, compiled=compiled)
     if run.stop is not None or run.cycles < 2:
         raise NotSupported(f"no prediction: the model's own run ended early: {run.stop}")
-    return NominalRun(problem, chosen, run["state"], run["desired"][:-1], believed)
+    return NominalRun(problem, ready, run["state"], run["desired"][:-1], believed)
 
 
 def response_errors(
@@ -84,8 +95,10 @@ def response_errors(
 ) -> ResponseErrors:
     """Return the response errors that the recursion predicts.
 
-    Parameters: another `deformation` than the controller's (Identity() is no adaptation), and other `exact` parameters than the
-    plant's (the believed ones: the null run).
+    Args:
+        nominal: the nominal run.
+        deformation: the deformation; None: the controller's; Identity() is no adaptation.
+        exact: exact parameters, shape (np,); None: the plant's; the believed ones give the null run.
     """
     map_ = nominal.controller.deformation if deformation is None else deformation
     parameters = nominal.problem.plant.exact if exact is None else np.asarray(exact, dtype=float)

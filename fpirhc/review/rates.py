@@ -1,4 +1,4 @@
-"""Are rate x period and rate x dead time inside their limits? They are where the loop converges with the right model."""
+"""Are rate x period and rate x dead time inside their limits? They are, where the loop converges with the right model."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ QUESTION = "Are rate x period and rate x dead time small enough?"
 
 
 def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answer:
-    """Return the products and whether the loop of plant = model, without deformation, converges."""
+    """Return the two products, and whether the loop of plant = model without deformation converges."""
     period, cycles = grid.problem.period, dead_cycles(grid.problem)
     rate = _rate(controller)
     numbers = {} if rate is None else {"rate_period": rate * period, "rate_dead_time": rate * cycles * period}

@@ -1,4 +1,4 @@
-"""Is the range of the map large enough? Some maps hold only for requests much smaller than a constant of their own."""
+"""Is the range of the map large enough? Some maps are valid only for requests that are much smaller than a constant of theirs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SPARE = 10.0
 
 
 def range_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray) -> Answer | None:
-    """Return the ratio of the map's constant to the largest request; None for a map without one."""
+    """Return the ratio of the map's constant to the largest request; None for a map without such a constant."""
     reach = deformation.reach
     if reach is None:
         return None

@@ -1,4 +1,4 @@
-"""Does adaptation pay, does it disturb a model that is right, and how far is the plant from the plan: answers before a run."""
+"""A prediction before a run: whether adaptation pays, how it disturbs a right model, and how far the plant is from the plan."""
 
 from __future__ import annotations
 
@@ -23,13 +23,16 @@ _DRAWS = 16  # of the parameters' box
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What adaptation will do along the nominal run.
+    """The predicted effect of adaptation along the nominal run.
 
-    Parameters:
-        nominal: the model's own run. adapted, without: response errors with the deformation and without one; null: with it, the
-            model being right, where every change does harm.
-        tube: bound of |plant's state - nominal state| (cycles + 1, nx) with the deformation, to first order; the
-            largest over the box of parameters where one was asked for. None where there is none, with `reason`.
+    Args:
+        nominal: the model's own run.
+        adapted: response errors with the deformation.
+        without: response errors without a deformation.
+        null: response errors with the deformation on a right model, where every change does harm.
+        tube: bound of |plant's state - nominal state| with the deformation, to first order, shape (cycles + 1, nx);
+            with a mismatch the largest over the box of parameters. None where there is no bound.
+        reason: why there is no tube; else empty.
     """
 
     nominal: NominalRun
@@ -85,16 +88,22 @@ class Prediction:
 def predict_response(
     problem: Problem, controller: Controller, *, mismatch: float | None = None, seed: int = 0, compiled: bool = True
 ) -> Prediction:
-    """Return what the controller's deformation will do, from one run of the model and no run of the plant.
+    """Return the predicted effect of the controller's deformation, from one run of the model and no run of the plant.
 
-    Errors that do not stay finite are predicted as they are.
+    A prediction whose errors do not stay finite is returned with these errors.
 
-    Parameters: `mismatch`: margin of the parameters' box around the exact ones, percent, over whose draws the tube is the largest
-    (None: the exact parameters alone); `seed` of the draws; `compiled`: run the model in C when there is a compiler.
+    Args:
+        problem: the problem.
+        controller: the controller with its deformation.
+        mismatch: margin of the parameters' box around the exact ones, percent; the tube is the largest over draws from
+            the box. None: the exact parameters alone.
+        seed: of the draws.
+        compiled: whether the model runs in C when there is a compiler.
 
     Raises:
-        NotSupported: see `nominal_run`; a controller without adaptation. InvalidValue: a mismatch outside [0, 100).
-        And what the controller raises about the problem.
+        NotSupported: see `nominal_run`; a controller without adaptation.
+        InvalidValue: a mismatch outside [0, 100).
+        FpirhcError: every error that the controller raises about the problem.
     """
     if mismatch is not None and not 0 <= mismatch < 100:
         raise InvalidValue(f"predict_response(mismatch={mismatch!r}): expected percent of at least 0 and below 100")

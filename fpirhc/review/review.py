@@ -36,20 +36,25 @@ from fpirhc.task.problem import Problem
 
 
 def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch: float, seed: int) -> Review:
-    """Return the answers to all questions that can be asked before a run.
+    """Return the answers to all questions that can be answered before a run.
 
-    Parameters: `mismatch` of the exact parameters, percent, see `fpirhc.plant.mismatch`; the box spans the approximate values too.
-    `seed` of the draws from the box.
+    Args:
+        problem: the problem.
+        controllers: the controllers by name.
+        mismatch: range of the exact parameters, percent, see `fpirhc.plant.mismatch`; the box spans the approximate
+            values too.
+        seed: of the draws from the box.
 
     Raises:
-        InvalidValue: a mismatch outside [0, 100). InvalidProblem: a range that leaves physical bounds.
+        InvalidValue: a mismatch outside [0, 100).
+        InvalidProblem: a range that leaves physical bounds.
         NotInvertible: the inputs and the controlled coordinates differ in number.
     """
     grid = review_grid(problem, mismatch, seed)
     general = [well_posed(grid), relative_orders(grid), inverse_exists(grid), commands_inside(grid)]
-    far = horizon_long_enough(grid)
-    if far is not None:
-        general.append(far)
+    reach = horizon_long_enough(grid)
+    if reach is not None:
+        general.append(reach)
     return Review(tuple(general), {name: _of(grid, one, general) for name, one in controllers.items()}, mismatch)
 
 
@@ -57,28 +62,29 @@ def predict(problem: Problem, controller: Controller) -> Answer:
     """Return the verdict alone: whether the deformation of a controller converges on the plant with its exact parameters.
 
     Raises:
-        NotInvertible: see `review`. And what the controller raises about the problem.
+        NotInvertible: see `review`.
+        FpirhcError: every error that the controller raises about the problem.
     """
     grid = review_grid(problem, 0.0, 0)
     own = replace(grid, draws=grid.draws[:1])  # the box does not matter
-    chosen = resolved(problem, controller)
+    ready = resolved(problem, controller)
     general = [well_posed(own), inverse_exists(own), commands_inside(own)]
-    loops = loops_along(own, chosen)
-    return converges(own, chosen, loops, _doubts([*general, *_speed_and_range(own, chosen, loops)]))
+    loops = loops_along(own, ready)
+    return converges(own, ready, loops, _doubts([*general, *_speed_and_range(own, ready, loops)]))
 
 
 def _of(grid: ReviewGrid, controller: Controller, general: list[Answer]) -> tuple[Answer, ...]:
     try:
-        chosen = resolved(grid.problem, controller)
-        chosen.check(grid.problem)
+        ready = resolved(grid.problem, controller)
+        ready.check(grid.problem)
     except FpirhcError as error:
         return (Answer("Does the controller fit the problem?", Verdict.NO, str(error), "See the message."),)
-    schedule = schedule_stable(grid.problem, chosen)
+    schedule = schedule_stable(grid.problem, ready)
     if schedule is not None:
         return (schedule,)
-    loops = loops_along(grid, chosen)
-    outer = [rates_inside(grid, chosen, loops), zero_dynamics(zero_dynamics_rate(grid), is_planned(chosen), loops)]
-    inner = [] if not chosen.deformation.adapts else _of_map(grid, chosen, loops, general)
+    loops = loops_along(grid, ready)
+    outer = [rates_inside(grid, ready, loops), zero_dynamics(zero_dynamics_rate(grid), is_planned(ready), loops)]
+    inner = [] if not ready.deformation.adapts else _of_map(grid, ready, loops, general)
     return (*inner, *outer, margins_enough(grid.problem, loops))
 
 
@@ -106,8 +112,8 @@ def _of_map(grid: ReviewGrid, controller: Controller, loops: Loops, general: lis
 def _speed_and_range(grid: ReviewGrid, controller: Controller, loops: Loops) -> list[Answer]:
     deformation, believed = controller.deformation, controller.parameters(grid.problem.plant)
     ideal = loops.ideal if is_planned(controller) else None
-    found = [slew_enough(grid, deformation, believed, ideal), range_enough(grid, deformation, believed)]
-    return [a for a in found if a is not None]
+    answers = [slew_enough(grid, deformation, believed, ideal), range_enough(grid, deformation, believed)]
+    return [a for a in answers if a is not None]
 
 
 def _doubts(answers: list[Answer]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Is a schedule of slots stable? By its Floquet radius, with ideal deformations."""
+"""Is a schedule of slots stable? It is, where its Floquet radius with ideal deformations is below 1."""
 
 from __future__ import annotations
 
@@ -11,19 +11,24 @@ QUESTION = "Is the schedule of slots stable?"
 
 
 def schedule_stable(problem: Problem, controller: Controller) -> Answer | None:
-    """Return the radius of one period, whose gains of the wrong sign the controller has already refused; None without slots."""
+    """Return the Floquet radius of one period; None without slots.
+
+    Gains of the wrong sign do not reach this question: the controller refuses them.
+    """
     try:
-        found = controller.floquet(problem)
+        floquet = controller.floquet(problem)
     except FpirhcError as error:
         return Answer(QUESTION, Verdict.UNKNOWN, str(error))
-    if found is None:
+    if floquet is None:
         return None
-    if found.radius is None:
-        return Answer(
-            QUESTION, Verdict.UNKNOWN, f"no Floquet radius: {found.reason}", "Use a periodic schedule to know one."
-        )
-    text = f"near the set-point errors change by {found.radius:.3g} per period of {found.period:g} s, with ideal deformations"
-    change = "" if found.radius < 1 else "Change the slots' durations or rates; see floquet_radius."
+    if floquet.radius is None:
+        return Answer(QUESTION, Verdict.UNKNOWN, f"no Floquet radius: {floquet.reason}", "Use a periodic schedule.")
+    text = f"near the set-point errors change by {floquet.radius:.3g} per period of {floquet.period:g} s, with ideal deformations"
+    change = "" if floquet.radius < 1 else "Change the slots' durations or rates; see floquet_radius."
     return Answer(
-        QUESTION, decided(found.radius < 1), text, change, {"floquet_radius": found.radius, "period": found.period}
+        QUESTION,
+        decided(floquet.radius < 1),
+        text,
+        change,
+        {"floquet_radius": floquet.radius, "period": floquet.period},
     )

@@ -1,47 +1,50 @@
-"""Is the map fast enough? Its largest step per cycle against how fast the request must change.
+"""Is the map fast enough? Its largest step per cycle is compared with the change of the request.
 
-Along the reference it changes by |d r*/dt|. After a start off the reference a plan asks for more: what the linear loop of
-plant = model does from there, B^ (v_{k+1} - v_k) in the commands v, must fit the step as well.
+Along the reference the request changes by |d r*/dt|. After a start off the reference a plan changes it faster: the step must also
+cover B^ (v_{k+1} - v_k), with the commands v of the linear loop of plant = model from this start.
 """
 
 from __future__ import annotations
 
 import math
 
-import casadi as ca
 import numpy as np
 
 from fpirhc.deformation.base import Deformation
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.linear import LinearLoop
+from fpirhc.review.linear import LinearLoop, controlled_gain, response_slopes
 
 QUESTION = "Is the map fast enough for reference and disturbances?"
-_SPARE = 2.0  # how many times faster than the reference it should be
+_SPARE = 2.0  # how many times faster than the reference the map should be
 _POINTS = 2001
 _CYCLES = 1000  # after the start
 
 
 def slew_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray, ideal: LinearLoop | None) -> Answer:
-    """Return the slew limit of the map beside what reference, disturbances and the start ask for.
+    """Return the slew limit of the map beside the slew that the reference, the disturbances and the start need.
 
-    Parameters: `ideal`: the linear loop of a plan with the right model; None where no plan is in the loop.
+    Args:
+        grid: points of the reference.
+        deformation: the map.
+        believed: parameters of the model, shape (np,).
+        ideal: the linear loop of a plan with the right model; None where no plan is in the loop.
     """
     problem = grid.problem
-    begun = 0.0 if ideal is None else _speed_after_start(grid, believed, ideal)
-    speed = max(_speed(grid, believed), begun)
+    after_start = 0.0 if ideal is None else _speed_after_start(grid, believed, ideal)
+    speed = max(_speed(grid, believed), after_start)
     sudden = max((d.jump * _effect(grid, name) for name, d in problem.disturbances.items()), default=0.0)
     steady = sum(d.slew * _effect(grid, name) for name, d in problem.disturbances.items())
     needed, step = speed + steady, deformation.largest_step()
     numbers = {"needed": needed, "limit": step / problem.period, "jump": sudden}
     text = f"the request changes by up to {needed:.3g} per second"
-    if begun == speed > 0:
+    if after_start == speed > 0:
         text += " after the start"
     if not math.isfinite(step):
         return Answer(QUESTION, Verdict.YES, f"{text}; the map's step has no bound", "", numbers)
     text += f", the map by {step / problem.period:.3g}"
     if sudden:
-        text += f"; a jump of a disturbance takes it {math.ceil(sudden / step)} cycles"
+        text += f"; a jump of a disturbance takes the map {math.ceil(sudden / step)} cycles"
     ratio = step / problem.period / max(needed, 1e-300)
     change = f"Raise the map's scale at least {_SPARE / ratio:.2g} times, or leave it out to have it chosen."
     if ratio >= _SPARE:
@@ -62,7 +65,7 @@ def _speed(grid: ReviewGrid, believed: np.ndarray) -> float:
 
 
 def _speed_after_start(grid: ReviewGrid, believed: np.ndarray, ideal: LinearLoop) -> float:
-    """Largest |d r/dt| that the plan's feedback asks for from the problem's start."""
+    """Largest |d r/dt| of the plan's feedback from the problem's start."""
     plant = grid.problem.plant
     z = np.zeros(len(ideal.dynamics))
     z[ideal.state] = grid.problem.start_state - grid.states[0]
@@ -70,21 +73,19 @@ def _speed_after_start(grid: ReviewGrid, believed: np.ndarray, ideal: LinearLoop
     for k in range(_CYCLES):
         commands[k] = ideal.arriving @ z
         z = ideal.dynamics @ z
-    x, u, p = plant._symbols()
-    slope = ca.jacobian(plant.controlled_response_function(x, u, p), u)
-    function = ca.Function("fpirhc_input_gain", [x, u, p], [slope])
-    gain = np.asarray(function(grid.states[0], np.nan_to_num(grid.commands[0, 0]), believed).full())
+    command = np.nan_to_num(grid.commands[0, 0])
+    gain = controlled_gain(plant, response_slopes(plant), grid.states[0], command, believed)
     changes = np.linalg.norm(np.diff(commands, axis=0) @ gain.T, axis=1)
     return float(changes.max() / grid.problem.period)
 
 
 def _effect(grid: ReviewGrid, name: str) -> float:
-    """What one unit of a disturbance changes in the responses: 1 on a coordinate, the exact gain on an input."""
+    """Change of the responses by one unit of a disturbance: 1 on a coordinate, the exact gain on an input."""
     plant = grid.problem.plant
     if name not in plant.inputs:
         return 1.0
     unit = np.array([1.0 if i == name else 0.0 for i in plant.inputs])
     command = np.nan_to_num(grid.commands[0, 0])
     respond = plant.controlled_response_function
-    moved = respond(grid.states[0], command + unit, plant.exact) - respond(grid.states[0], command, plant.exact)
-    return float(np.linalg.norm(moved.full()))
+    change = respond(grid.states[0], command + unit, plant.exact) - respond(grid.states[0], command, plant.exact)
+    return float(np.linalg.norm(change.full()))

@@ -1,4 +1,4 @@
-"""Is the iteration fast enough for its tracking law, and how late may the response be? By the poles of the law."""
+"""Is the iteration fast enough for its tracking law, and how late may the response be? The poles of the law decide."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 
 FAST = "Does the iteration keep up with its tracking law?"
-LAG = "Does it bear a small lag that nobody has modelled?"
+LAG = "Does it bear a small lag that is not in the model?"
 _SPARE = 3.0
 _DAMPING = 0.3
 _CYCLES = 3.0  # of lag that it should bear
 
 
 def fast_enough(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer | None:
-    """Return the smallest a lambda beside what the plain form needs; None for other forms, and laws without known poles."""
+    """Return the smallest a lambda beside the one that the plain form needs; None for other forms and laws without known poles."""
     law = _law(grid, controller)
     if law is None or not controller.deformation.slows_desired:
         return None
     rate, poles = law
     product = _products(controller, own)[0]
     ratio = product / least_product(poles, rate, grid.problem.period)
-    text = f"gain x eigenvalue is {product:.3g} and at least, {ratio:.3g} times what {poles} poles at {rate:g} 1/s need"
+    text = f"gain x eigenvalue is at least {product:.3g}, {ratio:.3g} times what {poles} poles at {rate:g} 1/s need"
     numbers = {"product": product, "ratio": ratio}
     change = "Raise the gain, lower the rate or the period, or use the form that passes the desired response at once (Increment)."
     if ratio >= _SPARE:
@@ -52,7 +52,7 @@ def bears_lag(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer
 
 
 def _law(grid: ReviewGrid, controller: Controller) -> tuple[float, int] | None:
-    """Rate and poles of the tracking law, the most demanding coordinate's; None where there is no such law."""
+    """Rate and number of poles of the tracking law for the most demanding coordinate; None where there is no such law."""
     law, plant = controller.law, grid.problem.plant
     laws = [law.feedback(plant.orders[k]) for k in plant.controlled_indices] if law else []
     known = [(one.rate, len(one.gains)) for one in laws if one is not None and one.rate is not None]

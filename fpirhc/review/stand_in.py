@@ -1,7 +1,7 @@
-"""What serves a linear plant as a controller does near the reference.
+"""The controller that acts on a linear plant as another controller acts near the reference.
 
-A controller without a plan serves it itself. A plan that restarts from the measured state is its feedback of the state; one
-that starts from its own state leaves the motion to its tracking law. A wrapper says by `linear_around` what it adds.
+A controller without a plan stands for itself. A plan that restarts from the measured state is a feedback of the state. A plan that
+starts from its own state leaves the motion to its tracking law. A wrapper adds its part by `linear_around`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,12 @@ from fpirhc.tracking.base import Tracking
 
 @dataclass(frozen=True)
 class StandIn(Controller):
-    """A law in place of a plan, with the plan's deformation."""
+    """A law in place of a plan, with the plan's deformation.
+
+    Args:
+        tracking: the law.
+        deformation: the deformation.
+    """
 
     tracking: Tracking
     deformation: Deformation
@@ -32,7 +37,7 @@ class StandIn(Controller):
 
 
 def linear_stand_in(controller: Controller) -> tuple[Controller, Planner | None]:
-    """Return what serves a linear plant as the controller does near the reference, and the plan whose feedback it needs.
+    """Return the stand-in of a controller on a linear plant, and the plan whose feedback it needs.
 
     Raises:
         NotSupported: a plan that is restarted and tracked.

@@ -1,18 +1,18 @@
-"""How far the plant's run can be from the model's: a tube around the nominal run, to first order.
+"""A tube around the nominal run, to first order: a bound of the distance between the plant's run and the model's.
 
-What acts on the deviation over cycle k is w_k (`prediction.ResponseErrors`). It is bounded by
+Over cycle k, w_k acts on the deviation (`prediction.ResponseErrors`). It is bounded by
 
     e+_k = |I - a J| e+_{k-1} + |e_k - (I - a J) e_{k-1}|,        w+_k = e+_k + |w_k - e_k|,
 
-absolute values entry by entry, so that |e_k| <= e+_k whatever the signs of the parts are. The loop of plant = model without
-deformation answers a unit of it with the impulse response h_j, taken at some points of the reference as the largest of all, and
+with absolute values entry by entry, so that |e_k| <= e+_k whatever the signs of the parts are. The loop of plant = model without
+deformation has the impulse response h_j from w. With the largest h_j at some points of the reference,
 
     |x_k - x^_k| <= sum_j |h_j| w+_{k-1-j}.
 
 For a tracking law with three poles at -Lambda and a constant w+ this is 4 e^-2 w+ / Lambda^2 for the coordinate.
 
-First order means: the response errors were found along the nominal run and not along the plant's, which matters where the deviation
-is not small, and the loop is that of the points. Limits that clip in the run and not in the prediction are not seen.
+The bound is one to first order: the response errors are those along the nominal run and not along the plant's, which matters where
+the deviation is not small, and the loop is linear. Limits that clip in the run and not in the prediction are left out.
 """
 
 from __future__ import annotations
@@ -34,10 +34,15 @@ _GONE = 1e-6  # share of its largest value below which an impulse response is ov
 def tube(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np.ndarray | None = None) -> np.ndarray:
     """Return the bound of |x_k - x^_k| (cycles + 1, nx) that the response errors allow, with x^_k the states of the nominal run.
 
-    Parameters: the `errors` that a deformation with the effective `gain` leaves, with `exact` parameters (None: the plant's).
+    Args:
+        nominal: the nominal run.
+        errors: the response errors that the deformation leaves.
+        gain: effective gain of the deformation.
+        exact: exact parameters, shape (np,); None: the plant's.
 
     Raises:
-        NotSupported: coordinates that are not controlled, no linear loop, one that does not converge even with the right model.
+        NotSupported: coordinates that are not controlled, no linear loop, one that does not converge even with the
+            right model.
     """
     plant = nominal.problem.plant
     if len(plant.controlled_names) < len(plant.names):
@@ -47,17 +52,14 @@ def tube(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np.nda
     answers = [_impulses(*one, nominal.cycles) for one in ideal_loops(grid, nominal.controller, _POINTS)]
     longest = max(len(a) for a in answers)
     largest = np.max([np.pad(a, ((0, longest - len(a)), (0, 0), (0, 0))) for a in answers], axis=0)
-    found = np.zeros((nominal.cycles + 1, largest.shape[1]))
+    bound = np.zeros((nominal.cycles + 1, largest.shape[1]))
     summed = fftconvolve(largest, force[:, None, :], axes=0).sum(axis=2)
-    found[1:] = np.maximum(summed[: nominal.cycles], 0.0)
-    return found
+    bound[1:] = np.maximum(summed[: nominal.cycles], 0.0)
+    return bound
 
 
 def majorant(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np.ndarray | None = None) -> np.ndarray:
-    """Return e+ (cycles, n); the errors' own size where |I - a J| does not contract.
-
-    Parameters: as in `tube`.
-    """
+    """Return e+ (cycles, n); the size of the errors where |I - a J| does not contract; arguments as in `tube`."""
     plant = nominal.problem.plant
     rows = np.tile(plant.exact if exact is None else exact, (nominal.cycles, 1))
     jacobians = response_jacobians(plant, nominal.states[:-1], nominal.desired, rows, nominal.believed)
@@ -66,23 +68,23 @@ def majorant(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np
     if gain == 0 or not np.isfinite(sizes).all() or np.abs(np.linalg.eigvals(sizes)).max() >= 1:
         return size
     parts = np.abs(errors.error[1:] - np.einsum("kij,kj->ki", factors[1:], errors.error[:-1]))
-    found = np.empty_like(size)
-    found[0] = size[0]
+    bound = np.empty_like(size)
+    bound[0] = size[0]
     for k, part in enumerate(parts):
-        found[k + 1] = sizes[k + 1] @ found[k] + part
-    return found
+        bound[k + 1] = sizes[k + 1] @ bound[k] + part
+    return bound
 
 
 def _impulses(loop: LinearLoop, gain: np.ndarray, cycles: int) -> np.ndarray:
-    """|h_j| (j, nx, n): the states' answer to a unit of the responses over one cycle."""
+    """|h_j| (j, nx, n): the motion of the states after a unit of the responses over one cycle."""
     if loop.radius >= 1:
         raise NotSupported("no tube: the loop does not converge even with the right model")
-    reached, found = loop.entry @ np.linalg.inv(gain), []
-    largest = 0.0
+    memory = loop.entry @ np.linalg.inv(gain)
+    sizes, largest = [], 0.0
     for _ in range(cycles):
-        found.append(np.abs(reached[loop.state]))
-        largest = max(largest, float(np.abs(reached).max()))
-        if np.abs(reached).max() < _GONE * largest:
+        sizes.append(np.abs(memory[loop.state]))
+        largest = max(largest, float(np.abs(memory).max()))
+        if np.abs(memory).max() < _GONE * largest:
             break
-        reached = loop.dynamics @ reached
-    return np.array(found)
+        memory = loop.dynamics @ memory
+    return np.array(sizes)

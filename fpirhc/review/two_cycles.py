@@ -1,4 +1,4 @@
-"""Can a large error end in a bounded two-cycle? Where the map's secant reaches the limit of the whole loop."""
+"""Can a large error end in a bounded two-cycle? It can, where the map's secant reaches the limit of the whole loop."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LOWER = 0.9  # gain of the second loop, as a share of the map's own
 def free_of_two_cycles(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answer | None:
     """Return the map's secant gain beside the smallest that makes a two-cycle along the reference.
 
-    None without linear loops, and where the response is late: there longer cycles come first.
+    The answer is None without linear loops, and where the response is late: there longer cycles come first.
     """
     if grid.problem.response_delay > 0:
         return None
@@ -31,10 +31,10 @@ def free_of_two_cycles(grid: ReviewGrid, controller: Controller, loops: Loops) -
     lower = _with_gain(controller, _LOWER * gain)
     if not loops.loops or not deformation.constant or lower is None:
         return None
-    chosen = np.unique(np.linspace(0, len(loops.places) - 1, _POINTS).astype(int))
+    points = np.unique(np.linspace(0, len(loops.places) - 1, _POINTS).astype(int))
     try:
-        others = loops_at(grid, lower, [loops.places[k] for k in chosen])
-        pairs = zip((loops.loops[k] for k in chosen), others, strict=True)
+        others = loops_at(grid, lower, [loops.places[k] for k in points])
+        pairs = zip((loops.loops[k] for k in points), others, strict=True)
         limit = min(two_cycle_limit(b.dynamics, a.dynamics, (_LOWER * gain, gain)) for a, b in pairs)
     except (FpirhcError, np.linalg.LinAlgError):
         return None
@@ -47,7 +47,7 @@ def free_of_two_cycles(grid: ReviewGrid, controller: Controller, loops: Loops) -
     if sizes:
         text += f"; there |f - d| alternates with the size {sizes[-1]:.3g}"
         numbers["amplitude"] = sizes[-1]
-    change = f"Lower the gain to less than {limit / secant:.3g} of it."
+    change = f"Multiply the gain by less than {limit / secant:.3g}."
     return Answer(QUESTION, Verdict.NO, text, change, numbers)
 
 

@@ -1,4 +1,4 @@
-"""Is the problem well posed? Everything that a run will ask along the reference must have a finite answer."""
+"""Is the problem well posed? Every quantity that a run needs along the reference must be finite."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def well_posed(grid: ReviewGrid) -> Answer:
     numbers = {"finite_share": share}
     if not own.all():
         when = grid.times[int(np.argmin(own))]
-        found = f"plant or model has no finite command for the reference at t = {when:g} s"
+        text = f"plant or model has no finite command for the reference at t = {when:g} s"
         return Answer(
-            QUESTION, Verdict.NO, found, "Keep the reference away from states where the response is singular.", numbers
+            QUESTION, Verdict.NO, text, "Keep the reference away from states where the response is singular.", numbers
         )
     if share < 1:
-        found = f"finite commands at {100 * share:.3g} % of the points and draws of the parameters"
+        text = f"finite commands at {100 * share:.3g} % of the points and draws of the parameters"
         return Answer(
-            QUESTION, Verdict.UNKNOWN, found, "Narrow the box of the parameters, or move the reference.", numbers
+            QUESTION, Verdict.UNKNOWN, text, "Narrow the box of the parameters, or move the reference.", numbers
         )
     return Answer(
         QUESTION, Verdict.YES, f"finite at {len(grid.times)} points with {len(grid.draws)} parameter draws", "", numbers

@@ -1,4 +1,4 @@
-"""Are the zero dynamics stable? What the other states do while the controlled coordinates are held on the reference.
+"""Are the zero dynamics stable? They are the motion of the other states while the controlled ones stay on the reference.
 
 With x' = A x + B u and the responses y^(r) = A_c x + B_c u of the controlled coordinates at zero, u = -B_c^-1 A_c x, the states
 that are no derivative of a controlled coordinate move by themselves.
@@ -38,26 +38,32 @@ def zero_dynamics_rate(grid: ReviewGrid) -> float | None:
 
 def _rate(plant: Plant, slopes: tuple[ca.DM, ca.DM], inside: list[int]) -> float:
     rows, gains = (np.asarray(m.full()) for m in slopes)
-    chosen = list(plant.controlled_indices)
+    controlled = list(plant.controlled_indices)
     a, b = state_matrices(plant, rows, gains)
-    moving = (a - b @ np.linalg.solve(gains[chosen], rows[chosen]))[np.ix_(inside, inside)]
-    return float(np.linalg.eigvals(moving).real.max())
+    internal = (a - b @ np.linalg.solve(gains[controlled], rows[controlled]))[np.ix_(inside, inside)]
+    return float(np.linalg.eigvals(internal).real.max())
 
 
 def zero_dynamics(rate: float | None, planned: bool, loops: Loops) -> Answer:
-    """Return whether they are stable; a plan (`planned`) that carries these states in its cost may hold unstable ones."""
+    """Return whether the zero dynamics are stable.
+
+    Args:
+        rate: largest real part of the zero dynamics, 1/s; None where there are none.
+        planned: whether the controller is a plan; with these states in its cost it may hold unstable ones.
+        loops: linear loops of the controller.
+    """
     if rate is None:
         return Answer(QUESTION, Verdict.YES, "there are none: every coordinate is controlled")
     numbers = {"rate": rate}
     text = f"their fastest growth is {rate:.3g} 1/s"
     if planned and loops.loops:
-        held = float(loops.radii.max())
-        text += f"; with the plan's feedback the linear loop changes by {held:.6g} per cycle"
-        change = "" if held < 1 else "Weigh the other states in the cost, or lengthen the horizon."
-        verdict = Verdict.UNKNOWN if loops.learns and held >= 1 else decided(held < 1)
+        radius = float(loops.radii.max())
+        text += f"; with the plan's feedback the linear loop changes by {radius:.6g} per cycle"
+        change = "" if radius < 1 else "Weigh the other states in the cost, or lengthen the horizon."
+        verdict = Verdict.UNKNOWN if loops.learns and radius >= 1 else decided(radius < 1)
         return Answer(QUESTION, verdict, text, change, numbers)
     if not np.isfinite(rate) or planned or abs(rate) <= _STILL:
-        change = "Undamped or not known: look at the coordinates that are not controlled in a run."
+        change = "Undamped or not known: run it and look at the coordinates that are not controlled."
         return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
     change = (
         "" if rate < 0 else "Let a plan carry those states in its cost, use time slots, or control another coordinate."

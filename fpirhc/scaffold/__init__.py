@@ -1,1 +1,1 @@
-"""The first files of a problem of one's own."""
+"""The first files of a user's problem."""

@@ -19,10 +19,10 @@ _FALLBACK = "my_plant"
 
 
 def create_problem(name: str, folder: Path) -> tuple[Path, ...]:
-    """Write NAME.py and test_NAME.py into the folder, which is made where it is missing, and return their paths.
+    """Write NAME.py and test_NAME.py into the folder, which is created where it is missing, and return their paths.
 
     Raises:
-        InvalidName: a name that is no plain identifier or that another module has; a usable one is offered.
+        InvalidName: a name that is no plain identifier or that another module has; the message offers a usable one.
         OutputError: one of the files exists already (nothing is written then), or the folder cannot be written to.
     """
     check_name(name)
@@ -53,17 +53,17 @@ def create_problem(name: str, folder: Path) -> tuple[Path, ...]:
 
 
 def first_baseline(problem_file: Path) -> Path:
-    """Measure what later runs of a new problem are compared with, and return where it is."""
+    """Measure the first baseline of a new problem and return its path."""
     task = load_problem(str(problem_file))
     _, path = accept(task, "first numbers of a new problem", working=problem_file.parent)
     return path
 
 
 def check_name(name: str) -> None:
-    """Raise unless a problem can be called so.
+    """Raise unless a problem can have this name.
 
     Raises:
-        InvalidName: with a name that can be used instead.
+        InvalidName: a name that cannot be used; the message offers another one.
     """
     usable = _usable(name)
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
@@ -79,12 +79,12 @@ def check_name(name: str) -> None:
 
 
 def _taken(name: str) -> str:
-    """Why a well-formed name cannot be used; empty when it can."""
+    """Reason why a well-formed name cannot be used; empty for a usable name."""
     if keyword.iskeyword(name) or keyword.issoftkeyword(name):
         return "it is a word of Python"
     if name.lower().startswith("test_") or name.lower() in ("test", "conftest"):
         return "pytest would take the problem file for a test"
-    # Without the folder that Python was started in: a problem that is there already is not an installed module.
+    # Without the current folder: a problem file in it is not an installed module.
     installed = [p for p in sys.path if p and Path(p).resolve() != Path.cwd()]
     if name in sys.stdlib_module_names or PathFinder.find_spec(name, installed):
         return "a module of that name is installed, which the file would hide from everything beside it"
@@ -103,7 +103,7 @@ def _usable(name: str) -> str:
 
 
 def _shown(name: str) -> str:
-    """The name between quotes, with what cannot be printed written out, and not longer than a line."""
+    """The name between quotes, at most a line long, with escapes for characters that cannot be printed."""
     return ascii(name if len(name) <= _LONGEST else name[:_LONGEST] + "...")
 
 

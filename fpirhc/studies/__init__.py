@@ -1,1 +1,1 @@
-"""Studies: what a user asks of several runs."""
+"""Studies: questions that take several runs."""

@@ -1,4 +1,4 @@
-"""Open-loop solves of a problem's first horizon, with what is known about each plan."""
+"""Open-loop solves of a problem's first horizon, with a certificate of each plan."""
 
 from __future__ import annotations
 
@@ -17,7 +17,13 @@ from fpirhc.studies.comparison.optimiser_choices import optimiser_choices
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """One optimiser's plan; no certificate where the plan is not inside its bounds."""
+    """One optimiser's plan.
+
+    Args:
+        name: label of the optimiser.
+        plan: its plan.
+        certificate: certificate of the plan; None where the plan is not inside its bounds.
+    """
 
     name: str
     plan: Plan
@@ -27,9 +33,15 @@ class Solved:
 def solve_first(task: Task, names: Sequence[str], tolerance: float) -> list[Solved]:
     """Solve the horizon that begins at the start of the problem, with the approximate model.
 
+    Args:
+        task: the loaded problem file.
+        names: names of optimisers; 'all' among them stands for every optimiser.
+        tolerance: tolerance of the optimisers.
+
     Raises:
-        InvalidProblem: the problem has no horizon or cost. InvalidName: an unknown optimiser. NotSupported: one that cannot
-            serve the problem.
+        InvalidProblem: the problem has no horizon or cost.
+        InvalidName: an unknown optimiser.
+        NotSupported: an optimiser that cannot serve the problem.
     """
     problem = task.problem
     if problem.horizon is None or problem.cost is None:

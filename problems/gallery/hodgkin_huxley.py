@@ -1,22 +1,23 @@
-"""A nerve cell's voltage on a slow wave: the model knows the membrane's leak and no ion channel.
+"""A nerve cell's voltage on a slow wave: the model has the membrane's leak and no ion channel.
 
 The membrane of the squid's giant axon (Hodgkin and Huxley, J. Physiol. 117, 1952), a current I clamps its voltage V,
 
     C V' = I - gNa m^3 h (V - ENa) - gK n^4 (V - EK) - gL (V - EL),     p' = alpha_p(V) (1 - p) - beta_p(V) p,  p = m, h, n.
 
 The unit of time is the millisecond, throughout: voltages in mV, currents in uA/cm^2. The model's conductances of sodium and
-potassium are zero, its leak and capacity are wrong. Current and voltage of a rest are those of the original: -64.996 mV
+potassium are zero, its leak and capacity are wrong. Current and voltage at rest are those of the original: -64.996 mV
 without a current, 68.3 spikes per second at 10 uA/cm^2.
 
-Task: V follows a wave of 20 mV and 25 ms, which alone would make the cell fire. Measured: the error of V from 10 ms on. The
-start is 10 mV too low, which costs a plan more current than there is, and from 2 to 5 ms a synapse adds 10 uA/cm^2 that no
-controller is told of. Rms error, mV (seed 0):
+Task: V follows a wave of 20 mV and 25 ms, which alone would make the cell fire. The error of V counts from 10 ms on. The
+start is 10 mV too low, so that a plan needs more current than the limits allow, and from 2 to 5 ms a synapse adds 10 uA/cm^2
+that no controller measures. Rms error, mV (seed 0):
 
     CTC 15.7    CTC+FPI 0.0072    RHC 12.1    RHC+FPI 0.0089    offset-free 0.034    exact model, 5 iterations 0.010
 
-Without adaptation the cell fires (errors of 60 mV and more). A draw among those that correct: a clock of 5 us leaves each of
-them a hundredth of a millivolt. The exact model needs more than one iteration per plan: with one its error is 8 mV. Every
-state is told to the controllers; the gates, which nobody can measure, are used by the exact model alone.
+Without adaptation the cell fires (errors of 60 mV and more). The controllers that correct are equally good: with a clock of
+5 us each has an error of about a hundredth of a millivolt. The exact model needs more than one iteration per plan: with one
+its error is 8 mV. The controllers measure every state; the gates, which cannot be measured in a cell, are used by the exact
+model alone.
 """
 
 import casadi as ca

@@ -1,12 +1,12 @@
 """The same tumour with one reading and one dose a day: a hasty gain is worse than none, and offset-free control wins.
 
-Everything is that of `tumour` but the cycle: a day, as long as a stage of the plan. Rms error of ln x from 60 days on (seed 0):
+Everything but the cycle is that of `tumour`: a day, as long as a stage of the plan. Rms error of ln x from 60 days on (seed 0):
 
     RHC 0.14    RHC+FPI 1.0e-4    gain -0.3 0.67    offset-free 2.8e-5    exact model 0.025
 
-An offset-free plan sees its estimate in every plan now, as often as the deformation acts, and its model of a constant
-disturbance fits. A small gain is no safe choice: with -0.3 the correction takes days to arrive, the plan answers what it
-sees meanwhile with doses from nothing to the largest, and the tumour is off by more than without adaptation.
+An offset-free plan now uses its estimate in every cycle, as often as the deformation acts, and its model of a constant
+disturbance fits. A small gain is no safe choice: with -0.3 the correction takes days to act, the plan reacts to the errors of
+these days with doses from zero to the largest, and the error is larger than without adaptation.
 """
 
 from dataclasses import replace

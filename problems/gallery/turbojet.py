@@ -1,7 +1,7 @@
 """The thrust of a small jet engine: a P220 flown by the published model of the smaller P100.
 
-Thrust T in N answers the throttle u in % as second-order grey box, identified on a test bench (Momin et al., Nonlinear Model
-Identification and Observer Design for Thrust Estimation of Small-scale Turbojet Engines, 2022),
+The thrust T in N depends on the throttle u in % by a second-order grey box, identified on a test bench (Momin et al.,
+Nonlinear Model Identification and Observer Design for Thrust Estimation of Small-scale Turbojet Engines, 2022),
 
     T'' = K_T T + K_TT T^2 + K_D T' + K_DD T'^2 + K_TD T T' + c + (B_U + B_T T + B_D T') (u + B_UU u^2).
 
@@ -9,9 +9,9 @@ The plant has the coefficients of the JetCat P220, the model those of the P100, 
 a jet-driven humanoid robot (ami-iit, paper_nava_2023_icra_fault-control-ironcub, BSD-3). At the same throttle of 60 % the
 P100 gives 110 N, the P220 150 N. The throttle's effect is kept above 0.3 N/s^2 in both, so that it never changes its sign.
 
-Task: T = 120 + 40 sin 0.3 t, from 60 N; a cycle of 10 ms and a plan every 100 ms; measured from 20 s on. The first second
-asks for more throttle than there is, and from 5 to 8 s a gust takes 15 N/s^2, of which no controller is told. Rms error, N
-(seed 0):
+Task: T = 120 + 40 sin 0.3 t, from 60 N; a cycle of 10 ms and a plan every 100 ms; the error counts from 20 s on. The first
+second needs more throttle than the limits allow, and from 5 to 8 s a gust takes 15 N/s^2, which no controller measures. Rms
+error, N (seed 0):
 
     CTC 4.60    CTC+FPI 0.020    RHC 4.36    RHC+FPI 0.012    offset-free 0.11    exact model 0.0004
 

@@ -1,11 +1,11 @@
-"""The same jet engine with a cycle as long as a stage of the plan, 100 ms: adaptation and offset-free control draw.
+"""The same jet engine with a cycle as long as a stage of the plan, 100 ms: adaptation and offset-free control are equally good.
 
-Everything is that of `turbojet` but the cycle. Rms error of the thrust, N (seed 0):
+Everything but the cycle is that of `turbojet`. Rms error of the thrust, N (seed 0):
 
     CTC 4.7    CTC+FPI 0.21    RHC 4.36    RHC+FPI 0.14    gain -0.3 27    offset-free 0.13    exact model 0.0004
 
 The deformation and the estimate of an offset-free plan act equally often now. A small gain is no safe choice: with -0.3 the
-correction takes a second to arrive, the plan answers what it sees meanwhile with all or no throttle, and the thrust swings.
+correction takes a second to act, the plan reacts to the errors of this second with all or no throttle, and the thrust swings.
 """
 
 from dataclasses import replace

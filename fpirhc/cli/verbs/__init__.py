@@ -1,1 +1,1 @@
-"""The commands, one file each: a module here is found by a scan and holds its command in `VERB`."""
+"""The commands, one file each: every module of this package has its command in `VERB`."""

@@ -14,7 +14,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     text = "why the new numbers are right; kept in the baseline"
     parser.add_argument("--reason", required=True, metavar="TEXT", help=text)
     add_seed(parser, "the run that is compared")
-    text = "number of seeds that the bands are made of (default: 8)"
+    text = "number of seeds for the bands (default: 8)"
     parser.add_argument("--seeds", type=int, default=8, metavar="N", help=text)
     add_baselines(parser)
     add_processes(parser)
@@ -55,7 +55,7 @@ VERB = Verb(
     ),
     notes="""
 The controllers run with other seeds where there is noise, in other ways of computing, and with start and parameters
-moved by rounding errors; the spread of each metric makes its band. Commit baselines/NAME.json with the change.
+changed by rounding errors; the band of each metric comes from its spread. Commit baselines/NAME.json with the change.
 """,
     former=("bless",),
 )

@@ -65,7 +65,7 @@ def _judgements(options: argparse.Namespace, problems: Sequence[str]) -> list[Ju
 
 
 def _code(judgements: Sequence[Judgement]) -> ExitCode:
-    """The first of 2, 6, 5 that one of the problems asks for."""
+    """The first of 2, 6, 5 that applies to one of the problems."""
     if any(j.broken for j in judgements):
         return ExitCode.BAD_INPUT
     if any(j.unusable or not j.rows for j in judgements):

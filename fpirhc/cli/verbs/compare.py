@@ -98,7 +98,7 @@ VERB = Verb(
     add=_add,
     run=_run,
     codes={
-        ExitCode.FINISHED: "at least one controller ran; the report says how each run ended",
+        ExitCode.FINISHED: "at least one controller ran; the report shows how each run ended",
         ExitCode.BAD_INPUT: f"{ExitCode.BAD_INPUT.meaning}; or no controller could run",
         ExitCode.NOT_WRITABLE: ExitCode.NOT_WRITABLE.meaning,
     },

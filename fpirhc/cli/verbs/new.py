@@ -11,7 +11,7 @@ from fpirhc.cli.verb import Verb
 
 def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", metavar="NAME", help="of the problem: letters, digits and underscores")
-    text = "folder for the files, which is made where it is missing (default: the current folder)"
+    text = "folder for the files, created where it is missing (default: the current folder)"
     parser.add_argument("--dir", metavar="FOLDER", default=".", help=text)
 
 

@@ -1,4 +1,4 @@
-"""`fpirhc review PROBLEM`: what is known before a run."""
+"""`fpirhc review PROBLEM`: questions that are answered before a run."""
 
 from __future__ import annotations
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fpirhc.cli.exit_codes import ExitCode
 from fpirhc.cli.options import add_controllers, add_mismatch, add_out, add_problem, add_scenarios, add_seed
-from fpirhc.cli.output import results_folder
+from fpirhc.cli.output import results_folder, resumable
 from fpirhc.cli.verb import Verb
 
 if TYPE_CHECKING:
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
 def _add(parser: argparse.ArgumentParser) -> None:
     add_problem(parser)
     add_out(parser, "results/PROBLEM/tuning_...")
-    add_controllers(parser, "all that the problem file lets be tuned")
+    add_controllers(parser, "all with a search space in the problem file")
     text = "trials of every controller (default: 50)"
     parser.add_argument("--trials", type=int, default=50, metavar="N", help=text)
     add_seed(parser, "the proposals and scenarios")
@@ -27,7 +26,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_mismatch(parser)
     text = "tune by this number of a run, such as settling.q1 (default: the relative error)"
     parser.add_argument("--metric", metavar="NAME", help=text)
-    text = "compile every trial: pays where its runs last longer than the compiler"
+    text = "compile every trial, which pays where its runs last longer than the compiler"
     parser.add_argument("--compile", action="store_true", help=text)
 
 
@@ -41,23 +40,19 @@ def _run(options: argparse.Namespace) -> ExitCode:
     name = f"tuning_{options.scenarios}x{options.mismatch:g}percent_seed{options.seed}"
     name += f"_by_{options.metric}" if options.metric else ""
     folder = results_folder(options.out, task.name, name)
-    try:
-        with progress_bars() as progress:
-            tuning = tune(
-                task,
-                trials=options.trials,
-                seed=options.seed,
-                folder=folder,
-                controllers=options.controllers,
-                count=options.scenarios,
-                percent=options.mismatch,
-                metric=options.metric,
-                compiled=options.compile,
-                progress=progress,
-            )
-    except KeyboardInterrupt:
-        print(f"fpirhc: what is finished is kept in {folder / LEDGER}; the same command goes on", file=sys.stderr)
-        raise
+    with resumable(folder / LEDGER), progress_bars() as progress:
+        tuning = tune(
+            task,
+            trials=options.trials,
+            seed=options.seed,
+            folder=folder,
+            controllers=options.controllers,
+            count=options.scenarios,
+            percent=options.mismatch,
+            metric=options.metric,
+            compiled=options.compile,
+            progress=progress,
+        )
     write_tuned(tuning.facts(), folder / "tuning.json")
     _show(tuning, folder / "tuning.json")
     return ExitCode.FINISHED
@@ -68,24 +63,27 @@ def _show(tuning: Tuning, saved: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from fpirhc.report.terminal import literal, say
+
     console = Console()
     title = (
         f"{tuning.problem}: {tuning.trials} trials each, seed {tuning.seed}, {tuning.conditions}, cost: {tuning.metric}"
     )
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title)
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=literal(title))
     table.add_column("controller, setting", no_wrap=True)
     for head in ("before", "after", "failed"):
         table.add_column(head, justify="right")
     for entry in tuning.entries:
-        name = entry.name.replace("[", "\\[")
-        table.add_row(f"{name}: cost", f"{entry.cost_before:.4g}", f"{entry.cost:.4g}", str(entry.failed))
+        table.add_row(
+            literal(f"{entry.name}: cost"), f"{entry.cost_before:.4g}", f"{entry.cost:.4g}", str(entry.failed)
+        )
         for path, value in entry.settings.items():
-            table.add_row(f"  {path}", f"{entry.before[path]:.4g}", f"{value:.4g}", "")
+            table.add_row(literal(f"  {path}"), f"{entry.before[path]:.4g}", f"{value:.4g}", "")
     console.print(table)
     if tuning.untouched:
-        console.print(f"not tuned: {', '.join(tuning.untouched)}", markup=False, highlight=False)
+        say(console, f"not tuned: {', '.join(tuning.untouched)}")
     print(f"for the problem file, below its controllers:\n\n{tuning.python()}\n")
-    console.print(f"saved: {saved}", markup=False, highlight=False, soft_wrap=True)
+    say(console, f"saved: {saved}", wrap=False)
 
 
 VERB = Verb(
@@ -96,21 +94,21 @@ VERB = Verb(
     codes={
         ExitCode.BAD_INPUT: f"{ExitCode.BAD_INPUT.meaning}; or Optuna is missing",
         ExitCode.NOT_WRITABLE: ExitCode.NOT_WRITABLE.meaning,
-        ExitCode.INTERRUPTED: "interrupted from the keyboard; the same command goes on",
+        ExitCode.INTERRUPTED: "interrupted from the keyboard; the same command continues",
     },
     examples=(
         ("fpirhc tune two_mass", "50 trials of every controller that may be tuned"),
         (
             "fpirhc tune two_mass --trials 200 --scenarios 5 --mismatch 20",
-            "each trial in 5 scenarios; goes on from the trials that are there",
+            "each trial in 5 scenarios; continues after the finished trials",
         ),
         (
             "fpirhc compare two_mass --scenarios 100 --mismatch 20 --tuned results/two_mass/tuning_5x20percent_seed0/tuning.json",
-            "what the new settings are worth",
+            "the tuned settings in other scenarios",
         ),
     ),
     notes="""
-A problem file says what may be tuned, by dotted path:
+A problem file lists the settings to tune, by dotted path:
   tuning = {"RHC+FPI": {"deformation.gain": fp.LogSpan(-1.5, -0.05), "deformation.scale": fp.LogSpan(5, 500)}}
 The cost is the rms error divided by the reference's range, the mean over the scenarios; runs that fail cost 10 to 20.
 The scenarios of tuning are never those of a comparison.

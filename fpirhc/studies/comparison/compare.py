@@ -1,4 +1,4 @@
-"""Runs several controllers on one problem, pairs them, and says what adaptation bought."""
+"""Runs several controllers on one problem, pairs them, and judges the effect of adaptation."""
 
 from __future__ import annotations
 
@@ -34,7 +34,14 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Contraction:
-    """Contraction of one adaptive controller: predicted from the symbols along the run, measured from the run."""
+    """Contraction of one adaptive controller.
+
+    Args:
+        predicted: factor predicted from the symbols along the run.
+        measured: factor measured from the run.
+        report: admissible and recommended gains.
+        spectrum: eigenvalues of the response Jacobian along the run.
+    """
 
     predicted: float
     measured: float
@@ -44,7 +51,21 @@ class Contraction:
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """One controller's share of a comparison; `pair` names the same controller without adaptation, if present."""
+    """One controller of a comparison.
+
+    Args:
+        name: name of the controller.
+        run: its run.
+        metrics: metrics of the run.
+        cycle: time of a control cycle; None for a run that is too short.
+        adaptive: whether the controller adapts.
+        pair: name of the same controller without adaptation, if there is one.
+        contraction: contraction of the iteration, if the controller adapts.
+        optimality: excess cost of its plans, if it plans.
+        notes: sentences for the report.
+        lyapunov: Lyapunov function along the run, if one is known.
+        prediction: prediction of the response, for the adaptive controller of the headline.
+    """
 
     name: str
     run: Run
@@ -56,12 +77,28 @@ class Entry:
     optimality: Optimality | None = None
     notes: tuple[str, ...] = ()
     lyapunov: LyapunovView | None = None
-    prediction: Prediction | None = None  # of the headline's adaptive controller, where there is one
+    prediction: Prediction | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What `compare` found: entries in order, skipped controllers with the reason, the verdict in sentences."""
+    """The result of `compare`.
+
+    Args:
+        problem: name of the problem.
+        title: its title.
+        description: its description.
+        seed: of the disturbances and the noise.
+        measure_from: time from which errors count, s.
+        entries: the controllers that ran, in order.
+        skipped: reasons why controllers were skipped, by name.
+        verdict: the verdict in sentences.
+        command: the command line.
+        versions: versions of fpirhc and of what its numbers depend on.
+        settings: settings of the problem.
+        elapsed: wall time of the comparison, s.
+        pictures: pictures of the problem for the report.
+    """
 
     problem: str
     title: str
@@ -128,26 +165,25 @@ def compare(
     command: str = "",
     progress: Progress | None = None,
 ) -> Comparison:
-    """Run the task's controllers with the same disturbances and return what they achieved.
+    """Run the task's controllers with the same disturbances and return their results.
 
-    A controller that cannot serve the problem is skipped with its reason. Ctrl-C keeps what is finished.
+    A controller that cannot serve the problem is skipped with its reason. Ctrl-C keeps the finished runs.
+
+    Args:
+        task: the loaded problem file.
+        seed: of the disturbances and the noise.
+        controllers: names of controllers; None: all.
+        compiled: whether runs use compiled C.
+        command: the command line, for the report.
+        progress: function of (controller, cycles done, cycles in all).
 
     Raises:
         InvalidProblem: unknown controllers, or deformations with a gain of the wrong sign.
     """
     begin = time.perf_counter()
-    check_gains(task, select(task, controllers))
-    chosen, skipped = select(task, controllers), {}
-    entries: list[Entry] = []
-    for name, controller in chosen.items():
-        try:
-            entries.append(_entry(task, chosen, name, controller, seed, compiled, progress))
-        except FpirhcError as error:
-            skipped[name] = str(error)
-        except KeyboardInterrupt:
-            waiting = list(chosen)[len(entries) + len(skipped) :]
-            skipped |= dict.fromkeys(waiting, "interrupted before it finished")
-            break
+    selected = select(task, controllers)
+    check_gains(task, selected)
+    entries, skipped = _entries(task, selected, seed, compiled, progress)
     return Comparison(
         problem=task.name,
         title=task.title,
@@ -165,16 +201,16 @@ def compare(
     )
 
 
-def check_gains(task: Task, chosen: Mapping[str, Controller]) -> None:
-    """A gain of the wrong sign is a mistake in the file, not a result: it is refused before anything runs."""
+def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
+    """Raise for gains of the wrong sign, which are mistakes in the file and no results, before anything runs."""
     mistakes = Mistakes(f"problem '{task.name}'")
-    for name, controller in chosen.items():
+    for name, controller in controllers.items():
         try:
             checked(task.problem, controller)
         except NotContractive as error:
             mistakes.add(f"controller '{name}': {error}")
         except FpirhcError:
-            continue  # said later, as the reason why the controller is skipped
+            continue  # reported later, as the reason why the controller is skipped
     mistakes.raise_if_any()
 
 
@@ -182,13 +218,31 @@ def versions() -> dict[str, str]:
     """Versions of fpirhc and of what its numbers depend on."""
     import platform
 
-    found = {name: version(name) for name in ("fpirhc", "casadi", "numpy", "scipy")}
-    return {**found, "python": platform.python_version(), "machine": platform.machine()}
+    packages = {name: version(name) for name in ("fpirhc", "casadi", "numpy", "scipy")}
+    return {**packages, "python": platform.python_version(), "machine": platform.machine()}
+
+
+def _entries(
+    task: Task, controllers: Mapping[str, Controller], seed: int, compiled: bool, progress: Progress | None
+) -> tuple[list[Entry], dict[str, str]]:
+    """Entries of the controllers that ran, and reasons why the others were skipped."""
+    entries: list[Entry] = []
+    skipped: dict[str, str] = {}
+    for name, controller in controllers.items():
+        try:
+            entries.append(_entry(task, controllers, name, controller, seed, compiled, progress))
+        except FpirhcError as error:
+            skipped[name] = str(error)
+        except KeyboardInterrupt:
+            waiting = list(controllers)[len(entries) + len(skipped) :]
+            skipped |= dict.fromkeys(waiting, "interrupted before it finished")
+            break
+    return entries, skipped
 
 
 def _entry(
     task: Task,
-    chosen: Mapping[str, Controller],
+    controllers: Mapping[str, Controller],
     name: str,
     controller: Controller,
     seed: int,
@@ -213,7 +267,7 @@ def _entry(
         metrics=metrics,
         cycle=measure_cycle(problem, ready, run, compiled=compiled),
         adaptive=adaptive,
-        pair=_pair(chosen, name) if adaptive else None,
+        pair=_pair(controllers, name) if adaptive else None,
         contraction=_contraction(problem, ready, run, metrics),
         optimality=measure_optimality(problem, ready, run, compiled=compiled),
         notes=(*_notes(controller, ready), *ready.notes(problem), *([view.text] if view else [])),
@@ -223,25 +277,25 @@ def _entry(
 
 
 def _predicted(problem: Problem, controller: Controller, compiled: bool) -> Prediction | None:
-    """What could have been known before the run; None where the prediction does not cover it."""
+    """The prediction before the run; None where no prediction covers the controller."""
     try:
         return predict_response(problem, controller, compiled=compiled)
     except FpirhcError:
         return None
 
 
-def _pair(chosen: Mapping[str, Controller], name: str) -> str | None:
+def _pair(controllers: Mapping[str, Controller], name: str) -> str | None:
     """The controller with the same settings and no adaptation."""
     try:
-        wanted = describe(without_deformation(chosen[name]))
+        wanted = describe(without_deformation(controllers[name]))
     except NotSupported:
         return None
-    others = ((n, c) for n, c in chosen.items() if not c.deformation.adapts)
-    return next((other for other, controller in others if describe(controller) == wanted), None)
+    plain = ((n, c) for n, c in controllers.items() if not c.deformation.adapts)
+    return next((other for other, controller in plain if describe(controller) == wanted), None)
 
 
 def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Metrics) -> Contraction | None:
-    """What stands behind the contraction that was measured; None where none was."""
+    """The measured contraction with its explanation; None where none was measured."""
     predicted = metrics.values.get("contraction.predicted")
     if not predicted:
         return None
@@ -249,7 +303,9 @@ def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Me
     return Contraction(predicted[""], measured, assess_gain(controller.deformation, spectrum), spectrum)
 
 
-def _notes(asked: Controller, ready: Controller) -> tuple[str, ...]:
+def _notes(controller: Controller, ready: Controller) -> tuple[str, ...]:
     """Which settings of the deformation were chosen automatically."""
-    chosen = innermost(ready.deformation)
-    return tuple(f"{name} = {getattr(chosen, name):g} was chosen automatically" for name in asked.deformation.automatic)
+    map_ = innermost(ready.deformation)
+    return tuple(
+        f"{name} = {getattr(map_, name):g} was chosen automatically" for name in controller.deformation.automatic
+    )

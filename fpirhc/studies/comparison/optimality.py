@@ -1,4 +1,4 @@
-"""How good the plans of a run were: their cost against the converged optimum of the same horizon."""
+"""The cost of the plans of a run against the converged optimum of the same horizon."""
 
 from __future__ import annotations
 
@@ -23,7 +23,13 @@ _ACCURATE = 1e-8  # of the input's range
 
 @dataclass(frozen=True)
 class Optimality:
-    """Relative excess (V - V*) / |V*| of sampled plans over the converged optimum: median and worst; how many were compared."""
+    """Relative excess (V - V*) / |V*| of sampled plans over the converged optimum.
+
+    Args:
+        median: median excess.
+        worst: largest excess.
+        plans: number of plans that were compared.
+    """
 
     median: float
     worst: float
@@ -33,19 +39,20 @@ class Optimality:
 def measure_optimality(
     problem: Problem, controller: Controller, run: Run, *, compiled: bool = True
 ) -> Optimality | None:
-    """Return the excess cost of sampled plans; None where plans do not start from a state in the run, or none was solved.
+    """Return the excess cost of sampled plans.
 
-    None too for a controller that learns: the models that its plans were made with are not in the run. A negative number is another
-    local optimum that the controller found and the solve from rest did not.
+    The result is None where plans do not start from a state in the run, where no plan was solved, and for a controller that
+    learns, because the models of its plans are not in the run. A negative excess is that of another local optimum, which the
+    controller reached and the solve from rest did not.
     """
     ready = checked(problem, controller)
-    chosen, sees = ready.planner, ready.feeds
-    if chosen is None or not chosen.restarts or problem.horizon is None or run.cycles < 2:
+    planner, feeds = ready.planner, ready.feeds
+    if planner is None or not planner.restarts or problem.horizon is None or run.cycles < 2:
         return None
-    if ready.learns or "parameters" in sees:
+    if ready.learns or "parameters" in feeds:
         return None
-    times, states = (run[sees[n] if sees.get(n) in run.layout.names else n] for n in ("time", "state"))
-    cost = chosen.cost or problem.cost
+    times, states = (run[feeds[n] if feeds.get(n) in run.layout.names else n] for n in ("time", "state"))
+    cost = planner.cost or problem.cost
     assert cost is not None
     ocp = transcribe(problem.plant, problem.reference, problem.horizon, cost, problem.limits)
     try:
@@ -58,13 +65,13 @@ def measure_optimality(
     rows = planned[np.unique(np.linspace(0, planned.size - 1, SAMPLES).astype(int))] if planned.size else planned
     parameters, excess = controller.parameters(problem.plant), []
     for row in rows:
-        correction = run["command_shift"][row - 1]
+        shift = run["command_shift"][row - 1]
         first = ocp.start(states[row], run["command"][row - 1]).full().ravel()
         data = np.asarray(data_of(np.ravel(times)[row], parameters).full())
-        best = solve(first, data, ocp.input_lower - correction, ocp.input_upper - correction)
-        told = run["solve.cost"][row]
+        best = solve(first, data, ocp.input_lower - shift, ocp.input_upper - shift)
+        cost_of_plan = run["solve.cost"][row]
         if best is not None and run["status"][row] <= Status.NOT_CONVERGED:
-            excess.append((told - best) / max(abs(best), 1e-12))
+            excess.append((cost_of_plan - best) / max(abs(best), 1e-12))
     return Optimality(float(np.median(excess)), float(np.max(excess)), len(excess)) if excess else None
 
 
@@ -83,7 +90,7 @@ class _Solver:
     def __call__(self, first: np.ndarray, data: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> float | None:
         memory = self._start
         for _ in range(20):
-            _, told, memory = self._evaluator(first, data.T, lower, upper, memory)
-            if told[4] == Status.OK:
-                return float(told[0])
+            _, facts, memory = self._evaluator(first, data.T, lower, upper, memory)
+            if facts[4] == Status.OK:
+                return float(facts[0])
         return None

@@ -1,4 +1,4 @@
-"""The same controllers with other optimisers, by the names that the command line knows."""
+"""The same controllers with other optimisers, by the names of the command line."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ Choice = tuple[str, Callable[[float], Optimiser]]  # label, function of the tole
 
 
 def optimiser_choices() -> dict[str, Choice]:
-    """Every optimiser that the command line knows: name -> (label, function of the tolerance).
+    """Return every optimiser of the command line: name -> (label, function of the tolerance).
 
-    A member's module offers them as `CHOICES`.
+    The modules of the optimisers define them as `CHOICES`.
     """
     choices: dict[str, Choice] = {}
     for module in member_modules("optimisers"):
@@ -31,25 +31,26 @@ def with_optimisers(task: Task, names: Sequence[str], controllers: Sequence[str]
     A controller that is named and does not plan stays as it is.
 
     Raises:
-        InvalidName: an unknown optimiser. InvalidProblem: no planning controller to vary.
+        InvalidName: an unknown optimiser.
+        InvalidProblem: no planning controller to vary.
     """
     choices = optimiser_choices()
     unknown = [n for n in names if n != "all" and n not in choices]
     if unknown:
         raise InvalidName(f"optimiser '{unknown[0]}' is unknown.{nearest(unknown[0], [*choices, 'all'])}")
-    chosen = list(choices) if "all" in names else list(dict.fromkeys(names))
+    keys = list(choices) if "all" in names else list(dict.fromkeys(names))
     sources = list(controllers or task.headline or task.controllers)
     planning = [name for name in sources if task.controllers[name].planner is not None]
     if not planning:
         raise InvalidProblem(f"problem '{task.name}': none of {', '.join(sources)} plans with an optimiser")
     varied: dict[str, Controller] = {}
     for name in sources if controllers else planning:
-        varied |= _varied(name, task.controllers[name], [choices[key] for key in chosen])
+        varied |= _varied(name, task.controllers[name], [choices[key] for key in keys])
     return replace(task, controllers=varied, headline=None)
 
 
 def _varied(name: str, controller: Controller, optimisers: Sequence[Choice]) -> dict[str, Controller]:
-    """The controller by name, once per optimiser; as it is where it does not plan."""
+    """The controller by name, once per optimiser; unchanged where it does not plan."""
     if controller.planner is None:
         return {name: controller}
     tolerance = float(getattr(controller.planner.optimiser, "tolerance", 1e-3))

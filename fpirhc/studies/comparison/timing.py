@@ -1,4 +1,4 @@
-"""How long one control cycle takes: the controller alone, from measurement to command."""
+"""The time of one control cycle: the controller alone, from measurement to command."""
 
 from __future__ import annotations
 
@@ -17,10 +17,14 @@ REPLAYED = 2000  # cycles of the run that are stepped again, one by one
 
 @dataclass(frozen=True)
 class CycleTime:
-    """Wall time of one call of `Stepper.step`, microseconds; `first` is kept apart from the rest.
+    """Wall time of one call of `Stepper.step`, microseconds; only `first` includes the first call.
 
-    median: of the mean over the cycles from one plan to the next, so that it holds its share of planning.
-    planning: median of the cycles in which a new plan is made; the median of all where none is.
+    Args:
+        median: median of the mean over the cycles from one plan to the next, so that it includes its share of planning.
+        p99: 99th percentile.
+        maximum: largest time.
+        first: time of the first call.
+        planning: median of the cycles in which a new plan is made; of all cycles where no plan is made.
     """
 
     median: float
@@ -33,8 +37,8 @@ class CycleTime:
 def measure_cycle(problem: Problem, controller: Controller, run: Run, *, compiled: bool = True) -> CycleTime | None:
     """Replay the run's measurements through the controller, one call per cycle, and return the times.
 
-    The replay computes what the run computed: the controller's memory starts afresh and sees the same measurements.
-    None when the run is too short to say anything.
+    The replay repeats the computations of the run: the controller starts afresh and has the same measurements.
+    The result is None for a run of fewer than two cycles.
     """
     cycles = min(run.cycles, REPLAYED)
     if cycles < 2:

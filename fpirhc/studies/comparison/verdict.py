@@ -1,6 +1,6 @@
-"""The verdict: what adaptation bought, in sentences; and why, where it bought nothing.
+"""The verdict: the effect of adaptation in sentences, with the reasons where there is none.
 
-Every claim is computed from the entries. Recognised reasons for a failure are the response Jacobian's eigenvalues, a step
+Every claim is computed from the entries. Known reasons are the response Jacobian's eigenvalues, a step
 limit below the slew of the desired response, and a cost that weighs absolute effort.
 """
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 HELPS = 0.9  # an rms error below this share of the pair's counts as lower
 HURTS = 1.1
-MANY_CYCLES = 3  # from which a run says something about the slew of its desired response
+MANY_CYCLES = 3  # of a run from which the slew of its desired response is judged
 
 
 def verdict(entries: Sequence[Entry], skipped: Mapping[str, str], headline: tuple[str, str] | None) -> tuple[str, ...]:
@@ -83,8 +83,8 @@ def _price(plain: Entry, adaptive: Entry) -> str:
 
 
 def _causes(plain: Entry, adaptive: Entry) -> str:
-    found = [c for c in (_gain_cause(adaptive), _slew_cause(plain, adaptive), _effort_cause(adaptive)) if c]
-    return " " + " ".join(found) if found else ""
+    causes = [c for c in (_gain_cause(adaptive), _slew_cause(plain, adaptive), _effort_cause(adaptive)) if c]
+    return " " + " ".join(causes) if causes else ""
 
 
 def _gain_cause(entry: Entry) -> str:
@@ -94,7 +94,7 @@ def _gain_cause(entry: Entry) -> str:
 
 
 def _slew_cause(plain: Entry, adaptive: Entry) -> str:
-    """The step limit is judged by what the same controller asks for without adaptation, before anything diverges."""
+    """The step limit is compared with the desired response of the same controller without adaptation, which does not diverge."""
     limit = adaptive.run.settings["step_limit"]
     if not isinstance(limit, float) or plain.run.cycles < MANY_CYCLES:
         return ""

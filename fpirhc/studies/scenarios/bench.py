@@ -1,4 +1,4 @@
-"""Runs single scenarios of a problem; what is costly is built once and used for all of them."""
+"""Runs of single scenarios of a problem; simulators are built once and used for all scenarios."""
 
 from __future__ import annotations
 
@@ -25,9 +25,13 @@ FORMAT = 2  # of records
 
 @dataclass(frozen=True)
 class Conditions:
-    """What, apart from the task, decides every number of a scenario.
+    """Everything apart from the task on which the numbers of a scenario depend.
 
-    Parameters: `seed` and `use` of the scenarios, `percent` of the exact parameters' draws, `compiled`: whether C is used.
+    Args:
+        seed: of the scenarios.
+        use: of the scenarios, see `draws`.
+        percent: range of the exact parameters' draws, percent.
+        compiled: whether runs use compiled C.
     """
 
     seed: int
@@ -37,7 +41,7 @@ class Conditions:
 
 
 def fingerprint(task: Task, conditions: Conditions) -> dict[str, Any]:
-    """Return the facts on which results depend; results with other facts are never put beside these."""
+    """Return the facts on which results depend; results with other facts are never mixed with these."""
     settings = json.dumps([describe(task.problem), describe(task.controllers)])
     return {
         "format": FORMAT,
@@ -58,6 +62,10 @@ def _hash(content: bytes) -> str:
 class Bench:
     """Runs scenarios by number and controller.
 
+    Args:
+        task: the loaded problem file.
+        conditions: conditions of the scenarios.
+
     Raises:
         InvalidProblem, InvalidValue: draws that could leave the parameters' physical bounds.
     """
@@ -70,7 +78,7 @@ class Bench:
         self._drawn: tuple[int, Scenario, Problem] | None = None
 
     def record(self, number: int, name: str) -> dict[str, Any]:
-        """Return what became of one controller in one scenario, as plain data; a number that is not finite becomes None.
+        """Return the result of one controller in one scenario, as plain data; a number that is not finite becomes None.
 
         A controller that cannot serve the problem gives {"controller": its name, "skipped": the reason}.
         """

@@ -1,4 +1,4 @@
-"""Median of a sample with the interval that resampling gives it."""
+"""Median of a sample with its confidence interval by resampling."""
 
 from __future__ import annotations
 
@@ -8,12 +8,18 @@ import numpy as np
 
 RESAMPLES = 4000
 LEVEL = 0.95
-_AT_ONCE = 2_000_000  # numbers that are drawn in one go
+_AT_ONCE = 2_000_000  # largest number of values that are drawn at once
 
 
 @dataclass(frozen=True)
 class ConfidenceInterval:
-    """A median and its interval at level `LEVEL`."""
+    """A median and its interval at level `LEVEL`.
+
+    Args:
+        median: the median.
+        low: lower end of the interval.
+        high: upper end of the interval.
+    """
 
     median: float
     low: float
@@ -31,11 +37,11 @@ def median_interval(values: np.ndarray, seed: int) -> ConfidenceInterval:
     """
     random = np.random.default_rng(np.random.SeedSequence(seed))
     rows = max(1, _AT_ONCE // values.size)
-    found: list[np.ndarray] = []
+    samples: list[np.ndarray] = []
     for at in range(0, RESAMPLES, rows):
         size = (min(rows, RESAMPLES - at), values.size)
-        found.append(middle(values[random.integers(values.size, size=size)]))
-    medians = np.sort(np.concatenate(found))
+        samples.append(middle(values[random.integers(values.size, size=size)]))
+    medians = np.sort(np.concatenate(samples))
     tail = round((1 - LEVEL) / 2 * RESAMPLES)
     return ConfidenceInterval(float(middle(values)), float(medians[tail]), float(medians[-1 - tail]))
 

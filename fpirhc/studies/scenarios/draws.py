@@ -1,4 +1,4 @@
-"""Scenarios: the exact parameters and the noise that every controller of a comparison meets alike.
+"""Scenarios: exact parameters and noise that are the same for every controller of a comparison.
 
 Scenario k of a seed is always the same: its numbers come from a stream of its own, `SeedSequence(seed, spawn_key=(use, k))`,
 whatever the number of scenarios, of processes and of controllers, and in whatever order they run. Every exact parameter
@@ -16,15 +16,17 @@ import numpy as np
 from fpirhc.plant.plant import Plant
 from fpirhc.task.problem import Problem
 
-COMPARING, TUNING = 0, 1  # uses: what a controller was tuned on is never what it is compared on
+COMPARING, TUNING = 0, 1  # uses: a controller is never compared on the scenarios on which it was tuned
 
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """What one scenario is made of.
+    """One scenario.
 
-    Parameters:
-        seed: of the disturbances' noise. exact: parameters of the plant, shape (np,). mismatch: see `mismatch_of`.
+    Args:
+        seed: of the disturbances' noise.
+        exact: exact parameters of the plant, shape (np,).
+        mismatch: distance of the model from them, see `mismatch_of`.
     """
 
     seed: int
@@ -33,7 +35,15 @@ class Scenario:
 
 
 def draw(plant: Plant, *, seed: int, use: int, number: int, percent: float) -> Scenario:
-    """Return scenario `number` of `seed`; the exact parameters lie in `exact_ranges(plant, percent)`."""
+    """Return a scenario; its exact parameters lie in `exact_ranges(plant, percent)`.
+
+    Args:
+        plant: the plant.
+        seed: seed of the study.
+        use: `COMPARING` or `TUNING`.
+        number: number of the scenario.
+        percent: range of the exact parameters, percent.
+    """
     parameters, noise = np.random.SeedSequence(seed, spawn_key=(use, number)).spawn(2)
     low, high = math.log1p(-percent / 100), math.log1p(percent / 100)
     factors = np.exp(np.random.default_rng(parameters).uniform(low, high, plant.exact.size))
@@ -42,7 +52,7 @@ def draw(plant: Plant, *, seed: int, use: int, number: int, percent: float) -> S
 
 
 def mismatch_of(approximate: np.ndarray, exact: np.ndarray) -> float:
-    """How wrong a model is: rms over its parameters of |approximate - exact| / max(|approximate|, |exact|), as a share."""
+    """Return the rms over the parameters of |approximate - exact| / max(|approximate|, |exact|), as a share."""
     size = np.maximum(np.abs(approximate), np.abs(exact))
     shares = np.abs(approximate - exact) / np.where(size > 0, size, 1.0)
     return float(np.sqrt(np.mean(shares**2))) if shares.size else 0.0

@@ -1,8 +1,8 @@
 """An append-only file of results that survives being killed at any moment.
 
-One JSON object per line. The first line is a header that says what the results are of; a file with another header is refused.
-Every line is on the disk before `append` returns. A last line that is torn was never acknowledged: it is cut off and its
-result computed again. Only one process may have the file open.
+Every line is one JSON object. The first line is a header with the conditions of the results; a file with another header is refused.
+Every line is on the disk before `append` returns. A last line that is torn was never acknowledged: it is cut off, and its
+result is computed again. Only one process may have the file open.
 """
 
 from __future__ import annotations
@@ -19,10 +19,14 @@ from fpirhc.errors import OutputError
 
 
 class Ledger:
-    """The open file; `records` are those found in it and those appended, in this order.
+    """The open file; `records` are those that it held and those appended, in this order.
+
+    Args:
+        path: path of the file.
+        header: conditions of the results.
 
     Raises:
-        OutputError: the file cannot be written, is damaged, is in use, or holds results of something else.
+        OutputError: the file cannot be written, is damaged, is in use, or holds results under other conditions.
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
@@ -43,7 +47,7 @@ class Ledger:
         """Write one record and wait until it is on the disk.
 
         Raises:
-            OutputError: it cannot be written.
+            OutputError: the file cannot be written.
         """
         self._write(record)
         self.records.append(dict(record))
@@ -93,9 +97,9 @@ class Ledger:
             yield value
 
 
-def _refusal(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> str:
-    names = [n for n in dict.fromkeys([*wanted, *found]) if found.get(n) != wanted.get(n)]
-    facts = "; ".join(f"{n} was {_short(found.get(n))}, is {_short(wanted.get(n))}" for n in names)
+def _refusal(path: Path, header: dict[str, Any], wanted: dict[str, Any]) -> str:
+    names = [n for n in dict.fromkeys([*wanted, *header]) if header.get(n) != wanted.get(n)]
+    facts = "; ".join(f"{n} was {_short(header.get(n))}, is {_short(wanted.get(n))}" for n in names)
     return (
         f"'{path}' holds results of something else, and results are never mixed: {facts}. "
         "Give another folder with --out, or remove the file"
@@ -124,7 +128,7 @@ def _lock(file: IO[bytes], path: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """A new file's name must be on the disk too; not every system allows it."""
+    """Write the name of a new file to the disk too, on systems that allow it."""
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

@@ -1,4 +1,4 @@
-"""What many paired scenarios say about each controller: medians, paired differences, worst cases, failures."""
+"""Statistics of each controller over many paired scenarios: medians, paired differences, worst cases, failures."""
 
 from __future__ import annotations
 
@@ -19,12 +19,20 @@ Record = Mapping[str, Any]
 class Summary:
     """One controller over all scenarios; errors are relative (see `score`), infinite for runs that ended early.
 
-    Parameters:
-        errors, mismatch: by scenario, shape (n,). median, worst: of the errors; worst_scenario: its number.
-        metrics: median over the scenarios, by metric and element; a run without the number counts as worse than any other.
-        outcomes: scenarios by outcome. statuses: cycles by status, over all scenarios.
+    Args:
+        name: name of the controller.
+        errors: relative errors by scenario, shape (n,).
+        mismatch: mismatch of the model by scenario, shape (n,).
+        median: median of the errors.
+        worst: largest error.
+        worst_scenario: number of the scenario with the largest error.
+        metrics: median over the scenarios, by metric and element; a run without the number counts as worse than any
+            other.
+        outcomes: number of scenarios by outcome.
+        statuses: number of cycles by status, over all scenarios.
         difference: this error minus the baseline's in the same scenario; None for the baseline itself.
-        ratio: median of this error over the baseline's. better: scenarios in which this error is the smaller one.
+        ratio: median of this error over the baseline's.
+        better: number of scenarios in which this error is the smaller one.
     """
 
     name: str
@@ -60,7 +68,12 @@ def summarise(
 ) -> Summary:
     """Return the summary of one controller's records against the baseline's of the same scenarios, in the same order.
 
-    Parameters: `metrics` that the records were measured by; None: the shipped and the installed ones.
+    Args:
+        name: name of the controller.
+        records: its records.
+        baseline: the baseline's records; None for the baseline itself.
+        seed: of the resampling.
+        metrics: metrics with which the records were measured; None: the shipped and the installed ones.
     """
     errors = errors_of(records)
     before = errors if baseline is None else errors_of(baseline)
@@ -85,10 +98,10 @@ def _medians(records: Sequence[Record], metrics: Sequence[Metric]) -> dict[str, 
     """Median of every number that some scenario has."""
     medians: dict[str, dict[str, float]] = {}
     for metric in metrics:
-        found = [r["metrics"].get(metric.name, {}) for r in records]
+        by_element = [r["metrics"].get(metric.name, {}) for r in records]
         missing = -np.inf if metric.better == "larger" else np.inf
-        for element in dict.fromkeys(e for numbers in found for e in numbers):
-            values = _numbers([numbers.get(element) for numbers in found], missing)
+        for element in dict.fromkeys(e for numbers in by_element for e in numbers):
+            values = _numbers([numbers.get(element) for numbers in by_element], missing)
             medians.setdefault(metric.name, {})[element] = float(middle(values))
     return medians
 
@@ -103,20 +116,20 @@ def _numbers(values: Sequence[float | None], missing: float = np.inf) -> np.ndar
 
 
 def _differences(after: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Where both failed there is no difference."""
+    """Differences of errors; where both runs failed, the difference is zero."""
     with np.errstate(invalid="ignore"):
-        found = after - before
-    return np.where(np.isnan(found), 0.0, found)
+        differences = after - before
+    return np.where(np.isnan(differences), 0.0, differences)
 
 
 def _ratios(after: np.ndarray, before: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore", divide="ignore"):
-        found = after / before
-    return np.where(np.isnan(found), 1.0, found)
+        ratios = after / before
+    return np.where(np.isnan(ratios), 1.0, ratios)
 
 
 def verdict(summaries: Sequence[Summary], skipped: Mapping[str, str]) -> tuple[str, ...]:
-    """Return sentences: every controller against the baseline, failures, and what was not run."""
+    """Return sentences: every controller against the baseline, failures, and controllers that were not run."""
     sentences = [_sentence(summaries[0], s) for s in summaries[1:]]
     if len(summaries) == 1:
         only = summaries[0]
@@ -132,16 +145,16 @@ def verdict(summaries: Sequence[Summary], skipped: Mapping[str, str]) -> tuple[s
 
 
 def _sentence(baseline: Summary, one: Summary) -> str:
-    found = one.difference
-    assert found is not None
+    difference = one.difference
+    assert difference is not None
     count = one.errors.size
     numbers = (
-        f"median difference {signed(found.median)} of the reference's range, "
-        f"95 % interval {signed(found.low)} to {signed(found.high)}; smaller in {one.better} of {count} scenarios"
+        f"median difference of the error {signed(difference.median)}, "
+        f"95 % interval {signed(difference.low)} to {signed(difference.high)}; smaller in {one.better} of {count} scenarios"
     )
-    if found.high < 0:
+    if difference.high < 0:
         return f"{one.name} has a smaller error than {baseline.name} ({numbers}; {one.ratio:.3g} times its error)."
-    if found.low > 0:
+    if difference.low > 0:
         return f"{one.name} has a larger error than {baseline.name} ({numbers}; {one.ratio:.3g} times its error)."
     return f"{one.name} and {baseline.name} show no clear difference ({numbers})."
 
@@ -152,12 +165,12 @@ def _failed(one: Summary) -> str:
 
 
 def percent(share: float) -> str:
-    """A share as text."""
+    """Return a share as text."""
     return f"{100 * share:.3g} %" if np.isfinite(share) else "none (failed)"
 
 
 def signed(share: float) -> str:
-    """A difference of shares as text."""
+    """Return a difference of shares as text."""
     return (
         f"{100 * share:+.3g} %"
         if np.isfinite(share)

@@ -1,8 +1,8 @@
-"""Worker processes that answer jobs, and are replaced when they die.
+"""Worker processes that answer jobs and are replaced when they die.
 
 A worker is a command that reads one JSON value per line and answers each with one line, in order; its first line is a greeting.
 It ends at the end of its input, so that no worker outlives its parent, however the parent ends. A worker that is killed is
-started anew and given the jobs that it had not answered.
+replaced by another one, which receives the jobs without an answer.
 """
 
 from __future__ import annotations
@@ -20,18 +20,22 @@ from typing import Any, Self
 
 from fpirhc.errors import FpirhcError, WorkerDied
 
-AHEAD = 2  # jobs that a worker is given at once, so that it never waits for the next
-DEATHS = 5  # of workers at one and the same job until it is given up
+AHEAD = 2  # jobs that a worker has at once, so that it never waits for the next one
+DEATHS = 5  # workers that die at one job before the study ends
 
 
 class Workers:
     """Answers to jobs from `count` processes.
 
-    Parameters: `module`: what each process runs; `opening`: the first line it is given; `greeting`: the answer to that which
-    every worker must give.
+    Args:
+        module: module that each process runs.
+        opening: first line of input of each process.
+        greeting: answer that each process must give to the opening.
+        count: number of processes.
 
-    Raises (while running):
-        WorkerDied: a job at which workers die again and again. FpirhcError: a worker's greeting is another one.
+    Raises:
+        WorkerDied: workers die again and again at one job; raised by `answers`.
+        FpirhcError: a worker's greeting is another one; raised by `answers`.
     """
 
     def __init__(self, module: str, opening: Any, greeting: Any, count: int) -> None:
@@ -56,31 +60,33 @@ class Workers:
     def answers(self, jobs: Sequence[Any], own: Callable[[Any], Any] | None = None) -> Iterator[Any]:
         """Yield the answer of every job as it comes, in no particular order.
 
-        With `own`, which answers a job, this process is one of the `count`: one that only waits would cost a start more.
+        Args:
+            jobs: the jobs.
+            own: function that answers a job. With it this process is one of the `count`, which saves the start of another.
         """
         waiting: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        given: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        answered: queue.SimpleQueue[Any] = queue.SimpleQueue()
         for job in jobs:
             waiting.put(job)
         for k in range(min(self._count, len(jobs)) - (own is not None)):
-            self._threads.append(threading.Thread(target=self._drive, args=(k, waiting, given), daemon=True))
+            self._threads.append(threading.Thread(target=self._drive, args=(k, waiting, answered), daemon=True))
             self._threads[-1].start()
         for _ in jobs:
-            answer = self._next(waiting, given, own)
+            answer = self._next(waiting, answered, own)
             if isinstance(answer, Exception):
                 raise answer
             yield answer
 
     def _next(
-        self, waiting: queue.SimpleQueue[Any], given: queue.SimpleQueue[Any], own: Callable[[Any], Any] | None
+        self, waiting: queue.SimpleQueue[Any], answered: queue.SimpleQueue[Any], own: Callable[[Any], Any] | None
     ) -> Any:
-        """What another process has answered, or else an answer of this one; with no job left, the next that comes."""
-        if own is None or not given.empty():
-            return given.get()
+        """The answer of another process if there is one, else one of this process; with no job left, the next that comes."""
+        if own is None or not answered.empty():
+            return answered.get()
         mine = _taken(waiting, 1)
-        return own(mine[0]) if mine else given.get()
+        return own(mine[0]) if mine else answered.get()
 
-    def _drive(self, k: int, waiting: queue.SimpleQueue[Any], given: queue.SimpleQueue[Any]) -> None:
+    def _drive(self, k: int, waiting: queue.SimpleQueue[Any], answered: queue.SimpleQueue[Any]) -> None:
         """Keep worker `k` busy until no job is left."""
         pending: deque[Any] = deque()
         process, deaths = None, 0
@@ -102,14 +108,14 @@ class Workers:
                     if deaths == DEATHS:
                         raise WorkerDied(
                             f"{DEATHS} processes died one after the other at the job {pending[0]} (killed, out of memory, or "
-                            "crashed); what is finished is kept, and the same command goes on from there"
+                            "crashed); finished results are kept, and the same command continues from them"
                         )
                     continue
                 deaths = 0
                 pending.popleft()
-                given.put(json.loads(line))
-        except Exception as error:  # noqa: BLE001 -- whatever it is must reach the one who waits for an answer
-            given.put(error)
+                answered.put(json.loads(line))
+        except Exception as error:  # noqa: BLE001 -- every error must reach the thread that waits for an answer
+            answered.put(error)
         finally:
             with self._starting:
                 last = self._running.pop(k, None)
@@ -117,7 +123,7 @@ class Workers:
                 _end(last)
 
     def _start(self, k: int) -> subprocess.Popen[str] | None:
-        """Start worker `k` and check its greeting; None when all are to stop. One that dies before it greets is replaced."""
+        """Start worker `k` and check its greeting; None when all are to stop. One that dies before its greeting is replaced."""
         for _ in range(DEATHS):
             with self._starting:
                 if self._stopping.is_set():
@@ -162,7 +168,7 @@ def _taken(waiting: queue.SimpleQueue[Any], most: int) -> list[Any]:
 
 
 def _send(process: subprocess.Popen[str], values: Sequence[Any]) -> None:
-    """Give the worker these lines; one that is dead is noticed when its answer is read."""
+    """Write these lines to the worker; a dead worker is noticed when its answer is read."""
     assert process.stdin is not None
     try:
         process.stdin.write("".join(json.dumps(value) + "\n" for value in values))

@@ -29,9 +29,26 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class ScenarioComparison:
-    """What `compare_scenarios` found: summaries in the controllers' order, the baseline first; records by controller.
+    """The result of `compare_scenarios`.
 
-    columns: of the summaries' metrics, in a short table.
+    Args:
+        problem: name of the problem.
+        title: its title.
+        description: its description.
+        count: number of scenarios.
+        percent: range of the exact parameters' draws, percent.
+        seed: of all draws.
+        measure_from: time from which errors count, s.
+        columns: columns of the summaries' metrics in a short table.
+        summaries: summaries in the controllers' order, the baseline first.
+        records: records of the scenarios, by controller.
+        skipped: reasons why controllers were not run, by name.
+        verdict: the verdict in sentences.
+        tuning: sentences about the origin of tuned settings, by controller.
+        settings: settings of the problem and the controllers.
+        versions: versions of fpirhc and of what its numbers depend on.
+        command: the command line.
+        elapsed: wall time of the study, s.
     """
 
     problem: str
@@ -75,28 +92,31 @@ def compare_scenarios(
     command: str = "",
     progress: Progress | None = None,
 ) -> ScenarioComparison:
-    """Run every controller in `count` scenarios and return paired statistics; what `folder` already holds is not run again.
+    """Run every controller in `count` scenarios and return paired statistics; scenarios that `folder` holds are not run again.
 
-    Parameters:
-        count: of scenarios. percent: by how much exact parameters are drawn around the problem's. seed: of all draws.
-        folder: where finished scenarios are written, one by one.
-        baseline: the controller that the others are compared with (None: the first).
-        processes: 1 stays in this process; more need a task that is as its file says.
-        tuned: settings to change, by controller and path; tuning: sentences about where they come from.
+    Args:
+        task: the loaded problem file.
+        count: number of scenarios.
+        percent: range of the exact parameters' draws around the problem's, percent.
+        seed: of all draws.
+        folder: folder to which finished scenarios are written, one by one.
+        controllers: names of controllers; None: all.
+        baseline: name of the controller with which the others are compared; None: the first.
+        processes: number of processes; more than 1 need a task that is the same as its file.
+        tuned: settings to change, by controller and path.
+        tuning: sentences about the origin of these settings, by controller.
+        compiled: whether runs use compiled C.
+        command: the command line, for the report.
+        progress: function of (controller, scenarios done, scenarios in all) that is called after every scenario.
 
     Raises:
-        InvalidProblem: unknown controllers or settings, gains of the wrong sign, draws that could leave physical bounds.
-        OutputError: the folder cannot be written, or holds results of something else.
+        InvalidProblem: unknown controllers or settings, gains of the wrong sign, draws that could leave physical
+            bounds.
+        OutputError: the folder cannot be written, or holds results under other conditions.
         WorkerDied: processes die again and again.
     """
     begin = time.perf_counter()
-    for name, value in (("scenarios", count), ("processes", processes)):
-        if value < 1:
-            raise InvalidValue(f"{name} {value}: expected at least 1")
-    if percent == 0 and not task.problem.disturbances:
-        raise InvalidValue(
-            "every scenario would be the same: the problem has no disturbances and no parameter is drawn; give --mismatch P"
-        )
+    _check_request(task, count, percent, processes)
     task = with_tuned(task, tuned or {})
     names = list(select(task, [*([baseline] if baseline else []), *(controllers or task.controllers)]))
     check_gains(task, select(task, names))
@@ -128,13 +148,24 @@ def compare_scenarios(
     )
 
 
+def _check_request(task: Task, count: int, percent: float, processes: int) -> None:
+    """Raise where there is nothing to run, or where all scenarios would be the same."""
+    for name, value in (("scenarios", count), ("processes", processes)):
+        if value < 1:
+            raise InvalidValue(f"{name} {value}: expected at least 1")
+    if percent == 0 and not task.problem.disturbances:
+        raise InvalidValue(
+            "every scenario would be the same: the problem has no disturbances and no parameter is drawn; give --mismatch P"
+        )
+
+
 def _completed(
     ledger: Ledger, bench: Bench, workers: Workers | None, count: int, names: Sequence[str], progress: Progress | None
 ) -> tuple[dict[str, Sequence[Record]], dict[str, str]]:
-    """Run what the ledger does not hold; return records by controller in the scenarios' order, and who was skipped and why."""
-    found = {(r["scenario"], r["controller"]): r for r in ledger.records}
-    jobs = [(k, name) for k in range(count) for name in names if (k, name) not in found]
-    done = {name: sum((k, name) in found for k in range(count)) for name in names}
+    """Run the jobs that the ledger lacks; return all records by controller in order, and the skipped with reasons."""
+    records = {(r["scenario"], r["controller"]): r for r in ledger.records}
+    jobs = [(k, name) for k in range(count) for name in names if (k, name) not in records]
+    done = {name: sum((k, name) in records for k in range(count)) for name in names}
     skipped: dict[str, str] = {}
     # Closed whatever happens: the workers end with it.
     with closing(_answers(bench, workers, jobs)) as answers:
@@ -144,15 +175,15 @@ def _completed(
                 skipped[name] = record["skipped"]
             else:
                 ledger.append(record)
-                found[record["scenario"], name] = record
+                records[record["scenario"], name] = record
             done[name] += 1
             if progress:
                 progress(name, done[name], count)
-    return {n: [found[k, n] for k in range(count)] for n in names if n not in skipped}, skipped
+    return {n: [records[k, n] for k in range(count)] for n in names if n not in skipped}, skipped
 
 
 def _answers(bench: Bench, workers: Workers | None, jobs: Sequence[tuple[int, str]]) -> Generator[dict[str, Any]]:
-    """Records of the jobs as they come; without workers they are made here."""
+    """Records of the jobs in the order in which they come; without workers this process runs the jobs."""
     if workers is None:
         for number, name in jobs:
             yield bench.record(number, name)

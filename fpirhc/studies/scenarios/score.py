@@ -1,4 +1,4 @@
-"""One number by which runs of different controllers are ranked, and when a run counts as failed."""
+"""The number by which runs of different controllers are ranked, and the rule by which a run counts as failed."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ from fpirhc.simulation.metrics import Metrics
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
 
-DIVERGED = 1.0  # relative error from which a run that lasted to its end has diverged: as large as the motion itself
+DIVERGED = 1.0  # relative error above which a run that lasted to its end has diverged: as large as the motion itself
 _SAMPLES = 2000
 
 
 def ranges(problem: Problem) -> dict[str, float]:
-    """Range of the reference of every judged coordinate; where it hardly moves, the error at the start, and else 1."""
+    """Return the range of the reference of every judged coordinate.
+
+    The error at the start stands for it where that is larger, and 1 where both are zero.
+    """
     plant = problem.plant
     places = [plant.state.elements.index(c) for c in problem.judged_names]
     function = problem.reference.function(plant)
@@ -26,13 +29,13 @@ def ranges(problem: Problem) -> dict[str, float]:
 
 
 def relative_error(metrics: Metrics, sizes: dict[str, float]) -> float:
-    """Rms error relative to the reference's range, root mean square over the judged coordinates.
+    """Return the rms error divided by the reference's range, root mean square over the judged coordinates.
 
-    Infinite for a run that ended early: it is worse than any that did not.
+    The error of a run that ended early is infinite, larger than that of every other run.
     """
-    shares = [error / sizes[c] for c, error in metrics.rms_error.items()]
-    found = math.sqrt(math.fsum(s * s for s in shares) / len(shares))
-    return found if math.isfinite(found) else math.inf
+    shares = [rms / sizes[c] for c, rms in metrics.rms_error.items()]
+    error = math.sqrt(math.fsum(s * s for s in shares) / len(shares))
+    return error if math.isfinite(error) else math.inf
 
 
 def outcome(run: Run, error: float) -> str:

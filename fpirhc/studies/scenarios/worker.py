@@ -1,7 +1,7 @@
 """A process that runs scenarios for another one: `python -m fpirhc.studies.scenarios.worker`, see `processes`.
 
-It is given the problem file and the conditions first and answers with the fingerprint; then jobs [scenario, controller],
-each answered by a record.
+Its first line of input has the problem file and the conditions, and it answers with the fingerprint. Every other line is a job
+[scenario, controller], and it answers with a record.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def main() -> None:
 
 
 def _private_output() -> TextIO:
-    """The output, kept from everything else that prints: a problem file's words go to standard error."""
+    """The standard output for answers alone: everything that a problem file prints goes to standard error."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     return answers

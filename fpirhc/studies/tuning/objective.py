@@ -1,4 +1,4 @@
-"""What a trial costs: the relative error, or any metric that has a better direction."""
+"""The cost of a trial: the relative error, or any metric that has a better direction."""
 
 from __future__ import annotations
 
@@ -18,8 +18,12 @@ _NO_METRIC = 1e12  # instead of `PENALTY` for a metric, whose size is not known
 class Objective:
     """The cost of one run.
 
-    Parameters: `metric` None: the relative rms error (see `score`). Else its number of `element`, with the opposite sign where
-    larger is better. A run that ended early, or without the number, costs between one and two penalties, less if it lasted long.
+    The cost is a number of the metric, with the opposite sign where larger is better. A run that ended early, or without the
+    number, costs between one and two penalties, less if it lasted long.
+
+    Args:
+        metric: the metric; None: the relative rms error (see `score`).
+        element: element of the metric.
     """
 
     metric: Metric | None = None
@@ -27,7 +31,7 @@ class Objective:
 
     @property
     def name(self) -> str:
-        """As it stands in files."""
+        """The name in files."""
         return RELATIVE_ERROR if self.metric is None else self.metric.key(self.element)
 
     @property
@@ -68,7 +72,8 @@ def objective(name: str | None, metrics: Sequence[Metric]) -> Objective:
     """Return the objective by the name of a number: None for the relative error, else 'clipped_share' or 'overshoot.q1'.
 
     Raises:
-        InvalidName: an unknown metric. InvalidValue: one without a better direction, or with one number for every element.
+        InvalidName: an unknown metric.
+        InvalidValue: one without a better direction, or with one number for every element.
     """
     if name is None or name == RELATIVE_ERROR:
         return Objective()

@@ -1,10 +1,9 @@
-"""Looks for better settings: every controller gets the same number of trials, the same scenarios and the same cost.
+"""A search for better settings: every controller has the same number of trials, the same scenarios and the same cost.
 
-The cost of a trial is the relative rms error (see `score`) or a metric, the mean over the scenarios; what fails costs a finite
-penalty.
-The scenarios are of a use of their own: settings are never tuned on what they are compared on. Settings are proposed by
-Optuna's tree-structured Parzen estimator. Its random numbers are drawn afresh for every trial from (seed, number of the trial),
-so that a study that was killed and goes on finds what an undisturbed one finds.
+The cost of a trial is the mean of the relative rms error (see `score`) or of a metric over the scenarios; a run that fails costs a
+finite penalty. The scenarios are drawn for tuning alone: settings are never tuned on the scenarios on which they are compared.
+Settings are proposed by Optuna's tree-structured Parzen estimator. Its random numbers are drawn afresh for every trial from
+(seed, number of the trial), so that a study that was killed and goes on has the result of an undisturbed one.
 
 References:
     J. Bergstra, R. Bardenet, Y. Bengio, B. Kégl, Algorithms for Hyper-Parameter Optimization, NIPS 2011.
@@ -40,7 +39,16 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class TunedController:
-    """One controller's settings by path, before and after, with their costs; failed: trials with a failure in some scenario."""
+    """One controller's settings before and after tuning, with their costs.
+
+    Args:
+        name: name of the controller.
+        before: settings of the problem file, by path.
+        settings: the best settings, by path.
+        cost_before: cost of the settings before.
+        cost: cost of the best settings.
+        failed: number of trials with a failure in some scenario.
+    """
 
     name: str
     before: Mapping[str, float]
@@ -52,7 +60,17 @@ class TunedController:
 
 @dataclass(frozen=True, eq=False)
 class Tuning:
-    """What `tune` found; metric: what the cost is; untouched: controllers without a search space."""
+    """The result of `tune`.
+
+    Args:
+        problem: name of the problem.
+        trials: number of trials of every controller.
+        seed: of the proposals and of the scenarios.
+        conditions: the scenarios in words.
+        metric: name of the number that is the cost.
+        entries: the tuned controllers.
+        untouched: names of controllers without a search space.
+    """
 
     problem: str
     trials: int
@@ -63,7 +81,7 @@ class Tuning:
     untouched: tuple[str, ...]
 
     def python(self) -> str:
-        """Lines that give a problem file's controllers what was found."""
+        """Lines of a problem file that give its controllers the best settings."""
         notes = {e.name: f"cost {e.cost_before:.4g} before, {e.cost:.4g} after" for e in self.entries}
         return as_python({e.name: e.settings for e in self.entries}, notes)
 
@@ -103,23 +121,30 @@ def tune(
     compiled: bool = False,
     progress: Progress | None = None,
 ) -> Tuning:
-    """Try `trials` settings of every controller with a search space and return the best; what `folder` holds is not repeated.
+    """Try settings of every controller with a search space and return the best; trials that `folder` holds are not repeated.
 
-    Parameters:
-        trials: of every controller, in all. seed: of the proposals and of the scenarios.
-        folder: where finished trials are written, one by one. controllers: names (None: all that the task's tuning has).
-        count, percent: number of scenarios in a trial, and how far exact parameters are drawn.
-        metric: what to tune by, 'settling.q1' or 'clipped_share' (None: the relative error); the cost has the opposite sign where
-            larger is better.
-        compiled: other settings are other C code; compiling pays where the runs of a trial last longer than the compiler.
+    Args:
+        task: the loaded problem file.
+        trials: number of trials of every controller.
+        seed: of the proposals and of the scenarios.
+        folder: folder to which finished trials are written, one by one.
+        controllers: names of controllers; None: all that the task's tuning has.
+        count: number of scenarios in a trial.
+        percent: range of the exact parameters' draws, percent.
+        metric: number that is the cost, for example 'settling.q1' or 'clipped_share'; the cost has the opposite sign
+            where larger is better. None: the relative error.
+        compiled: whether runs use compiled C. Other settings are other C code, so compiling pays where the runs of a
+            trial last longer than the compiler.
+        progress: function of (controller, trials done, trials in all) that is called after every trial.
 
     Raises:
-        InvalidProblem: no search space, or draws that could leave physical bounds. NotSupported: Optuna is not installed.
+        InvalidProblem: no search space, or draws that could leave physical bounds.
+        NotSupported: Optuna is not installed.
         InvalidName, InvalidValue: an unknown metric, or one without a better direction.
-        OutputError: the folder cannot be written, or holds results of something else.
+        OutputError: the folder cannot be written, or holds results under other conditions.
     """
     optuna = _optuna()
-    names = _chosen(task, controllers)
+    names = _tunable(task, controllers)
     for name, value in (("trials", trials), ("scenarios", count)):
         if value < 1:
             raise InvalidValue(f"{name} {value}: expected at least 1")
@@ -128,9 +153,9 @@ def tune(
     header = {**fingerprint(task, conditions), "scenarios": count, "optuna": optuna.__version__, "metric": aim.name}
     with Ledger(folder / LEDGER, header) as ledger:
         entries = tuple(_tuned(optuna, task, n, conditions, count, trials, aim, ledger, progress) for n in names)
-    said = f"{count} scenario{'s' if count > 1 else ''} within {percent:g} %"
+    words = f"{count} scenario{'s' if count > 1 else ''} within {percent:g} %"
     untouched = tuple(n for n in task.controllers if n not in names)
-    return Tuning(task.name, trials, seed, said, aim.name, entries, untouched)
+    return Tuning(task.name, trials, seed, words, aim.name, entries, untouched)
 
 
 def _optuna() -> ModuleType:
@@ -142,18 +167,18 @@ def _optuna() -> ModuleType:
     return optuna
 
 
-def _chosen(task: Task, names: Sequence[str] | None) -> list[str]:
+def _tunable(task: Task, names: Sequence[str] | None) -> list[str]:
     if not task.tuning:
         first = next(iter(task.controllers))
         raise InvalidProblem(
-            f"problem '{task.name}' says nothing of what may be tuned; add to its file, for example, "
+            f"problem '{task.name}' has no search space for tuning; add to its file, for example, "
             f"tuning = {{{first!r}: {{'deformation.gain': fpirhc.LogSpan(-1.5, -0.05)}}}}"
         )
-    chosen = list(select(task, names)) if names else list(task.tuning)
-    without = [n for n in chosen if not task.tuning.get(n)]
-    if without:
-        raise InvalidProblem(f"problem '{task.name}': its tuning has no search space for controller '{without[0]}'")
-    return chosen
+    selected = list(select(task, names)) if names else list(task.tuning)
+    spanless = [n for n in selected if not task.tuning.get(n)]
+    if spanless:
+        raise InvalidProblem(f"problem '{task.name}': its tuning has no search space for controller '{spanless[0]}'")
+    return selected
 
 
 def _tuned(
@@ -182,8 +207,8 @@ def _tuned(
             ledger.append(record)
             known[number] = record
         if number != _PRESENT:
-            told = optuna.trial.create_trial(params=record["shares"], distributions=ranges, value=record["cost"])
-            study.add_trial(told)
+            finished = optuna.trial.create_trial(params=record["shares"], distributions=ranges, value=record["cost"])
+            study.add_trial(finished)
         if progress:
             progress(name, number + 1, trials)
     tried = [known[n] for n in range(_PRESENT, trials)]
@@ -195,21 +220,21 @@ def _tuned(
 def _proposal(optuna: ModuleType, study: Any, ranges: Mapping[str, Any], seed: int, number: int) -> dict[str, float]:
     """Shares of the spans that trial `number` is to try, given all trials before it."""
     state = int(np.random.SeedSequence(seed, spawn_key=(TUNING, number)).generate_state(1)[0])
-    # A copy is asked, because a question that is not answered stays in the study as a trial that runs.
-    asked = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=state))
-    asked.add_trials(study.get_trials(deepcopy=False))
-    return dict(asked.ask(ranges).params)
+    # A copy of the study proposes, because a proposal stays in its study as a running trial until its cost is added.
+    proposing = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=state))
+    proposing.add_trials(study.get_trials(deepcopy=False))
+    return dict(proposing.ask(ranges).params)
 
 
 def _numbers(task: Task, name: str, spans: TuningSpans, shares: Mapping[str, float]) -> dict[str, float]:
-    found = {path: span.number(shares[path]) for path, span in spans.items()}
-    return {p: round(v) if is_whole(task.controllers[name], p) else v for p, v in found.items()}
+    settings = {path: span.number(shares[path]) for path, span in spans.items()}
+    return {p: round(v) if is_whole(task.controllers[name], p) else v for p, v in settings.items()}
 
 
 def _judged(
     task: Task, name: str, settings: Mapping[str, float], conditions: Conditions, count: int, aim: Objective
 ) -> dict[str, float]:
-    """Cost of these settings, and in how many scenarios they fail; settings that are refused fail in all."""
+    """Cost of these settings, and in how many scenarios they fail; settings that are refused fail in all of them."""
     try:
         changed = with_settings(task.controllers[name], settings)
         bench = Bench(replace(task, controllers={name: changed}), conditions)

@@ -1,4 +1,4 @@
-"""The file in which `fpirhc tune` leaves what it found, and what a comparison says of it."""
+"""The file that `fpirhc tune` writes, and the notes about it in a comparison."""
 
 from __future__ import annotations
 
@@ -19,7 +19,12 @@ FORMAT = 1
 
 @dataclass(frozen=True, eq=False)
 class TunedSettings:
-    """TunedSettings settings by controller and path, and a sentence for every controller of the task."""
+    """The content of a file of `fpirhc tune`.
+
+    Args:
+        values: settings by controller and path.
+        notes: a sentence for every controller of the task.
+    """
 
     values: Mapping[str, Values]
     notes: Mapping[str, str]
@@ -29,7 +34,8 @@ def read_tuned(path: str | Path, task: Task) -> TunedSettings:
     """Read the file that `fpirhc tune` wrote for this problem.
 
     Raises:
-        OutputError: it cannot be read. ProblemFileError: it is of another problem, or no such file.
+        OutputError: the file cannot be read.
+        ProblemFileError: the file is of another problem, or was not written by `fpirhc tune`.
     """
     try:
         facts = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -55,8 +61,8 @@ def read_tuned(path: str | Path, task: Task) -> TunedSettings:
 
 def noted(comparison: Comparison, notes: Mapping[str, str]) -> Comparison:
     """Return the comparison with a note on every controller that `notes` names."""
-    told = {e.name: (*e.notes, notes[e.name]) if e.name in notes else e.notes for e in comparison.entries}
-    return replace(comparison, entries=tuple(replace(e, notes=told[e.name]) for e in comparison.entries))
+    all_notes = {e.name: (*e.notes, notes[e.name]) if e.name in notes else e.notes for e in comparison.entries}
+    return replace(comparison, entries=tuple(replace(e, notes=all_notes[e.name]) for e in comparison.entries))
 
 
 def with_tuned(task: Task, tuned: Mapping[str, Values]) -> Task:
@@ -89,7 +95,7 @@ def as_python(tuned: Mapping[str, Values], notes: Mapping[str, str]) -> str:
 
 
 def write_tuned(facts: Mapping[str, Any], path: Path) -> None:
-    """Write what was found, atomically.
+    """Write the facts of a tuning, atomically.
 
     Raises:
         OutputError: the file cannot be written.
