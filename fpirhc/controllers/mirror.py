@@ -1,16 +1,16 @@
-"""The mirror: the model's response seen the way the plant's is, for a model-referenced deformation.
+"""The mirror: the model's response on the same way as the plant's, for a model-referenced deformation.
 
     commands -> believed dead time -> believed actuator lag -> model -> [sensors' quanta -> late samples -> estimator] -> modelled
 
-Where the response itself is measured it is that of this instant, f^(x_k, u_{k-1}), u_{k-1} what acted by the beliefs. Where it is
-estimated from samples, a twin of the plant runs beside it: the model with the deformation taken off, f^(x, u) - delta, which is
-what the plant is believed to do, integrated over the cycle; its samples pass the same estimator. What the estimator makes of
-delta is added again. With an exact model delta is zero and both estimates are the same number, late, rounded and smoothed as
-they are.
+Where the response itself is measured, the modelled response is that of this instant, f^(x_k, u_{k-1}), where u_{k-1} is the command
+that acted according to the believed dead times and lags. Where the response is estimated from samples, a twin of the plant runs
+beside it: the model minus the deformation, f^(x, u) - delta, which is the believed behaviour of the plant, integrated over the
+cycle. Its samples pass the same estimator, and the estimator's response to delta is added again. With an exact model delta is zero,
+and both estimates are the same number, equally late, rounded and smoothed.
 
-A twin would drift away from the plant. So after each cycle it is put where its own estimate of the state is the controller's, and
-what the estimator remembers of it is moved along the same path, a polynomial below the plant's order, which no estimate of the
-response sees: the twin's response is always the model's, and never that of the move.
+A twin would drift away from the plant. So after each cycle it is shifted until its own estimate of the state is the controller's.
+The memory of its estimator is shifted along the same path, a polynomial of a degree below the plant's order. Such a path does not
+change any estimate of the response: the twin's response is always the model's, and never that of the shift.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from fpirhc.symbolic.expression import Signals, expression, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 
-MEASURED = "_measured_state"  # the state that the response belongs to, where a controller may act on a predicted one
+MEASURED = "_measured_state"  # the state that the response belongs to; a controller may act on a predicted state
 _BEFORE = "_deformation_before"
 _NONE = 1e-9  # a fraction of a cycle below this is none
 _FINITE = 1e300
 
 
 def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
-    """Return the block that writes '_modelled', with what it remembers; none where the map is given its own last request."""
+    """Return the block that writes '_modelled', with what it remembers; nothing for a map that is given its own last request."""
     mirror = deformation.mirror
     if mirror is None:
         return [], []
@@ -50,7 +50,7 @@ def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Bloc
 
 
 def with_measured_state(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
-    """Return the blocks, before them one that names the state as the measured one where some block reads that."""
+    """Return the blocks, preceded by a block that copies the state to the measured state where some block reads that."""
     if not any(MEASURED in block.reads for block in blocks):
         return list(blocks)
     target = measured_state(plant)
@@ -59,7 +59,7 @@ def with_measured_state(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
 
 
 def measured_state(plant: Plant) -> Signal:
-    """The signal of the measured state."""
+    """Return the signal of the measured state."""
     return Signal(MEASURED, plant.state.elements, plant.state.units)
 
 
@@ -67,8 +67,12 @@ def measured_state(plant: Plant) -> Signal:
 class _Path:
     """The believed way from the commands to the model.
 
-    `counts`: whether the first cycles differ from the others. The whole cycles of the measurement's dead time are put before the
-    model: the twin lives in the time of the samples.
+    The whole cycles of the measurement's dead time stand before the model: the twin lives in the time of the samples.
+
+    Args:
+        problem: that the mirror is built for.
+        mirror: the believed dead times and lags.
+        counts: whether the first cycles of a run differ from the others.
     """
 
     problem: Problem
@@ -82,26 +86,26 @@ class _Path:
 
     @property
     def fraction(self) -> float:
-        """What is left of it, in cycles."""
+        """The fraction of a cycle beyond `late`."""
         rest = self.mirror.measurement - self.late
         return rest if rest > _NONE else 0.0
 
     @property
     def decays(self) -> tuple[float, ...]:
-        """Share of an actuator's distance from its command that is left after one cycle; empty where none lags."""
+        """Share of an actuator's distance from its command that remains after one cycle; empty where no actuator lags."""
         taus = every(self.mirror.lag)
         return tuple(math.exp(-self.problem.period / t) if t else 0.0 for t in taus) if any(taus) else ()
 
     @property
     def queue(self) -> Queue:
-        """Of the commands; the newest one is that of the last cycle."""
+        """The queue of commands; the newest one is that of the last cycle."""
         if isinstance(self.mirror.cycles, tuple):
             return Queue(tuple(c + self.late for c in self.mirror.cycles))
         return Queue(self.mirror.cycles + self.late)
 
     @property
     def memory(self) -> tuple[Signal, ...]:
-        """Commands on their way, what lagging actuators do, and the cycles so far."""
+        """Commands on their way, positions of lagging actuators, and the number of cycles so far."""
         plant, length = self.problem.plant, self.queue.length
         start = tuple(self.problem.dead_time.commands_before(plant))
         names = tuple(f"{e}@{k}" for k in range(1, length) for e in plant.input.elements)
@@ -112,13 +116,13 @@ class _Path:
 
     @property
     def reads(self) -> tuple[Signal, ...]:
-        """What every mirror reads."""
+        """Signals that every mirror reads."""
         plant = self.problem.plant
         before = Signal("_command_before", plant.input.elements, plant.input.units)
         return measured_state(plant), before, plant.parameter
 
     def acted(self, s: Signals) -> tuple[Expression, Expression, dict[str, Expression]]:
-        """What acted in the last cycle: at its end, in the mean, and what is remembered."""
+        """Return the input that acted in the last cycle, at its end and in the mean, and what is remembered."""
         size, newest = self.problem.plant.input.size, s._command_before
         remembered: dict[str, Expression] = {}
         if self.counts:
@@ -129,18 +133,18 @@ class _Path:
         if self.queue.length > 1:
             column = ca.vertcat(newest, s.mirror_commands)
             remembered["mirror_commands_next"] = column[: size * (self.queue.length - 1)]
-        arrived = self.queue.delayed(column, size)
+        arriving = self.queue.delayed(column, size)
         if not self.decays:
-            return arrived, arrived, remembered
+            return arriving, arriving, remembered
         decay = ca.DM(self.decays) if len(self.decays) > 1 else self.decays[0]
         share = ca.DM(_mean_shares(every(self.mirror.lag), self.problem.period))
-        away = s.mirror_actuators - arrived
-        end = arrived + decay * away
-        return end, arrived + share * away, {**remembered, "mirror_actuators_next": end}
+        away = s.mirror_actuators - arriving
+        end = arriving + decay * away
+        return end, arriving + share * away, {**remembered, "mirror_actuators_next": end}
 
 
 def _mean_shares(taus: Sequence[float], period: float) -> list[float]:
-    """Mean over one cycle of what is left of an actuator's distance from its command: (tau / T) (1 - e^(-T / tau))."""
+    """Mean over one cycle of the remaining share of an actuator's distance from its command: (tau / T) (1 - e^(-T / tau))."""
     return [t / period * -math.expm1(-period / t) if t else 0.0 for t in taus]
 
 
@@ -168,40 +172,35 @@ def _twin_block(path: _Path) -> Block:
     seen, calm = _seen(problem, names), np.zeros(len(plant.names))
     resting = np.asarray(seen(start, np.zeros(plant.input.size), plant.approximate, calm).full()).ravel()
     late = (Signal("mirror_sample", names, start=tuple(map(float, resting))),) if path.fraction else ()
-    advance, moves, past = (
-        problem.integrator.step(plant, problem.period),
-        _Moves(problem, names, path),
-        _Deformations(path),
-    )
+    advance = problem.integrator.step(plant, problem.period)
+    shifts, past = _Shifts(problem, names, path), _Deformations(path)
 
     def step(s: Signals) -> dict[str, Expression]:
         end, mean, remembered = path.acted(s)
-        acting, answered, following = past.seen(s)
-        waits = s.mirror_cycles < path.late + 0.5  # the samples still show the start
-        at = ca.if_else(waits, s.mirror_state, advance(s.mirror_state, mean, s.parameters, -acting))
+        acting, response_to_deformation, deformations_next = past.seen(s)
+        at_rest = s.mirror_cycles < path.late + 0.5  # the samples still show the start
+        at = ca.if_else(at_rest, s.mirror_state, advance(s.mirror_state, mean, s.parameters, -acting))
         sample = seen(at, end, s.parameters, -acting)
-        arrived = (1 - path.fraction) * sample + path.fraction * s.mirror_sample if late else sample
-        state, response, *memories = estimate.function(arrived, *(getattr(s, m.name) for m in own))
+        late_sample = (1 - path.fraction) * sample + path.fraction * s.mirror_sample if late else sample
+        state, response, *memories = estimate.function(late_sample, *(getattr(s, m.name) for m in own))
         away = getattr(s, MEASURED) - state
-        # What is not finite must not be remembered.
-        move = ca.if_else(ca.mmin(ca.fabs(away) <= _FINITE), away, 0)
-        remembered |= {"mirror_state_next": at + moves.state @ move, **following}
+        # A shift that is not finite must not be remembered.
+        shift = ca.if_else(ca.mmin(ca.fabs(away) <= _FINITE), away, 0)
+        remembered |= {"mirror_state_next": at + shifts.state @ shift, **deformations_next}
         if late:
-            remembered["mirror_sample_next"] = sample + moves.sample @ move
-        for signal, value, matrix in zip(own, memories, moves.memory, strict=True):
-            remembered[f"{signal.name}_next"] = value + matrix @ move
-        return {"_modelled": response + answered, **remembered}
+            remembered["mirror_sample_next"] = sample + shifts.sample @ shift
+        for signal, value, matrix in zip(own, memories, shifts.memory, strict=True):
+            remembered[f"{signal.name}_next"] = value + matrix @ shift
+        return {"_modelled": response + response_to_deformation, **remembered}
 
-    writes, memory = (
-        Layout((plant.response_signal("_modelled"),)),
-        Layout((*path.memory, past.memory, twin, *late, *own)),
-    )
+    writes = Layout((plant.response_signal("_modelled"),))
+    memory = Layout((*path.memory, past.memory, twin, *late, *own))
     reads = Layout((*path.reads, plant.response_signal(_BEFORE)))
     return Block("mirror", reads, writes, step, memory, opaque=problem.integrator.opaque)
 
 
 class _Deformations:
-    """Deformations of earlier cycles: the one that acts, and what the estimator shows of them."""
+    """Deformations of earlier cycles: the one that acts, and the estimator's response to them."""
 
     def __init__(self, path: _Path) -> None:
         plant = path.problem.plant
@@ -217,7 +216,7 @@ class _Deformations:
         return Signal("mirror_deformations", tuple(f"{e}@{k}" for k in range(1, self._length + 1) for e in self._names))
 
     def seen(self, s: Signals) -> tuple[Expression, Expression, dict[str, Expression]]:
-        """The forcing of every coordinate that stands for the acting deformation, its estimated response, what is remembered."""
+        """Return the acting deformation as forcing of every coordinate, the estimated response to it, and what is remembered."""
         size = len(self._names)
         column = ca.vertcat(getattr(s, _BEFORE), s.mirror_deformations)
         late = [self._acting.delayed(column[size * j :], size) for j in range(max(w.size for w in self._weights))]
@@ -227,18 +226,18 @@ class _Deformations:
         forcing: list[Expression] = [expression(0.0)] * len(self._plant.names)
         for place, value in zip(self._plant.controlled_indices, ca.vertsplit(late[0]), strict=True):
             forcing[place] = value
-        kept = {"mirror_deformations_next": column[: size * self._length]}
-        return ca.vertcat(*forcing), ca.vertcat(*answered), kept
+        remembered = {"mirror_deformations_next": column[: size * self._length]}
+        return ca.vertcat(*forcing), ca.vertcat(*answered), remembered
 
 
 def _seen(problem: Problem, names: Sequence[str]) -> ca.Function:
-    """Function (state, command that acted, parameters, forcing) -> what the sensors show without noise, rounded as they round."""
+    """Function (state, command that acted, parameters, forcing) -> sensor readings without noise, rounded to the quanta."""
     plant = problem.plant
     x, u, p = plant._symbols()
     w = ca.SX.sym("w", len(plant.names))
     values = dict(zip(plant.state.elements, ca.vertsplit(x), strict=True))
-    answered = plant.controlled_response_function(x, u, p) + w[list(plant.controlled_indices)]
-    values |= dict(zip(response_names(plant), ca.vertsplit(answered), strict=True))
+    forced = plant.controlled_response_function(x, u, p) + w[list(plant.controlled_indices)]
+    values |= dict(zip(response_names(plant), ca.vertsplit(forced), strict=True))
     entries = []
     for name in names:
         sensor = problem.sensing.sensors.get(name)
@@ -247,8 +246,8 @@ def _seen(problem: Problem, names: Sequence[str]) -> ca.Function:
     return ca.Function("fpirhc_mirror_seen", [x, u, p, w], [ca.densify(ca.vertcat(*entries))])
 
 
-class _Moves:
-    """Matrices that turn a move of the estimated state into moves of the twin and of what its estimator remembers."""
+class _Shifts:
+    """Matrices that turn a shift of the estimated state into shifts of the twin and of its estimator's memory."""
 
     def __init__(self, problem: Problem, names: Sequence[str], path: _Path) -> None:
         plant, period = problem.plant, problem.period
@@ -257,7 +256,7 @@ class _Moves:
         rows = [np.asarray(self.state)[places[n]] if n in places else np.zeros(plant.state.size) for n in names]
         self.sample = ca.DM(np.array(rows))
         ahead = _drift(plant, period)
-        # What is remembered at a start is linear in the start; a cycle later the start would have been on the same path.
+        # The memory at a start is linear in the start, and one cycle later the start would lie on the same path.
         columns = [
             _remembered(problem, names, unit) for unit in (np.zeros(plant.state.size), *np.eye(plant.state.size))
         ]
@@ -267,18 +266,18 @@ class _Moves:
 
 
 def _remembered(problem: Problem, names: Sequence[str], start: np.ndarray) -> list[np.ndarray]:
-    """What the estimator remembers at a start, signal by signal."""
+    """The estimator's memory at a start, signal by signal."""
     block = problem.sensing.estimator.block(problem.plant, problem.period, start, Signal("_seen", tuple(names)))
     return [m.start_vector() for m in block.memory.signals]
 
 
 def _drift(plant: Plant, time: float) -> np.ndarray:
-    """Matrix by which a state moves in that time while all highest derivatives are zero: Taylor's formula."""
+    """Matrix of a state's motion over that time with all highest derivatives zero: Taylor's formula."""
     elements = plant.state.elements
-    found = np.zeros((len(elements), len(elements)))
+    drift = np.zeros((len(elements), len(elements)))
     for k, element in enumerate(elements):
         for j, other in enumerate(elements):
             power = len(other) - len(element)
             if other.rstrip("'") == element.rstrip("'") and power >= 0:
-                found[k, j] = time**power / math.factorial(power)
-    return found
+                drift[k, j] = time**power / math.factorial(power)
+    return drift
