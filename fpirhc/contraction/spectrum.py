@@ -76,11 +76,11 @@ def response_jacobian(plant: Plant) -> ca.Function:
     x = matrix.sym("x", plant.state.size)
     r = matrix.sym("r", len(plant.controlled_names))
     exact = matrix.sym("exact", plant.parameter.size if plant.parameters else 0)
-    believed = matrix.sym("approximate", exact.numel())
-    realised = plant.controlled_response_function(x, plant.inverse_function(x, r, believed), exact)
+    assumed = matrix.sym("approximate", exact.numel())
+    realised = plant.controlled_response_function(x, plant.inverse_function(x, r, assumed), exact)
     jacobian = ca.densify(ca.jacobian(realised, r))
     names = ["state", "deformed", "exact", "approximate"]
-    return ca.Function("fpirhc_response_jacobian", [x, r, exact, believed], [jacobian], names, ["jacobian"])
+    return ca.Function("fpirhc_response_jacobian", [x, r, exact, assumed], [jacobian], names, ["jacobian"])
 
 
 def spectrum_over_run(

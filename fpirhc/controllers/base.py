@@ -7,7 +7,7 @@ Every controller reads (time, state, realised, parameters) and ends in the same 
     limit    clip it; what the clipped command means becomes the stored q^Def (anti-windup)
     judge    one status for the cycle
 
-A command that is not finite never reaches the plant: the last command is held and the cycle's status says so.
+A command that is not finite never reaches the plant: the last command is held, and the status of the cycle is NON_FINITE.
 """
 
 from __future__ import annotations

@@ -212,7 +212,7 @@ def checked(problem: Problem, controller: Controller) -> Controller:
     if late or not problem.sensing.ideal:
         what = "dead time" if late else "sensing"
         raise NotSupported(
-            f"{type(ready).__name__} reads responses of its own, at once and as they are; leave {what} out of the problem"
+            f"{type(ready).__name__} reads responses of its own, without delay and noise; leave {what} out of the problem"
         )
     return ready
 

@@ -133,7 +133,7 @@ def _too_late(problem: Problem, deformation: Deformation, form: _Form, limit: fl
     remedies += ["a shorter window or time constant"]
     return (
         f"{type(deformation).__name__}({name}={value:.4g}): {' and '.join(reasons)}, so the iteration converges only for "
-        f"effective gains below {limit:.3g}, and this is {gain:.3g}; use {', or '.join(remedies)}"
+        f"effective gains below {limit:.3g}, and this one is {gain:.3g}; use {', or '.join(remedies)}"
     )
 
 

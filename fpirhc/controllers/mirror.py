@@ -163,24 +163,24 @@ def _instant_block(path: _Path) -> Block:
 
 
 def _twin_block(path: _Path) -> Block:
-    """Block (measured state, last command, last deformation, parameters) -> the twin's estimated response and the deformation's."""
+    """Block (measured state, last command, last deformation, parameters) -> the response that the estimator makes of the twin."""
     problem, plant = path.problem, path.problem.plant
     start, names = problem.start_state, problem.sensing.estimator.measures(plant)
     estimate = problem.sensing.estimator.block(plant, problem.period, start, Signal("_seen", names))
     own = tuple(Signal(f"mirror_{m.name}", m.elements, m.units, m.start) for m in estimate.memory.signals)
     twin = Signal("mirror_state", plant.state.elements, plant.state.units, tuple(map(float, start)))
-    seen, calm = _seen(problem, names), np.zeros(len(plant.names))
-    resting = np.asarray(seen(start, np.zeros(plant.input.size), plant.approximate, calm).full()).ravel()
+    sensors, calm = _sensors(problem, names), np.zeros(len(plant.names))
+    resting = np.asarray(sensors(start, np.zeros(plant.input.size), plant.approximate, calm).full()).ravel()
     late = (Signal("mirror_sample", names, start=tuple(map(float, resting))),) if path.fraction else ()
     advance = problem.integrator.step(plant, problem.period)
     shifts, past = _Shifts(problem, names, path), _Deformations(path)
 
     def step(s: Signals) -> dict[str, Expression]:
         end, mean, remembered = path.acted(s)
-        acting, response_to_deformation, deformations_next = past.seen(s)
+        acting, response_to_deformation, deformations_next = past.acting(s)
         at_rest = s.mirror_cycles < path.late + 0.5  # the samples still show the start
         at = ca.if_else(at_rest, s.mirror_state, advance(s.mirror_state, mean, s.parameters, -acting))
-        sample = seen(at, end, s.parameters, -acting)
+        sample = sensors(at, end, s.parameters, -acting)
         late_sample = (1 - path.fraction) * sample + path.fraction * s.mirror_sample if late else sample
         state, response, *memories = estimate.function(late_sample, *(getattr(s, m.name) for m in own))
         away = getattr(s, MEASURED) - state
@@ -215,22 +215,22 @@ class _Deformations:
     def memory(self) -> Signal:
         return Signal("mirror_deformations", tuple(f"{e}@{k}" for k in range(1, self._length + 1) for e in self._names))
 
-    def seen(self, s: Signals) -> tuple[Expression, Expression, dict[str, Expression]]:
+    def acting(self, s: Signals) -> tuple[Expression, Expression, dict[str, Expression]]:
         """Return the acting deformation as forcing of every coordinate, the estimated response to it, and what is remembered."""
         size = len(self._names)
         column = ca.vertcat(getattr(s, _BEFORE), s.mirror_deformations)
         late = [self._acting.delayed(column[size * j :], size) for j in range(max(w.size for w in self._weights))]
-        answered = [
+        responses = [
             total(v * late[j][k] for j, v in enumerate(weights) if v != 0) for k, weights in enumerate(self._weights)
         ]
         forcing: list[Expression] = [expression(0.0)] * len(self._plant.names)
         for place, value in zip(self._plant.controlled_indices, ca.vertsplit(late[0]), strict=True):
             forcing[place] = value
         remembered = {"mirror_deformations_next": column[: size * self._length]}
-        return ca.vertcat(*forcing), ca.vertcat(*answered), remembered
+        return ca.vertcat(*forcing), ca.vertcat(*responses), remembered
 
 
-def _seen(problem: Problem, names: Sequence[str]) -> ca.Function:
+def _sensors(problem: Problem, names: Sequence[str]) -> ca.Function:
     """Function (state, command that acted, parameters, forcing) -> sensor readings without noise, rounded to the quanta."""
     plant = problem.plant
     x, u, p = plant._symbols()

@@ -1,6 +1,6 @@
 """Policies of a receding-horizon controller for a solve that fails: infeasible, or not finite.
 
-The plan of a solve that only ran out of iterations is used, because it is feasible and finite; its status says so.
+The plan of a solve that only ran out of iterations is used, because it is feasible and finite; the status records it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The contract of deformations: how the next request follows from the last request and its response error.
 
-A controller wants a response d (desired) and asks its model for r (the request, or deformed response); the plant
-answers f(r). A deformation is the fixed-point iteration r+ = G(r, f, d) with G(r, d, d) = r: where the response is the
+A controller computes a desired response d and requests r, the deformed response, from its model; the realised response of the plant
+is f(r). A deformation is the fixed-point iteration r+ = G(r, f, d) with G(r, d, d) = r: where the response is the
 desired one the request stays, so at the fixed point the plant does what was desired although the model is wrong. To
 first order every map here is r+ = r - a (f - d) with one number a, its effective gain.
 """
@@ -220,7 +220,7 @@ def with_inner(wrapper: Any, inner: object) -> Any:
     names = [f.name for f in own if getattr(wrapper, f.name) is current]
     if not names or current is None:
         raise NotSupported(
-            f"{type(wrapper).__name__} has no field that holds its `inner`, so nothing else can be put there; override around()"
+            f"{type(wrapper).__name__} has no field that holds its `inner`, so the inner one cannot be replaced; override around()"
         )
     return replace(wrapper, **{names[0]: inner})
 

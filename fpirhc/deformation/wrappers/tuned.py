@@ -64,7 +64,7 @@ class Tuned(Wrapper):
         if gain == 0 or not math.isfinite(self.largest_gain) or self.largest_gain / gain < 1:
             raise InvalidValue(
                 f"Tuned(largest_gain={self.largest_gain!r}): expected a bound beyond the map's own effective gain {gain:.4g}; "
-                "assess_gain(...).sector_limit gives one. A tuner without a bound probes until the loop oscillates"
+                "assess_gain(...).sector_limit gives one. Without a bound a tuner raises the gain until the loop oscillates"
             )
         if not 0 < self.target < 2:
             raise InvalidValue(
