@@ -455,7 +455,7 @@ def test_all_mistakes_of_a_schedule_at_once():
     message = refused(CRANE.problem, replace(CRANE.controllers["slots"], schedule=fp.FixedSchedule(spans)))
     assert "coordinate 'angel' is unknown. Did you mean 'angle'? Valid: cart, angle." in message
     assert "slot 'angle' is never active" in message
-    assert "'angel' from 1 to 3 s overlaps what came before, which ends at 1.4 s; let it start there" in message
+    assert "'angel' from 1 to 3 s overlaps the slot before it, which ends at 1.4 s; let it start there" in message
     assert "no slot from 3 to 4 s; let 'cart' start at 3 s" in message
     assert "the last slot ends at 30 s, after the run's 26.5 s; let it end there" in message
     assert "5 mistakes" in message

@@ -1,13 +1,13 @@
-"""How large a response error the plain form survives behind a saturating map, and the step that a wanted one needs.
+"""How large a response error the plain form survives behind a saturating map, and the step that a given error needs.
 
-A map with the largest step s answers an error h with the gain s / |h| at most, which falls below the slowest iteration that the
-tracking law bears (`least_product`) at
+A map with the largest step s has the gain s / |h| at most for an error h. This gain falls below the slowest iteration with which
+the tracking law is stable (`least_product`) at
 
     |h| = s lambda / g_low,      g_low = a lambda at the edge of the plain form.
 
-Beyond it the loop behaves as one whose gain is too small: the error grows. This is the first harmonic's balance and no
-proof; simulated thresholds are at 0.85 to 0.98 of it for three and more poles and at 0.72 for two, so a wanted basin needs
-a spare factor on the step, 1.25 and 1.5. For the sigmoid with D = 0.3 (s = 0.8088 S) and three poles this is
+Beyond this error the loop behaves as one whose gain is too small: the error grows. This is a balance of the first harmonic, not a
+proof. Simulated thresholds are at 0.85 to 0.98 of it for three and more poles and at 0.72 for two. A required basin therefore needs
+a spare factor on the step: 1.25, and 1.5 for two poles. For the sigmoid with D = 0.3 (s = 0.8088 S) and three poles this is
 S >= 1.55 g_low h_max / lambda.
 """
 
@@ -26,11 +26,15 @@ def basin_of_plain_form(
 ) -> float:
     """Return the largest |f - d| from which the plain form comes back; infinite for one pole or an unbounded step.
 
-    Parameters: `largest_step` of the map per cycle, in units of the response; `poles`, `rate`, `period` of the
-    tracking law as in `least_product`; `eigenvalue` lambda of the response Jacobian.
+    Args:
+        largest_step: of the map per cycle, in units of the response.
+        poles: N of the tracking law, as in `slowest_iteration`.
+        rate: Lambda of the tracking law, 1/s.
+        period: T of the control cycle, s.
+        eigenvalue: lambda of the response Jacobian.
 
     Raises:
-        InvalidValue: a step or an eigenvalue that is not positive, and what `least_product` raises.
+        InvalidValue: a step, rate, period or eigenvalue that is not positive, or fewer than one pole.
     """
     if not (largest_step > 0 and 0 < eigenvalue < math.inf):
         raise InvalidValue(
@@ -43,10 +47,15 @@ def basin_of_plain_form(
 def step_for_basin(largest_error: float, poles: int, rate: float, period: float, *, eigenvalue: float = 1.0) -> float:
     """Return the step per cycle that a map needs to come back from an error of that size, with its spare factor.
 
-    Parameters: `largest_error` |f - d|, in units of the response; the rest as in `basin_of_plain_form`.
+    Args:
+        largest_error: |f - d|, in units of the response.
+        poles: N of the tracking law, as in `slowest_iteration`.
+        rate: Lambda of the tracking law, 1/s.
+        period: T of the control cycle, s.
+        eigenvalue: lambda of the response Jacobian.
 
     Raises:
-        InvalidValue: a negative error, an eigenvalue that is not positive, and what `least_product` raises.
+        InvalidValue: a negative error, a rate, period or eigenvalue that is not positive, or fewer than one pole.
     """
     if not (largest_error >= 0 and 0 < eigenvalue < math.inf):
         raise InvalidValue(

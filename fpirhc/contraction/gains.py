@@ -19,7 +19,7 @@ def predicted_factor(eigenvalues: Array, effective_gain: float) -> float:
 def linear_limit(eigenvalues: Array) -> tuple[float, float]:
     """Return the open interval of effective gains with |1 - a lambda| < 1 for every eigenvalue.
 
-    Its inner end is 0, its outer one min 2 Re(lambda) / |lambda|^2 (negative when all real parts are).
+    One end is 0, the other is min 2 Re(lambda) / |lambda|^2, with a minus sign where all real parts are negative.
 
     Raises:
         NotContractive: eigenvalues with real parts of both signs, or zero.
@@ -32,10 +32,10 @@ def linear_limit(eigenvalues: Array) -> tuple[float, float]:
 
 
 def sector_limit(deformation: Deformation, eigenvalues: Array) -> tuple[float, float]:
-    """Return the interval of effective gains whose steepest secant, too, is within the linear limit.
+    """Return the interval of effective gains whose steepest secant is also within the linear limit.
 
-    Within it a linear plant converges from errors of any size, because a step of any size is one of a linear map that
-    contracts; outside it, large errors may end in a bounded 2-cycle.
+    Within it the iteration on a linear plant converges from errors of any size, because every step is the step of some linear map
+    that contracts. Outside it large errors may end in a bounded two-cycle.
 
     Raises:
         NotContractive: eigenvalues with real parts of both signs, or zero.

@@ -1,19 +1,19 @@
-"""A first-order lag between request and response that the controller does not know, or pairs through.
+"""A first-order lag between request and response: one that the model lacks, and one that the pairing contains.
 
 With the lag tau and rho = exp(-T / tau) the response is f_k = rho f_{k-1} + (1 - rho) lambda r_{k-1}.
 
-Unknown, inner iteration alone:  z^2 - (1 + rho - g (1 - rho)) z + rho = 0, g = a lambda, so the limit grows,
-g < 2 coth(T / (2 tau)): a lag makes the iteration swing, |z| = sqrt(rho), but never unstable. Around it the tracking law
-with N poles at -Lambda does not bear the swing. In continuous time, lambda = 1,
+Unknown lag, inner iteration alone:  z^2 - (1 + rho - g (1 - rho)) z + rho = 0, g = a lambda. The limit grows to
+g < 2 coth(T / (2 tau)): a lag makes the iteration swing, |z| = sqrt(rho), but does not lower the limit. A tracking law with N poles
+at -Lambda around it is made unstable by the swing. In continuous time, with lambda = 1, the characteristic polynomials are
 
     plain                          tau s^(N+2) + s^(N+1) + w (s + Lambda)^N
     increment, model-referenced    tau s^(N+2) + (s + w) (s + Lambda)^N,
 
-and the fast pair of either is that of tau s^2 + (1 - N Lambda tau) s + w: for large s, w (1 + Lambda / s)^N = w + w N
-Lambda / s, and 1 / s = -(tau / w) s on the pair. So for a fast iteration the loop is stable while N Lambda tau < 1,
+and the fast pair of both is the pair of roots of tau s^2 + (1 - N Lambda tau) s + w: for large s, w (1 + Lambda / s)^N =
+w + w N Lambda / s, and 1 / s = -(tau / w) s on the pair. So for a fast iteration the loop is stable while N Lambda tau < 1,
 whatever the gain, and a pair of damping zeta needs g <= (T / tau) ((1 - N Lambda tau) / (2 zeta))^2.
 
-Paired through the lag (the model's response passes the same lag), delta_k = (1 - a) delta_{k-1} - a (f_k - m_k), m the model's:
+Paired through the lag (the response m of the model passes the same lag), delta_k = (1 - a) delta_{k-1} - a (f_k - m_k):
 
     (z - 1 + a)(z - rho) + a (1 - rho)(lambda - 1) z = 0,    stable for  lambda < 1 + (2 - a)(1 + rho) / (a (1 - rho)),
 
@@ -33,7 +33,9 @@ _BISECTIONS = 60
 def lagged_limit(period: float, lag: float) -> float:
     """Return the limit of a lambda of the inner iteration behind an unknown lag, 2 coth(T / (2 tau)); 2 without a lag.
 
-    Parameters: `period` T, `lag` tau, s.
+    Args:
+        period: T of the control cycle, s.
+        lag: tau, s.
 
     Raises:
         InvalidValue: a period that is not positive, a negative lag.
@@ -43,10 +45,13 @@ def lagged_limit(period: float, lag: float) -> float:
 
 
 def fastest_rate(poles: int, lag: float) -> float:
-    """Return the rate Lambda of a tracking law at which a fast iteration behind an unknown lag becomes unstable, 1 /
-    (N tau), 1/s.
+    """Return the rate Lambda = 1 / (N tau), 1/s, of a tracking law at which a fast iteration behind an unknown lag turns unstable.
 
-    Parameters: `poles` N of the tracking law, `lag` tau, s. To first order in rate x period.
+    It holds to first order in rate x period.
+
+    Args:
+        poles: N of the tracking law.
+        lag: tau, s.
 
     Raises:
         InvalidValue: fewer than one pole, a negative lag.
@@ -58,9 +63,14 @@ def fastest_rate(poles: int, lag: float) -> float:
 def damped_product(period: float, lag: float, rate: float, poles: int, *, damping: float) -> float:
     """Return the largest a lambda whose fast pair keeps that damping behind an unknown lag; 0 where none does.
 
-    (T / tau) ((1 - N Lambda tau) / (2 zeta))^2, for the increment and model-referenced forms; infinite without a lag.
+    It is (T / tau) ((1 - N Lambda tau) / (2 zeta))^2 for the increment and the model-referenced form, and infinite without a lag.
 
-    Parameters: `period` T and `lag` tau, s; `rate` Lambda, 1/s, and `poles` N of the tracking law; `damping` zeta.
+    Args:
+        period: T of the control cycle, s.
+        lag: tau, s.
+        rate: Lambda of the tracking law, 1/s.
+        poles: N of the tracking law.
+        damping: zeta, dimensionless.
 
     Raises:
         InvalidValue: a period or a damping that is not positive, a negative lag or rate, fewer than one pole.
@@ -79,7 +89,12 @@ def damped_product(period: float, lag: float, rate: float, poles: int, *, dampin
 def bearable_lag(product: float, period: float, rate: float, poles: int, *, damping: float) -> float:
     """Return the longest unknown lag, s, with which the fast pair keeps that damping: `damped_product` solved for tau.
 
-    Parameters: `product` a lambda; the rest as in `damped_product`.
+    Args:
+        product: a lambda, dimensionless.
+        period: T of the control cycle, s.
+        rate: Lambda of the tracking law, 1/s.
+        poles: N of the tracking law.
+        damping: zeta, dimensionless.
 
     Raises:
         InvalidValue: a product, period or damping that is not positive, a negative rate, fewer than one pole.
@@ -97,7 +112,10 @@ def bearable_lag(product: float, period: float, rate: float, poles: int, *, damp
 def through_lag_limit(period: float, lag: float, gain: float) -> float:
     """Return the largest eigenvalue lambda with which a response paired through the same lag converges.
 
-    Parameters: `period` T and `lag` tau, s; effective `gain` a, in (0, 2).
+    Args:
+        period: T of the control cycle, s.
+        lag: tau, s.
+        gain: effective gain a, in (0, 2).
 
     Raises:
         InvalidValue: a period that is not positive, a negative lag, a gain outside (0, 2).
@@ -105,12 +123,15 @@ def through_lag_limit(period: float, lag: float, gain: float) -> float:
     _check(period, lag)
     if not 0 < gain < 2:
         raise InvalidValue(f"through_lag_limit(gain={gain!r}): expected an effective gain between 0 and 2")
-    left = math.exp(-period / lag) if lag else 0.0
-    return 1 + (2 - gain) * (1 + left) / (gain * (1 - left))
+    decay = math.exp(-period / lag) if lag else 0.0
+    return 1 + (2 - gain) * (1 + decay) / (gain * (1 - decay))
 
 
 def through_lag_damping(eigenvalue: float) -> float:
     """Return the least damping, over all gains, of a response paired through the right lag: 1 / sqrt(lambda), at most 1.
+
+    Args:
+        eigenvalue: lambda of the response Jacobian.
 
     Raises:
         InvalidValue: an eigenvalue that is not positive.

@@ -1,13 +1,13 @@
 """How large a gain may be where the deformation leaks or is model-referenced, and the response is late or smoothed.
 
-With the effective gain a, the leak p, the own pair of the deformation d cycles back, an error filter with the pole f, and
-W(z) = sum_j w_j z^-j from request to response, the deformation follows
+With the effective gain a, the leak p, a deformation that is paired with its own value d cycles earlier, an error filter with the
+pole f, and W(z) = sum_j w_j z^-j from request to response, the deformation follows
 
     1 = p / z + (1 - p) [ z^-(1+d) - a F(z) E(z) ],     F = (1 - f) / (1 - f / z),
     E = lambda W(z)                                     increment
     E = (lambda - 1) W(z) + z^-(1+d)                    model-referenced: the model's response passes W too
 
-With a model of the right gain, lambda = 1, W drops out of the latter: the limit is that of no delay.
+With a model of the right gain, lambda = 1, W drops out of the model-referenced form, and the limit is that without delay.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from fpirhc.contraction.spectrum import Array
 
 _PER_TERM = 64  # points of the unit circle per term of the polynomial
 _STEPS, _HALVINGS = 400, 30
-_RANGE = 1e-3, 20.0  # of the gain times |lambda| that is looked at
+_RANGE = 1e-3, 20.0  # of the gain times |lambda| that is searched
 
 
 def leaking_limit(
@@ -32,11 +32,15 @@ def leaking_limit(
     eigenvalue: complex = 1.0,
     referenced: bool = False,
 ) -> float:
-    """Return the effective gain up to which all converge; 0 when none does, infinite when all below 20 / |lambda| do.
+    """Return the effective gain up to which every gain converges; 0 when none does, infinite when all below 20 / |lambda| do.
 
-    Parameters: `weights` w_1, w_2, ... of past requests in the response, dead time included; `cycles` d of the deformation's own
-    pair; `leak` p; `pole` f of the error's filter; `eigenvalue` lambda of the response Jacobian, a negative gain is that of
-    -lambda; `referenced` for the model-referenced form.
+    Args:
+        weights: w_1, w_2, ... of past requests in the response, dead time included.
+        cycles: d, age of the deformation that the next one is paired with, cycles.
+        leak: p, dimensionless.
+        pole: f of the filter of the error.
+        eigenvalue: lambda of the response Jacobian; give -lambda for the limit of a negative gain.
+        referenced: whether the form is the model-referenced one.
     """
     if complex(eigenvalue).real <= 0:
         return 0.0
@@ -44,11 +48,11 @@ def leaking_limit(
     def stable(gain: float) -> bool:
         return _stable(loop_polynomial(weights, gain, cycles, leak, pole, eigenvalue, referenced))
 
-    tried = np.geomspace(*_RANGE, _STEPS) / abs(eigenvalue)
-    wrong = next((k for k, gain in enumerate(tried) if not stable(float(gain))), None)
+    gains = np.geomspace(*_RANGE, _STEPS) / abs(eigenvalue)
+    wrong = next((k for k, gain in enumerate(gains) if not stable(float(gain))), None)
     if wrong is None:
         return math.inf
-    low, high = (float(tried[wrong - 1]) if wrong else 0.0), float(tried[wrong])
+    low, high = (float(gains[wrong - 1]) if wrong else 0.0), float(gains[wrong])
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if stable(middle) else (low, middle)
@@ -58,22 +62,22 @@ def leaking_limit(
 def loop_polynomial(
     weights: Array, gain: float, cycles: float, leak: float, pole: float, eigenvalue: complex, referenced: bool
 ) -> Array:
-    """Return the coefficients in 1 / z of (1 - f / z) times left side minus right side."""
+    """Return the coefficients in 1 / z of (1 - f / z) times (left side minus right side); arguments as in `leaking_limit`."""
     whole = math.floor(cycles + 1e-9)
     share = max(cycles - whole, 0.0)
     own = np.zeros(max(whole + 3, len(weights) + 1), dtype=complex)
     own[whole + 1], own[whole + 2] = 1 - share, share
-    answered = np.zeros_like(own)
-    answered[1 : len(weights) + 1] = weights
+    delayed = np.zeros_like(own)
+    delayed[1 : len(weights) + 1] = weights
     smooth = np.array([1.0, -pole])
-    error = (eigenvalue - 1) * answered + own if referenced else eigenvalue * answered
-    left = np.convolve(smooth, [1.0, -leak])
-    right = (1 - leak) * (np.convolve(smooth, own) - gain * (1 - pole) * np.append(error, 0.0))
-    return np.asarray(np.pad(left, (0, right.size - left.size)) - right)
+    error = (eigenvalue - 1) * delayed + own if referenced else eigenvalue * delayed
+    left_side = np.convolve(smooth, [1.0, -leak])
+    right_side = (1 - leak) * (np.convolve(smooth, own) - gain * (1 - pole) * np.append(error, 0.0))
+    return np.asarray(np.pad(left_side, (0, right_side.size - left_side.size)) - right_side)
 
 
 def _stable(coefficients: Array) -> bool:
-    """Whether no root z is on or outside the unit circle: the curve over the circle does not go round zero."""
+    """Whether every root z is inside the unit circle: the curve over the circle does not go round zero."""
     size = 2 ** math.ceil(math.log2(_PER_TERM * coefficients.size))
     curve = np.fft.fft(coefficients, size)
     if np.abs(curve).min() < 1e-12:

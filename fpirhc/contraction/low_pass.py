@@ -26,7 +26,8 @@ from fpirhc.errors import InvalidValue
 def slowest_iteration(poles: int) -> float:
     """Return the least a lambda / (T Lambda) with which the plain form is stable; 0 for one pole.
 
-    Parameters: `poles` N of the tracking law: n + 1 for relative order n with the integral, n without it.
+    Args:
+        poles: N of the tracking law: n + 1 for relative order n with the integral, n without it.
 
     Raises:
         InvalidValue: fewer than one pole.
@@ -38,10 +39,14 @@ def slowest_iteration(poles: int) -> float:
 
 
 def least_product(poles: int, rate: float, period: float) -> float:
-    """Return the least a lambda with which the plain form is stable around a tracking law of that rate (first order
-    in rate x period).
+    """Return the least a lambda with which the plain form is stable around a tracking law of that rate.
 
-    Parameters: `poles` as in `slowest_iteration`; `rate` Lambda, 1/s; `period` T of the control cycle, s.
+    It holds to first order in rate x period.
+
+    Args:
+        poles: N of the tracking law, as in `slowest_iteration`.
+        rate: Lambda of the tracking law, 1/s.
+        period: T of the control cycle, s.
 
     Raises:
         InvalidValue: fewer than one pole, a rate or a period that is not positive.

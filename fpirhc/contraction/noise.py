@@ -6,13 +6,13 @@ With the error filtered by the pole p and the effective gain a, on f = J r with 
 
 is a linear system whose stationary covariance solves a Lyapunov equation. For one coordinate, with g = a lambda,
 
-    Var r = a^2 (1 + p) / (g (2 (1 + p) - g (1 - p))) sigma^2,     Var (r_k - r_{k-1}) = 2 a^2 (1 - p) / (2 (1 + p) -
-    g (1 - p)) sigma^2.
+    Var r               = a^2 (1 + p) / (g (2 (1 + p) - g (1 - p))) sigma^2,
+    Var (r_k - r_{k-1}) = 2 a^2 (1 - p) / (2 (1 + p) - g (1 - p)) sigma^2.
 
-A drift of the task leaves an error proportional to 1 / g whatever the pole is, so the filter buys gain: a budget B of
-step variance per noise variance allows a = sqrt(B) without it, and with kappa = g / (1 - p) held, to first order, a =
-(2 kappa B / lambda)^(1/3). kappa sets the damping of the iteration, zeta = 1 / (2 sqrt(kappa)); beyond 8 the error
-falls no more, as the noise that the plant follows remains.
+A drift of the task leaves an error proportional to 1 / g whatever the pole is, so a filter that allows a larger gain lowers the
+error. A budget B of step variance per noise variance allows a = sqrt(B) without a filter, and a = (2 kappa B / lambda)^(1/3) to
+first order with kappa = g / (1 - p) held. kappa sets the damping of the iteration, zeta = 1 / (2 sqrt(kappa)). Beyond kappa = 8 the
+error falls no further, because the noise that the plant follows remains.
 """
 
 from __future__ import annotations
@@ -31,14 +31,24 @@ _BISECTIONS = 60
 
 @dataclass(frozen=True, eq=False)
 class NoiseSpread:
-    """Covariances (n, n) of the request and of its step per cycle."""
+    """Covariances of the request and of its step per cycle.
+
+    Args:
+        request: covariance of r, shape (n, n), in the unit of the response squared.
+        step: covariance of r_k - r_{k-1}, shape (n, n), in the same unit.
+    """
 
     request: Array
     step: Array
 
 
 def request_variance(gain: float, pole: float, eigenvalue: float = 1.0) -> float:
-    """Return Var r / sigma^2 for one coordinate; see the module.
+    """Return Var r / sigma^2 for one coordinate; the equation stands at the top of the module.
+
+    Args:
+        gain: effective gain a.
+        pole: p of the filter of the error, in [0, 1).
+        eigenvalue: lambda of the response Jacobian.
 
     Raises:
         NotContractive: gain and pole outside 0 < a lambda < 2 (1 + p) / (1 - p).
@@ -48,7 +58,12 @@ def request_variance(gain: float, pole: float, eigenvalue: float = 1.0) -> float
 
 
 def step_variance(gain: float, pole: float, eigenvalue: float = 1.0) -> float:
-    """Return Var(r_k - r_{k-1}) / sigma^2 for one coordinate; see the module.
+    """Return Var(r_k - r_{k-1}) / sigma^2 for one coordinate; the equation stands at the top of the module.
+
+    Args:
+        gain: effective gain a.
+        pole: p of the filter of the error, in [0, 1).
+        eigenvalue: lambda of the response Jacobian.
 
     Raises:
         NotContractive: gain and pole outside 0 < a lambda < 2 (1 + p) / (1 - p).
@@ -60,11 +75,15 @@ def step_variance(gain: float, pole: float, eigenvalue: float = 1.0) -> float:
 def noise_spread(jacobian: Array, noise: Array, gain: float, pole: float) -> NoiseSpread:
     """Return the covariances for several coordinates.
 
-    Parameters: `jacobian` J (n, n), covariance `noise` (n, n) of the response, in its unit squared; effective `gain`
-    a, filter `pole`.
+    Args:
+        jacobian: J, shape (n, n), dimensionless.
+        noise: covariance of the noise of the response, shape (n, n), in the unit of the response squared.
+        gain: effective gain a.
+        pole: p of the filter of the error, in [0, 1).
 
     Raises:
-        InvalidShape: matrices that do not fit. NotContractive: a loop that is not stable.
+        InvalidShape: matrices that do not fit.
+        NotContractive: a loop that is not stable.
     """
     j, covariance = np.atleast_2d(jacobian), np.atleast_2d(noise)
     if j.shape != covariance.shape or j.shape[0] != j.shape[1]:
@@ -86,9 +105,12 @@ def noise_spread(jacobian: Array, noise: Array, gain: float, pole: float) -> Noi
 def gain_within_chatter(budget: float, ringing: float, eigenvalue: float = 1.0) -> tuple[float, float]:
     """Return (effective gain a, filter pole p) with `step_variance` equal to the budget, for one coordinate.
 
-    The gain ends at the deadbeat 1 / lambda, where more buys nothing: then the variance is below the budget.
+    The gain is at most the deadbeat gain 1 / lambda, where the error is smallest. There the variance is below the budget.
 
-    Parameters: `budget` B, step variance per noise variance; `ringing` kappa = a lambda / (1 - p), 4 to 8, 0 for no filter.
+    Args:
+        budget: B, step variance per noise variance.
+        ringing: kappa = a lambda / (1 - p), usually 4 to 8; 0 for no filter.
+        eigenvalue: lambda of the response Jacobian.
 
     Raises:
         InvalidValue: a budget that is not positive, a negative ringing, an eigenvalue that is not positive.
@@ -107,7 +129,7 @@ def gain_within_chatter(budget: float, ringing: float, eigenvalue: float = 1.0) 
 
 
 def filter_pole(product: float, ringing: float) -> float:
-    """Return p with a lambda / (1 - p) = ringing; 0 where the product alone is larger, or without ringing."""
+    """Return p with a lambda / (1 - p) = ringing; 0 where the product exceeds the ringing, and where the ringing is 0."""
     return max(0.0, 1 - product / ringing) if ringing else 0.0
 
 

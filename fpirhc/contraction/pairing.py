@@ -1,6 +1,6 @@
 """Whether a response paired through a model of its own dynamics converges, from two frequency responses.
 
-With request to response G(z), the model's G^(z) that its own response passes through, both stable, and the effective gain a,
+With G(z) from request to response, G^(z) that the response of the model passes through, both stable, and the effective gain a,
 
     delta_k = (1 - a) delta_{k-1} - a (G - G^) r,      r = d + delta,
     (1 - (1 - a) / z) + a (G(z) - G^(z)) = 0.
@@ -10,7 +10,7 @@ if on the circle
 
     |G(z) - G^(z)| < |1 - (1 - a) / z| / a.
 
-This is sufficient and not necessary: of stable random pairs of lags and dead times four in five fulfil it.
+The condition is sufficient and not necessary: four in five of the stable random pairs of lags and dead times fulfil it.
 """
 
 from __future__ import annotations
@@ -25,19 +25,23 @@ from fpirhc.errors import InvalidShape, InvalidValue
 def pairing_margin(plant: npt.ArrayLike, model: npt.ArrayLike, frequencies: npt.ArrayLike, gain: float) -> float:
     """Return by which factor G - G^ may grow before the sufficient condition fails; above 1 the iteration converges.
 
-    Parameters: `plant` G and `model` G^ on the unit circle (m,), complex, dimensionless, at `frequencies` (m,) in rad
-    per cycle from 0 to pi, close enough that the functions do not bend in between; effective `gain` a.
+    Args:
+        plant: G on the unit circle, shape (m,), complex, dimensionless.
+        model: G^ on the unit circle, shape (m,), complex, dimensionless.
+        frequencies: shape (m,), rad per cycle from 0 to pi, so close that both functions are straight in between.
+        gain: effective gain a, in (0, 2).
 
     Raises:
-        InvalidShape: arrays of different lengths. InvalidValue: a gain outside (0, 2).
+        InvalidShape: arrays of different lengths.
+        InvalidValue: a gain outside (0, 2).
     """
-    answered, believed, angles = (np.asarray(v).ravel() for v in (plant, model, frequencies))
-    if not answered.size == believed.size == angles.size > 0:
+    actual, modelled, angles = (np.asarray(v).ravel() for v in (plant, model, frequencies))
+    if not actual.size == modelled.size == angles.size > 0:
         raise InvalidShape(
-            f"plant {answered.shape}, model {believed.shape}, frequencies {angles.shape}: expected one length, at least one"
+            f"plant {actual.shape}, model {modelled.shape}, frequencies {angles.shape}: expected one length, at least one"
         )
     if not 0 < gain < 2:
         raise InvalidValue(f"pairing_margin(gain={gain!r}): expected an effective gain between 0 and 2")
     allowed: Array = np.abs(1 - (1 - gain) * np.exp(-1j * angles)) / gain
-    apart = np.abs(answered - believed)
+    apart = np.abs(actual - modelled)
     return float((allowed[apart > 0] / apart[apart > 0]).min(initial=np.inf))

@@ -1,4 +1,4 @@
-"""What a deformation with its gain will do on plants with a given spectrum."""
+"""Whether a deformation with its gain converges on plants with a given spectrum, and which gains do."""
 
 from __future__ import annotations
 
@@ -18,12 +18,23 @@ SECTOR_SHARE = 0.8  # recommended gains keep this distance from the sector bound
 
 @dataclass(frozen=True)
 class ContractionReport:
-    """What a deformation will do on a plant with a given spectrum.
+    """Whether a deformation converges on plants with a given spectrum, and which gains do.
 
-    `linear_limit` and `sector_limit` are intervals of the effective gain, `own_linear_limit` and `own_sector_limit` the
-    same in the deformation's own gain (`gain_name`), and so is `recommended`. Within the sector limit no error is
-    large enough to start a bounded oscillation; between the two limits only small errors converge. Where no gain
-    converges the limits are empty and `recommended` is NaN.
+    Within the sector limit errors of any size converge. Between the two limits only small errors converge, and a large one may end
+    in a bounded oscillation. Where no gain converges the limits are empty and `recommended` is NaN.
+
+    Args:
+        predicted: max|1 - a lambda|, the factor of an error of the request per cycle.
+        effective_gain: a of the deformation.
+        gain_name: name of the gain that the user sets, the deformation's own gain.
+        linear_limit: interval of the effective gain in which small errors converge.
+        sector_limit: interval of the effective gain in which errors of any size converge.
+        own_linear_limit: the linear limit in the deformation's own gain.
+        own_sector_limit: the sector limit in the deformation's own gain.
+        recommended: a value of the deformation's own gain.
+        contractive: whether the effective gain is within the linear limit.
+        within_sector: whether the effective gain is within the sector limit.
+        text: the verdict and the admissible gains, for a reader.
     """
 
     predicted: float
@@ -59,13 +70,13 @@ class ContractionReport:
 
 
 def check_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionReport:
-    """Return what the deformation will do on plants with these eigenvalues.
+    """Return the report of a deformation that converges on plants with these eigenvalues.
 
-    A gain between the sector and the linear limit is reported (`within_sector` False), not refused.
+    A gain between the sector and the linear limit is not refused: `within_sector` is False in its report.
 
     Raises:
-        NotContractive: real parts of both signs (no gain converges), a gain of the wrong sign or none, or one beyond
-            the linear limit; the message gives the admissible gains.
+        NotContractive: eigenvalues with real parts of both signs, or a gain that is zero, of the wrong sign, or beyond the linear
+            limit; the message names the admissible gains.
     """
     report = assess_gain(deformation, spectrum)
     if not report.contractive:
@@ -74,7 +85,7 @@ def check_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionRepor
 
 
 def assess_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionReport:
-    """Return what `check_gain` returns, and where that raises a report with `contractive` False and the same text."""
+    """Return the report of `check_gain`; where `check_gain` raises, a report with `contractive` False and the same text."""
     gain = deformation.effective_gain()
     name, own = _own_gain(deformation)
     predicted = predicted_factor(spectrum.eigenvalues, gain)

@@ -1,4 +1,4 @@
-"""The largest gain behind a resonance (a flexible joint) that the model does not know.
+"""The largest gain behind a resonance (a flexible joint) that the model lacks.
 
 With f = lambda r w0^2 / (s^2 + 2 zeta w0 s + w0^2) the increment and model-referenced forms and a tracking law with N poles at
 -Lambda give, near s = i w0, where the resonance alone has s^2 + 2 zeta w0 s + w0^2 = 0,
@@ -20,14 +20,18 @@ from fpirhc.errors import InvalidValue
 def resonant_limit(
     period: float, rate: float, poles: int, *, frequency: float, damping: float, eigenvalue: float = 1.0
 ) -> float:
-    """Return the largest effective gain a behind the resonance, T (2 zeta w0 / lambda - N Lambda); 0 or less where
-    none is stable.
+    """Return the largest effective gain behind the resonance, T (2 zeta w0 / lambda - N Lambda); 0 or less where none is stable.
 
-    Good to 10 % where the margin is not small and w0 > 20 Lambda. A negative value says that the tracking law alone excites the
-    resonance.
+    The value is accurate to 10 % where w0 > 20 Lambda and the margin is large. A negative value means that the tracking law alone
+    excites the resonance.
 
-    Parameters: `period` T, s; `rate` Lambda, 1/s, 0 for the iteration alone, and `poles` N of the tracking law;
-    `frequency` w0, rad/s, `damping` zeta of the resonance; `eigenvalue` lambda of the response Jacobian.
+    Args:
+        period: T of the control cycle, s.
+        rate: Lambda of the tracking law, 1/s; 0 for the iteration alone.
+        poles: N of the tracking law.
+        frequency: w0 of the resonance, rad/s.
+        damping: zeta of the resonance, dimensionless.
+        eigenvalue: lambda of the response Jacobian.
 
     Raises:
         InvalidValue: a period, frequency or eigenvalue that is not positive, a negative rate or damping, fewer than one pole.

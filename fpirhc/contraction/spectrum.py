@@ -23,7 +23,14 @@ _NO_SIGN = 1e-9  # real parts below this share of the largest eigenvalue have no
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Eigenvalues of the response Jacobian, one row per sample, shape (samples, n), complex."""
+    """Eigenvalues of the response Jacobian.
+
+    Args:
+        eigenvalues: one row per sample, shape (samples, n), complex; rows that are not finite are left out.
+
+    Raises:
+        InvalidValue: no row is finite.
+    """
 
     eigenvalues: Array
 
@@ -35,9 +42,9 @@ class Spectrum:
                 "no finite eigenvalue of the response Jacobian: the inverse response is singular at every sample; "
                 "check that the inputs act on the controlled coordinates there"
             )
-        kept = np.array(finite)
-        kept.setflags(write=False)
-        object.__setattr__(self, "eigenvalues", kept)
+        values = np.array(finite)
+        values.setflags(write=False)
+        object.__setattr__(self, "eigenvalues", values)
 
     @cached_property
     def smallest_real(self) -> float:
@@ -56,7 +63,7 @@ class Spectrum:
         return self.smallest_real > small or self.largest_real < -small
 
 
-@lru_cache(maxsize=16)  # a run is judged by it more than once
+@lru_cache(maxsize=16)  # one run needs it several times
 def response_jacobian(plant: Plant) -> ca.Function:
     """Return Function (state, deformed, exact, approximate) -> J = df/dr of the controlled coordinates, n x n.
 
@@ -69,11 +76,11 @@ def response_jacobian(plant: Plant) -> ca.Function:
     x = matrix.sym("x", plant.state.size)
     r = matrix.sym("r", len(plant.controlled_names))
     exact = matrix.sym("exact", plant.parameter.size if plant.parameters else 0)
-    believed = matrix.sym("approximate", exact.numel())
-    realised = plant.controlled_response_function(x, plant.inverse_function(x, r, believed), exact)
+    assumed = matrix.sym("approximate", exact.numel())
+    realised = plant.controlled_response_function(x, plant.inverse_function(x, r, assumed), exact)
     jacobian = ca.densify(ca.jacobian(realised, r))
     names = ["state", "deformed", "exact", "approximate"]
-    return ca.Function("fpirhc_response_jacobian", [x, r, exact, believed], [jacobian], names, ["jacobian"])
+    return ca.Function("fpirhc_response_jacobian", [x, r, exact, assumed], [jacobian], names, ["jacobian"])
 
 
 def spectrum_over_run(
@@ -81,11 +88,16 @@ def spectrum_over_run(
 ) -> Spectrum:
     """Return the eigenvalues of J along a run; long runs are thinned to `LARGEST_SAMPLE` cycles.
 
-    Parameters: `states` (cycles, nx) and `deformed` (cycles, n), row k the state and the request of cycle k; parameter
-    vectors are the plant's own unless given.
+    Args:
+        plant: that ran.
+        states: state of every cycle, shape (cycles, nx).
+        deformed: request of every cycle, shape (cycles, n).
+        exact: parameters of the plant, shape (np,); None: the plant's own.
+        approximate: parameters of the model, shape (np,); None: the plant's own.
 
     Raises:
-        InvalidShape: arrays that do not fit the plant or each other. InvalidValue: no finite eigenvalue.
+        InvalidShape: arrays that do not fit the plant or each other.
+        InvalidValue: no finite eigenvalue.
     """
     states, deformed = _checked_rows(plant, states, deformed)
     thinned = np.unique(np.linspace(0, len(states) - 1, min(len(states), LARGEST_SAMPLE)).astype(int))
@@ -99,12 +111,21 @@ def spectrum_over_box(
 ) -> Spectrum:
     """Return the eigenvalues of J for exact parameters drawn from a box, at states drawn from the given rows.
 
-    Every corner of the box is among the samples when they are at least as many; the rest is uniform. Parameters that
-    the box does not name keep the plant's exact value.
+    Every corner of the box is a sample where there are at least as many samples as corners; the other samples are uniform.
+    Parameters that the box does not name keep the plant's exact value.
+
+    Args:
+        plant: whose exact parameters vary.
+        box: parameter -> (lower, upper), in its unit.
+        states: states to draw from, shape (rows, nx).
+        deformed: the requests at these states, shape (rows, n).
+        samples: number of draws.
+        seed: of the draws.
 
     Raises:
-        InvalidName: the box names an unknown parameter. InvalidValue: an interval whose ends are swapped or not finite,
-        or samples < 1. InvalidShape: arrays that do not fit the plant or each other.
+        InvalidName: the box names an unknown parameter.
+        InvalidValue: an interval whose ends are swapped or not finite, or fewer than one sample.
+        InvalidShape: arrays that do not fit the plant or each other.
     """
     states, deformed = _checked_rows(plant, states, deformed)
     if samples < 1:
@@ -123,10 +144,17 @@ def spectrum_over_box(
 def contraction_along(
     plant: Plant, states: Array, deformed: Array, effective_gain: float, *, approximate: Array | None = None
 ) -> Array:
-    """Return the predicted factor max|1 - a lambda| of every cycle of a run, shape (cycles,); NaN-free.
+    """Return the predicted factor max|1 - a lambda| of every cycle of a run, shape (cycles,); every entry is a number.
 
     Long runs are evaluated at `LARGEST_SAMPLE` cycles, and in between the last value holds. Where J is singular or not
-    finite nothing contracts: the factor is 1.
+    finite nothing contracts, and the factor is 1.
+
+    Args:
+        plant: that ran.
+        states: state of every cycle, shape (cycles, nx).
+        deformed: request of every cycle, shape (cycles, n).
+        effective_gain: a of the deformation.
+        approximate: parameters of the model, shape (np,); None: the plant's own.
 
     Raises:
         InvalidShape: arrays that do not fit the plant or each other.
@@ -144,8 +172,12 @@ def contraction_along(
 def response_jacobians(plant: Plant, states: Array, deformed: Array, exact: Array, approximate: Array | None) -> Array:
     """Return J of every row, shape (rows, n, n); not finite where the model's inverse is not.
 
-    Parameters: `states` (rows, nx), `deformed` requests (rows, n), `exact` parameters (rows, np); `approximate` (np,), the
-    plant's own unless given.
+    Args:
+        plant: whose response is differentiated.
+        states: shape (rows, nx).
+        deformed: requests, shape (rows, n).
+        exact: parameters of the plant, one set per row, shape (rows, np).
+        approximate: parameters of the model, shape (np,); None: the plant's own.
     """
     model = plant.approximate if approximate is None else np.asarray(approximate, dtype=float)
     function, n = response_jacobian(plant), deformed.shape[1]
@@ -163,11 +195,11 @@ def _spectrum(plant: Plant, states: Array, deformed: Array, exact: Array, approx
 def _checked_rows(plant: Plant, states: Array, deformed: Array) -> tuple[Array, Array]:
     states = np.atleast_2d(np.asarray(states, dtype=float))
     deformed = np.atleast_2d(np.asarray(deformed, dtype=float))
-    wanted = (plant.state.size, len(plant.controlled_names))
-    if (states.shape[1], deformed.shape[1]) != wanted or len(states) != len(deformed):
+    widths = (plant.state.size, len(plant.controlled_names))
+    if (states.shape[1], deformed.shape[1]) != widths or len(states) != len(deformed):
         raise InvalidShape(
-            f"states {states.shape} and deformed {deformed.shape}: expected (cycles, {wanted[0]}) "
-            f"and (cycles, {wanted[1]})"
+            f"states {states.shape} and deformed {deformed.shape}: expected (cycles, {widths[0]}) "
+            f"and (cycles, {widths[1]})"
         )
     if len(states) == 0:
         raise InvalidShape("states and deformed have no rows; give at least one state and request")

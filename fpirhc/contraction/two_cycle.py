@@ -1,17 +1,17 @@
 """The exact condition for a bounded two-cycle of the whole loop behind a saturating map, and the size of its errors.
 
-Open the linear loop at the map's step s: h = -L(z) s, with the tracking law, the plan's feedback, delays and filters
-in L. The map is radial and odd, s = -sigma(|h|) h with the secant sigma. In a two-cycle the mean step is zero,
-because the map integrates it, so h alternates between X and -X and L acts at z = -1 alone: harmonic balance is exact
-here. A two-cycle exists if and only if
+Open the linear loop at the step s of the map: h = -L(z) s, where L contains the tracking law, the feedback of the plan, delays and
+filters. The map is radial and odd, s = -sigma(|h|) h with the secant sigma. In a two-cycle the mean step is zero, because the map
+sums its steps. So h alternates between X and -X, L acts at z = -1 alone, and harmonic balance is exact. A two-cycle exists if and
+only if
 
     sigma(|X|) = 1 / mu      for some |X| and a positive real eigenvalue mu of -L(-1) (h = mu times the negative step).
 
 With the effective gain a in place of sigma the closed loop is z+ = (F0 + a F1) z, and -1 is an eigenvalue of it when
 a = 1 / mu, so mu are the positive real eigenvalues of -(I + F0)^-1 F1.
 
-A single secant slope makes the smallest 1 / mu a limit of `secant_gain()`. Where the secant rises to a maximum there are two
-amplitudes: the smaller one is a threshold, the larger one what a run shows.
+So the smallest 1 / mu is a limit of `secant_gain()`. Where the secant rises to a maximum there are two amplitudes: the smaller one
+is a threshold, and a run ends at the larger one.
 """
 
 from __future__ import annotations
@@ -26,21 +26,25 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidShape, InvalidValue
 
 _REAL = 1e-6  # imaginary part of an eigenvalue, relative, below which it is real
-_NONE = 1e-12  # eigenvalues below this share of the largest are none
-_DECADES = (1e-6, 1e6)  # of the size that is given
+_NONE = 1e-12  # share of the largest eigenvalue below which an eigenvalue counts as zero
+_DECADES = (1e-6, 1e6)  # range of amplitudes that is searched, as multiples of the typical size
 _POINTS = 400
 _BISECTIONS = 50
 
 
 def two_cycle_limit(low: Array, high: Array, gains: Sequence[float]) -> float:
-    """Return the gain from which on a two-cycle exists; infinite where none does.
+    """Return the gain from which on a two-cycle exists; infinite where no gain leads to one.
 
-    A secant gain beyond it, at any size of the error, means a bounded two-cycle; below it there is none.
+    A secant gain beyond it, at any size of the error, leads to a bounded two-cycle. Below it there is no two-cycle.
 
-    Parameters: `low`, `high` (m, m): the closed loop's matrices per cycle with two effective `gains` of one sign.
+    Args:
+        low: matrix of the closed loop over one cycle with the first effective gain, shape (m, m).
+        high: the same with the second effective gain.
+        gains: the two effective gains, different and of one sign.
 
     Raises:
-        InvalidShape: matrices of different shapes. InvalidValue: two equal gains, or of different signs.
+        InvalidShape: matrices of different shapes.
+        InvalidValue: two equal gains, or of different signs.
     """
     first, second = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
     if first.shape != second.shape or first.ndim != 2 or first.shape[0] != first.shape[1]:
@@ -59,8 +63,10 @@ def two_cycle_limit(low: Array, high: Array, gains: Sequence[float]) -> float:
 def two_cycle_amplitudes(deformation: Deformation, limit: float, *, size: float) -> tuple[float, ...]:
     """Return every |h| at which the map's secant is the limit, smallest first; empty where there is no two-cycle.
 
-    Parameters: a `deformation` without memory, `limit` of `two_cycle_limit`, `size` of typical errors in units of the response:
-    amplitudes from 1e-6 to 1e6 of it are found.
+    Args:
+        deformation: a map without memory.
+        limit: from `two_cycle_limit`.
+        size: typical size of errors, in units of the response; amplitudes from 1e-6 to 1e6 times this size are searched.
 
     Raises:
         InvalidValue: a map with memory, a limit or a size that is not positive.
@@ -76,12 +82,12 @@ def two_cycle_amplitudes(deformation: Deformation, limit: float, *, size: float)
 
     grid = size * np.geomspace(*_DECADES, _POINTS)
     above = np.asarray(secant(grid[None, :]).full()).ravel() > limit
-    found = []
+    amplitudes = []
     for k in np.flatnonzero(above[1:] != above[:-1]):
         low, high = grid[k], grid[k + 1]
         for _ in range(_BISECTIONS):
             middle = 0.5 * (low + high)
             same = (float(secant(middle)) > limit) == above[k]
             low, high = (middle, high) if same else (low, middle)
-        found.append(float(0.5 * (low + high)))
-    return tuple(found)
+        amplitudes.append(float(0.5 * (low + high)))
+    return tuple(amplitudes)

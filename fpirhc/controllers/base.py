@@ -7,7 +7,7 @@ Every controller reads (time, state, realised, parameters) and ends in the same 
     limit    clip it; what the clipped command means becomes the stored q^Def (anti-windup)
     judge    one status for the cycle
 
-A command that is not finite never reaches the plant: the last command is held and the cycle's status says so.
+A command that is not finite never reaches the plant: the last command is held, and the status of the cycle is NON_FINITE.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ FINITE = 1e300  # |v| <= FINITE is false for NaN and infinity, and CasADi does n
 
 
 def controller_reads(problem: Problem, controller: Controller) -> Layout:
-    """What a controller is given each cycle."""
+    """Return what a controller reads in every cycle: time, state, realised response, parameters."""
     plant, response = problem.plant, controller.response(problem)
     realised = response.signal if response else plant.response_signal("realised")
     return Layout((scalar("time", "s"), plant.state, realised, plant.parameter))
@@ -42,7 +42,11 @@ def controller_reads(problem: Problem, controller: Controller) -> Layout:
 def compose_controller(problem: Problem, controller: Controller, *, ahead: bool = False) -> Composite:
     """Return the controller as one step: (memory, time, state, realised, parameters) -> (memory, trace, command).
 
-    `ahead`: time and state are to be those in which the command acts; a block that needs the measured state then reads it too.
+    Args:
+        problem: that the controller is composed for.
+        controller: checked here against the problem.
+        ahead: whether time and state are those at which the command will act. The step then also reads the measured state where a
+            block needs it.
     """
     ready = checked(problem, controller)
     blocks, delays = ready.blocks(problem)
@@ -53,14 +57,20 @@ def compose_controller(problem: Problem, controller: Controller, *, ahead: bool 
 
 
 def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block:
-    """A composed step as one block; `feeds` renames what it reads."""
+    """Return a composed step as one block.
+
+    Args:
+        name: of the block.
+        composite: the step.
+        feeds: name of a signal that the step reads -> the signal that it is given instead.
+    """
     reads = tuple(feeds.get(s.name, s) for s in composite.reads.signals)
 
     def step(s: Signals) -> dict[str, Expression]:
         memory = composite.memory.join({m: getattr(s, m) for m in composite.memory.names})
-        following, trace, *_ = composite.function(memory, *(getattr(s, r.name) for r in reads))
-        kept = {f"{m}_next": v for m, v in composite.memory.split(following).items()}
-        return {**composite.trace.split(trace), **kept}
+        next_memory, trace, *_ = composite.function(memory, *(getattr(s, r.name) for r in reads))
+        remembered = {f"{m}_next": v for m, v in composite.memory.split(next_memory).items()}
+        return {**composite.trace.split(trace), **remembered}
 
     return Block(name, Layout(reads), composite.trace, step, composite.memory, opaque=True)
 
@@ -69,12 +79,16 @@ def reference_block(problem: Problem) -> Block:
     """Block (time, state) -> (reference state, response of the controlled coordinates, error of the judged ones)."""
     plant = problem.plant
     function = problem.reference.function(plant)
-    chosen = list(plant.controlled_indices)
+    controlled = list(plant.controlled_indices)
     places = [plant.state.elements.index(c) for c in problem.judged_names]
 
     def step(s: Signals) -> dict[str, Expression]:
         state, response = function(s.time)
-        return {"reference": state, "_reference_response": response[chosen], "error": state[places] - s.state[places]}
+        return {
+            "reference": state,
+            "_reference_response": response[controlled],
+            "error": state[places] - s.state[places],
+        }
 
     reads = Layout((scalar("time", "s"), plant.state))
     writes = (
@@ -99,52 +113,58 @@ def rename(name: str, source: Signal, target: Signal) -> Block:
 def closing_blocks(
     problem: Problem, deformation: Deformation, judged: Sequence[Signal] = ()
 ) -> tuple[list[Block], list[Delay]]:
-    """Return the blocks deform, invert, limit and judge with what they remember; `judged` are solver statuses."""
+    """Return the blocks deform, invert, limit, judge and running with what they remember; `judged` are solver statuses."""
     plant = problem.plant
     closing, delays = commanding_blocks(problem, judged)
-    mirrors, seen = mirror_blocks(problem, deformation)
+    mirrors, mirror_delays = mirror_blocks(problem, deformation)
     blocks = [*mirrors, deform_block(plant, deformation, problem.warm_up_cycles), invert_block(plant), *closing]
     before = [] if mirrors else [Delay(plant.response_signal("_deformed_last"), "deformed")]
-    return blocks, [*delays, *seen, *before]
+    return blocks, [*delays, *mirror_delays, *before]
 
 
 def commanding_blocks(problem: Problem, judged: Sequence[Signal] = ()) -> tuple[list[Block], list[Delay]]:
-    """Return the blocks limit, judge and running with what they remember, for a controller that gives 'command_unclipped' itself.
+    """Return the blocks limit, judge and running with what they remember, for a controller that writes 'command_unclipped'.
 
-    It also gives 'desired', and '_deformed_unclipped': the response that its model expects of the requested command.
+    The controller also writes 'desired', and '_deformed_unclipped': the response that its model expects of this command.
+    `judged` are solver statuses.
     """
     delays = [Delay(scalar("warm_up"), "_warm_up_now"), Delay(like(problem.plant.input, "_command_before"), "command")]
     return [_limit_block(problem), _judge_block(judged), _warm_up_block(problem.warm_up_cycles)], delays
 
 
-def _warm_up_block(blind: int) -> Block:
-    """Block that counts the cycles of a run up to `blind`, after which the response may be used."""
+def _warm_up_block(warm_up_cycles: int) -> Block:
+    """Block that counts the cycles of a run up to `warm_up_cycles`, after which the response may be used."""
 
     def step(s: Signals) -> dict[str, Expression]:
-        return {"_warm_up_now": ca.fmin(s.warm_up + 1, blind)}
+        return {"_warm_up_now": ca.fmin(s.warm_up + 1, warm_up_cycles)}
 
     return Block("running", Layout((scalar("warm_up"),)), Layout((scalar("_warm_up_now"),)), step)
 
 
-def deform_block(plant: Plant, deformation: Deformation, blind: int = 1) -> Block:
-    """Block (request before, realised, desired) -> deformed request; without a valid pair it passes the desired one.
+def deform_block(plant: Plant, deformation: Deformation, warm_up_cycles: int = 1) -> Block:
+    """Block (request before, realised, desired) -> deformed request; without a valid pair it passes the desired response.
 
     A model-referenced deformation is given the model's response, '_modelled', in place of the request before.
-    A pair is valid after `blind` cycles, which `started` counts: one, or more where the response is estimated from more samples.
+
+    Args:
+        plant: whose responses are deformed.
+        deformation: the map.
+        warm_up_cycles: number of cycles, counted by 'warm_up', after which a pair is valid: one, or more where the response is
+            estimated from more samples.
     """
     memory = deformation.memory(plant.controlled_names)
-    asked = "_deformed_last" if deformation.mirror is None else "_modelled"
-    responses = [plant.response_signal(name) for name in (asked, "realised", "desired")]
+    request_before = "_deformed_last" if deformation.mirror is None else "_modelled"
+    responses = [plant.response_signal(name) for name in (request_before, "realised", "desired")]
     reads = (*responses, scalar("warm_up"))
 
     def step(s: Signals) -> dict[str, Expression]:
         remembered = {m: getattr(s, m) for m in memory.names}
-        deformed, following = deformation.step(getattr(s, asked), s.realised, s.desired, remembered)
-        valid = s.warm_up > blind - 0.5
-        kept = {f"{m}_next": ca.if_else(valid, following[m], remembered[m]) for m in memory.names}
-        shown = {name: kept[f"{source}_next"] for name, source in deformation.shown().items()}
-        wanted = ca.if_else(valid, deformed, s.desired)
-        return {"_deformed_unclipped": wanted, "_deformation": wanted - s.desired, **shown, **kept}
+        deformed, next_memory = deformation.step(getattr(s, request_before), s.realised, s.desired, remembered)
+        valid = s.warm_up > warm_up_cycles - 0.5
+        next_values = {f"{m}_next": ca.if_else(valid, next_memory[m], remembered[m]) for m in memory.names}
+        shown = {name: next_values[f"{source}_next"] for name, source in deformation.shown().items()}
+        next_request = ca.if_else(valid, deformed, s.desired)
+        return {"_deformed_unclipped": next_request, "_deformation": next_request - s.desired, **shown, **next_values}
 
     written = [plant.response_signal(name) for name in ("_deformed_unclipped", "_deformation")]
     logged = [scalar(name) for name in deformation.shown()]
@@ -165,7 +185,7 @@ def invert_block(plant: Plant) -> Block:
 def _limit_block(problem: Problem) -> Block:
     plant = problem.plant
     lower, upper = problem.limits.input_bounds(plant)
-    meant = _meaning(plant)
+    meaning = _meaning(plant)
     reads = (
         like(plant.input, "command_unclipped"),
         plant.response_signal("_deformed_unclipped"),
@@ -177,11 +197,11 @@ def _limit_block(problem: Problem) -> Block:
     writes = (plant.input, plant.response_signal("deformed"), scalar("clipped"), scalar("_held"))
 
     def step(s: Signals) -> dict[str, Expression]:
-        # Finiteness is asked before the clamp: fmin and fmax turn NaN into a full-scale command.
+        # Finiteness is checked before the clamp: fmin and fmax turn NaN into a full-scale command.
         finite = ca.mmin(ca.fabs(s.command_unclipped) <= FINITE)
         safe = ca.if_else(finite, s.command_unclipped, s._command_before)
         command = clip(safe, lower, upper)
-        clipped_request = meant(s.state, command, safe, s._deformed_unclipped, s.parameters)
+        clipped_request = meaning(s.state, command, safe, s._deformed_unclipped, s.parameters)
         return {
             "command": command,
             "deformed": ca.if_else(finite, clipped_request, s.desired),
@@ -193,21 +213,21 @@ def _limit_block(problem: Problem) -> Block:
 
 
 def _meaning(plant: Plant) -> ca.Function:
-    """Function (state, command, wanted command, wanted response, parameters) -> response that the command asks for.
+    """Function (state, command, unclipped command, request, parameters) -> the request that the clipped command stands for.
 
-    For a response affine in the inputs this is wanted + B (command - wanted command): exactly the wanted response where
-    nothing was clipped, and without evaluating the model again.
+    For a response affine in the inputs this is request + B (command - unclipped command): exactly the request where nothing was
+    clipped, without a second evaluation of the model.
     """
     x, u, p = plant._symbols()
-    wanted, r = ca.SX.sym("wanted", u.numel()), ca.SX.sym("r", len(plant.controlled_names))
+    unclipped, r = ca.SX.sym("unclipped", u.numel()), ca.SX.sym("r", len(plant.controlled_names))
     response = plant.controlled_response_function(x, u, p)
-    moved = r + ca.mtimes(ca.jacobian(response, u), u - wanted)
-    means = moved if plant.affine else ca.if_else(ca.mmax(u != wanted), response, r)
-    return ca.Function("fpirhc_meaning", [x, u, wanted, r, p], [ca.densify(means)])
+    shifted = r + ca.mtimes(ca.jacobian(response, u), u - unclipped)
+    meaning = shifted if plant.affine else ca.if_else(ca.mmax(u != unclipped), response, r)
+    return ca.Function("fpirhc_meaning", [x, u, unclipped, r, p], [ca.densify(meaning)])
 
 
 def clip(u: Expression, lower: np.ndarray, upper: np.ndarray) -> Expression:
-    """Clip entry by entry; a free side costs nothing."""
+    """Return u clipped entry by entry; a side without a finite limit adds no operation."""
     entries = []
     for k, (low, high) in enumerate(zip(lower, upper, strict=True)):
         entry = u[k] if np.isinf(low) else ca.fmax(u[k], low)

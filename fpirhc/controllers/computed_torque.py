@@ -20,18 +20,18 @@ from fpirhc.tracking.exponential import Exponential
 
 @dataclass(frozen=True)
 class ComputedTorque(Controller):
-    """Inverse dynamics with a tracking law; adaptive when given a deformation.
+    """Inverse dynamics with a tracking law; adaptive with a deformation.
 
-    Parameters:
+    Args:
         tracking: the law that gives the desired response.
-        deformation: the fixed-point map between desired response and request; Identity() is no adaptation.
+        deformation: the map between desired response and request; Identity() is no adaptation.
     """
 
     tracking: Tracking
     deformation: Deformation = field(default_factory=Identity)
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks reference, tracking, deform, invert, limit, judge, tracking update."""
+        """Return the blocks reference, tracking, deform, invert, limit, judge, running, tracking update."""
         return tracked_blocks(problem, self.tracking, self.deformation)
 
 

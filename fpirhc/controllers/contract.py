@@ -1,7 +1,7 @@
-"""The contract of controllers: blocks for a problem, and facts that reviews, studies and reports ask for.
+"""The contract of controllers: blocks for a problem, and facts for reviews, studies and reports.
 
-A controller that wraps another one tells it by `inner`. What it does not say otherwise is then the fact of the inner controller,
-on the problem that the inner one sees; so a wrapper of a wrapper is treated as what it is made of.
+A controller that wraps another one has it as `inner`. It has the facts of the inner controller, on the problem that the inner
+controller is built for, unless it overrides them. So the facts pass through any number of wrappers.
 """
 
 from __future__ import annotations
@@ -34,7 +34,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """A response that the plant answers with: the signal 'realised' and its Function (state, input, parameters, forcing)."""
+    """A response of the plant.
+
+    Args:
+        signal: named 'realised'.
+        function: Function (state, input, parameters, forcing) -> the response.
+    """
 
     signal: Signal
     function: ca.Function
@@ -42,10 +47,14 @@ class Response:
 
 @dataclass(frozen=True)
 class Planner:
-    """What a controller plans with over the problem's horizon.
+    """How a controller plans over the problem's horizon.
 
-    cost: of its own; None: the problem's. restarts: whether every plan starts from the measured state. tracking: the law that
-    keeps the plant on the planned motion between plans; None: the plan's first response is the desired one.
+    Args:
+        optimiser: that finds the plan.
+        cost: of the plan; None: the problem's.
+        restarts: whether every plan starts from the measured state.
+        tracking: the law that keeps the plant on the planned motion between plans; None: the plan's first response is the desired
+            one.
     """
 
     optimiser: Optimiser
@@ -76,7 +85,7 @@ class Controller(ABC):
 
     @abstractmethod
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks of one control cycle, from (time, state, realised, parameters) to 'command'."""
+        """Return the blocks of one control cycle, from (time, state, realised, parameters) to 'command', and what they remember."""
 
     def around(self, inner: Controller) -> Self:
         """Return the same wrapper around another controller.
@@ -87,42 +96,42 @@ class Controller(ABC):
         return with_inner(self, inner)
 
     def inner_problem(self, problem: Problem) -> Problem:
-        """The problem that the inner controller sees."""
+        """Return the problem that the inner controller is built for."""
         return problem
 
     @property
     def feeds(self) -> Mapping[str, str]:
-        """What the inner controller reads under other names: 'time', 'state', 'realised' or 'parameters' -> signal of a run."""
+        """Signals that the inner controller is given under other names: 'time', 'state', 'realised' or 'parameters' -> name."""
         return {} if self.inner is None else self.inner.feeds
 
     def linear_around(self, inner: Controller) -> Controller:
-        """What serves a linear plant as this wrapper does near the reference, `inner` serving it as the inner one does."""
+        """Return the controller that equals this wrapper near the reference, where `inner` equals the inner controller there."""
         return self.around(inner)
 
     def parameters(self, plant: Plant) -> np.ndarray:
-        """Parameters that the controller believes: the approximate ones."""
+        """Return the parameters of the controller's model, shape (np,): the approximate ones."""
         return plant.approximate if self.inner is None else self.inner.parameters(plant)
 
     @property
     def learns(self) -> bool:
-        """Whether its model or its gains change on line, so that what is known of them before a run is how they begin."""
+        """Whether its model or its gains change during a run."""
         return False if self.inner is None else self.inner.learns
 
     @property
     def law(self) -> Tracking | None:
-        """The law by which it tracks the reference itself: its field `tracking`, if it has one."""
+        """The law with which the controller tracks the reference: its field `tracking`; None without this field."""
         return getattr(self, "tracking", None) if self.inner is None else self.inner.law
 
     @property
     def planner(self) -> Planner | None:
-        """What it plans with; None for one that does not plan over a horizon."""
+        """How the controller plans; None for a controller that does not plan over a horizon."""
         return None if self.inner is None else self.inner.planner
 
     def with_optimiser(self, optimiser: Optimiser) -> Self:
         """Return the controller with another optimiser in its planner.
 
         Raises:
-            NotSupported: it does not plan, or not with an optimiser that can be replaced.
+            NotSupported: it has no optimiser that can be replaced.
         """
         if self.inner is not None:
             return self.around(self.inner.with_optimiser(optimiser))
@@ -142,25 +151,25 @@ class Controller(ABC):
         raise NotSupported(f"{type(self).__name__} has no deformation that can be replaced")
 
     def demand(self, problem: Problem) -> Demand | None:
-        """How much its desired response changes; None where it leaves the deformation's automatic settings open."""
+        """Return how much the desired response changes; None where the deformation's automatic settings stay open."""
         if self.inner is not None:
             return self.inner.demand(self.inner_problem(problem))
         return reference_demand(problem, self.law) if self.planner is None else plan_demand(problem)
 
     def response(self, problem: Problem) -> Response | None:
-        """What the controller reads as 'realised', where that is not the response of the plant's controlled coordinates."""
+        """Return the response that the controller reads as 'realised'; None: that of the plant's controlled coordinates."""
         return None if self.inner is None else self.inner.response(self.inner_problem(problem))
 
     def unusable(self, problem: Problem, mirror: Mirror) -> str:
-        """Why a model-referenced deformation with this mirror cannot be used on this problem; empty where it can."""
+        """Return why a model-referenced deformation with this mirror cannot be used on this problem; empty where it can."""
         return "" if self.inner is None else self.inner.unusable(self.inner_problem(problem), mirror)
 
     def floquet(self, problem: Problem) -> Floquet | None:
-        """The stability of one period of a controller that switches; None for one that does not."""
+        """Return the stability of one period of a controller that switches; None for a controller that does not switch."""
         return None if self.inner is None else self.inner.floquet(self.inner_problem(problem))
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
-        """Sentences about the controller on this problem for a reader of results."""
+        """Return sentences about the controller on this problem, for a reader of results."""
         return () if self.inner is None else self.inner.notes(self.inner_problem(problem))
 
     def check(self, problem: Problem) -> None:
@@ -173,7 +182,7 @@ def resolved(problem: Problem, controller: Controller) -> Controller:
     """Return the controller with every automatic setting replaced by its value for this problem.
 
     Raises:
-        InvalidValue: a setting that cannot be chosen, with what to give.
+        InvalidValue: a setting cannot be chosen; the message names what to set.
     """
     if controller.inner is not None:
         inner = resolved(controller.inner_problem(problem), controller.inner)
@@ -187,8 +196,10 @@ def checked(problem: Problem, controller: Controller) -> Controller:
     """Return the resolved controller, checked against the problem.
 
     Raises:
-        NotContractive: a deformation with a gain of the wrong sign, or one that its estimator or filter makes
-            unstable. NotSupported: own responses behind sensors or dead time. And what the controller's own check raises.
+        FpirhcError: the controller's own check fails.
+        NotContractive: the gain of the deformation has the wrong sign, or is too large behind estimator and filter.
+        NotSupported: a form of the deformation that cannot be used here; a response of the controller's own behind sensors or dead
+            time.
     """
     ready = resolved(problem, controller)
     ready.check(problem)
@@ -201,7 +212,7 @@ def checked(problem: Problem, controller: Controller) -> Controller:
     if late or not problem.sensing.ideal:
         what = "dead time" if late else "sensing"
         raise NotSupported(
-            f"{type(ready).__name__} reads responses of its own, at once and as they are; leave {what} out of the problem"
+            f"{type(ready).__name__} reads responses of its own, without delay and noise; leave {what} out of the problem"
         )
     return ready
 

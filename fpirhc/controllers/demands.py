@@ -1,11 +1,11 @@
-"""How much the desired response of a controller changes: what a deformation with automatic settings chooses them by.
+"""How much the desired response of a controller changes: the basis of a deformation's automatic settings.
 
-The sigmoid, for one, moves the request by at most 0.81 S per cycle (for D = 0.3), so S must cover the largest change of the
-desired response per cycle, or the loop falls behind and diverges. A tracking law asks for what its reference asks; a plan
-may move between the input limits within one cycle.
+The sigmoid, for example, moves the request by at most 0.81 S per cycle (for D = 0.3). So S must cover the largest change of the
+desired response per cycle, or the loop falls behind and diverges. The desired response of a tracking law changes as its reference
+does; a plan may move between the input limits within one cycle.
 
-Around a tracking law the step must also cover the errors that the loop is to come back from (`fpirhc.contraction.basin`), whose
-size nobody knows before a run. A model is taken to be wrong by no more than its own command does:
+Around a tracking law the step must also cover the errors from which the loop is to come back (`fpirhc.contraction.basin`). Their
+size is unknown before a run. The error of a model is assumed to be no larger than the effect of the model's own command:
 |f - d| <= |r^N - response(x^N, 0)|, along the reference.
 """
 
@@ -24,7 +24,7 @@ _SAMPLES = 2000
 
 
 def reference_demand(problem: Problem, law: Tracking | None = None) -> Demand:
-    """Return period max|d/dt r^N|, r^N the nominal response, which goes on from cycle to cycle, and what `law` needs."""
+    """Return the change period max|d/dt r^N| of the nominal response r^N, from cycle to cycle, with the recovery for `law`."""
     t = ca.MX.sym("t")
     responses = problem.reference.function(problem.plant)(t)[1][list(problem.plant.controlled_indices)]
     change = problem.period * _slew(ca.Function("r", [t], [responses]), problem.duration)
@@ -32,10 +32,10 @@ def reference_demand(problem: Problem, law: Tracking | None = None) -> Demand:
 
 
 def plan_demand(problem: Problem) -> Demand:
-    """Return a jump of the model's response when the command jumps from limit to limit in one cycle.
+    """Return the jump of the model's response when the command jumps from limit to limit in one cycle.
 
     Raises:
-        InvalidValue: some input has no finite limits, so nothing bounds the jump.
+        InvalidValue: some input has no finite limits, so the jump has no bound.
     """
     plant = problem.plant
     lower, upper = problem.limits.input_bounds(plant)
@@ -52,7 +52,7 @@ def plan_demand(problem: Problem) -> Demand:
 
 
 def command_demand(problem: Problem, parameters: np.ndarray) -> Demand:
-    """Return period max|dQ/dt|, Q the command that the model with these parameters needs along the reference."""
+    """Return the change period max|dQ/dt| of the command Q that the model with these parameters needs along the reference."""
     reference, inverse = problem.reference.function(problem.plant), problem.plant.inverse_function
     t, p = ca.MX.sym("t"), ca.DM(parameters)
     state, response = reference(t)
@@ -61,7 +61,7 @@ def command_demand(problem: Problem, parameters: np.ndarray) -> Demand:
 
 
 def _recovery(problem: Problem, law: Tracking | None) -> float:
-    """Step per cycle from which the plain form comes back from the largest error that is expected; 0 without a law of one rate."""
+    """Step per cycle with which the plain form comes back from the largest expected error; 0 without a law of one rate."""
     plant = problem.plant
     laws = [law.feedback(plant.orders[k]) for k in plant.controlled_indices] if law else []
     rates = [(len(one.gains), one.rate) for one in laws if one is not None and one.rate is not None]
@@ -72,7 +72,7 @@ def _recovery(problem: Problem, law: Tracking | None) -> float:
 
 
 def _largest_error(problem: Problem) -> float:
-    """Largest |r^N - response(x^N, 0)| of the model along the reference: what its commands do there; 0 where that is not finite."""
+    """Largest |r^N - response(x^N, 0)| of the model along the reference, over the samples where it is finite."""
     plant = problem.plant
     times = np.linspace(0.0, problem.duration, _SAMPLES)
     states, responses = (np.asarray(v.full()) for v in problem.reference.function(plant).map(_SAMPLES)(times[None, :]))

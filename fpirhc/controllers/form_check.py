@@ -1,4 +1,4 @@
-"""Refuses a form of the deformation that the controller, the plant or a wrapper cannot serve, before anything runs."""
+"""Refuses, before a run, a form of the deformation that the controller, the plant or a wrapper does not support."""
 
 from __future__ import annotations
 
@@ -11,19 +11,21 @@ from fpirhc.errors import NotSupported
 from fpirhc.task.problem import Problem
 
 
-class _Serves(Protocol):
+class _Controller(Protocol):
+    """The two members of a controller that the check needs; the contract itself imports this module."""
+
     @property
     def deformation(self) -> Deformation: ...
 
     def unusable(self, problem: Problem, mirror: Mirror) -> str: ...
 
 
-def check_form(problem: Problem, controller: _Serves) -> None:
+def check_form(problem: Problem, controller: _Controller) -> None:
     """Raise if the controller's deformation has a form that cannot be used.
 
     Raises:
-        NotSupported: dead times or lags of another number of channels than the plant has; a wrapper around a model-referenced form
-            that changes what the form compares; a controller that cannot give it the model's response.
+        NotSupported: the number of dead times or lags differs from the plant's number of channels; a wrapper changes what a
+            model-referenced form inside it compares; the controller cannot compute the model's response for the form.
     """
     deformation, plant = controller.deformation, problem.plant
     channels, controlled = deformation.channels, len(plant.controlled_names)
@@ -47,6 +49,6 @@ def check_form(problem: Problem, controller: _Serves) -> None:
                 f"ModelReferenced({name}={values!r}): the plant has {len(plant.inputs)} inputs ({', '.join(plant.inputs)}); give "
                 "one number for each, or one for all"
             )
-    why = controller.unusable(problem, mirror)
-    if why:
-        raise NotSupported(f"{type(controller).__name__} cannot use a model-referenced deformation here: {why}")
+    reason = controller.unusable(problem, mirror)
+    if reason:
+        raise NotSupported(f"{type(controller).__name__} cannot use a model-referenced deformation here: {reason}")

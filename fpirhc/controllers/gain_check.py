@@ -1,8 +1,8 @@
-"""Refuses a deformation that cannot converge, before anything runs.
+"""Refuses, before a run, a deformation that cannot converge.
 
-Where the response Jacobian's eigenvalues at the start have real parts of both signs, no gain converges; where they have one
-sign, gains of the other one enlarge every error. And where the response is estimated or the error filtered, the delay of that
-lowers the gain that converges. Too large a gain for the plant alone is not refused: it ends in a bounded oscillation that a
+Where the eigenvalues of the response Jacobian at the start have real parts of both signs, no gain converges. Where they have one
+sign, gains of the other sign enlarge every error. Where the response is estimated or the error is filtered, the delay lowers the
+largest gain that converges. A gain that is too large for the plant alone is not refused: it ends in a bounded oscillation, which a
 run shows and the verdict explains.
 """
 
@@ -23,7 +23,7 @@ def check_gain_sign(problem: Problem, deformation: Deformation) -> None:
     """Raise if the deformation cannot converge from the start of the problem.
 
     Raises:
-        NotContractive: with the eigenvalues' verdict and the admissible gains.
+        NotContractive: the gain has the wrong sign, or no gain converges; the message names the admissible gains.
     """
     gain = deformation.effective_gain()
     if gain == 0:
@@ -37,12 +37,12 @@ def check_gain_sign(problem: Problem, deformation: Deformation) -> None:
 
 
 def check_response_delay(problem: Problem, deformation: Deformation) -> None:
-    """Raise if a gain that the plant itself allows is too large for the delay of estimator and filter.
+    """Raise if a gain that converges on the plant itself is too large behind the delay of estimator and filter.
 
-    The dead time of the problem is counted, where all inputs have the same; dead time alone is not judged.
+    The dead time of the problem is added where all inputs have the same. Without estimator and filter dead time is not judged.
 
     Raises:
-        NotContractive: with the limit, the gain, and what to do.
+        NotContractive: the gain is too large; the message names the limit, the gain, and remedies.
     """
     gain, form = deformation.effective_gain(), _form(deformation)
     weights = _delayed_weights(problem, form) if gain else []
@@ -55,17 +55,17 @@ def check_response_delay(problem: Problem, deformation: Deformation) -> None:
         return min(form.limit(w, complex(v), pairing) for w in weights for v in eigenvalues)
 
     if limit(form.pairing) <= abs(gain) < max(map(abs, linear_limit(spectrum.eigenvalues))):
-        # A fraction of a cycle damps requests that alternate, which a window does not see.
+        # A window does not see requests that alternate; a fraction of a cycle in the pairing damps them.
         delay = problem.response_delay
-        tried = {d: limit(d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0}
-        best = None if form.referenced else next((d for d, reached in tried.items() if abs(gain) < reached), None)
+        limits = {d: limit(d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0}
+        best = None if form.referenced else next((d for d, largest in limits.items() if abs(gain) < largest), None)
         raise NotContractive(_too_late(problem, deformation, form, limit(form.pairing), best))
 
 
 def product_limit(problem: Problem, deformation: Deformation) -> float | None:
-    """Limit of effective gain times a positive eigenvalue behind an estimator or a filter; None where there is neither.
+    """Return the limit of effective gain times a positive eigenvalue behind an estimator or a filter.
 
-    None too where the inputs have different dead times.
+    It is None without estimator and filter, and where the inputs have different dead times.
     """
     form = _form(deformation)
     weights = _delayed_weights(problem, form)
@@ -73,19 +73,26 @@ def product_limit(problem: Problem, deformation: Deformation) -> float | None:
 
 
 def _delayed_weights(problem: Problem, form: _Form) -> list[np.ndarray]:
-    """Weights of past requests in the estimated responses, dead time included, where estimator or filter have any of their own."""
+    """Weights of past requests in the estimated responses, dead time included; empty without estimator and filter."""
     orders = {problem.plant.orders[k] for k in problem.plant.controlled_indices}
     weights = [problem.sensing.estimator.weights(order, problem.period) for order in orders]
-    waits = {problem.dead_time.inputs.get(name, 0.0) for name in problem.plant.inputs}
-    if (form.pole == 0 and all(w.size == 1 for w in weights)) or len(waits) > 1:
+    dead_times = {problem.dead_time.inputs.get(name, 0.0) for name in problem.plant.inputs}
+    if (form.pole == 0 and all(w.size == 1 for w in weights)) or len(dead_times) > 1:
         return []
-    waiting = (waits.pop() + problem.dead_time.measurement) / problem.period
-    return [_late(w, waiting) for w in weights]
+    dead_time = (dead_times.pop() + problem.dead_time.measurement) / problem.period
+    return [_late(w, dead_time) for w in weights]
 
 
 @dataclass(frozen=True)
 class _Form:
-    """Which request the map is given, its leak, the pole of the filter of its error, and whether it is given the model's answer."""
+    """The facts of a deformation that set its limit behind a delay.
+
+    Args:
+        pairing: age of the request that a response is paired with, cycles.
+        leak: pole of the leak.
+        pole: of the filter of the error.
+        referenced: whether the form is the model-referenced one.
+    """
 
     pairing: float
     leak: float
@@ -119,19 +126,19 @@ def _too_late(problem: Problem, deformation: Deformation, form: _Form, limit: fl
     name = deformation.gain_name if own is not None else "effective gain"
     value = float(own) if own is not None else deformation.effective_gain()
     delay = problem.response_delay
-    wholes = [f"the response comes {delay:.4g} cycles late ({estimator})"] if delay else []
-    wholes += [f"the error is filtered with the pole {form.pole:g}"] if form.pole else []
+    reasons = [f"the response comes {delay:.4g} cycles late ({estimator})"] if delay else []
+    reasons += [f"the error is filtered with the pole {form.pole:g}"] if form.pole else []
     remedies = [f"0 < |{name}| < {limit / gain * abs(value):.3g}"] if limit else []
     remedies += [f"Paired(map, cycles={pairing:.4g})"] if pairing is not None else []
     remedies += ["a shorter window or time constant"]
     return (
-        f"{type(deformation).__name__}({name}={value:.4g}): {' and '.join(wholes)}, so the iteration converges only for "
-        f"effective gains below {limit:.3g}, and this is {gain:.3g}; use {', or '.join(remedies)}"
+        f"{type(deformation).__name__}({name}={value:.4g}): {' and '.join(reasons)}, so the iteration converges only for "
+        f"effective gains below {limit:.3g}, and this one is {gain:.3g}; use {', or '.join(remedies)}"
     )
 
 
 def _at_start(problem: Problem) -> Spectrum | None:
-    """Eigenvalues of the response Jacobian at the start; None where it is singular and nothing can be said."""
+    """Eigenvalues of the response Jacobian at the start; None where the inverse response is singular there."""
     plant = problem.plant
     state = problem.start_state[None, :]
     response = plant.controlled_response_function(problem.start_state, [0] * plant.input.size, plant.approximate)

@@ -1,6 +1,6 @@
-"""What a receding-horizon controller does when a solve fails (infeasible, or not finite): a stated policy.
+"""Policies of a receding-horizon controller for a solve that fails: infeasible, or not finite.
 
-A solve that merely ran out of iterations is counted as such and used: its plan is feasible and finite.
+The plan of a solve that only ran out of iterations is used, because it is feasible and finite; the status records it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,14 @@ class OnFailure(ABC):
     def choose(
         self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
     ) -> tuple[Expression, Expression]:
-        """Return (input, status) from the plan's first input and the model's feedforward along the reference."""
+        """Return (input, status).
+
+        Args:
+            failed: whether the solve failed, a scalar expression.
+            planned: first input of the plan.
+            feedforward: input that the model needs along the reference.
+            status: of the solve.
+        """
 
 
 @dataclass(frozen=True)
@@ -32,19 +39,19 @@ class HoldPlan(OnFailure):
     def choose(
         self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
     ) -> tuple[Expression, Expression]:
-        """The optimiser already returns its last good plan when it fails."""
+        """Return the plan: an optimiser that fails returns its last good plan."""
         del feedforward
         return planned, ca.if_else(failed, int(Status.HELD), status)
 
 
 @dataclass(frozen=True)
 class Feedforward(OnFailure):
-    """Apply what the model needs along the reference, without feedback from the plan."""
+    """Apply the input that the model needs along the reference, without feedback from the plan."""
 
     def choose(
         self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
     ) -> tuple[Expression, Expression]:
-        """Replace the plan by the feedforward."""
+        """Return the feedforward in place of the plan."""
         return ca.if_else(failed, feedforward, planned), ca.if_else(failed, int(Status.HELD), status)
 
 
@@ -55,6 +62,6 @@ class StopRun(OnFailure):
     def choose(
         self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
     ) -> tuple[Expression, Expression]:
-        """Make the failure visible as NaN."""
+        """Return NaN in place of the plan."""
         del feedforward
         return ca.if_else(failed, math.nan, planned), status

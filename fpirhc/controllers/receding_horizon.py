@@ -6,9 +6,9 @@ response that the model gives to the plan's first input is the nominal one; it i
 
     delta = command - inverse model(q^Des),
 
-so the optimiser is given input bounds shifted by -delta of the last cycle: what it plans stays feasible for the actuator.
+so the optimiser is given input bounds shifted by -delta of the last cycle, and its plan stays feasible for the actuator.
 
-The first plan is prepared before the run, for the problem's start, so that one iteration per cycle only has to follow.
+The first plan is computed before the run, for the problem's start, so that one iteration per cycle only has to follow the changes.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ _SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")
 class RecedingHorizon(Controller):
     """Model-predictive control with a fixed-point deformation of its nominal acceleration.
 
-    Parameters:
+    Args:
         optimiser: finds the plan.
-        deformation: the map between desired response and request; Identity() is plain RHC.
-        nominal: where each horizon starts and what is tracked in between (FromMeasurement, FromMeasurementTracked, FromPlan).
+        deformation: the map between desired response and request; Identity() is plain receding-horizon control.
+        replanning: where each horizon starts and what is tracked in between (FromMeasurement, FromMeasurementTracked, FromPlan).
         on_failure: what is applied when a solve fails (HoldPlan, Feedforward, StopRun).
-        cost: another cost than the problem's own (None: the problem's).
+        cost: of the plan; None: the problem's.
     """
 
     optimiser: Optimiser
@@ -59,7 +59,7 @@ class RecedingHorizon(Controller):
 
     @property
     def planner(self) -> Planner:
-        """Optimiser, cost, and where its plans start."""
+        """Optimiser, cost, start of the plans, and the tracking law between plans."""
         return Planner(self.optimiser, self.cost, self.replanning.restarts, self.replanning.law)
 
     def with_optimiser(self, optimiser: Optimiser) -> RecedingHorizon:
@@ -67,10 +67,11 @@ class RecedingHorizon(Controller):
         return replace(self, optimiser=optimiser)
 
     def check(self, problem: Problem) -> None:
-        """Raise if the problem has no horizon or cost, or the optimiser cannot serve it.
+        """Raise if the problem has no horizon or cost, or the optimiser does not support it.
 
         Raises:
-            InvalidProblem: horizon or cost missing. NotSupported: bounds that the optimiser cannot keep.
+            InvalidProblem: horizon or cost missing.
+            NotSupported: the optimiser cannot keep the problem's bounds.
         """
         if problem.horizon is None:
             raise InvalidProblem("RecedingHorizon needs Problem(horizon=...), which this problem does not have")
@@ -79,7 +80,7 @@ class RecedingHorizon(Controller):
         self.optimiser.check(_optimal_control(self._planned(problem)))
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks reference, plan (every n-th cycle), nominal, deform, invert, limit, judge."""
+        """Return the blocks reference, plan (every n-th cycle), nominal, deform, invert, limit, judge, running, command shift."""
         problem = self._planned(problem)
         assert problem.horizon is not None
         plant = problem.plant
@@ -89,7 +90,7 @@ class RecedingHorizon(Controller):
         closing, delays = closing_blocks(problem, self.deformation, [scalar("_solve_status")])
         blocks = [reference_block(problem), _due_block(cycles), *before, plan, *after, *closing, *late]
         delays = [*delays, *remembered]
-        blocks.append(_correction_block(problem, self.deformation))
+        blocks.append(_command_shift_block(problem, self.deformation))
         delays.append(Delay(like(plant.input, "_command_shift_last"), "command_shift"))
         return blocks, delays
 
@@ -105,18 +106,18 @@ def _optimal_control(problem: Problem) -> OptimalControl:
 
 
 def _due_block(cycles: int) -> Block:
-    """Block that says whether a new plan is due in this cycle."""
+    """Block -> whether a new plan is due in this cycle."""
     count = scalar("plan_count")
 
     def step(s: Signals) -> dict[str, Expression]:
-        following = s.plan_count + 1
-        return {"_due": s.plan_count < 0.5, "plan_count_next": ca.if_else(following > cycles - 0.5, 0, following)}
+        count_next = s.plan_count + 1
+        return {"_due": s.plan_count < 0.5, "plan_count_next": ca.if_else(count_next > cycles - 0.5, 0, count_next)}
 
     return Block("due", Layout(), Layout((scalar("_due"),)), step, Layout((count,)))
 
 
 def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -> Block:
-    """Block (time, plan state, parameters, correction) -> (planned input, solve statistics)."""
+    """Block (time, plan state, parameters, shift and command of the last cycle) -> (planned input, solve statistics)."""
     assert problem.horizon is not None
     assert problem.cost is not None
     plant, ocp = problem.plant, _optimal_control(problem)
@@ -139,26 +140,32 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         lower, upper = ocp.input_lower - s._command_shift_last, ocp.input_upper - s._command_shift_last
         before = graph(memory.join({m: getattr(s, m) for m in memory.names}))
         remembered = expression(ca.if_else(graph(s.plan_begun) > 0.5, optimiser.shifted(ocp, before), before))
-        inputs, diagnostics, following = solve(first, data, lower, upper, remembered)
+        inputs, diagnostics, next_memory = solve(first, data, lower, upper, remembered)
         status = diagnostics[_SOLVE.index("status")]
         failed = status > int(Status.NOT_CONVERGED) + 0.5
         planned, judged = on_failure.choose(failed, inputs[:, 0], feedforward_of(s.time, s.parameters), status)
-        kept = {f"{m}_next": v for m, v in memory.split(following).items()}
-        return {"planned": planned, "solve": diagnostics, "_solve_status": judged, "plan_begun_next": 1, **kept}
+        remembered_next = {f"{m}_next": v for m, v in memory.split(next_memory).items()}
+        return {
+            "planned": planned,
+            "solve": diagnostics,
+            "_solve_status": judged,
+            "plan_begun_next": 1,
+            **remembered_next,
+        }
 
     own = memory + Layout((scalar("plan_begun"),))
     return Block("plan", Layout(reads), Layout(writes), step, own, opaque=True)
 
 
 def _first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> Layout:
-    """The optimiser's memory, starting with what it finds for the first horizon at the problem's start."""
+    """The optimiser's memory; it begins with the plan for the first horizon at the problem's start."""
     first = np.asarray(ocp.start(problem.start_state, np.zeros(ocp.input.size)).full()).ravel()
     data = np.asarray(data_of(0.0, problem.plant.approximate).full())
     return optimiser.memory(ocp).starting_at(optimiser.first_memory(ocp, first, data))
 
 
 def _feedforward(problem: Problem) -> ca.Function:
-    """Function (time, parameters) -> input that the model needs along the reference (zero when it has no inverse)."""
+    """Function (time, parameters) -> input that the model needs along the reference; zero for a model without inverse."""
     plant = problem.plant
     t, p = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
     state, response = problem.reference.function(plant)(t)
@@ -169,8 +176,8 @@ def _feedforward(problem: Problem) -> ca.Function:
     return ca.Function("fpirhc_feedforward", [t, p], [needed])
 
 
-def _correction_block(problem: Problem, deformation: Deformation) -> Block:
-    """Block that measures by how much the deformation changes the command; zero without adaptation."""
+def _command_shift_block(problem: Problem, deformation: Deformation) -> Block:
+    """Block (state, desired, command, parameters) -> the deformation's change of the command; zero without adaptation."""
     plant = problem.plant
     inverse = plant.inverse_function
     reads = Layout((plant.state, plant.response_signal("desired"), plant.input, plant.parameter))
@@ -180,7 +187,8 @@ def _correction_block(problem: Problem, deformation: Deformation) -> Block:
             return {"command_shift": 0 * s.command}
         return {"command_shift": s.command - inverse(s.state, s.desired, s.parameters)}
 
-    return Block("correction", reads, Layout((like(plant.input, "command_shift"),)), step, opaque=plant.inverse_opaque)
+    writes = Layout((like(plant.input, "command_shift"),))
+    return Block("command_shift", reads, writes, step, opaque=plant.inverse_opaque)
 
 
 EXAMPLES = (RecedingHorizon(FixedPoint(iterations=2, tolerance=1e-3), Sigmoid(gain=-0.5, scale=50.0)),)

@@ -1,15 +1,14 @@
-"""Where a horizon starts and what is tracked between two plans: three documented values.
+"""Where a horizon starts and what is tracked between two plans: three choices.
 
 `FromMeasurement` -- every plan starts from the measured state; the model's response to the plan's first input at the measured
-state is the nominal and desired response, q^Des = f(x, u_0). There is no tracking law: feedback comes from restarting. As
+state is the nominal and desired response, q^Des = f(x, u_0). There is no tracking law: feedback comes from planning anew. As
 the response error goes to zero the plant becomes the model for the optimiser, so the plan's stability carries over.
 
 `FromMeasurementTracked` -- every plan starts from the measured state; between plans the model propagates the planned motion and a
-tracking law keeps the plant on it. It corrects what happens within a stage, and forgets the tracking error at restarts.
+tracking law keeps the plant on it. The law corrects errors within a stage; the tracking error is forgotten at every new plan.
 
-`FromPlan` -- the plan starts from the model's own propagated state and never sees the measured one; a tracking law keeps
-the plant on the planned motion. The optimiser cannot be destabilised by the plant, but limits bind the model's motion,
-not the plant's.
+`FromPlan` -- the plan starts from the model's own propagated state and is independent of the measured one; a tracking law keeps
+the plant on the planned motion. The plant cannot destabilise the optimiser, but limits bind the model's motion, not the plant's.
 """
 
 from __future__ import annotations
@@ -47,25 +46,25 @@ class Replanning(ABC):
 
     @abstractmethod
     def parts(self, problem: Problem) -> Parts:
-        """Blocks before the plan, after the plan, and after the command is limited; what is remembered."""
+        """Return the blocks before the plan, after the plan, and after the command is limited; and what is remembered."""
 
 
 @dataclass(frozen=True)
 class FromMeasurement(Replanning):
-    """Plan from the measured state; the plan's first response is the desired one (no tracking law)."""
+    """Plan from the measured state; the plan's first response is the desired one, without a tracking law."""
 
     @property
     def restarts(self) -> bool:
-        """They do."""
+        """True: every plan starts from the measured state."""
         return True
 
     @property
     def law(self) -> None:
-        """None."""
+        """None: there is no tracking law."""
         return
 
     def parts(self, problem: Problem) -> Parts:
-        """Blocks of this choice."""
+        """Return the blocks plan_state before the plan and nominal after it."""
         plant = problem.plant
         start = _choose("plan_state", plant, lambda s: {"_plan_state": s.state}, ["_plan_state"])
         response = plant.controlled_response_function
@@ -81,13 +80,17 @@ class FromMeasurement(Replanning):
 
 @dataclass(frozen=True)
 class FromMeasurementTracked(Replanning):
-    """Plan from the measured state; between plans track the motion that the model propagates."""
+    """Plan from the measured state; between plans track the motion that the model propagates.
+
+    Args:
+        tracking: the law between plans.
+    """
 
     tracking: Tracking
 
     @property
     def restarts(self) -> bool:
-        """They do."""
+        """True: every plan starts from the measured state."""
         return True
 
     @property
@@ -96,7 +99,7 @@ class FromMeasurementTracked(Replanning):
         return self.tracking
 
     def parts(self, problem: Problem) -> Parts:
-        """Blocks of this choice."""
+        """Return the blocks of a tracked motion that begins at the measured state with every plan."""
 
         def start(s: Signals) -> dict[str, Expression]:
             fresh = ca.logic_or(s.warm_up < 0.5, s._due > 0.5)
@@ -107,13 +110,17 @@ class FromMeasurementTracked(Replanning):
 
 @dataclass(frozen=True)
 class FromPlan(Replanning):
-    """Plan from the model's own state and track the planned motion."""
+    """Plan from the model's own state and track the planned motion.
+
+    Args:
+        tracking: the law that keeps the plant on the planned motion.
+    """
 
     tracking: Tracking
 
     @property
     def restarts(self) -> bool:
-        """They do not."""
+        """False: plans start from the model's own state."""
         return False
 
     @property
@@ -122,7 +129,7 @@ class FromPlan(Replanning):
         return self.tracking
 
     def parts(self, problem: Problem) -> Parts:
-        """Blocks of this choice."""
+        """Return the blocks of a tracked motion that begins at the measured state once, in the first cycle."""
 
         def start(s: Signals) -> dict[str, Expression]:
             target = ca.if_else(s.warm_up < 0.5, s.state, s._target_before)
@@ -153,7 +160,7 @@ def _propagate(plant: Plant, period: float) -> Block:
     response, rate = plant.controlled_response_function, plant.derivative_function
 
     def step(s: Signals) -> dict[str, Expression]:
-        following = runge_kutta_4(lambda x: rate(x, s.planned, s.parameters), s._target, period)
-        return {"nominal": response(s._target, s.planned, s.parameters), "target": following}
+        target_next = runge_kutta_4(lambda x: rate(x, s.planned, s.parameters), s._target, period)
+        return {"nominal": response(s._target, s.planned, s.parameters), "target": target_next}
 
     return Block("propagate", reads, writes, step)

@@ -13,7 +13,7 @@ from fpirhc.tracking.base import Tracking
 
 
 def tracked_blocks(problem: Problem, tracking: Tracking, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
-    """Blocks reference, tracking, deform, invert, limit, judge, tracking update, and what they remember."""
+    """Return the blocks reference, tracking, deform, invert, limit, judge, running, tracking update, and what they remember."""
     plant = problem.plant
     closing, delays = closing_blocks(problem, deformation)
     response = plant.response_signal("_reference_response")

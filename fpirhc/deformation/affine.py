@@ -16,7 +16,7 @@ class Affine(Deformation):
 
     It is eq. (6) of Khan, Tar and Rudas with the kernel zeta(x) = x / 2 + D, whose fixed point x* = 2 D cancels D.
 
-    Parameters:
+    Args:
         gain: A_c, negative where the model has the sign of the plant's input effect right.
 
     Raises:
@@ -39,11 +39,11 @@ class Affine(Deformation):
         return request + 0.5 * self.gain * (response - desired), {}
 
     def effective_gain(self) -> float:
-        """A = -A_c / 2."""
+        """The effective gain a = -A_c / 2."""
         return -0.5 * self.gain
 
     def secant_gain(self) -> float:
-        """The effective gain: the map is linear."""
+        """The same as the effective gain, because the map is linear."""
         return self.effective_gain()
 
     def largest_step(self) -> float:

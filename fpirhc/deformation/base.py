@@ -1,7 +1,7 @@
 """The contract of deformations: how the next request follows from the last request and its response error.
 
-A controller wants a response d (desired) and asks its model for r (the request, or deformed response); the plant
-answers f(r). A deformation is the fixed-point iteration r+ = G(r, f, d) with G(r, d, d) = r: where the response is the
+A controller computes a desired response d and requests r, the deformed response, from its model; the realised response of the plant
+is f(r). A deformation is the fixed-point iteration r+ = G(r, f, d) with G(r, d, d) = r: where the response is the
 desired one the request stays, so at the fixed point the plant does what was desired although the model is wrong. To
 first order every map here is r+ = r - a (f - d) with one number a, its effective gain.
 """
@@ -22,11 +22,12 @@ from fpirhc.symbolic.layout import Expression, Layout
 
 @dataclass(frozen=True)
 class Mirror:
-    """What the model's response must pass to be seen as the plant's is: the believed way of a command to its response.
+    """The believed way of a command to its response: the model's response passes it, to be as late as the plant's.
 
-    Parameters:
-        cycles: dead time of the inputs, control cycles; a tuple for one per input. measurement: of the measurement, cycles.
-        lag: time constant of the actuators, s; a tuple for one per input.
+    Args:
+        cycles: dead time of the inputs, control cycles; a tuple gives one per input.
+        measurement: dead time of the measurement, cycles.
+        lag: time constant of the actuators, s; a tuple gives one per input.
     """
 
     cycles: float | tuple[float, ...] = 0.0
@@ -36,7 +37,12 @@ class Mirror:
 
 @dataclass(frozen=True)
 class Reach:
-    """The setting of a map, with its size, that requests and responses must stay far below, in units of the response."""
+    """The setting of a map that requests and responses must stay far below.
+
+    Args:
+        name: of the setting.
+        size: of the setting, in units of the response.
+    """
 
     name: str
     size: float
@@ -44,10 +50,11 @@ class Reach:
 
 @dataclass(frozen=True)
 class Pairing:
-    """With which earlier request a response is paired: that of `cycles` cycles before the last one.
+    """The earlier request that a response is paired with: the request of `cycles` cycles before the last one.
 
-    cycles: None where the map estimates it on line; of several dead times the longest.
-    uncertainty: half width of the mean over the requests around it, cycles.
+    Args:
+        cycles: the longest of several dead times; None where the map estimates it on line.
+        uncertainty: half width of the mean over the requests around it, cycles.
     """
 
     cycles: float | None
@@ -56,11 +63,14 @@ class Pairing:
 
 @dataclass(frozen=True)
 class Demand:
-    """How much the desired response of a controller changes, for maps that choose a setting of theirs by it.
+    """How much the desired response of a controller changes, for maps whose automatic settings depend on it.
 
-    change: largest change in one cycle, in units of the response. sudden: whether that is a jump once in a while, which one
-    step has to cover; otherwise it goes on from cycle to cycle, and the map needs room beyond it. recovery: step per cycle with
-    which the plain form comes back from the largest response error that is expected (`fpirhc.contraction.basin`).
+    Args:
+        change: largest change in one cycle, in units of the response.
+        sudden: whether the change is an occasional jump, which one step has to cover. Otherwise it goes on from cycle to cycle,
+            and the map needs room beyond it.
+        recovery: step per cycle with which the plain form comes back from the largest response error that is expected, in units
+            of the response (`fpirhc.contraction.basin`).
     """
 
     change: float
@@ -71,14 +81,13 @@ class Demand:
 class Deformation(ABC):
     """Contract: a map from (request, response, desired) to the next request, and facts about it.
 
-    Concrete maps are frozen dataclasses. What a map around another one does not say otherwise is the fact of the inner map.
+    Concrete maps are frozen dataclasses. A map around another one has the facts of the inner map unless it overrides them.
     `fpirhc.conformance.check_deformation` tests that a map keeps this contract.
     """
 
     gain_name: ClassVar[str] = "gain"  # the field that the effective gain is proportional to
-    passes_pair: ClassVar[bool] = (
-        False  # whether an inner map is given request, response and desired response as they are
-    )
+    # Whether an inner map is given request, response and desired response as they are.
+    passes_pair: ClassVar[bool] = False
 
     if TYPE_CHECKING:
 
@@ -104,21 +113,21 @@ class Deformation(ABC):
 
     @property
     def constant(self) -> bool:
-        """Whether the map keeps the gain and the pairing that it begins with.
+        """Whether gain and pairing stay as they are at the start of a run.
 
-        Unless a map says otherwise it does where it remembers nothing itself.
+        By default this is so for a map that remembers nothing of its own.
         """
         own = self.memory(("q",)).names
         return not own if self.inner is None else self.inner.constant and own == self.inner.memory(("q",)).names
 
     @property
     def reach(self) -> Reach | None:
-        """What bounds the requests for which the gains hold; None where nothing does."""
+        """The setting that bounds the requests for which the gains hold; None where the gains hold for all requests."""
         return None if self.inner is None else self.inner.reach
 
     @property
     def pairing(self) -> Pairing | None:
-        """Which earlier request a response is paired with; None: with the last one."""
+        """The earlier request that a response is paired with; None: the last one."""
         return None if self.inner is None else self.inner.pairing
 
     @property
@@ -128,7 +137,7 @@ class Deformation(ABC):
 
     @property
     def mirror(self) -> Mirror | None:
-        """How the model's response is seen that `step` is given as `request`; None: it is given the map's own last request."""
+        """The way of the model's response to `step`, which is given it as `request`; None: `step` is given the last request."""
         return None if self.inner is None else self.inner.mirror
 
     @property
@@ -143,7 +152,7 @@ class Deformation(ABC):
 
     @property
     def automatic(self) -> tuple[str, ...]:
-        """Names of settings that are still to be chosen, see `suited`."""
+        """Names of the settings that `suited` still has to choose."""
         return () if self.inner is None else self.inner.automatic
 
     def suited(self, demand: Demand) -> Self:
@@ -152,31 +161,35 @@ class Deformation(ABC):
 
     @property
     def slows_desired(self) -> bool:
-        """Whether a change of the desired response passes through the iteration, which is then a low-pass on it: the plain form."""
+        """Whether the form is the plain one, in which a change of the desired response passes through the iteration, a low-pass."""
         return True if self.inner is None else self.inner.slows_desired
 
     def settled(self, request: Expression, response: Expression) -> dict[str, Expression]:
-        """What the map remembers, by name, where `request` causes `response` and that is desired; its start where not named."""
+        """Return what the map remembers where `request` causes the desired `response`, by name; other signals keep their start."""
         return {} if self.inner is None else self.inner.settled(request, response)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """What the map remembers besides the pair (request, desired); nothing unless it says otherwise."""
+        """What the map remembers besides the pair (request, desired); by default nothing."""
         del elements
         return Layout()
 
     def shown(self) -> Mapping[str, str]:
-        """Signals to log: name -> the scalar of the memory that it shows."""
+        """Signals to log: name of the signal -> name of the scalar in the memory."""
         return {}
 
     @abstractmethod
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return the next request and what to remember.
+        """Return the next request and what to remember, by name of the memory's signals.
 
-        Parameters: `request` caused `response` (or is what the model answered, see `mirror`); `desired` is asked for now; all
-        are CasADi columns of the same size.
         Values and derivatives of any order are finite at response = desired.
+
+        Args:
+            request: the request that caused the response, a CasADi column; the model's response where there is a `mirror`.
+            response: the realised response, a column of the same size.
+            desired: the response that is desired now, a column of the same size.
+            memory: the signals of `memory`, by name.
         """
 
     @abstractmethod
@@ -189,7 +202,7 @@ class Deformation(ABC):
 
     @abstractmethod
     def largest_step(self) -> float:
-        """Bound of |r+ - r| in one cycle, in units of the response; infinite when there is none."""
+        """Bound of |r+ - r| in one cycle, in units of the response; infinite where the step has no bound."""
 
     @abstractmethod
     def with_effective_gain(self, gain: float) -> Self:
@@ -200,13 +213,14 @@ def with_inner(wrapper: Any, inner: object) -> Any:
     """Return a frozen dataclass with another value in the field that holds its `inner`.
 
     Raises:
-        NotSupported: no field does.
+        NotSupported: no field holds it.
     """
-    held = wrapper.inner
-    names = [f.name for f in fields(wrapper) if getattr(wrapper, f.name) is held] if is_dataclass(type(wrapper)) else []
-    if not names or held is None:
+    current = wrapper.inner
+    own = fields(wrapper) if is_dataclass(type(wrapper)) else ()
+    names = [f.name for f in own if getattr(wrapper, f.name) is current]
+    if not names or current is None:
         raise NotSupported(
-            f"{type(wrapper).__name__} has no field that holds its `inner`, so nothing else can be put there; override around()"
+            f"{type(wrapper).__name__} has no field that holds its `inner`, so the inner one cannot be replaced; override around()"
         )
     return replace(wrapper, **{names[0]: inner})
 
@@ -227,7 +241,7 @@ def require_numbers(owner: str, values: Mapping[str, float]) -> None:
     """Check that every value is a finite number other than zero.
 
     Raises:
-        InvalidValue: naming every value that is not.
+        InvalidValue: some value is zero or not finite; the message names every such value.
     """
     wrong = [f"{name}={value!r}" for name, value in values.items() if not _is_number(value) or value == 0]
     if wrong:

@@ -13,19 +13,19 @@ from fpirhc.symbolic.layout import Expression
 
 @dataclass(frozen=True)
 class Identity(Deformation):
-    """r+ = d: the model is trusted, whatever the plant answers.
+    """r+ = d: the request is the desired response, whatever the response of the plant.
 
-    It is the only map that does not iterate: its gains are zero and no response error is ever corrected.
+    It is the only map that does not iterate: its gains are zero, and it corrects no response error.
     """
 
     @property
     def adapts(self) -> bool:
-        """It does not."""
+        """False: the response does not change the request."""
         return False
 
     @property
     def slows_desired(self) -> bool:
-        """No: the request is the desired response."""
+        """False: the request is the desired response."""
         return False
 
     def step(
@@ -36,11 +36,11 @@ class Identity(Deformation):
         return desired, {}
 
     def effective_gain(self) -> float:
-        """Zero: the response is not looked at."""
+        """Zero: the response does not change the request."""
         return 0.0
 
     def secant_gain(self) -> float:
-        """Zero: the response is not looked at."""
+        """Zero: the response does not change the request."""
         return 0.0
 
     def largest_step(self) -> float:

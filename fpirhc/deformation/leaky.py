@@ -1,8 +1,8 @@
-"""Leaky pairing: how much leak a dead time needs that may be wrong by some cycles.
+"""Leaky pairing: how much leak is needed where the dead time may be wrong by some cycles.
 
     delta_k = p delta_{k-1} + (1 - p) G(delta_{k-1-d}),
 
-G being a map whose effective gain times the plant's gain is g. Where the dead time is really d', the deformation follows
+where G is a map whose effective gain times the plant's gain is g. Where the true dead time is d', the deformation follows
 
     1 - p / z = (1 - p) (z^-(d+1) - g z^-(d'+1)).
 
@@ -12,8 +12,8 @@ It is stable for every d and d' with |d' - d| <= m if
 
 Proof. On the circle z = e^{iw} the left side is at least what the right side must stay below: |1 - p / z|^2 = (1 - p)^2
 + 4 p sin^2(w / 2), and with n = d' - d the right side's bracket has |1 - g e^{-inw}|^2 = (1 - g)^2 + 4 g sin^2(n w / 2). Since
-|sin(n w / 2)| <= |n| |sin(w / 2)| and <= 1, both inequalities above make the left side the larger one for all w; then, by Rouche's
-theorem, the equation has as many roots outside the circle as 1 - p / z = 0, which is none.
+|sin(n w / 2)| <= |n| |sin(w / 2)| and <= 1, both inequalities above make the left side the larger one for all w. Then, by Rouche's
+theorem, the equation has as many roots outside the circle as 1 - p / z = 0, which has none there.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import math
 from fpirhc.deformation.queue import Cycles, every
 from fpirhc.errors import InvalidValue
 
-_BEYOND = 1.01, 1e-3  # share and amount by which a pole exceeds the bound, at which nothing is damped
+_BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped
 
 _LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists
 
@@ -33,23 +33,30 @@ def leaky_pole(product: float, uncertainty: float) -> float:
 
     p = (2 c + 1 - sqrt(4 c + 1)) / (2 c) with c = g (2 + g) m^2 / 4; 0 where the dead time is certain.
 
-    Parameters: `product` g, effective gain times the largest eigenvalue of the response Jacobian, in (0, 2); `uncertainty` m,
-    in cycles.
+    Args:
+        product: g, effective gain times the largest eigenvalue of the response Jacobian, in (0, 2).
+        uncertainty: m, in cycles.
 
     Raises:
-        InvalidValue: a product outside (0, 2), with which no pole is enough; a negative or infinite uncertainty.
+        InvalidValue: a product outside (0, 2), for which no pole is large enough; a negative or infinite uncertainty.
     """
     _check_product("leaky_pole", product)
     if not (math.isfinite(uncertainty) and uncertainty >= 0):
         raise InvalidValue(f"leaky_pole(uncertainty={uncertainty!r}): expected a number of cycles of at least 0")
     bound = product * (2 + product) * uncertainty**2 / 4
-    # The same as above, without cancellation at small bounds.
+    # The formula of the docstring, without cancellation at small bounds.
     root = math.sqrt(4 * bound + 1)
     return 2 * bound / (2 * bound + 1 + root)
 
 
 def leaky_margin(product: float, pole: float) -> float:
-    """Return by how many cycles the dead time may be wrong at least: 2 sqrt(p / (g (2 + g))) / (1 - p).
+    """Return the error of the dead time, in cycles, up to which the pairing is stable: 2 sqrt(p / (g (2 + g))) / (1 - p).
+
+    The bound is sufficient: the true margin may be larger.
+
+    Args:
+        product: g, effective gain times the largest eigenvalue of the response Jacobian, in (0, 2).
+        pole: p, in [0, 1).
 
     Raises:
         InvalidValue: a product outside (0, 2), a pole outside [0, 1).
@@ -65,10 +72,10 @@ def default_uncertainty(cycles: float) -> int:
 
 
 def default_pole(product: float, uncertainty: float) -> float:
-    """The theorem's pole and a little more, below one; 0 where the dead time is certain."""
+    """The pole of the theorem and a little more, below one; 0 where the dead time is certain."""
     least = leaky_pole(product, uncertainty)
-    share, amount = _BEYOND
-    return min(share * least + amount, 0.5 * (1 + least)) if uncertainty else 0.0
+    factor, amount = _BEYOND
+    return min(factor * least + amount, 0.5 * (1 + least)) if uncertainty else 0.0
 
 
 def check_pole(owner: str, pole: float) -> None:

@@ -1,21 +1,22 @@
-"""The model-referenced form: the model's own response to the command that acted stands beside the measured one.
+"""The model-referenced form: the iteration runs on the difference between the measured response and the model's.
 
-    asked     = f^(x_k, u_{k-1}) - delta_{k-1}
-    delta_k   = G(asked + delta_{k-1}, f_k, asked) - asked
-    request_k = desired_k + delta_k
+    undeformed = f^(x_k, u_{k-1}) - delta_{k-1}
+    delta_k    = G(undeformed + delta_{k-1}, f_k, undeformed) - undeformed
+    request_k  = desired_k + delta_k
 
-f^ is the model's response, f_k the measured one, G any map. So the iteration runs on f - f^, what the model is wrong by:
+f^ is the model's response to the command that acted, f_k the measured one, G any map. So the iteration runs on f - f^, the error of
+the model:
 
     an exact model leaves delta at zero, whatever the task, the period, or how far the plant drifts within a cycle;
-    a clipped command needs no anti-windup, because f^ is what the model answers to the clipped command;
+    a clipped command needs no anti-windup, because f^ is the model's response to the clipped command;
     with the affine map it is the additive disturbance estimate w+ = w + a (f - f^ - w), delta = -w; with a = 1 it is incremental
     dynamic inversion, u_k = u_{k-1} + (d_k - f_k) / beta^.
 
-On f = lambda r the factor per cycle is 1 - a lambda, as in the other forms. They differ in what drives the error: the change of
-f - f^ here, where the plain form has that of f; but a change of the desired response passes with the model's wrong gain.
+On f = lambda r the factor per cycle is 1 - a lambda, as in the other forms. The forms differ in what drives the error: here the
+change of f - f^, in the plain form the change of f. But a change of the desired response passes with the model's wrong gain.
 
-f^ is seen the way f is: late by the same dead time, through the same estimator, through the actuator's lag (`Mirror`). With a dead
-time delta is leaky and paired with its own response, as in `Increment`.
+f^ reaches the iteration the way f does: after the same dead time, through the same estimator and the lag of the actuators
+(`Mirror`). With a dead time delta is leaky and paired with its own response, as in `Increment`.
 """
 
 from __future__ import annotations
@@ -40,14 +41,15 @@ _FINITE = 1e300
 class ModelReferenced(Wrapper):
     """The map on the difference between the plant's response and the model's.
 
-    Parameters:
+    Args:
         map: any deformation that iterates; wrappers that change the gain or the error go inside: ModelReferenced(Filtered(map)).
         cycles: believed dead time d of the inputs, in control cycles beyond the one that every loop has; a tuple gives every
             input its own, and then input k belongs to controlled coordinate k.
         measurement: believed dead time of the measurement, in cycles.
-        lag: believed time constant of the actuators, tau u_act' = u - u_act, s; a tuple for one per input. Too long a lag is nearly
-            harmless, too short a one is not, none is worst.
-        uncertainty, pole: of the leak under a dead time, as in `Increment`; both count for the sum of the dead times.
+        lag: believed time constant of the actuators, tau u_act' = u - u_act, s; a tuple gives one per input. Too long a lag is
+            nearly harmless, too short a lag is not, and no lag is worst.
+        uncertainty: by how many cycles the sum of the dead times may be wrong; None: the default of `Increment`.
+        pole: of the leak, in [0, 1); None: from the uncertainty, as in `Increment`.
 
     Raises:
         InvalidValue: a dead time, lag, uncertainty or pole out of range.
@@ -75,28 +77,28 @@ class ModelReferenced(Wrapper):
 
     @property
     def mirror(self) -> Mirror:
-        """What stands between a command and the response that it causes."""
+        """The believed dead times and lag between a command and its response."""
         return Mirror(self.cycles, self.measurement, self.lag)
 
     @property
     def constant(self) -> bool:
-        """What it remembers are deformations; gain and pairing stay."""
+        """As the map: the wrapper remembers deformations, which change neither gain nor pairing."""
         return self.map.constant
 
     @property
     def slows_desired(self) -> bool:
-        """No: the desired response is added after the map."""
+        """False: the desired response is added after the map."""
         return False
 
     @property
     def pairing(self) -> Pairing | None:
-        """Of several dead times the longest, that of the measurement included; None without any."""
+        """The longest dead time, that of the measurement included; None without dead time."""
         longest = max(every(self._delays))
         return Pairing(longest) if longest else None
 
     @property
     def channels(self) -> int | None:
-        """One for each dead time, where there are several."""
+        """The number of dead times where there are several."""
         return len(self.cycles) if isinstance(self.cycles, tuple) else self.map.channels
 
     @property
@@ -110,24 +112,24 @@ class ModelReferenced(Wrapper):
         return Layout((Signal("own_deformation", past),)) + self.map.memory(elements)
 
     def settled(self, request: Expression, response: Expression) -> dict[str, Expression]:
-        """The deformation is what the request exceeds the response by."""
+        """Return what is remembered at a fixed point: every deformation is request minus response."""
         past = ca.repmat(request - response, self._queue.length, 1)
         return {"own_deformation": past, **self.map.settled(request, response)}
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return the next request; `request` is the model's response, seen through the mirror."""
+        """Return the next request; `request` is the model's response, behind the mirror."""
         size, queue, past = request.numel(), self._queue, memory["own_deformation"]
         before, pole = past[:size], self.leak
-        asked = request - queue.delayed(past, size)
-        wanted, following = self.map.step(request, response, asked, of_map(self, memory, size))
-        deformation = wanted - asked
+        undeformed = request - queue.delayed(past, size)
+        next_request, next_memory = self.map.step(request, response, undeformed, of_map(self, memory, size))
+        deformation = next_request - undeformed
         if pole:
             deformation = pole * before + (1 - pole) * deformation
-        # A response that is not a number must not be remembered.
+        # A deformation that is not a number must not be remembered.
         remembered = ca.if_else(ca.mmin(ca.fabs(deformation) <= _FINITE), deformation, before)
-        return desired + deformation, {"own_deformation": queue.pushed(past, remembered), **following}
+        return desired + deformation, {"own_deformation": queue.pushed(past, remembered), **next_memory}
 
     @property
     def _delays(self) -> Cycles:
@@ -154,7 +156,7 @@ def require_own_requests(owner: str, deformation: Deformation) -> None:
 
 
 def form_inside(deformation: Deformation) -> Deformation | None:
-    """The wrapper, if any, that would change what a model-referenced form inside it compares."""
+    """Return the wrapper that changes what a model-referenced form inside it compares; None where there is no such wrapper."""
     while deformation.inner is not None:
         if deformation.inner.mirror is not None and not deformation.passes_pair:
             return deformation

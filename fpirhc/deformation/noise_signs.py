@@ -1,11 +1,11 @@
-"""What white measurement noise makes of the signs of successive response errors.
+"""The mean sign of the product of successive response errors under white measurement noise.
 
 On f = lambda r the iteration r+ = r - a (h + n) with white noise n of m independent components gives errors whose correlation from
 one cycle to the next is rho = -a lambda / 2. The angle between two such vectors is distributed as if they were drawn on a sphere,
 
     E sgn(h_k' h_{k-1}) = 2 I_{(1+rho)/2}(m/2, m/2) - 1 = int_0^rho (1 - x^2)^(m/2-1) dx / int_0^1 (1 - x^2)^(m/2-1) dx,
 
-I the regularised incomplete beta function: (2/pi) asin(rho) for one component, rho itself for two.
+where I is the regularised incomplete beta function: (2/pi) asin(rho) for one component, rho itself for two.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from fpirhc.errors import InvalidValue
 def expected_sign(product: float, components: int) -> float:
     """Return the mean of sgn(h_k' h_{k-1}) in white noise.
 
-    Parameters: `product` g = a lambda of gain and eigenvalue, 0 to 2; `components` m of the response.
+    Args:
+        product: g = a lambda, effective gain times eigenvalue, 0 to 2.
+        components: m of the response.
 
     Raises:
         InvalidValue: a product outside [0, 2], fewer than one component.
@@ -28,7 +30,7 @@ def expected_sign(product: float, components: int) -> float:
             f"expected_sign(product={product!r}, components={components!r}): expected a product from 0 to 2, at least one component"
         )
     correlation = -0.5 * product
-    # By parts: the mean of m + 2 components is that of m and one more term.
+    # Integration by parts: the mean for m + 2 components is the mean for m plus one term.
     size = 1 if components % 2 else 2
     mean = 2 / math.pi * math.asin(correlation) if size == 1 else correlation
     whole = math.pi / 2 if size == 1 else 1.0  # int_0^1 (1 - x^2)^(m/2-1) dx

@@ -1,4 +1,4 @@
-"""Past values of a vector, each entry with a delay of its own: what pairing remembers."""
+"""Past values of a vector, each entry with a delay of its own; pairing remembers them."""
 
 from __future__ import annotations
 
@@ -11,19 +11,23 @@ from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression
 
-MOST = 1000  # cycles of dead time: what is remembered is static
+MOST = 1000  # cycles of dead time; the memory has a fixed size
 Cycles = float | tuple[float, ...]  # one dead time for all channels, or one for each
 
 
 @dataclass(frozen=True)
 class Queue:
-    """Delays in cycles, one for all entries or one each; a fraction is interpolated between two cycles.
+    """Delays of the entries of a vector; a fraction of a cycle is interpolated between two cycles.
 
-    The column that it works on holds the newest value of every entry first, then those of the cycle before, and so on.
+    The column of past values holds the newest value of every entry first, then the values of the cycle before, and so on.
+
+    Args:
+        cycles: delay of all entries, or a tuple with one per entry.
+        width: of the triangular mean around the delay, cycles to either side.
     """
 
     cycles: Cycles
-    width: int = 0  # of the triangular mean around the delay, cycles to either side
+    width: int = 0
 
     @property
     def length(self) -> int:
@@ -31,13 +35,13 @@ class Queue:
         return max(max(self._shares(c)) for c in every(self.cycles)) + 1
 
     def pushed(self, queue: Expression, newest: Expression) -> Expression:
-        """The column one cycle later."""
+        """Return the column one cycle later."""
         # Not an empty slice: CasADi's [:0] of one entry is that entry.
         remembered = newest.numel() * (self.length - 1)
         return ca.vertcat(newest, queue[:remembered]) if remembered else newest
 
     def delayed(self, queue: Expression, size: int) -> Expression:
-        """What was pushed `cycles` ago, entry by entry."""
+        """Return what was pushed `cycles` ago, entry by entry; `size` is the number of entries."""
         if not isinstance(self.cycles, tuple):
             shares = self._shares(self.cycles)
             return total(share * queue[size * k : size * (k + 1)] for k, share in shares.items())
@@ -65,7 +69,7 @@ def every(cycles: Cycles) -> tuple[float, ...]:
 
 
 def check_cycles(owner: str, cycles: Cycles, name: str = "cycles") -> None:
-    """Raise InvalidValue for a dead time that is negative, not finite, or beyond 1000 cycles, and for no dead time at all."""
+    """Raise InvalidValue for a dead time that is negative, not finite, or beyond 1000 cycles, and for an empty tuple."""
     values = every(cycles)
     if not values or not all(isinstance(c, int | float) and math.isfinite(c) and 0 <= c <= MOST for c in values):
         raise InvalidValue(
@@ -75,7 +79,7 @@ def check_cycles(owner: str, cycles: Cycles, name: str = "cycles") -> None:
 
 
 def check_uncertainty(owner: str, uncertainty: int, cycles: Cycles) -> None:
-    """Raise InvalidValue for an uncertainty that is no whole number or reaches beyond the shortest queue."""
+    """Raise InvalidValue for an uncertainty that is no whole number or exceeds the shortest dead time, rounded up."""
     shortest = min(every(cycles))
     if not (
         isinstance(uncertainty, int) and not isinstance(uncertainty, bool) and 0 <= uncertainty <= math.ceil(shortest)

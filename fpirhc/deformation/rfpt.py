@@ -18,9 +18,10 @@ class RFPT(Deformation):
     """r+ = (K_c + r) [1 + B_c tanh(A_c (f - d))] - K_c, for each coordinate by itself.
 
     The gains hold for |K_c| >> |r|; at a request r they are larger by the factor 1 + r / K_c. A second, false fixed
-    point r = -K_c repels the iteration when B_c tanh(A_c (f(-K_c) - d)) > 0. One step is at most |K_c + r|.
+    point r = -K_c repels the iteration when B_c tanh(A_c (f(-K_c) - d)) > 0. One step is at most |K_c + r|, and the effective
+    gain is a = -K_c B_c A_c.
 
-    Parameters:
+    Args:
         offset: K_c, 10 to 100 times the largest |request|, in units of the response.
         sign: B_c, -1 or 1; the opposite of the sign of K_c df/dr.
         gain: A_c, in reciprocal units of the response; a / |K_c| with a = 0.2 ... 0.6 / max df/dr.
@@ -52,17 +53,17 @@ class RFPT(Deformation):
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return r + (K_c + r) B_c tanh(A_c (f - d)); adding and taking away K_c would cost digits."""
+        """Return r + (K_c + r) B_c tanh(A_c (f - d)), the same without the digits that adding and subtracting K_c would cost."""
         del memory
-        bent = self.sign * ca.tanh(self.gain * (response - desired))
-        return request + (self.offset + request) * bent, {}
+        saturated = self.sign * ca.tanh(self.gain * (response - desired))
+        return request + (self.offset + request) * saturated, {}
 
     def effective_gain(self) -> float:
-        """A = -K_c B_c A_c."""
+        """The effective gain a = -K_c B_c A_c."""
         return -self.offset * self.sign * self.gain
 
     def secant_gain(self) -> float:
-        """The effective gain: tanh is steepest at zero."""
+        """The same as the effective gain, because tanh is steepest at zero."""
         return self.effective_gain()
 
     def largest_step(self) -> float:

@@ -21,7 +21,7 @@ class RFPTVector(Deformation):
 
     The gains hold for |K_c| >> |r|. One step is at most |r| + |K_c|.
 
-    Parameters:
+    Args:
         offset: K_c, 10 to 100 times the largest |request|, in units of the response.
         sign: B_c, -1 or 1; the opposite of the sign of K_c times the eigenvalues of df/dr.
         gain: A_c, in reciprocal units of the response; a / |K_c| with a = 0.2 ... 0.6 / max eigenvalue of df/dr.
@@ -53,21 +53,21 @@ class RFPTVector(Deformation):
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return r + B_c [tanh(A_c s) / s] (n r + K_c h), where s is |h| never zero and n is |h| zero at h = 0."""
+        """Return r + B_c [tanh(A_c s) / s] (n r + K_c h); s is |h| rounded off above zero, n is |h| and zero at h = 0."""
         del memory
         error = response - desired
         floor = _FLOOR / abs(self.gain)
         size = smooth_norm(error, floor)
         vanishing = ca.sumsqr(error) / (size + floor)
-        bent = self.sign * ca.tanh(self.gain * size) / size
-        return request + bent * (vanishing * request + self.offset * error), {}
+        slope = self.sign * ca.tanh(self.gain * size) / size
+        return request + slope * (vanishing * request + self.offset * error), {}
 
     def effective_gain(self) -> float:
-        """A = -K_c B_c A_c."""
+        """The effective gain a = -K_c B_c A_c."""
         return -self.offset * self.sign * self.gain
 
     def secant_gain(self) -> float:
-        """The effective gain: tanh is steepest at zero."""
+        """The same as the effective gain, because tanh is steepest at zero."""
         return self.effective_gain()
 
     def largest_step(self) -> float:

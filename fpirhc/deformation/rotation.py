@@ -36,8 +36,8 @@ class Rotation(Deformation):
     r+ = r - fraction (f - d) up to terms of third order in |vectors| / R. Where a vector is longer than radius / 2, R
     grows to twice its length, so the map is defined everywhere and its steps are bounded by the secant gain.
 
-    Parameters:
-        fraction: of the angle, dimensionless; positive where the model has the sign of the input effect right, and
+    Args:
+        fraction: share of the angle, dimensionless; positive where the model has the sign of the input effect right, and
             usually at most 1.
         radius: R, the common norm; several times the largest request, response and desired response, in their units.
 
@@ -46,7 +46,7 @@ class Rotation(Deformation):
 
     References:
         B. Csanádi, P. Galambos, J. K. Tar, Gy. Györök, A. Serester, A novel, abstract rotation-based fixed point
-        transformation in adaptive control, IEEE SMC 2018 (in the spirit of).
+        transformation in adaptive control, IEEE SMC 2018. The map here is in its spirit.
     """
 
     gain_name: ClassVar[str] = "fraction"
@@ -76,16 +76,16 @@ class Rotation(Deformation):
         radius = ca.sqrt(radius2)
         unit = (response / radius, heights[1] / radius)
         error = response - desired
-        # the difference of the two heights, written so that it keeps its digits near zero error
+        # The difference of the two heights in a form that keeps its digits near zero error.
         drop = -ca.dot(error, response + desired) / (heights[1] + heights[2])
         chord = (error / radius, drop / radius)
         first = _turned(unit, chord, (request, heights[0]))
         second = _turned(unit, chord, first)
-        along, bending = self._coefficients(ca.sumsqr(chord[0]) + chord[1] ** 2)
-        return request + along * first[0] + bending * second[0], {}
+        along, across = self._coefficients(ca.sumsqr(chord[0]) + chord[1] ** 2)
+        return request + along * first[0] + across * second[0], {}
 
     def effective_gain(self) -> float:
-        """The fraction."""
+        """The effective gain a is the fraction."""
         return float(self.fraction)
 
     def secant_gain(self) -> float:

@@ -32,7 +32,7 @@ class Sigmoid(Deformation):
     Small errors shrink exponentially, large ones by at most `largest_step()` per cycle, so S must cover the largest
     change of the desired response in one cycle; apart from that S does not matter.
 
-    Parameters:
+    Args:
         gain: A_c, dimensionless; negative where the model has the sign of the plant's input effect right.
         shift: D, dimensionless, |D| <= 5. Give it the sign opposite to A_c, or the largest step shrinks (for |D| = 0.3
             from 0.81 S to 0.29 S).
@@ -67,13 +67,14 @@ class Sigmoid(Deformation):
 
     @property
     def automatic(self) -> tuple[str, ...]:
-        """The scale, unless it is given."""
+        """The scale, unless the user has set it."""
         return ("scale",) if self.scale is None else ()
 
     def suited(self, demand: Demand) -> Self:
-        """Return the map with a scale S whose largest step covers a jump, or of twice a change that goes on; at least 1.
+        """Return the map with a scale S of at least 1 that serves the demand; a scale that the user has set stays.
 
-        The largest step also covers the recovery that is demanded.
+        The largest step covers a sudden change. For a change that goes on from cycle to cycle S is twice the change. In both cases
+        the largest step covers the recovery.
         """
         if self.scale is not None:
             return self
@@ -83,7 +84,7 @@ class Sigmoid(Deformation):
 
     @cached_property
     def _tanh_fixed_point(self) -> float:
-        """Y = tanh(x*), the root of 2 t y^2 + y = t with t = tanh(D), in the form that has no 0/0 at D = 0."""
+        """The root y = tanh(x*) of 2 t y^2 + y = t with t = tanh(D), in the form that has no 0/0 at D = 0."""
         t = math.tanh(self.shift)
         return 2 * t / (1 + math.sqrt(1 + 8 * t**2))
 
@@ -128,21 +129,21 @@ class Sigmoid(Deformation):
         scale = self._chosen_scale()
         error = response - desired
         size = smooth_norm(error, _FLOOR * scale)
-        bent = ca.tanh((self.gain / scale) * size)
+        saturated = ca.tanh((self.gain / scale) * size)
         y = self._tanh_fixed_point
-        growth = ca.atanh(self.slope * bent / (1 + 1.5 * y / (1 - y**2) * bent))
+        growth = ca.atanh(self.slope * saturated / (1 + 1.5 * y / (1 - y**2) * saturated))
         return request + (scale * growth / size) * error, {}
 
     def effective_gain(self) -> float:
-        """A = -A_c zeta'(x*)."""
+        """The effective gain a = -A_c zeta'(x*)."""
         return -self.gain * self.slope
 
     def secant_gain(self) -> float:
-        """-A_c times the steepest secant of zeta at x*."""
+        """The secant gain: -A_c times the steepest secant of zeta at x*."""
         return -self.gain * self.steepest_secant
 
     def largest_step(self) -> float:
-        """S (atanh(1/2) + x*) for A_c < 0 and S (atanh(1/2) - x*) for A_c > 0.
+        """The largest step: S (atanh(1/2) + x*) for A_c < 0 and S (atanh(1/2) - x*) for A_c > 0, with D > 0.
 
         Raises:
             InvalidValue: the scale is still to be chosen.

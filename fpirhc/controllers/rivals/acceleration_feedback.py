@@ -7,12 +7,14 @@ f = J r + c with constant eigenvalues of J,
     error left by a constant residual w = c - (1 - J) d:  h = w / (1 + kappa J),
     stable for  kappa lambda_max(J) < (1 + p) / (1 - p).
 
-So without a filter the error can at most be halved, and with one it is divided by as much as the filter is slow: a
-proportional law on the response, where a deformation is a summing one. Nothing is remembered but the filter.
+So without a filter the error can at most be halved; a filter lowers it further, the more the slower it is. The law is proportional
+in the response, whereas a deformation sums. It remembers only the state of the filter.
 
-References: J. Studenny, P. R. Bélanger, Robot manipulator control by acceleration feedback, IEEE CDC 1984. B. de Jager,
-Acceleration assisted tracking control, IEEE Control Systems 14(5), 1994. In their spirit: there K and the filter are designed
-in continuous time.
+It is in the spirit of the references, which design K and the filter in continuous time.
+
+References:
+    J. Studenny, P. R. Bélanger, Robot manipulator control by acceleration feedback, IEEE CDC 1984.
+    B. de Jager, Acceleration assisted tracking control, IEEE Control Systems 14(5), 1994.
 """
 
 from __future__ import annotations
@@ -38,10 +40,10 @@ from fpirhc.tracking.base import Tracking
 class AccelerationFeedback(Controller):
     """Inverse dynamics of q^Des + kappa (q^Des - q^(n)), with the measured response q^(n).
 
-    Parameters:
+    Args:
         tracking: the law that gives the desired response.
         gain: kappa, dimensionless.
-        time_constant: of the low-pass on the response error, s; 0 is none.
+        time_constant: of the low-pass on the response error, s; 0: no low-pass.
 
     Raises:
         InvalidValue: a gain that is not positive, or a negative time constant.
@@ -61,19 +63,19 @@ class AccelerationFeedback(Controller):
 
     @property
     def deformation(self) -> Deformation:
-        """None: the request is not iterated."""
+        """Identity(): no request is iterated."""
         return Identity()
 
     def pole(self, period: float) -> float:
-        """Pole p of the low-pass, in control cycles of that period, s."""
+        """Return the pole p of the low-pass for control cycles of that period, s."""
         return math.exp(-period / self.time_constant) if self.time_constant > 0 else 0.0
 
     def largest_gain(self, period: float) -> float:
-        """Stability limit of kappa lambda_max(J), (1 + p) / (1 - p)."""
+        """Return the stability limit (1 + p) / (1 - p) of kappa lambda_max(J) for control cycles of that period, s."""
         return (1 + self.pole(period)) / (1 - self.pole(period))
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks reference, tracking, feedback, invert, limit, judge, tracking update."""
+        """Return the blocks reference, tracking, feedback, invert, limit, judge, running, tracking update."""
         plant = problem.plant
         closing, delays = commanding_blocks(problem)
         blocks = [
@@ -89,14 +91,14 @@ class AccelerationFeedback(Controller):
         return blocks, [*delays, *self.tracking.delays(plant)]
 
     def _feedback_block(self, problem: Problem) -> Block:
-        """Block (desired, realised) -> request; without a response yet it passes the desired one."""
-        plant, pole, blind = problem.plant, self.pole(problem.period), problem.warm_up_cycles
+        """Block (desired, realised) -> request; before the first response the request is the desired response."""
+        plant, pole, warm_up_cycles = problem.plant, self.pole(problem.period), problem.warm_up_cycles
         memory = Layout((plant.response_signal("filtered_error"),))
 
         def step(s: Signals) -> dict[str, Expression]:
             error = pole * s.filtered_error + (1 - pole) * (s.realised - s.desired)
             # A measurement that is not finite must not stay in the filter.
-            running = s.warm_up > blind - 0.5
+            running = s.warm_up > warm_up_cycles - 0.5
             usable = ca.logic_and(running, ca.mmin(ca.fabs(error) <= FINITE))
             request = s.desired - self.gain * ca.if_else(running, error, 0)
             return {"_deformed_unclipped": request, "filtered_error_next": ca.if_else(usable, error, s.filtered_error)}

@@ -26,24 +26,23 @@ from fpirhc.tracking.exponential import Exponential
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveInverseDynamics(Controller):
-    """u = Y(q, q', r) p_hat + Q0 with r the desired response of the tracking law, or what a deformation makes of it.
+    """u = Y(q, q', r) p_hat + Q0 with r the desired response of the tracking law, deformed where there is a deformation.
 
     With x = (e_int, e, e') of every coordinate the errors obey x' = A x + B M_hat^-1 Y(q, q', q'') (p - p_hat), and with
     A^T P + P A = -Q_L the Lyapunov function x^T P x + (p - p_hat)^T Gamma^-1 (p - p_hat) falls under p_hat' = Gamma G^T w,
-    G = M_hat^-1 Y and w = B^T P x. Q_L is diagonal, (rate^4, rate^2, 1), in units of e'. The measured response is needed, and
-    M_hat^-1, so the bounds must keep M_hat positive definite. A deformation keeps the errors small whatever p_hat is; the Lyapunov
-    rule then has little to learn from, a Projection as much as without.
+    G = M_hat^-1 Y and w = B^T P x. Q_L is diagonal, (rate^4, rate^2, 1), in units of e'. The rule needs the measured response and
+    M_hat^-1, so the bounds must keep M_hat positive definite. A deformation keeps the errors small whatever p_hat is. Then the
+    Lyapunov rule learns slowly, because it learns from these errors; a Projection learns as fast as without a deformation.
 
-    Parameters:
+    Args:
         tracking: the law that gives the desired response.
-        rule: how the estimate moves: LyapunovRule or Projection.
-        bounds: parameter or combination -> (lower, upper); these are learned, from their approximate values on.
+        rule: moves the estimate: LyapunovRule or Projection.
+        bounds: parameter or combination -> (lower, upper); these are learned, beginning at their approximate values.
         combinations: expressions of parameters that enter linearly as a whole, by name.
         deformation: the fixed-point map between desired response and request.
 
-    Raises:
-        When the loop is built: NotSupported where the plant is not fully actuated mechanics or has dead time; InvalidValue where
-        parameters enter nonlinearly or the bounds do not keep the mass matrix positive definite.
+    `check` raises NotSupported where the plant is not fully actuated mechanics or has dead time, and InvalidValue where
+    parameters enter nonlinearly or the bounds do not keep the mass matrix positive definite.
 
     References:
         J. J. Craig, P. Hsu, S. S. Sastry, Adaptive control of mechanical manipulators, Int. J. Robotics Research 6(2), 1987.
@@ -57,15 +56,15 @@ class AdaptiveInverseDynamics(Controller):
 
     @property
     def learns(self) -> bool:
-        """It does."""
+        """True: the parameters of the model change during a run."""
         return True
 
     def check(self, problem: Problem) -> None:
-        """Raise if plant, bounds or rule do not fit (see Learning.check)."""
+        """Raise if plant, bounds or rule do not fit, as `Learning.check` does."""
         self._learning.check(problem, inverts=True, reads_response=True)
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks reference, tracking, learn, deform, invert, limit, judge, tracking update."""
+        """Return the blocks reference, tracking, learn, deform, invert, limit, judge, running, tracking update."""
         plant, regressor = problem.plant, self._learning.regressor(problem)
         closing, delays = closing_blocks(replace(problem, plant=regressor.believed), self.deformation)
         believed = like(regressor.believed.parameter, "_believed")
@@ -97,11 +96,11 @@ class AdaptiveInverseDynamics(Controller):
             along = [sum(w * e for w, e in zip(weights, chain, strict=True)) for chain in chains]
             return matrix, ca.vertcat(*along)
 
-        given = (like(plant.state, "_target"), integral_signal(plant, "_integral_used"))
-        return learning.block(problem, given, gradient)
+        reads = (like(plant.state, "_target"), integral_signal(plant, "_integral_used"))
+        return learning.block(problem, reads, gradient)
 
     def lyapunov_row(self) -> np.ndarray:
-        """B^T P: weights of (e_int, e, e'), or of (e, e') without the integral, in w."""
+        """Return B^T P: the weights of (e_int, e, e'), or of (e, e') without the integral, in w."""
         gains = self.tracking.gains(2)
         size = len(gains)
         companion = np.vstack([np.eye(size)[1:], -np.array(gains)])

@@ -4,12 +4,13 @@ With e = y - q, y the reference model's motion, and rates k_1 ... k_n the nested
 
     z_1 = e,    z_{i+1} = z_i' + k_i z_i + z_{i-1}   (z_0 = 0),    and    z_n' = -k_n z_n - z_{n-1}
 
-gives q^(n),Des. Then V = (z_1^2 + ... + z_n^2) / 2 has V' = -sum k_i z_i^2 - z_n h: it falls for a realised response without
-error, and the deformation keeps the response error h small, where the textbook adapts parameters by a Lyapunov function.
-(Every z is counted in the unit of the coordinate, time in seconds; so z_{i-1} stands with a factor of 1 1/s^2.)
+gives q^(n),Des. Then V = (z_1^2 + ... + z_n^2) / 2 has V' = -sum k_i z_i^2 - z_n h: it falls where the response error h is zero.
+The deformation keeps h small, where the textbook adapts parameters by a Lyapunov function. The fixed-point iteration in place of
+the adaptation is in the spirit of the group of J. K. Tar. (Every z is in the unit of the coordinate and time is in seconds, so
+z_{i-1} has the factor 1 1/s^2.)
 
-References: M. Krstić, I. Kanellakopoulos, P. Kokotović, Nonlinear and Adaptive Control Design, Wiley 1995, ch. 2 (nested
-errors). With a fixed-point iteration in place of the adaptation it is in the spirit of the group of J. K. Tar.
+References:
+    M. Krstić, I. Kanellakopoulos, P. Kokotović, Nonlinear and Adaptive Control Design, Wiley 1995, ch. 2 (nested errors).
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from fpirhc.tracking.error import error_chains
 class BacksteppingMRAC(Controller):
     """A reference model followed by nested error variables.
 
-    Parameters:
+    Args:
         model_rate: rate of the reference model, 1/s.
         rates: k_1 ... k_n, 1/s, one per derivative below the relative order n, the same for all controlled coordinates.
         deformation: the fixed-point map between desired response and request; Identity() is no adaptation.
@@ -72,7 +73,7 @@ class BacksteppingMRAC(Controller):
         mistakes.raise_if_any()
 
     def nested(self) -> np.ndarray:
-        """Nested errors as sums over (e, e', ..., e^(n)), one per row; the last row is what is made zero."""
+        """Return the nested errors as sums over (e, e', ..., e^(n)), one per row; the law makes the last row zero."""
         size = len(self.rates)
         rows = np.zeros((size + 1, size + 1))
         rows[0, 0] = 1.0
@@ -82,14 +83,14 @@ class BacksteppingMRAC(Controller):
         return rows
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks reference, reference model, nested errors, deform, invert, limit, judge."""
+        """Return the blocks reference, reference model, nested errors, deform, invert, limit, judge, running."""
         plant = problem.plant
         closing, delays = closing_blocks(problem, self.deformation)
         model = model_block(plant, self.model_rate, problem.period)
         return [reference_block(problem), model, self._nested_block(plant), *closing], delays
 
     def _nested_block(self, plant: Plant) -> Block:
-        """Block (state, model, its response) -> (nested errors, desired)."""
+        """Block (state, model, response of the model) -> (nested errors, desired)."""
         rows = self.nested()
         names = tuple(f"{c}_{i + 1}" for c in plant.controlled_names for i in range(len(self.rates)))
 

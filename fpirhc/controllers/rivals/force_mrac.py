@@ -1,17 +1,18 @@
 """Model reference adaptive control by fixed-point iteration: the command is deformed against a reference model.
 
-The outer loop believes that it commands the reference model q^(n) = f_r(x, Q), whose inverse is Q = M_r q^(n) + c_r for a
-mechanical plant. It asks for, and from the measured response recalculates,
+The outer loop is designed for the reference model q^(n) = f_r(x, Q), whose inverse is Q = M_r q^(n) + c_r for a mechanical plant.
+It computes the desired command, and from the measured response the recalculated one,
 
     Q^Des = M_r q^(n),Des + c_r,       Q^Rec = M_r q^(n) + c_r,
 
-and the plant is given the deformed Q^Def+ = G(Q^Def, Q^Rec, Q^Des), G any deformation. Where Q^Rec = Q^Des the plant moves as
-the reference model would under Q^Des: the outer loop cannot tell them apart, although Q^Def is another force. The Jacobian of
-Q^Def -> Q^Rec is M_r M^-1, with the eigenvalues of M^-1 M_r, so gains and limits are those of a deformed response; scales are
-forces.
+and the plant is given the deformed Q^Def+ = G(Q^Def, Q^Rec, Q^Des), where G is any deformation. Where Q^Rec = Q^Des the plant moves
+as the reference model does under Q^Des, although Q^Def is another force. The Jacobian of Q^Def -> Q^Rec is M_r M^-1, with the
+eigenvalues of M^-1 M_r, so gains and limits are those of a deformed response; scales are forces. The law is in the spirit of the
+reference.
 
-In the spirit of J. K. Tar, J. F. Bitó, I. Rudas, Replacement of Lyapunov's direct method in model reference adaptive control
-with robust fixed point transformations, IEEE INES 2010.
+References:
+    J. K. Tar, J. F. Bitó, I. Rudas, Replacement of Lyapunov's direct method in model reference adaptive control with robust
+    fixed point transformations, IEEE INES 2010.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from fpirhc.tracking.base import Tracking
 class ForceMRAC(Controller):
     """Tracking of the reference model, made true by deforming the command.
 
-    Parameters:
+    Args:
         tracking: the law that gives the desired response.
         deformation: the fixed-point map on commands; a scale is in units of the inputs.
         model: values of the reference model's parameters by name; those not named are the plant's approximate ones.
@@ -51,15 +52,15 @@ class ForceMRAC(Controller):
     model: Mapping[str, float] = field(default_factory=dict)
 
     def demand(self, problem: Problem) -> Demand:
-        """Of the command that the reference model needs along the reference."""
+        """Return the demand of the command that the reference model needs along the reference."""
         return command_demand(problem, self.parameters(problem.plant))
 
     def parameters(self, plant: Plant) -> np.ndarray:
-        """Parameters of the reference model."""
+        """Return the parameters of the reference model, shape (np,)."""
         return np.array([self.model.get(n, p.approximate) for n, p in plant.parameters.items()], dtype=float)
 
     def unusable(self, problem: Problem, mirror: Mirror) -> str:
-        """A command and its recalculation are compared at once: with ideal sensing the last command is the model's own answer."""
+        """Return a reason unless sensing is ideal and nothing is late: only then the last command equals the modelled one."""
         late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
         if problem.sensing.ideal and not late and mirror == Mirror():
             return ""
@@ -82,7 +83,7 @@ class ForceMRAC(Controller):
         mistakes.raise_if_any()
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks reference, tracking, force, limit, judge, tracking update."""
+        """Return the blocks reference, tracking, force, limit, judge, running, tracking update."""
         plant = problem.plant
         closing, delays = commanding_blocks(problem)
         blocks = [
@@ -96,27 +97,27 @@ class ForceMRAC(Controller):
         ]
         return blocks, [*delays, *self.tracking.delays(plant)]
 
-    def _force_block(self, plant: Plant, blind: int) -> Block:
+    def _force_block(self, plant: Plant, warm_up_cycles: int) -> Block:
         """Block (state, desired, realised, last command) -> Q^Des, Q^Rec, Q^Def, and the model's response to it."""
         memory = self.deformation.memory(plant.input.elements)
         inverse, response = plant.inverse_function, plant.controlled_response_function
 
         def step(s: Signals) -> dict[str, Expression]:
             remembered = {m: getattr(s, m) for m in memory.names}
-            running = s.warm_up > blind - 0.5
+            running = s.warm_up > warm_up_cycles - 0.5
             desired = inverse(s.state, s.desired, s.parameters)
             recalculated = ca.if_else(running, inverse(s.state, s.realised, s.parameters), desired)
-            deformed, following = self.deformation.step(s._command_before, recalculated, desired, remembered)
-            kept = {f"{m}_next": ca.if_else(running, following[m], remembered[m]) for m in memory.names}
-            shown = {name: kept[f"{source}_next"] for name, source in self.deformation.shown().items()}
-            requested = ca.if_else(running, deformed, desired)
+            deformed, next_memory = self.deformation.step(s._command_before, recalculated, desired, remembered)
+            next_values = {f"{m}_next": ca.if_else(running, next_memory[m], remembered[m]) for m in memory.names}
+            shown = {name: next_values[f"{source}_next"] for name, source in self.deformation.shown().items()}
+            command = ca.if_else(running, deformed, desired)
             return {
                 "force_desired": desired,
                 "force_recalculated": recalculated,
-                "command_unclipped": requested,
-                "_deformed_unclipped": response(s.state, requested, s.parameters),
+                "command_unclipped": command,
+                "_deformed_unclipped": response(s.state, command, s.parameters),
                 **shown,
-                **kept,
+                **next_values,
             }
 
         responses = [plant.response_signal(n) for n in ("desired", "realised")]

@@ -1,10 +1,10 @@
-"""The estimated parameters of a controller that learns: the block that moves them, and what is checked before a run.
+"""The estimated parameters of a controller that learns: the block that moves them, and the checks before a run.
 
-The equation that rules learn from uses the last command u and the response q'' that it had: u = Q(q, q', q''; p) is exact, so
+The equation that rules learn from uses the last command u and the response q'' to it: u = Q(q, q', q''; p) is exact, so
 
-    h = M_hat^-1 (u - Q(q, q', q''; p_hat)) = M_hat^-1 Y(q, q', q'') (p - p_hat),
+    h = M_hat^-1 (u - Q(q, q', q''; p_hat)) = M_hat^-1 Y(q, q', q'') (p - p_hat).
 
-which is the deformation's r - q'' with r what the model now takes the last command for.
+In terms of a deformation h = r - q'', where r is the response that the present model expects of the last command.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ _DEFINITE = 1e-9  # smallest over largest eigenvalue of a mass matrix that count
 class Learning:
     """Which parameters are learned, within which bounds, by which rule.
 
-    Parameters:
-        rule: how the estimate moves.
-        bounds: parameter or combination -> (lower, upper); these are the ones that are learned.
+    Args:
+        rule: moves the estimate.
+        bounds: parameter or combination -> (lower, upper); these are learned.
         combinations: expressions of parameters that enter linearly as a whole, by name.
     """
 
@@ -45,16 +45,22 @@ class Learning:
     combinations: dict[str, Combination] = field(default_factory=dict)
 
     def regressor(self, problem: Problem) -> Regressor:
-        """The plant's regressor for the learned parameters."""
+        """Return the plant's regressor for the learned parameters."""
         return Regressor(problem.plant, tuple(self.bounds), self.combinations)
 
     def check(self, problem: Problem, *, inverts: bool, reads_response: bool) -> None:
         """Raise if plant, bounds, or rule do not fit each other.
 
+        Args:
+            problem: with the plant.
+            inverts: whether the controller inverts the mass matrix.
+            reads_response: whether the controller pairs a command with its response.
+
         Raises:
-            NotSupported: not fully actuated, not of order 2, no symmetric mass matrix; dead time where the rule pairs command
-            and response. InvalidValue: parameters that enter nonlinearly, a first estimate outside its bounds, or bounds that
-            admit a mass matrix that is not positive definite where the controller inverts it.
+            NotSupported: the plant is not fully actuated, not of order 2, or has no symmetric mass matrix; there is dead time
+                where the rule pairs command and response.
+            InvalidValue: parameters enter nonlinearly, a first estimate is outside its bounds, or the bounds admit a mass matrix
+                that is not positive definite where the controller inverts it.
         """
         _check_order(problem)
         regressor = self.regressor(problem)
@@ -73,12 +79,16 @@ class Learning:
             _check_definite(self.bounds, coefficients)
 
     def block(
-        self, problem: Problem, given: Sequence[Signal], gradient: Callable[[Signals, Expression], Pair]
+        self, problem: Problem, extra: Sequence[Signal], gradient: Callable[[Signals, Expression], Pair]
     ) -> Block:
-        """Block (what every controller reads, what was issued, `given`) -> (estimate, _believed).
+        """Return Block (what every controller reads, last command, `extra`) -> (estimate, _believed).
 
-        Parameters: `gradient` returns (G, w) from the signals and the estimate; `_believed` are the parameters of
-        `Regressor.believed`.
+        '_believed' holds the parameters of `Regressor.believed`.
+
+        Args:
+            problem: with the plant.
+            extra: signals that `gradient` reads.
+            gradient: (signals, estimate) -> (G, w) of the Lyapunov rule.
         """
         plant, regressor = problem.plant, self.regressor(problem)
         believed = like(regressor.believed.parameter, "_believed")
@@ -93,7 +103,7 @@ class Learning:
             like(plant.input, "_command_before"),
             scalar("warm_up"),
             scalar("_clipped_before"),
-            *given,
+            *extra,
         )
 
         def step(s: Signals) -> dict[str, Expression]:
@@ -104,21 +114,21 @@ class Learning:
                 lambda: pair(equation(s.state, s.realised, s._command_before, old, s.parameters)),
                 s._clipped_before,
             )
-            moved = old + self.rule.change(evidence, self.bounds, problem.period)
-            good = ca.logic_and(running, ca.mmin(ca.fabs(moved) <= FINITE))
-            new = ca.if_else(good, clip(moved, lower, upper), old)
+            candidate = old + self.rule.change(evidence, self.bounds, problem.period)
+            good = ca.logic_and(running, ca.mmin(ca.fabs(candidate) <= FINITE))
+            new = ca.if_else(good, clip(candidate, lower, upper), old)
             return {"estimate": new, "_believed": ca.vertcat(new, s.parameters[others]), "learned_next": new}
 
         return Block("learn", Layout(reads), Layout((regressor.signal, believed)), step, Layout((learned,)))
 
 
 def learning_delays() -> list[Delay]:
-    """What learning carries to the next cycle besides the closing blocks' delays."""
+    """Return the delays of learning, besides those of the closing blocks."""
     return [Delay(scalar("_clipped_before"), "clipped")]
 
 
 def fed(block: Block, name: str, source: Signal) -> Block:
-    """The block, reading `source` where it would read the signal `name`, if it does."""
+    """Return the block with `source` in place of the signal `name`; a block that does not read `name` stays as it is."""
     if name not in block.reads:
         return block
     reads = tuple(source if s.name == name else s for s in block.reads.signals)
@@ -130,7 +140,7 @@ def fed(block: Block, name: str, source: Signal) -> Block:
 
 
 def equation_function(regressor: Regressor) -> ca.Function:
-    """Function (state, response, last command, estimate, parameters) -> (M_hat^-1 Y, h)."""
+    """Return Function (state, response, last command, estimate, parameters) -> (M_hat^-1 Y, h)."""
     x, r, p = regressor._symbols()
     u, theta = ca.SX.sym("u", len(regressor.plant.inputs)), ca.SX.sym("theta", len(regressor.names))
     y, rest = regressor.function(x, r, p)
@@ -174,8 +184,8 @@ def _mass_coefficients(regressor: Regressor, states: np.ndarray) -> np.ndarray:
     zero = ca.substitute(mass, theta, ca.SX.zeros(theta.numel()))
     function = ca.Function("fpirhc_coefficients", [x, p], [ca.densify(ca.horzcat(zero, ca.jacobian(mass, theta)))])
     n = len(regressor.plant.names)
-    found = [np.asarray(function(state, regressor.plant.approximate).full()) for state in states]
-    return np.stack([f.T.reshape((-1, n, n)) for f in found])
+    blocks = [np.asarray(function(state, regressor.plant.approximate).full()) for state in states]
+    return np.stack([f.T.reshape((-1, n, n)) for f in blocks])
 
 
 def _check_mechanical(coefficients: np.ndarray, resting: np.ndarray) -> None:
@@ -190,7 +200,7 @@ def _check_mechanical(coefficients: np.ndarray, resting: np.ndarray) -> None:
 
 
 def _check_definite(bounds: Bounds, coefficients: np.ndarray) -> None:
-    """The smallest eigenvalue is a concave function of theta, so over a box it is smallest at a corner."""
+    """Raise where a corner of the box is not definite: the smallest eigenvalue is concave in theta, so least at a corner."""
     entering = np.abs(coefficients[:, 1:]).max(axis=(0, 2, 3)) > 0
     ends = np.array([b if e else (0.0, 0.0) for b, e in zip(bounds.values(), entering, strict=True)], dtype=float)
     if not np.isfinite(ends).all():
@@ -205,12 +215,12 @@ def _check_definite(bounds: Bounds, coefficients: np.ndarray) -> None:
             corner = ", ".join(f"{n} = {v:g}" for n, v, e in zip(bounds, corners[worst], entering, strict=True) if e)
             raise InvalidValue(
                 f"the bounds admit a mass matrix that is not positive definite (smallest eigenvalue {values[worst, 0]:.3g}) at "
-                f"{corner}; narrow them, or learn parameters whose every positive value is possible (masses and inertias)"
+                f"{corner}; narrow them, or learn parameters for which every positive value is possible (masses and inertias)"
             )
 
 
 def _corners(ends: np.ndarray, free: int) -> np.ndarray:
-    """Corners of the box: all of them, or as many random ones as are tried at most."""
+    """Corners of the box: all of them, or a random sample where there are more than `_CORNERS`."""
     if 2**free <= _CORNERS:
         return np.array(list(itertools.product(*(sorted(set(pair)) for pair in ends.tolist()))))
     sides = np.random.default_rng(0).integers(2, size=(_CORNERS, len(ends)))

@@ -11,14 +11,17 @@ rate 1, and the last row p of P
 
     Theta' = sign(B) gamma (p z) phi' - leakage (Theta - Theta_0),
 
-V = sum z'P z + tr(dTheta' |B| dTheta) / gamma has V' = -rate |z|^2 without leakage: e goes to zero, Theta need not converge.
-Theta_0 is the model's own inverse, linearised at the start. Where the plant is not linear in x, or under disturbances, Theta
-drifts; leakage (P. Ioannou, P. Kokotovic 1984) bounds it, for an error that stays. The rule is stepped once per period, and
-stands still while the command is clipped: for n = 2 the adaptation oscillates at about
-w = (gamma |B| |phi|^2 / 2)^(1/2) rad/s, rings where w is far above the rate, and grows from w^2 period = rate on.
+gives V = sum z'P z + tr(dTheta' |B| dTheta) / gamma the derivative V' = -rate |z|^2 without leakage: e goes to zero, Theta need not
+converge. Theta_0 is the model's own inverse, linearised at the start. Where the plant is not linear in x, or under disturbances,
+Theta drifts. Leakage bounds the drift and leaves a constant error. The rule takes one step per period, and none while the command
+is clipped. For n = 2 the adaptation oscillates at about w = (gamma |B| |phi|^2 / 2)^(1/2) rad/s, rings where w is far above the
+rate, and grows from w^2 period = rate on.
 
-References: K. S. Narendra, A. M. Annaswamy, Stable Adaptive Systems, Prentice Hall 1989. I. D. Landau, Adaptive Control: The
-Model Reference Approach, Dekker 1979. J.-J. E. Slotine, W. Li, Applied Nonlinear Control, Prentice Hall 1991, ch. 8.
+References:
+    K. S. Narendra, A. M. Annaswamy, Stable Adaptive Systems, Prentice Hall 1989.
+    I. D. Landau, Adaptive Control: The Model Reference Approach, Dekker 1979.
+    J.-J. E. Slotine, W. Li, Applied Nonlinear Control, Prentice Hall 1991, ch. 8.
+    P. Ioannou, P. Kokotovic, Instability analysis and improvement of robustness of adaptive control, Automatica 20, 1984 (leakage).
 """
 
 from __future__ import annotations
@@ -48,10 +51,10 @@ from fpirhc.tracking.error import error_chains
 class LyapunovMRAC(Controller):
     """Gains on state, reference and bias, adapted so that the plant becomes the reference model.
 
-    Parameters:
+    Args:
         rate: of the reference model, 1/s.
         adaptation: gamma, in units of the input times s^(2n-1) per squared unit of the coordinate.
-        leakage: pull of the gains to those of the model, 1/s.
+        leakage: rate with which the gains return to those of the model, 1/s.
 
     Raises:
         InvalidValue: a rate or adaptation that is not positive, a negative leakage.
@@ -70,20 +73,20 @@ class LyapunovMRAC(Controller):
 
     @property
     def deformation(self) -> Deformation:
-        """None: gains are adapted, no request is iterated."""
+        """Identity(): gains are adapted, and no request is iterated."""
         return Identity()
 
     @property
     def learns(self) -> bool:
-        """It does."""
+        """True: the gains change during a run."""
         return True
 
     def weights(self, order: int) -> np.ndarray:
-        """P of the scaled error z for one coordinate, shape (order, order)."""
+        """Return P of the scaled error z for one coordinate, shape (order, order)."""
         return np.asarray(solve_continuous_lyapunov(companion(decay_gains(1.0, order)).T, -np.eye(order)))
 
     def check(self, problem: Problem) -> None:
-        """Raise if the plant is not one that the proof of the rule covers.
+        """Raise if the proof of the rule does not cover the plant.
 
         Raises:
             InvalidProblem: not fully actuated, or the inputs' effect on the response is not of one sign at the start.
@@ -94,13 +97,13 @@ class LyapunovMRAC(Controller):
             mistakes.add(f"the plant is not fully actuated: '{free[0]}' has no input of its own; use ComputedTorque")
         elif _sign(problem) == 0:
             mistakes.add(
-                "the inputs' effect on the response is not definite at the start, so the rule may go uphill; "
+                "the inputs' effect on the response is not definite at the start, so the rule may enlarge the error; "
                 "order the inputs as the coordinates, each with a positive effect on its own"
             )
         mistakes.raise_if_any()
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks reference, reference model, law, limit, judge, adapt."""
+        """Return the blocks reference, reference model, law, limit, judge, running, adapt."""
         plant = problem.plant
         closing, delays = commanding_blocks(problem)
         blocks = [
@@ -124,17 +127,17 @@ class LyapunovMRAC(Controller):
         def step(s: Signals) -> dict[str, Expression]:
             errors = error_chains(plant, s.reference - s.state)
             feedback = [ca.dot(ca.DM(list(decay_gains(rate, len(c)))), ca.vertcat(*c)) for c in errors]
-            wanted = s._reference_response + ca.vertcat(*feedback)
-            begun = start(s.state, wanted, s.parameters)
+            desired = s._reference_response + ca.vertcat(*feedback)
+            begun = start(s.state, desired, s.parameters)
             first = ca.if_else(s.warm_up > 0.5, s._gains_first_before, begun)
             gains = ca.if_else(s.warm_up > 0.5, s._gains_before, begun)
-            regressor = ca.vertcat(s.state, wanted, 1)
-            requested = ca.mtimes(ca.reshape(gains, wanted.numel(), regressor.numel()), regressor)
+            regressor = ca.vertcat(s.state, desired, 1)
+            command = ca.mtimes(ca.reshape(gains, desired.numel(), regressor.numel()), regressor)
             chains = error_chains(plant, s.model - s.state)
             return {
-                "desired": wanted,
-                "command_unclipped": requested,
-                "_deformed_unclipped": response(s.state, requested, s.parameters),
+                "desired": desired,
+                "command_unclipped": command,
+                "_deformed_unclipped": response(s.state, command, s.parameters),
                 "_pull": ca.vertcat(*(pull(row, chain) for row, chain in zip(rows, chains, strict=True))),
                 "_regressor": regressor,
                 "_gains_used": gains,
@@ -174,13 +177,13 @@ def _gains(plant: Plant, name: str) -> Signal:
 
 
 def _adapted(plant: Plant) -> tuple[Signal, ...]:
-    """What the adaptation reads of the law."""
+    """Signals of the law that the adaptation reads."""
     own = (Signal("_pull", plant.controlled_names), Signal("_regressor", _regressed(plant)))
     return (*own, _gains(plant, "_gains_used"), _gains(plant, "_gains_first"))
 
 
 def _start_gains(plant: Plant) -> ca.Function:
-    """Function (state, wanted response, parameters) -> Theta_0: the model's inverse, linearised there."""
+    """Function (state, desired response, parameters) -> Theta_0: the model's inverse, linearised there."""
     x, r = ca.MX.sym("x", plant.state.size), ca.MX.sym("r", len(plant.controlled_names))
     p = ca.MX.sym("p", len(plant.parameters))
     command = plant.inverse_function(x, r, p)

@@ -4,13 +4,14 @@ With e = q^N - q of a controlled coordinate and the integral of its error,
 
     u = k_i e_int + k_p e + k_d e' + ...,
 
-the k-th input for the k-th controlled coordinate. The chain may go on to e^(n-1), all that is measured for the relative order
-n; without it no PID stabilises a chain of three or more integrators. On n integrators with the gain b the error obeys
+the k-th input for the k-th controlled coordinate. The chain may go on to e^(n-1), the highest measured derivative for the relative
+order n; without it no PID stabilises a chain of three or more integrators. On n integrators with the gain b the error obeys
 e^(n+1) + b (... + k_d e'' + k_p e' + k_i e) = 0 (Routh: b k_d k_p > k_i for n = 2).
 
-The integral stands still while some command is clipped (conditional integration), and starts where the first command is zero.
+The integral does not change while some command is clipped (conditional integration). It starts where the first command is zero.
 
-References: K. J. Åström, T. Hägglund, PID Controllers: Theory, Design, and Tuning, 2nd ed., ISA 1995.
+References:
+    K. J. Åström, T. Hägglund, PID Controllers: Theory, Design, and Tuning, 2nd ed., ISA 1995.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ from fpirhc.tracking.error import error_chains, error_signal, integral_delay, in
 class PID(Controller):
     """One PID loop per controlled coordinate.
 
-    Parameters:
+    Args:
         proportional: k_p of every controlled coordinate by name, in units of the input per unit of the coordinate.
-        integral: k_i by name, per s more; a coordinate that is not named has none.
-        derivative: by name the gain of e', or of (e', e'', ...), one less than the relative order at most.
-        bumpless: start the integral so that the first command is zero (needs k_i).
+        integral: k_i by name, in the unit of k_p per s; 0 for a coordinate that is not named.
+        derivative: gain of e', or gains of (e', e'', ...), by name; at most one less than the relative order.
+        bumpless: whether the integral starts where the first command is zero (needs k_i).
     """
 
     proportional: Mapping[str, float]
@@ -51,13 +52,13 @@ class PID(Controller):
 
     @property
     def deformation(self) -> Deformation:
-        """None: there is no model whose request could be deformed."""
+        """Identity(): the controller has no model, so it makes no request."""
         return Identity()
 
     def gains(self, name: str, order: int) -> tuple[float, ...]:
-        """Gains of (e_int, e, e', ...) of a coordinate of that relative order, shape (order + 1,)."""
-        given = self.derivative.get(name, ())
-        higher = list(given) if isinstance(given, Sequence) else [given]
+        """Return the gains of (e_int, e, e', ...) of a coordinate of that relative order, shape (order + 1,)."""
+        derivative = self.derivative.get(name, ())
+        higher = list(derivative) if isinstance(derivative, Sequence) else [derivative]
         padded = [*higher, *[0.0] * (order - 1 - len(higher))]
         return (self.integral.get(name, 0.0), self.proportional[name], *padded)
 
@@ -65,7 +66,7 @@ class PID(Controller):
         """Raise if the gains do not fit the plant.
 
         Raises:
-            InvalidProblem: all mistakes together: gains by name, and inputs that do not bring their coordinates back.
+            InvalidProblem: mistakes in the gains, all together; inputs that do not bring their coordinates back.
         """
         plant, mistakes = problem.plant, Mistakes("PID")
         names = plant.controlled_names
@@ -94,7 +95,7 @@ class PID(Controller):
         mistakes.raise_if_any()
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks reference, pid, limit, judge, integral."""
+        """Return the blocks reference, pid, limit, judge, running, integral."""
         plant = problem.plant
         response = plant.response_signal("_reference_response")
         closing, delays = commanding_blocks(problem)
@@ -109,7 +110,7 @@ class PID(Controller):
         return blocks, [*delays, *integral_delay(plant)]
 
     def _law(self, problem: Problem) -> Block:
-        """Block (state, reference, integral, started) -> command, and what the model expects of it (for the reader only)."""
+        """Block (state, reference, integral, warm_up) -> command, and the model's response to it (for readers of a log)."""
         plant = problem.plant
         orders = [plant.orders[k] for k in plant.controlled_indices]
         gains = [self.gains(n, order) for n, order in zip(plant.controlled_names, orders, strict=True)]
@@ -120,20 +121,20 @@ class PID(Controller):
                 sum(g * e for g, e in zip(k[1:], chain, strict=True)) for k, chain in zip(gains, errors, strict=True)
             ]
             starts = [-d / k[0] if self.bumpless and k[0] else 0 * d for k, d in zip(gains, direct, strict=True)]
-            used = ca.if_else(s.warm_up > 0.5, s._integral_before, ca.vertcat(*starts))
-            requested = ca.vertcat(*(k[0] * used[i] + d for i, (k, d) in enumerate(zip(gains, direct, strict=True))))
+            integral = ca.if_else(s.warm_up > 0.5, s._integral_before, ca.vertcat(*starts))
+            command = ca.vertcat(*(k[0] * integral[i] + d for i, (k, d) in enumerate(zip(gains, direct, strict=True))))
             return {
                 "_target_error": ca.vertcat(*(chain[0] for chain in errors)),
-                "_integral_used": used,
-                "command_unclipped": requested,
-                "_deformed_unclipped": plant.controlled_response_function(s.state, requested, s.parameters),
+                "_integral_used": integral,
+                "command_unclipped": command,
+                "_deformed_unclipped": plant.controlled_response_function(s.state, command, s.parameters),
             }
 
-        before, used = integral_signal(plant, "_integral_before"), integral_signal(plant, "_integral_used")
+        before, in_use = integral_signal(plant, "_integral_before"), integral_signal(plant, "_integral_used")
         reads = (plant.state, like(plant.state, "reference"), plant.parameter, scalar("warm_up"), before)
         writes = (
             error_signal(plant),
-            used,
+            in_use,
             like(plant.input, "command_unclipped"),
             plant.response_signal("_deformed_unclipped"),
         )

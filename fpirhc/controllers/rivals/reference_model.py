@@ -1,10 +1,10 @@
 """The reference model of model reference adaptive control: a motion from the plant's start to the nominal one.
 
-Per controlled coordinate of relative order n its deviation eps = q^N - y obeys (d/dt + rate)^n eps = 0, that is
+For a controlled coordinate of relative order n the deviation eps = q^N - y obeys (d/dt + rate)^n eps = 0, that is
 
     y^(n) = q^(n),N + sum_{s<n} C(n, s) rate^(n-s) (q^N - y)^(s),     y(0) = q(0), y'(0) = q'(0), ...
 
-The deviation is carried by its exact solution over one period, so the model has no integration error.
+The deviation follows its exact solution over one period, so the model has no integration error.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from fpirhc.tracking.error import error_chains
 
 
 def decay_gains(rate: float, order: int) -> tuple[float, ...]:
-    """Gains of (e, e', ...) in (d/dt + rate)^n e = 0, lowest derivative first."""
+    """Return the gains of (e, e', ...) in (d/dt + rate)^n e = 0, lowest derivative first."""
     return tuple(math.comb(order, s) * rate ** (order - s) for s in range(order))
 
 
 def companion(gains: tuple[float, ...]) -> np.ndarray:
-    """Matrix A of x' = A x for the chain x = (e, e', ...) with e^(n) = -gains . x, shape (n, n)."""
+    """Return the matrix A of x' = A x for the chain x = (e, e', ...) with e^(n) = -gains . x, shape (n, n)."""
     matrix = np.diag(np.ones(len(gains) - 1), 1)
     matrix[-1] = -np.array(gains)
     return matrix
 
 
 def model_block(plant: Plant, rate: float, period: float) -> Block:
-    """Block (state, reference and its response, started) -> model: the model's state and its response 'nominal'.
+    """Return Block (state, reference and its response, warm_up) -> 'model', the model's state, and 'nominal', its response.
 
     Coordinates that are not controlled follow the reference.
     """
@@ -52,11 +52,11 @@ def model_block(plant: Plant, rate: float, period: float) -> Block:
         spread = dict(zip(memory.signals[0].elements, ca.vertsplit(ca.vertcat(*deviation)), strict=True))
         lag = ca.vertcat(*(spread.get(e, 0) for e in plant.state.elements))
         pull = [ca.dot(ca.DM(list(g)), d) for g, d in zip(gains, deviation, strict=True)]
-        following = [ca.mtimes(ca.DM(m), d) for m, d in zip(steps, deviation, strict=True)]
+        deviation_next = [ca.mtimes(ca.DM(m), d) for m, d in zip(steps, deviation, strict=True)]
         return {
             "model": s.reference - lag,
             "nominal": s._reference_response + ca.vertcat(*pull),
-            "model_deviation_next": ca.vertcat(*following),
+            "model_deviation_next": ca.vertcat(*deviation_next),
         }
 
     reads = (

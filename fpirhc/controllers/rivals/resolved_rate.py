@@ -1,6 +1,6 @@
-"""Resolved acceleration rate control: the rate of the response is prescribed, and commands are moved by increments.
+"""Resolved acceleration rate control: the law prescribes the rate of the response, and commands change by increments.
 
-Resolved acceleration control (Luh, Walker and Paul 1980) is what computed torque does: it prescribes q^(n). Here the measured
+Resolved acceleration control (Luh, Walker and Paul 1980) is computed torque: it prescribes q^(n). Here the measured
 q^(n) belongs to the error, e^(n) = q^(n),N - q^(n), and (d/dt + rate)^(n+1) e = 0 is prescribed,
 
     q^(n+1),Des = q^(n+1),N + sum_{s=0}^{n} C(n+1, s) rate^(n+1-s) e^(s),
@@ -9,19 +9,20 @@ which the model turns into the command's increment over one period: with f^ the 
 
     f^(x_k, u_k) = f^(x_k, u_{k-1}) + period (q^(n+1),Des - df^/dx x').
 
-Only the model's changes count, never its values: a constant residual leaves no error and needs no integral. With a model
-whose gain is wrong by J the errors obey e^(n+1) + J sum C(n+1, s) rate^(n+1-s) e^(s) = 0: for n = 1 stable for every J > 0,
-for n = 2 for J > 1/9; in control cycles also (n + 1) rate period J < 2. A dead time counts as for any loop of n + 1
-integrators.
+Only the model's changes count, not its values: a constant residual leaves no error, without an integral. With a model whose gain is
+wrong by J the errors obey e^(n+1) + J sum C(n+1, s) rate^(n+1-s) e^(s) = 0, which is stable for every J > 0 for n = 1, and for
+J > 1/9 for n = 2; in control cycles also (n + 1) rate period J < 2 is needed. A dead time has the effect that it has in any loop of
+n + 1 integrators.
 
-It is in the spirit of time-delay control (T. C. Hsia 1989; K. Youcef-Toumi, O. Ito 1990), whose increments
-u_k = u_{k-1} + M^ (q^Des - q^(n)) aim at the whole response in one cycle: where the rest of the model stands
-still that law is ComputedTorque with Affine(gain=-2).
+The law is in the spirit of time-delay control (T. C. Hsia 1989; K. Youcef-Toumi, O. Ito 1990), whose increments
+u_k = u_{k-1} + M^ (q^Des - q^(n)) aim at the whole response in one cycle. Where the rest of the model is constant, time-delay
+control is ComputedTorque with Affine(gain=-2).
 
-References: J. Y. S. Luh, M. W. Walker, R. P. C. Paul, Resolved-acceleration control of mechanical manipulators, IEEE Trans.
-Automatic Control 25(3), 1980. T. C. Hsia, A new technique for robust control of servo systems, IEEE Trans. Industrial
-Electronics 36(1), 1989. K. Youcef-Toumi, O. Ito, A time delay controller for systems with unknown dynamics, ASME J. Dyn.
-Syst. 112(1), 1990.
+References:
+    J. Y. S. Luh, M. W. Walker, R. P. C. Paul, Resolved-acceleration control of mechanical manipulators, IEEE Trans. Automatic
+    Control 25(3), 1980.
+    T. C. Hsia, A new technique for robust control of servo systems, IEEE Trans. Industrial Electronics 36(1), 1989.
+    K. Youcef-Toumi, O. Ito, A time delay controller for systems with unknown dynamics, ASME J. Dyn. Syst. 112(1), 1990.
 """
 
 from __future__ import annotations
@@ -45,11 +46,11 @@ from fpirhc.tracking.error import error_chains
 
 @dataclass(frozen=True)
 class ResolvedAccelerationRate(Controller):
-    """Commands moved so that all modes of the error and its first n derivatives decay as exp(-rate t).
+    """Increments of the command with which all modes of the error and its first n derivatives decay as exp(-rate t).
 
-    The first cycle, which has no response to look at, prescribes (d/dt + rate)^n e = 0.
+    The first cycle has no measured response yet and prescribes (d/dt + rate)^n e = 0.
 
-    Parameters:
+    Args:
         rate: Lambda, 1/s.
 
     Raises:
@@ -64,20 +65,20 @@ class ResolvedAccelerationRate(Controller):
 
     @property
     def deformation(self) -> Deformation:
-        """None: no request is iterated."""
+        """Identity(): no request is iterated."""
         return Identity()
 
     def gains(self, degree: int) -> tuple[float, ...]:
-        """Coefficients of (d/dt + rate)^degree below the highest, lowest derivative first."""
+        """Return the coefficients of (d/dt + rate)^degree below the highest, lowest derivative first."""
         return tuple(math.comb(degree, s) * self.rate ** (degree - s) for s in range(degree))
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks reference, rate, increment, invert, limit, judge."""
+        """Return the blocks reference, rate, increment, invert, limit, judge, running."""
         plant = problem.plant
         closing, delays = commanding_blocks(problem)
         blocks = [
             reference_block(problem),
-            _following_block(problem),
+            _nominal_block(problem),
             self._rate_block(problem),
             _increment_block(problem),
             invert_block(plant),
@@ -87,7 +88,7 @@ class ResolvedAccelerationRate(Controller):
 
     def _rate_block(self, problem: Problem) -> Block:
         """Block (state, realised, reference now and one cycle later) -> (desired, its change in this cycle)."""
-        plant, period, blind = problem.plant, problem.period, problem.warm_up_cycles
+        plant, period, warm_up_cycles = problem.plant, problem.period, problem.warm_up_cycles
 
         def step(s: Signals) -> dict[str, Expression]:
             errors = error_chains(plant, s.reference - s.state)
@@ -95,57 +96,57 @@ class ResolvedAccelerationRate(Controller):
             for k, chain in enumerate(errors):
                 whole = [*chain, s.nominal[k] - s.realised[k]]
                 feedback = sum(g * e for g, e in zip(self.gains(len(whole)), whole, strict=True))
-                change.append(s._nominal_following[k] - s.nominal[k] + period * feedback)
+                change.append(s._nominal_later[k] - s.nominal[k] + period * feedback)
                 first.append(s.nominal[k] + sum(g * e for g, e in zip(self.gains(len(chain)), chain, strict=True)))
-            running = s.warm_up > blind - 0.5
-            moved = s.realised + ca.vertcat(*change)
-            return {"_change": ca.vertcat(*change), "desired": ca.if_else(running, moved, ca.vertcat(*first))}
+            running = s.warm_up > warm_up_cycles - 0.5
+            desired = s.realised + ca.vertcat(*change)
+            return {"_change": ca.vertcat(*change), "desired": ca.if_else(running, desired, ca.vertcat(*first))}
 
-        names = ("nominal", "_nominal_following", "realised")
+        names = ("nominal", "_nominal_later", "realised")
         reads = (plant.state, like(plant.state, "reference"), *map(plant.response_signal, names), scalar("warm_up"))
         return Block(
             "rate", Layout(reads), Layout((plant.response_signal("_change"), plant.response_signal("desired"))), step
         )
 
 
-def _following_block(problem: Problem) -> Block:
+def _nominal_block(problem: Problem) -> Block:
     """Block time -> nominal response now and one cycle later."""
     plant, function = problem.plant, problem.reference.function(problem.plant)
-    chosen = list(plant.controlled_indices)
+    controlled = list(plant.controlled_indices)
 
     def step(s: Signals) -> dict[str, Expression]:
-        later = function(s.time + problem.period)[1][chosen]
-        return {"nominal": s._reference_response, "_nominal_following": later}
+        later = function(s.time + problem.period)[1][controlled]
+        return {"nominal": s._reference_response, "_nominal_later": later}
 
     reads = Layout((scalar("time", "s"), plant.response_signal("_reference_response")))
-    writes = Layout((plant.response_signal("nominal"), plant.response_signal("_nominal_following")))
-    return Block("following", reads, writes, step, opaque=problem.reference.opaque)
+    writes = Layout((plant.response_signal("nominal"), plant.response_signal("_nominal_later")))
+    return Block("nominal", reads, writes, step, opaque=problem.reference.opaque)
 
 
 def _increment_block(problem: Problem) -> Block:
-    """Block (change, last command, state) -> request: what the model gives with the last command, moved by the change."""
-    plant, period, blind = problem.plant, problem.period, problem.warm_up_cycles
+    """Block (change, last command, state) -> request: the model's response to the last command plus the change."""
+    plant, period, warm_up_cycles = problem.plant, problem.period, problem.warm_up_cycles
     x, u, p = plant._symbols()
     measured = ca.SX.sym("f", len(plant.controlled_names))
     response = plant.controlled_response_function(x, u, p)
-    every = plant.response_function(x, u, p)
-    # The measured responses move the state; the model's where nothing is measured.
+    highest = plant.response_function(x, u, p)
+    # The measured responses move the state; the model's response does where nothing is measured.
     for k, index in enumerate(plant.controlled_indices):
-        every[index] = measured[k]
-    moving = []
+        highest[index] = measured[k]
+    rates = []
     for element in plant.state.elements:
         higher = element + "'"
         inside = higher in plant.state.elements
-        moving.append(
-            x[plant.state.elements.index(higher)] if inside else every[plant.names.index(element.rstrip("'"))]
+        rates.append(
+            x[plant.state.elements.index(higher)] if inside else highest[plant.names.index(element.rstrip("'"))]
         )
-    drift = ca.jtimes(response, x, ca.vertcat(*moving))
+    drift = ca.jtimes(response, x, ca.vertcat(*rates))
     model = ca.Function("fpirhc_drifting", [x, u, p, measured], [response, drift])
 
     def step(s: Signals) -> dict[str, Expression]:
         now, drifting = model(s.state, s._command_before, s.parameters, s.realised)
-        wanted = now + s._change - period * drifting
-        return {"_deformed_unclipped": ca.if_else(s.warm_up > blind - 0.5, wanted, s.desired)}
+        request = now + s._change - period * drifting
+        return {"_deformed_unclipped": ca.if_else(s.warm_up > warm_up_cycles - 0.5, request, s.desired)}
 
     names = ("_change", "desired", "realised")
     reads = (plant.state, like(plant.input, "_command_before"), plant.parameter, *map(plant.response_signal, names))

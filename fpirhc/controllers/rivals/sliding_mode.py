@@ -4,13 +4,15 @@ With e = q^N - q and S = (d/dt + rate)^(n-1) e the desired response
 
     q^(n),Des = q^(n),N + sum_{s=1}^{n-1} C(n-1, s-1) rate^(n-s) e^(s) + K tanh(S / w)
 
-makes S' = -K tanh(S / w) - h with the response error h = q^(n) - q^(n),Des of the wrong model. A residual |h| < K is held at
-|S| = w atanh(|h| / K), and e at S / rate^(n-1): the law is a proportional one of gain K / w, so a constant residual leaves an
-error, while a deformation sums its errors and leaves none. In control cycles S is multiplied by 1 - K period / w near
-zero: from K period / w = 2 on it chatters, with a model whose gain is wrong by J from K period J / w = 2 on.
+makes S' = -K tanh(S / w) - h with the response error h = q^(n) - q^(n),Des of the wrong model. A constant residual |h| < K leads to
+|S| = w atanh(|h| / K) and e = S / rate^(n-1). The law is proportional with the gain K / w, so a constant residual leaves an error,
+whereas a deformation sums its errors and leaves none. In control cycles S is multiplied by 1 - K period / w near zero: it chatters
+from K period / w = 2 on, and with a model whose gain is wrong by J from K period J / w = 2 on.
 
-References: V. I. Utkin, Variable structure systems with sliding modes, IEEE Trans. Automatic Control 22(2), 1977. J.-J. E.
-Slotine, W. Li, Applied Nonlinear Control, Prentice Hall 1991, ch. 7 (boundary layer; there a saturation instead of tanh).
+References:
+    V. I. Utkin, Variable structure systems with sliding modes, IEEE Trans. Automatic Control 22(2), 1977.
+    J.-J. E. Slotine, W. Li, Applied Nonlinear Control, Prentice Hall 1991, ch. 7 (boundary layer, with a saturation instead of
+    tanh).
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ from fpirhc.tracking.error import error_chains
 class SlidingMode(Controller):
     """Inverse dynamics with the switching term K tanh(S / w).
 
-    Parameters:
+    Args:
         rate: Lambda, decay of the error on S = 0, 1/s.
         gain: K, above the largest response error of the model, in units of the response (m/s^2 for n = 2).
         width: w, boundary layer, in units of the response times s (m/s for n = 2); K period / w must stay below 2.
@@ -58,11 +60,11 @@ class SlidingMode(Controller):
 
     @property
     def deformation(self) -> Deformation:
-        """None: the model is trusted up to the switching term."""
+        """Identity(): no request is iterated."""
         return Identity()
 
     def check(self, problem: Problem) -> None:
-        """Raise if the loop would chatter even with an exact model.
+        """Raise if the loop chatters even with an exact model.
 
         Raises:
             InvalidProblem: K period / w is 2 or more.
@@ -77,7 +79,7 @@ class SlidingMode(Controller):
         mistakes.raise_if_any()
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks reference, surface, deform, invert, limit, judge."""
+        """Return the blocks reference, surface, deform, invert, limit, judge, running."""
         response = problem.plant.response_signal("_reference_response")
         closing, delays = closing_blocks(problem, self.deformation)
         blocks = [

@@ -27,25 +27,27 @@ class SlotineLi(Controller):
     """u = Y_s(q, q', v, v') p_hat + Q0_s + K_D rho,  v = q'^N + rate e,  rho = e' + rate e.
 
     Then M rho' + C rho + K_D rho = Y_s (p - p_hat), and because M' - 2 C is skew-symmetric the Lyapunov function
-    (rho^T M rho + (p - p_hat)^T Gamma^-1 (p - p_hat)) / 2 falls by rho^T K_D rho under p_hat' = Gamma Y_s^T rho. Neither q'' nor
-    M_hat^-1 is needed: p_hat may be anything.
+    (rho^T M rho + (p - p_hat)^T Gamma^-1 (p - p_hat)) / 2 falls by rho^T K_D rho under p_hat' = Gamma Y_s^T rho. The law needs
+    neither q'' nor M_hat^-1, so p_hat may have any value.
 
-    A deformation acts on v'. The model makes of the law the response d = v' + M_hat^-1 (C_hat + K_D) rho, which is the desired
-    response of the pair; then q'' and M_hat^-1 are needed as elsewhere, and the bounds must keep M_hat positive definite. Without a
-    deformation 'desired' is logged as v'.
+    A deformation acts on v'. The model's response to the law is d = v' + M_hat^-1 (C_hat + K_D) rho, which is the desired response
+    of the pair. The law then needs q'' and M_hat^-1, and the bounds must keep M_hat positive definite. Without a deformation v' is
+    logged as 'desired'.
 
-    Parameters:
+    `check` raises NotSupported where the plant is not fully actuated mechanics, and InvalidValue where parameters enter
+    nonlinearly, the bounds do not fit, or the damping does not name every coordinate.
+
+    Args:
         rate: Lambda, 1/s.
         damping: diagonal of K_D by coordinate, input per unit of rho.
-        rule: how the estimate moves: LyapunovRule or Projection.
-        bounds: parameter or combination -> (lower, upper); these are learned, from their approximate values on. May be infinite
-            with a LyapunovRule and no deformation.
+        rule: moves the estimate: LyapunovRule or Projection.
+        bounds: parameter or combination -> (lower, upper); these are learned, beginning at their approximate values. Bounds may be
+            infinite with a LyapunovRule and no deformation.
         combinations: expressions of parameters that enter linearly as a whole, by name.
-        deformation: the fixed-point map between desired response and request.
+        deformation: the map between desired response and request; Identity() is no deformation.
 
     Raises:
-        InvalidValue: rate or damping not positive. When the loop is built: NotSupported where the plant is not fully actuated
-        mechanics; InvalidValue where parameters enter nonlinearly or the bounds do not do.
+        InvalidValue: rate or damping not positive.
 
     References:
         J.-J. E. Slotine, W. Li, On the adaptive control of robot manipulators, Int. J. Robotics Research 6(3), 1987.
@@ -65,11 +67,11 @@ class SlotineLi(Controller):
 
     @property
     def learns(self) -> bool:
-        """It does."""
+        """True: the parameters of the model change during a run."""
         return True
 
     def check(self, problem: Problem) -> None:
-        """Raise if plant, damping, bounds or rule do not fit (see Learning.check)."""
+        """Raise if plant, bounds or rule do not fit, as `Learning.check` does, or the damping does not name every coordinate."""
         self._learning.check(problem, inverts=self._deforms, reads_response=self._deforms)
         odd = sorted(set(self.damping) ^ set(problem.plant.names))
         if odd:
@@ -78,7 +80,7 @@ class SlotineLi(Controller):
             )
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks reference, sliding, learn, demand, deform, force, limit, judge; invert instead of force with a deformation."""
+        """Return the blocks reference, sliding, learn, [demand with a deformation], deform, force or invert, limit, judge."""
         regressor = self._learning.regressor(problem)
         believed = like(regressor.believed.parameter, "_believed")
         front = [reference_block(problem), self._sliding_block(problem), self._learn_block(problem, regressor)]
@@ -87,7 +89,7 @@ class SlotineLi(Controller):
             closing = [fed(block, "parameters", believed) for block in closing]
             return [*front, self._demand_block(problem, regressor), *closing], [*delays, *learning_delays()]
         closing, delays = closing_blocks(problem, self.deformation)
-        # What a clipped command means is asked of the approximate model: the estimated one may have no inverse.
+        # The request of a clipped command comes from the approximate model: the estimated one may have no inverse.
         deform, _, *rest = closing
         return [*front, deform, self._force_block(problem, regressor), *rest], [*delays, *learning_delays()]
 
@@ -127,11 +129,11 @@ class SlotineLi(Controller):
             matrix, _ = regressor.split_function(s.state, s._velocity, getattr(s, slope.name), s.parameters)
             return matrix, s.sliding
 
-        given = (_rates(problem, "sliding"), _rates(problem, "_velocity"), slope)
-        return self._learning.block(problem, given, gradient)
+        reads = (_rates(problem, "sliding"), _rates(problem, "_velocity"), slope)
+        return self._learning.block(problem, reads, gradient)
 
     def _demand_block(self, problem: Problem, regressor: Regressor) -> Block:
-        """Block -> desired: the response that the model makes of the law."""
+        """Block -> desired: the model's response to the law."""
         plant, damping = problem.plant, self._damping(problem)
         slope = plant.response_signal("_velocity_slope")
         reads = (plant.state, plant.parameter, regressor.signal, _rates(problem, "sliding"), slope)
@@ -167,7 +169,7 @@ class SlotineLi(Controller):
 
 
 def _rates(problem: Problem, name: str) -> Signal:
-    """A signal of velocities."""
+    """A signal with a velocity of every coordinate."""
     plant = problem.plant
     return vector(name, plant.names, [f"{plant.coordinates[c]}/s" for c in plant.names])
 

@@ -33,13 +33,14 @@ Scores = Callable[[Signals], list[Expression]]
 
 @dataclass(frozen=True, eq=False)
 class ByError(Schedule):
-    """The coordinate with the largest weighted error is next.
+    """The coordinate with the largest weighted error w|e| is next.
 
-    A slot that has lasted `dwell` ends in the first cycle in which some admissible slot has w|e| above (1 + hysteresis) times
-    that of the active one.
+    A slot that has lasted `dwell` ends in the first cycle in which w|e| of some admissible slot is more than (1 + hysteresis) times
+    that of the active slot.
 
-    Parameters:
-        weights: coordinate -> weight, in 1 / unit of the coordinate. dwell: shortest duration of a slot, s.
+    Args:
+        weights: coordinate -> weight, in 1 / unit of the coordinate.
+        dwell: shortest duration of a slot, s.
         hysteresis: by how much another weighted error must be larger, relative.
     """
 
@@ -48,7 +49,7 @@ class ByError(Schedule):
     hysteresis: float = 0.1
 
     def check(self, names: Sequence[str], problem: Problem, mistakes: Mistakes) -> None:
-        """Note unknown or missing weights and what is out of range."""
+        """Note unknown or missing weights, and values out of range."""
         mistakes.unknown("ByError: weight of coordinate", self.weights, names)
         for name in names:
             weight = self.weights.get(name)
@@ -57,12 +58,12 @@ class ByError(Schedule):
         _check_choice("ByError", self.dwell, self.hysteresis, problem, mistakes)
 
     def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
-        """The shortest duration of a slot."""
+        """Return the shortest duration of a slot."""
         del problem
         return dict.fromkeys(names, self.dwell)
 
     def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
-        """Block (error, ...) -> slot."""
+        """Return Block (error, ...) -> slot."""
         weights = [self.weights[c.slot.coordinate] for c in channels]
         places = [problem.judged_names.index(c.slot.coordinate) for c in channels]
 
@@ -74,15 +75,16 @@ class ByError(Schedule):
 
 @dataclass(frozen=True, eq=False)
 class ByLookAhead(Schedule):
-    """The slot that brings the state closest to the reference within one dwell, by the linearised closed loop, is next.
+    """The slot whose linearised closed loop brings the state closest to the reference within one dwell is next.
 
         argmin_j V(e^(A_j T) (x - x^N)),    V(x) = sum w x^2,   T = dwell
 
-    A slot that has lasted `dwell` ends in the first cycle in which some admissible slot's V is below that of the active one by
-    the share that the hysteresis says. The matrices A_j are the model's at the reference's last point.
+    A slot that has lasted `dwell` ends in the first cycle in which V of the active slot exceeds (1 + hysteresis) times V of some
+    admissible slot. The matrices A_j are the model's at the reference's last point.
 
-    Parameters:
-        weights: state -> weight of its square. dwell: shortest duration of a slot, s.
+    Args:
+        weights: state -> weight of its square.
+        dwell: shortest duration of a slot, s.
         hysteresis: by how much the active slot's V must exceed the best one's, relative.
     """
 
@@ -91,7 +93,7 @@ class ByLookAhead(Schedule):
     hysteresis: float = 0.1
 
     def check(self, names: Sequence[str], problem: Problem, mistakes: Mistakes) -> None:
-        """Note unknown weights and what is out of range."""
+        """Note unknown weights, and values out of range."""
         del names
         mistakes.unknown("ByLookAhead: weight of state", self.weights, problem.plant.state.elements)
         weights = list(self.weights.values())
@@ -100,12 +102,12 @@ class ByLookAhead(Schedule):
         _check_choice("ByLookAhead", self.dwell, self.hysteresis, problem, mistakes)
 
     def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
-        """The shortest duration of a slot."""
+        """Return the shortest duration of a slot."""
         del problem
         return dict.fromkeys(names, self.dwell)
 
     def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
-        """Block (state, reference, ...) -> slot.
+        """Return Block (state, reference, ...) -> slot.
 
         Raises:
             NotSupported: the closed loops cannot be linearised at the reference's last point.
@@ -115,8 +117,8 @@ class ByLookAhead(Schedule):
             raise NotSupported(f"ByLookAhead: {reason}; use ByError")
         n = problem.plant.state.size
         weight = np.diag([self.weights.get(e, 0.0) for e in problem.plant.state.elements])
-        moved = [(scipy.linalg.expm(m.generator * self.dwell) @ m.start(m))[:n, :n] for m in modes]
-        forms = [phi.T @ weight @ phi for phi in moved]
+        transitions = [(scipy.linalg.expm(m.generator * self.dwell) @ m.start(m))[:n, :n] for m in modes]
+        forms = [phi.T @ weight @ phi for phi in transitions]
 
         def score(s: Signals) -> list[Expression]:
             away = s.state - s.reference
@@ -136,7 +138,7 @@ def _is_number(value: object) -> TypeGuard[float]:
 
 
 def _chosen(problem: Problem, channels: Sequence[Channel], score: Scores, dwell: float, hysteresis: float) -> Block:
-    """Block that stays with a slot for the dwell and then leaves it for an admissible one whose score is clearly larger."""
+    """Block -> slot: it stays for the dwell and then changes to an admissible slot whose score is clearly larger."""
     plant = problem.plant
     names = tuple(c.slot.coordinate for c in channels)
     reads = (

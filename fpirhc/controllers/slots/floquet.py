@@ -2,11 +2,12 @@
 
     rho = max |eig( e^(A_m T_m) R_m ... e^(A_1 T_1) R_1 )|
 
-with the slots' matrices A_j at the set-point, their durations T_j, and R_j, what happens at the start of a slot: the law's
-integral is set anew, and an offset takes up the difference between what the plant did and what the law asks. Below 1 the
-error shrinks by rho per period near the set-point, although no slot need be stable alone.
+with the slots' matrices A_j at the set-point, their durations T_j, and R_j for the start of a slot: the integral of the law is set
+anew, and an offset takes up the difference between the realised response and the law. Below rho = 1 the error shrinks by rho per
+period near the set-point; no slot need be stable alone.
 
-References: G. Floquet, Annales scientifiques de l'ENS 12, 1883, for linear systems with periodic coefficients.
+References:
+    G. Floquet, Annales scientifiques de l'ENS 12, 1883, for linear systems with periodic coefficients.
 """
 
 from __future__ import annotations
@@ -25,7 +26,14 @@ from fpirhc.task.problem import Problem
 
 @dataclass(frozen=True, eq=False)
 class Floquet:
-    """The radius of one period, s; None with the reason where there is none. eigenvalues: by slot, of its closed loop."""
+    """The stability of one period of a schedule.
+
+    Args:
+        radius: spectral radius of one period, dimensionless; None where it does not exist.
+        period: duration of one period, s.
+        eigenvalues: of the closed loop in each slot, 1/s, by coordinate.
+        reason: why there is no radius; empty where there is one.
+    """
 
     radius: float | None
     period: float
@@ -38,17 +46,24 @@ def floquet_radius(problem: Problem, slots: Sequence[Slot], schedule: Schedule, 
 
     Limits, dead time and the hold of the command over a cycle are left out.
 
-    Parameters: `blend` as in Slotted, s; 0 leaves the offset at switches out.
+    Args:
+        problem: with the plant.
+        slots: one per coordinate.
+        schedule: of the slots.
+        blend: time constant of the offset at a switch, s; 0 leaves the offset out.
 
     Raises:
-        what `Slotted.check` raises about slots.
+        InvalidName: a coordinate or an input of a slot is unknown.
+        InvalidProblem: the order of a slot is not the model's.
+        NotInvertible: an input has no effect on the coordinate of its slot.
+        NotSupported: a deformation that a slot does not support.
     """
     channels = [channel(problem, slot, k) for k, slot in enumerate(slots)]
     return radius_of(problem, channels, schedule, blend)
 
 
 def radius_of(problem: Problem, channels: Sequence[Channel], schedule: Schedule, blend: float) -> Floquet:
-    """`floquet_radius` of slots that are already on the plant."""
+    """Return the same as `floquet_radius`, for slots that are already on the plant."""
     modes, reason = linear_modes(problem, channels, problem.plant.exact, blend)
     names = [c.slot.coordinate for c in channels]
     eigenvalues = {name: mode.eigenvalues for name, mode in zip(names, modes, strict=False)}
@@ -64,6 +79,6 @@ def radius_of(problem: Problem, channels: Sequence[Channel], schedule: Schedule,
         begin = mode.start(before) if len(sequence) > 1 else mode.goes_on()
         whole = scipy.linalg.expm(mode.generator * duration) @ begin @ whole
         before = mode
-    used = np.flatnonzero(np.abs(whole).sum(axis=0) > 0)
-    radius = float(np.abs(np.linalg.eigvals(whole[np.ix_(used, used)])).max())
+    entering = np.flatnonzero(np.abs(whole).sum(axis=0) > 0)
+    radius = float(np.abs(np.linalg.eigvals(whole[np.ix_(entering, entering)])).max())
     return Floquet(radius, period, eigenvalues, "")

@@ -3,8 +3,7 @@
     FixedSchedule  spans of time, given one by one
     Periodic       durations, repeated
 
-Every slot begins with a control cycle: times are rounded to whole cycles. Schedules that choose by the state are in
-`chosen_schedules`.
+Times are rounded to whole control cycles. Schedules that choose by the state are in `chosen_schedules`.
 """
 
 from __future__ import annotations
@@ -35,22 +34,22 @@ class Schedule(ABC):
 
     @abstractmethod
     def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
-        """How long each slot may last at least at a stretch, s: the longest of its known stretches."""
+        """Return the longest stretch of each slot that is certain before a run, s, by coordinate."""
 
     def sequence(self, problem: Problem) -> SlotSpans:  # noqa: ARG002
-        """One period as (coordinate, duration in s); empty where the schedule is not periodic."""
+        """Return one period as (coordinate, duration in s); empty where the schedule is not periodic."""
         return ()
 
     @abstractmethod
     def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
-        """Block (time, error, state, reference, _slot_before, _age_before, _admissible, started) -> slot, its number."""
+        """Return Block (time, error, state, reference, _slot_before, _age_before, _admissible, warm_up) -> slot, its number."""
 
 
 @dataclass(frozen=True)
 class FixedSchedule(Schedule):
     """Slots at given times.
 
-    Parameters:
+    Args:
         spans: (coordinate, start, end) in s, without gaps from 0 s to the end of the run.
     """
 
@@ -70,7 +69,7 @@ class FixedSchedule(Schedule):
             if end - start < problem.period * (1 - 1e-9):
                 mistakes.add(f"{where} is shorter than one control cycle of {problem.period:g} s; let it end later")
             if start < at - half:
-                mistakes.add(f"{where} overlaps what came before, which ends at {at:g} s; let it start there")
+                mistakes.add(f"{where} overlaps the slot before it, which ends at {at:g} s; let it start there")
             elif start > at + half:
                 mistakes.add(f"FixedSchedule: no slot from {at:g} to {start:g} s; let '{name}' start at {at:g} s")
             at = max(at, end)
@@ -81,7 +80,7 @@ class FixedSchedule(Schedule):
             mistakes.add(f"FixedSchedule: no slot from {at:g} s to the end of the run at {end:g} s; add one")
 
     def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
-        """The longest stretch of each coordinate; spans that follow each other are one."""
+        """Return the longest stretch of each coordinate; adjacent spans of one coordinate count as one."""
         del problem
         longest, before, stretch = dict.fromkeys(names, 0.0), "", 0.0
         for name, start, end in self._ordered():
@@ -90,7 +89,7 @@ class FixedSchedule(Schedule):
         return longest
 
     def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
-        """Block time -> slot."""
+        """Return Block time -> slot."""
         starts = [(name, start / problem.period) for name, start, _ in self._ordered()]
         return _timed(problem, channels, starts, math.inf)
 
@@ -102,7 +101,7 @@ class FixedSchedule(Schedule):
 class Periodic(Schedule):
     """Slots in turn, again and again.
 
-    Parameters:
+    Args:
         durations: coordinate -> s, in the order of the slots.
     """
 
@@ -115,17 +114,17 @@ class Periodic(Schedule):
             check_stretch(f"Periodic: duration of '{name}'", duration, problem, mistakes)
 
     def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
-        """The durations; alone, a slot lasts as long as the run."""
+        """Return the durations; a single slot lasts as long as the run."""
         if len(self.durations) == 1:
             return dict.fromkeys(self.durations, problem.duration)
         return {n: self.durations.get(n, 0.0) for n in names}
 
     def sequence(self, problem: Problem) -> SlotSpans:
-        """One period, in whole cycles."""
+        """Return one period, in whole cycles."""
         return tuple((n, round(d / problem.period) * problem.period) for n, d in self.durations.items())
 
     def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
-        """Block time -> slot."""
+        """Return Block time -> slot."""
         starts, at = [], 0
         for name, duration in self.durations.items():
             starts.append((name, float(at)))
@@ -143,10 +142,10 @@ def _is_span(span: object) -> bool:
 
 def _check_visits(owner: str, visited: Iterable[str], names: Sequence[str], mistakes: Mistakes) -> None:
     """Note coordinates that have no slot, and slots that are never active."""
-    found = list(visited)
-    mistakes.unknown(f"{owner}: coordinate", found, names)
+    coordinates = list(visited)
+    mistakes.unknown(f"{owner}: coordinate", coordinates, names)
     for name in names:
-        if name not in found:
+        if name not in coordinates:
             mistakes.add(f"{owner}: slot '{name}' is never active; give it time, or leave the slot out")
 
 

@@ -1,7 +1,7 @@
 """A time slot: one coordinate, controlled alone with its own relative order, tracking law and deformation.
 
-A slot is lowered onto a plant as a `Channel`: the coordinate's chain of derivatives, and a light plant that has nothing but
-that chain, y^(r) = u, so that tracking laws and deformations serve a slot as they serve a whole plant.
+On a plant a slot becomes a `Channel`: the coordinate's chain of derivatives, and a light plant that consists of this chain alone,
+y^(r) = u. So tracking laws and deformations work in a slot as they do on a whole plant.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ First = Callable[[Signals], Mapping[str, Expression]]
 
 @dataclass(frozen=True)
 class Slot:
-    """What is controlled while the slot lasts, and how.
+    """The coordinate that is controlled while the slot lasts, and how.
 
-    Parameters:
+    Args:
         coordinate: the coordinate y that follows its reference.
         tracking: the law that gives the desired y^(r).
         deformation: the fixed-point map between desired y^(r) and request, its scale given; Identity() is no adaptation.
-        order: the relative order r from the input to y; None: found from the model. A wrong one is refused.
-        input: the input that acts; may be left out where the plant has only one. Other inputs keep their last command.
+        order: the relative order r from the input to y; None: computed from the model. A wrong order is refused.
+        input: the input that acts; None where the plant has only one. Other inputs keep their last command.
     """
 
     coordinate: str
@@ -56,9 +56,12 @@ class Slot:
 class Channel:
     """A slot on a plant.
 
-    Parameters:
-        slot, chain: the slot and its coordinate's derivatives. number: place among the slots.
-        plant: the light plant y^(r) = u. start_gain: d y^(r)/du of the model at the problem's start.
+    Args:
+        slot: that is on the plant.
+        chain: the derivatives of its coordinate.
+        number: place among the slots.
+        plant: the light plant y^(r) = u.
+        start_gain: d y^(r)/du of the model at the problem's start.
     """
 
     slot: Slot
@@ -68,11 +71,11 @@ class Channel:
     start_gain: float
 
     def wire(self, name: str) -> str:
-        """Name of this slot's own copy of a signal."""
+        """Return the name of this slot's own copy of a signal."""
         return f"_{name.lstrip('_')}_{self.number}"
 
     def signal(self, name: str, elements: tuple[str, ...] = ()) -> Signal:
-        """A signal of this slot's own: a scalar, or with named elements."""
+        """Return a signal of this slot's own: a scalar, or a vector with named elements."""
         return Signal(self.wire(name), elements)
 
 
@@ -80,8 +83,10 @@ def channel(problem: Problem, slot: Slot, number: int) -> Channel:
     """Return the slot on the problem's plant.
 
     Raises:
-        InvalidName, NotInvertible: see `output_chain`; y^(r) not affine in the input, or its gain zero at the start.
-        InvalidProblem: the given order is not the model's. NotSupported: a deformation that queues pairs.
+        InvalidName: the coordinate or the input is unknown.
+        NotInvertible: the input has no effect on the coordinate, y^(r) is not affine in it, or its gain is zero at the start.
+        InvalidProblem: the order of the slot is not the model's.
+        NotSupported: a deformation that keeps pairs or commands of earlier cycles.
     """
     plant = problem.plant
     chain = output_chain(plant, slot.coordinate, slot.input)
@@ -124,10 +129,10 @@ def _check_deformation(deformation: Deformation) -> None:
 
 
 def _light_plant(plant: Plant, chain: OutputChain) -> Plant:
-    """The plant y^(r) = u that has the chain as its state; only its signals are used."""
+    """The plant y^(r) = u with the chain as its state; only its signals are used."""
 
-    def response(*given: Named) -> dict[str, Expression]:
-        return {chain.coordinate: given[-2].vector}
+    def response(*arguments: Named) -> dict[str, Expression]:
+        return {chain.coordinate: arguments[-2].vector}
 
     names = [f"d{k}" for k in range(chain.order)] + ["u", "p"]
     kind = inspect.Parameter.POSITIONAL_ONLY
@@ -138,9 +143,14 @@ def _light_plant(plant: Plant, chain: OutputChain) -> Plant:
 def for_channel(
     block: Block, one: Channel, shared: Set[str], names: Mapping[str, str], first: First | None = None
 ) -> Block:
-    """The block on the slot's own copies of all signals that are not `shared`; `names` renames some differently.
+    """Return the block on the slot's own copies of its signals. The memory of the block starts anew with every slot.
 
-    What the block itself remembers starts afresh with every slot, with what `first` makes of the slot's signals where it names it.
+    Args:
+        block: that runs in the slot.
+        one: the slot.
+        shared: names of signals that all slots share.
+        names: signal of the block -> another name for the slot's copy.
+        first: (signals) -> values with which the memory starts, by name; signals that are not named keep their own start.
     """
 
     def renamed(signal: Signal) -> Signal:
@@ -157,12 +167,12 @@ def for_channel(
         first_values = [
             starts.get(m.name, ca.DM(w.start_vector())) for m, w in zip(block.memory.signals, own, strict=True)
         ]
-        kept = [
+        memories = [
             ca.if_else(getattr(s, begun.name) > 0.5, getattr(s, w.name), start)
             for w, start in zip(own, first_values, strict=True)
         ]
-        given = block.function(*(getattr(s, r.name) for r in reads), *kept)
-        values = given if isinstance(given, tuple) else (given,)
+        outputs = block.function(*(getattr(s, r.name) for r in reads), *memories)
+        values = outputs if isinstance(outputs, tuple) else (outputs,)
         results = [renamed(w).name for w in block.writes.signals] + [f"{m.name}_next" for m in own]
         return dict(zip(results, values, strict=True))
 
@@ -172,7 +182,7 @@ def for_channel(
 
 
 def delays_for_channel(delays: tuple[Delay, ...], one: Channel) -> list[Delay]:
-    """What a law carries to the next cycle, on the slot's own copies."""
+    """Return the delays of a law, on the slot's own copies of its signals."""
     return [
         Delay(Signal(one.wire(d.now.name), d.now.elements, d.now.units, d.now.start), one.wire(d.source))
         for d in delays

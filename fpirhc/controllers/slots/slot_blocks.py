@@ -1,14 +1,14 @@
 """The blocks of a control cycle in time slots, in the order in which they run.
 
     reference   the reference state, and the error of every judged coordinate
-    state       per slot: its chain, what it is to be, alpha and beta of the model, and whether beta is large enough
-    admissible  which slots have gain enough, for the schedule
-    switch      which slot is active, and whether it was in the last cycle too
-    join        per slot: the desired response, joined to what the plant did before, and the pair that came before
+    state       per slot: its chain and target, alpha and beta of the model, and whether beta is large enough
+    admissible  which slots have a gain that is large enough, for the schedule
+    switch      which slot is active, and whether it was active in the last cycle too
+    join        per slot: the desired response, joined to the plant's last motion, and the pair of the last cycle
     command     the active slot's request inverted and clipped, and what the command means for every slot
     judge       one status for the cycle
 
-Each slot has signals of its own (`Channel.signal`), computed in every cycle; those of the active one are used.
+Each slot has signals of its own (`Channel.signal`). All are computed in every cycle; those of the active slot are used.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def reference_block(problem: Problem) -> Block:
 
 
 def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
-    """Block -> the slot's chain and its target, y^(r),N, and alpha, beta of the model; whether beta is large enough."""
+    """Block -> the slot's chain, its target, y^(r),N, alpha and beta of the model, and whether beta is large enough."""
     plant, chain = problem.plant, one.chain
     derivatives = problem.reference.derivatives(chain.coordinate, chain.order)
     place = plant.input.elements.index(chain.input)
@@ -78,7 +78,7 @@ def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
 
 
 def admissible_block(channels: Sequence[Channel]) -> Block:
-    """Block that puts together which slots have gain enough."""
+    """Block that gathers, for the schedule, which slots have a gain that is large enough."""
     writes = Signal("_admissible", tuple(c.slot.coordinate for c in channels))
     reads = Layout(tuple(c.signal("good") for c in channels))
     return Block("admissible", reads, Layout((writes,)), lambda s: {"_admissible": _column(s, channels, "good")})
@@ -89,143 +89,140 @@ def _column(s: Signals, channels: Sequence[Channel], name: str) -> Expression:
 
 
 def switch_block(channels: Sequence[Channel]) -> Block:
-    """Block -> per slot whether it is active, and whether it was in the last cycle too; cycles since it began."""
+    """Block -> per slot whether it is active and whether it was active in the last cycle too; cycles since it began."""
     reads = Layout((scalar("slot"), scalar("_slot_before"), scalar("_age_before"), scalar("warm_up")))
 
     def step(s: Signals) -> dict[str, Expression]:
         goes_on = ca.logic_and(s.warm_up > 0.5, s.slot == s._slot_before)
-        found = {"_age": ca.if_else(goes_on, s._age_before + 1, 0)}
+        flags = {"_age": ca.if_else(goes_on, s._age_before + 1, 0)}
         for one in channels:
             active = s.slot == one.number
-            found[one.wire("active")] = active
-            found[one.wire("warm_up")] = ca.logic_and(active, goes_on)
-        return found
+            flags[one.wire("active")] = active
+            flags[one.wire("warm_up")] = ca.logic_and(active, goes_on)
+        return flags
 
     writes = [c.signal(n) for c in channels for n in ("active", "warm_up")]
     return Block("switch", reads, Layout((scalar("_age"), *writes)), step)
 
 
 def join_block(problem: Problem, channels: Sequence[Channel], one: Channel, blend: float, blank: int) -> Block:
-    """Block that joins the slot's law to what the plant did before: the desired response, and the pair that came before."""
+    """Block that joins the slot's law to the plant's last motion: the desired response and the pair of the last cycle."""
     decay = math.exp(-problem.period / blend) if blend > 0 else 0.0
     place = problem.plant.input.elements.index(one.chain.input)
     names = ("law", "free", "gain", "active", "warm_up")
-    referenced = one.slot.deformation.mirror is not None
+    request_before = _request_before(one)
 
     def step(s: Signals) -> dict[str, Expression]:
         law, free, gain, active, goes_on = (getattr(s, one.wire(name)) for name in names)
         running, realised = s.warm_up > 0.5, s.realised[one.number]
         switched = ca.logic_and(ca.logic_and(active, running), ca.logic_not(goes_on))
-        meant = free + gain * s._command_before[place]
-        as_it_is = realised if one.slot.adapts else meant
-        offset = ca.if_else(switched, as_it_is - law, decay * s._offset_before)
+        last_request = free + gain * s._command_before[place]
+        response = realised if one.slot.adapts else last_request
+        offset = ca.if_else(switched, response - law, decay * s._offset_before)
         desired = law + ca.if_else(active, offset, 0)
         blanked = ca.logic_and(ca.logic_and(active, running), s._age < blank - 0.5)
+        if request_before == "deformed_last":
+            own_request = ca.if_else(switched, last_request, s._deformed_before[one.number])
+        else:
+            own_request = last_request
         values = {
             "offset": offset,
             "desired": desired,
-            "kept": ca.if_else(switched, meant - desired, s._kept_before),
-            "modelled" if referenced else "deformed_last": (
-                meant if referenced else ca.if_else(switched, meant, s._deformed_before[one.number])
-            ),
+            "distance": ca.if_else(switched, last_request - desired, s._distance_before),
+            request_before: own_request,
             "realised": realised,
             "valid": ca.logic_and(ca.logic_and(active, running), ca.logic_not(blanked)),
             "blanked": blanked,
         }
         return {one.wire(name): value for name, value in values.items()}
 
-    shared = [scalar(n) for n in ("warm_up", "_age", "_offset_before", "_kept_before")]
+    shared = [scalar(n) for n in ("warm_up", "_age", "_offset_before", "_distance_before")]
     columns = [by_slot(channels, n) for n in ("realised", "_deformed_before")]
     reads = [*(one.signal(n) for n in names), *shared, *columns, like(problem.plant.input, "_command_before")]
-    asked = "modelled" if referenced else "deformed_last"
-    results = ("offset", "desired", "kept", asked, "realised", "valid", "blanked")
+    results = ("offset", "desired", "distance", request_before, "realised", "valid", "blanked")
     return Block(f"join_{one.number}", Layout(tuple(reads)), Layout(tuple(one.signal(n) for n in results)), step)
 
 
+def _request_before(one: Channel) -> str:
+    """Name of the request that the slot's map is given: the response of the model in a model-referenced form, else its last one."""
+    return "deformed_last" if one.slot.deformation.mirror is None else "modelled"
+
+
 def settled_in(one: Channel) -> First:
-    """What the slot's deformation remembers when it begins: the last command was just realised."""
-    asked = "modelled" if one.slot.deformation.mirror is not None else "deformed_last"
+    """Return what the slot's deformation remembers when it begins: the pair of the last command, just realised."""
+    request = one.wire(_request_before(one))
 
     def first(s: Signals) -> Mapping[str, Expression]:
-        return one.slot.deformation.settled(getattr(s, one.wire(asked)), getattr(s, one.wire("realised")))
+        return one.slot.deformation.settled(getattr(s, request), getattr(s, one.wire("realised")))
 
     return first
 
 
-_OF_A_SLOT = (
-    "active",
-    "good",
-    "nominal",
-    "desired",
-    "deformed_unclipped",
-    "blanked",
-    "kept",
-    "offset",
-    "free",
-    "gain",
-    "divisor",
-)
+_FLAGS = ("active", "good", "blanked")
+_VALUES = ("nominal", "desired", "deformed_unclipped", "distance", "offset", "free", "gain", "divisor")
+_PER_SLOT = (*_FLAGS, *_VALUES)
 
 
 def command_block(problem: Problem, channels: Sequence[Channel]) -> Block:
-    """Block that inverts the active slot's request, clips the command, and says what it means for every slot."""
+    """Block that inverts the active slot's request, clips the command, and writes what the command means for every slot."""
     plant = problem.plant
     lower, upper = problem.limits.input_bounds(plant)
     places = [plant.input.elements.index(c.chain.input) for c in channels]
 
     def step(s: Signals) -> dict[str, Value]:
-        per_slot = {name: _column(s, channels, name) for name in _OF_A_SLOT}
-        active, free, gain = per_slot["active"], per_slot["free"], per_slot["gain"]
-        wanted = ca.if_else(per_slot["blanked"], per_slot["desired"] + per_slot["kept"], per_slot["deformed_unclipped"])
-        requests = (wanted - free) / per_slot["divisor"]
-        good = _pick(active, per_slot["good"]) > 0.5
-        requested = [
-            _pick(active * ca.DM([p == k for p in places]), requests, s._command_before[k])
-            for k in range(plant.input.size)
-        ]
-        asked = ca.vertcat(*requested)
-        finite = ca.mmin(ca.fabs(asked) <= FINITE)
+        slot = {name: _column(s, channels, name) for name in _PER_SLOT}
+        requests = ca.if_else(slot["blanked"], slot["desired"] + slot["distance"], slot["deformed_unclipped"])
+        commands = (requests - slot["free"]) / slot["divisor"]
+        unclipped = _column_of_inputs(slot["active"], commands, places, s._command_before)
+        good = _pick(slot["active"], slot["good"]) > 0.5
+        finite = ca.mmin(ca.fabs(unclipped) <= FINITE)
         usable = ca.logic_and(finite, good)
-        command = clip(ca.if_else(usable, asked, s._command_before), lower, upper)
+        command = clip(ca.if_else(usable, unclipped, s._command_before), lower, upper)
         entries = ca.vertcat(*(command[p] for p in places))
-        # Exactly the wanted response where nothing was clipped.
-        moved = wanted + gain * (entries - requests)
-        exact = ca.logic_and(active, usable)
+        # Exactly the request where nothing was clipped.
+        clipped_requests = requests + slot["gain"] * (entries - commands)
+        exact = ca.logic_and(slot["active"], usable)
         return {
             "command": command,
-            "nominal": per_slot["nominal"],
-            "desired": per_slot["desired"],
-            "deformed": ca.if_else(exact, moved, free + gain * entries),
-            "clipped": ca.mmax(command != asked),
+            "nominal": slot["nominal"],
+            "desired": slot["desired"],
+            "deformed": ca.if_else(exact, clipped_requests, slot["free"] + slot["gain"] * entries),
+            "clipped": ca.mmax(command != unclipped),
             "slot_held": ca.logic_not(good),
             "_held": ca.logic_not(finite),
-            "_offset": _finite(_pick(active, per_slot["offset"])),
-            "_kept": _finite(_pick(active, per_slot["kept"])),
+            "_offset": _finite(_pick(slot["active"], slot["offset"])),
+            "_distance": _finite(_pick(slot["active"], slot["distance"])),
             "_warm_up_now": 1,
         }
 
-    reads = [c.signal(n) for c in channels for n in _OF_A_SLOT]
+    reads = [c.signal(n) for c in channels for n in _PER_SLOT]
     responses = [by_slot(channels, n) for n in ("nominal", "desired", "deformed")]
-    scalars = [scalar(n) for n in ("clipped", "slot_held", "_held", "_offset", "_kept", "_warm_up_now")]
+    scalars = [scalar(n) for n in ("clipped", "slot_held", "_held", "_offset", "_distance", "_warm_up_now")]
     writes = (plant.input, *responses, *scalars)
     return Block("command", Layout((*reads, like(plant.input, "_command_before"))), Layout(writes), step)
 
 
+def _column_of_inputs(active: Expression, commands: Expression, places: list[int], before: Expression) -> Expression:
+    """The command of the active slot at the place of its input; the other inputs keep their last command."""
+    own = [active * ca.DM([p == k for p in places]) for k in range(before.numel())]
+    return ca.vertcat(*(_pick(mask, commands, before[k]) for k, mask in enumerate(own)))
+
+
 def _pick(active: Expression, values: Expression, otherwise: Value = 0) -> Expression:
-    """The value of the active slot; no sum, in which a value that is not finite would spoil the others."""
-    found = otherwise
+    """The value of the active slot. It is not a sum, because one value that is not finite would spoil a sum."""
+    value = otherwise
     for k in range(values.numel()):
-        found = ca.if_else(active[k] > 0.5, values[k], found)
-    return expression(found)
+        value = ca.if_else(active[k] > 0.5, values[k], value)
+    return expression(value)
 
 
 def _finite(value: Expression) -> Expression:
-    """Zero in place of a number that is not finite, which would otherwise be remembered for the rest of the slot."""
+    """Zero in place of a number that is not finite: the number would be remembered for the rest of the slot."""
     return ca.if_else(ca.fabs(value) <= FINITE, value, 0)
 
 
 def judge_block() -> Block:
-    """Block that says whether the command was held: because it was not finite, or because the gain is too small."""
+    """Block -> status: whether the command was held, because it was not finite or because the gain is too small."""
 
     def step(s: Signals) -> dict[str, Expression]:
         return {"status": ca.fmax(s._held * int(Status.NON_FINITE), s.slot_held * int(Status.HELD))}

@@ -1,20 +1,20 @@
 """Time slots: one input serves several coordinates in turn.
 
-A plant with fewer inputs than coordinates cannot prescribe all of them at once. Instead of weighing them in one cost, time is cut
-into slots: in each one coordinate y follows its reference with its own relative order r,
+With fewer inputs than coordinates a controller cannot prescribe all coordinates at once. Instead of weighing them in one cost, time
+is divided into slots. In each slot one coordinate y follows its reference with its own relative order r,
 
     y^(r) = alpha(x) + beta(x) u,        u = (r^Def - alpha) / beta  by the model,
 
-while the others follow the zero dynamics of y. A slot need not be stable alone; the schedule must be, see `floquet_radius`.
+while the others follow the zero dynamics of y. A slot need not be stable alone, but the schedule must be (`floquet_radius`).
 
-At a switch the command is continuous. The first request of a slot is what the last command means for it by the model,
+At a switch the command is continuous. The first request of a slot is the response that the model expects of the last command,
 r_0 = alpha + beta u, and the law is joined without a step,
 
-    desired = law + offset e^(-(t - t_0) / blend),    offset = y^(r) as it is - law  at t_0,
+    desired = law + offset e^(-(t - t_0) / blend),    offset = y_0 - law  at t_0,
 
-where y^(r) as it is means the realised one for a slot that adapts (its deformation then begins at a fixed point: the request r_0
-was just realised) and r_0 for one that does not. So the command of the first cycle of a slot is the last command, and the
-change per cycle afterwards is at most
+where y_0 is the realised y^(r) for a slot that adapts (its deformation then begins at a fixed point: the request r_0 was just
+realised) and r_0 for a slot that does not. So the command of the first cycle of a slot is the last command, and the change per
+cycle afterwards is at most
 
     ( |offset| (1 - e^(-period / blend)) + |change of law and of alpha| + |step of the deformation| ) / |beta|.
 """
@@ -58,13 +58,13 @@ from fpirhc.task.problem import Problem
 class Slotted(Controller):
     """One coordinate at a time, by a schedule.
 
-    Parameters:
-        slots: what each slot controls; one per coordinate.
-        schedule: which slot is active (FixedSchedule, Periodic, ByError, ByLookAhead).
+    Args:
+        slots: one per coordinate.
+        schedule: chooses the active slot (FixedSchedule, Periodic, ByError, ByLookAhead).
         blend: time constant with which the offset of a switch decays, s; 0: the law is joined at once, and the command jumps
             one cycle after the switch.
-        blank: cycles at the start of a slot in which the request keeps its distance from the desired response, for measurements
-            of y^(r) that need as many cycles after a switch.
+        blank: number of cycles at the start of a slot in which the difference between request and desired response stays constant,
+            for measurements of y^(r) that need as many cycles after a switch.
         smallest_gain: share of its size at the start that |beta| must keep; below it the command is held (signal `slot_held`).
         largest_growth: by how much a diverging zero dynamics may grow within one slot.
 
@@ -96,62 +96,60 @@ class Slotted(Controller):
 
     @property
     def deformation(self) -> Deformation:
-        """The first slot's deformation that iterates, or Identity."""
+        """The deformation of the first slot that adapts; Identity() where no slot does."""
         return next((s.deformation for s in self.slots if s.adapts), Identity())
 
     def response(self, problem: Problem) -> Response:
-        """y^(r) of every slot's coordinate."""
+        """Return the response y^(r) of every slot's coordinate."""
         channels = self.channels(problem)
         x, u, p = problem.plant._symbols()
         w = ca.SX.sym("w", len(problem.plant.names))
-        found = ca.vertcat(*(c.chain.response(x, u, p, w) for c in channels))
-        return Response(by_slot(channels, "realised"), ca.Function("fpirhc_slots_realised", [x, u, p, w], [found]))
+        responses = ca.vertcat(*(c.chain.response(x, u, p, w) for c in channels))
+        return Response(by_slot(channels, "realised"), ca.Function("fpirhc_slots_realised", [x, u, p, w], [responses]))
 
     def with_deformation(self, deformation: Deformation) -> Slotted:
         """Return the controller with this deformation in every slot."""
         return replace(self, slots=tuple(replace(slot, deformation=deformation) for slot in self.slots))
 
     def demand(self, problem: Problem) -> None:
-        """None: every slot's deformation has its scale given."""
+        """Return None: the deformation of every slot needs its settings from the user."""
         del problem
 
     def floquet(self, problem: Problem) -> Floquet:
-        """Of the schedule, with ideal deformations and the plant's exact parameters."""
+        """Return the stability of the schedule, with ideal deformations and the plant's exact parameters."""
         return radius_of(problem, self.channels(problem), self.schedule, self.blend)
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
-        """The Floquet radius of the schedule, and each slot's fastest divergence."""
-        found = self.floquet(problem)
-        if found.radius is None:
-            return (f"no Floquet radius: {found.reason}",)
+        """Return a sentence with the Floquet radius of the schedule and the largest real part in each slot."""
+        floquet = self.floquet(problem)
+        if floquet.radius is None:
+            return (f"no Floquet radius: {floquet.reason}",)
         alone = ", ".join(
-            f"{name} {round(values.real.max(), 6) + 0.0:.3g}" for name, values in found.eigenvalues.items()
+            f"{name} {round(values.real.max(), 6) + 0.0:.3g}" for name, values in floquet.eigenvalues.items()
         )
-        verb = "shrink" if found.radius < 1 else "grow"
+        verb = "shrink" if floquet.radius < 1 else "grow"
         return (
-            f"Floquet radius {found.radius:.3g} per period of {found.period:g} s: near the set-point errors of ideal slots {verb} "
-            f"(largest real part in each slot alone, 1/s: {alone})",
+            f"Floquet radius {floquet.radius:.3g} per period of {floquet.period:g} s: near the set-point errors of ideal slots "
+            f"{verb} (largest real part in each slot alone, 1/s: {alone})",
         )
 
     def channels(self, problem: Problem) -> list[Channel]:
-        """The slots on the plant."""
+        """Return the slots on the plant."""
         return [channel(problem, slot, k) for k, slot in enumerate(self.slots)]
 
     def check(self, problem: Problem) -> None:
         """Raise if the slots or the schedule do not fit the problem.
 
         Raises:
-            InvalidProblem: all mistakes together, of slots and schedule; slots that last too long. NotContractive: a
-            deformation's gain of the wrong sign or too large at the start.
+            InvalidProblem: mistakes of slots and schedule, all together; a slot that lasts too long.
+            NotContractive: the gain of a deformation has the wrong sign or is too large at the start.
         """
         mistakes = Mistakes("Slotted")
         names = [s.coordinate for s in self.slots]
         if not names:
             mistakes.add("there are no slots; give at least one Slot(coordinate, tracking)")
         for name in sorted({n for n in names if names.count(n) > 1}):
-            mistakes.add(
-                f"coordinate '{name}' has more than one slot; a schedule may visit one slot as often as it likes"
-            )
+            mistakes.add(f"coordinate '{name}' has more than one slot; give it one, which the schedule may repeat")
         for slot in self.slots:
             _check_slot(problem, slot, mistakes)
         if names:
@@ -163,7 +161,7 @@ class Slotted(Controller):
         self._check_growth(problem, channels)
 
     def _check_growth(self, problem: Problem, channels: Sequence[Channel]) -> None:
-        """By the model, at the reference's last point; without a set-point nothing is said."""
+        """Raise where zero dynamics grow too much by the model at the reference's last point; it needs a set-point there."""
         modes, _ = linear_modes(problem, channels, problem.plant.approximate, 0.0)
         dwells = self.schedule.dwells([c.slot.coordinate for c in channels], problem)
         mistakes = Mistakes("Slotted")
@@ -178,7 +176,7 @@ class Slotted(Controller):
         mistakes.raise_if_any()
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks reference, schedule; per slot tracking, join, deform; then command, judge, tracking updates."""
+        """Return the blocks reference, schedule; per slot tracking, join, deform; then command, judge, tracking updates."""
         channels = self.channels(problem)
         blocks = [reference_block(problem)]
         blocks += [state_block(problem, one, self.smallest_gain) for one in channels]
@@ -197,7 +195,7 @@ class Slotted(Controller):
             for_channel(c.slot.tracking.update(c.plant, problem.period), c, {"clipped", "time"}, {}) for c in channels
         ]
         remembered = {"warm_up": "_warm_up_now", "_slot_before": "slot", "_age_before": "_age"}
-        remembered |= {"_offset_before": "_offset", "_kept_before": "_kept"}
+        remembered |= {"_offset_before": "_offset", "_distance_before": "_distance"}
         delays += [Delay(scalar(now), source) for now, source in remembered.items()]
         delays.append(Delay(like(problem.plant.input, "_command_before"), "command"))
         delays.append(Delay(by_slot(channels, "_deformed_before"), "deformed"))
@@ -208,7 +206,7 @@ def _check_slot(problem: Problem, slot: Slot, mistakes: Mistakes) -> None:
     name = slot.coordinate
     try:
         channel(problem, slot, 0)
-        slot.deformation.largest_step()  # says so where a scale is still to be chosen
+        slot.deformation.largest_step()  # raises where a scale is not set
     except FpirhcError as error:
         mistakes.add(f"slot '{name}': {error}")
         return
@@ -220,7 +218,7 @@ def _check_slot(problem: Problem, slot: Slot, mistakes: Mistakes) -> None:
 
 
 def _check_gain(problem: Problem, one: Channel) -> None:
-    """J = beta / beta of the model, at the start."""
+    """Raise NotContractive where the deformation does not converge with J = beta of the plant / beta of the model, at the start."""
     if not one.slot.adapts:
         return
     exact = float(one.chain.gain(problem.start_state, np.zeros(problem.plant.input.size), problem.plant.exact))

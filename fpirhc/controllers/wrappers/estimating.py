@@ -1,11 +1,11 @@
-"""A controller whose model is learned on line: an estimator corrects the parameters that the wrapped controller believes.
+"""A controller whose model is learned on line: an estimator corrects the parameters of the wrapped controller's model.
 
     command = controller(state; p + parameter_change),      parameter_change = estimator(state, last command, response; p).
 
-Offset-free receding-horizon control is RecedingHorizon with DisturbanceKalman; adaptive receding-horizon control in the
-sense of certainty equivalence is RecedingHorizon with RecursiveLeastSquares or MovingHorizon. They are what an engineer
-would use instead of a deformation, or with one. The change is used where the controller evaluates its model: in the
-inverse every cycle, in a receding horizon whenever it plans.
+Offset-free receding-horizon control is RecedingHorizon with DisturbanceKalman. Adaptive receding-horizon control in the
+sense of certainty equivalence is RecedingHorizon with RecursiveLeastSquares or MovingHorizon. Both are alternatives to a
+deformation, or companions of one. The change is used where the controller evaluates its model: in the inverse every cycle, in a
+receding horizon whenever it plans.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ _BELIEVED = "_believed"
 class Estimating(Controller):
     """The wrapped controller with the parameters of its model corrected every cycle.
 
-    Parameters:
-        controller: any controller that uses its model. estimator: what learns, and what is learned.
+    Args:
+        controller: any controller that uses its model.
+        estimator: learns the change of the parameters.
     """
 
     controller: Controller
@@ -46,34 +47,35 @@ class Estimating(Controller):
 
     @property
     def deformation(self) -> Deformation:
-        """The wrapped controller's."""
+        """The deformation of the wrapped controller."""
         return self.controller.deformation
 
     def inner_problem(self, problem: Problem) -> Problem:
-        """The problem with the estimator's model of the plant."""
+        """Return the problem with the estimator's model of the plant."""
         model = self.estimator.model(problem.plant)
         return problem if model is problem.plant else replace(problem, plant=model)
 
     @property
     def feeds(self) -> Mapping[str, str]:
-        """The wrapped controller reads the corrected parameters."""
+        """Corrected parameters in place of the parameters."""
         return {"parameters": _BELIEVED, **self.controller.feeds}
 
     @property
     def learns(self) -> bool:
-        """It does."""
+        """True: the parameters of the model change during a run."""
         return True
 
     def linear_around(self, inner: Controller) -> Controller:
-        """The wrapped one: near the reference the model is the one that it begins with."""
+        """Return the inner controller: near the reference the parameters are those of the start."""
         return inner
 
     def check(self, problem: Problem) -> None:
-        """Raise what the wrapped controller and the estimator raise.
+        """Raise if the estimator or the wrapped controller does not fit the problem.
 
         Raises:
-            NotSupported: dead time, with which the response answers another command than the last; or a controller that
-            reads a response of its own.
+            FpirhcError: a check of the estimator or of the wrapped controller fails.
+            NotSupported: dead time, with which the response does not belong to the last command; a controller that reads a response
+                of its own.
         """
         modelled = self.inner_problem(problem)
         self.estimator.check(modelled)
@@ -88,7 +90,7 @@ class Estimating(Controller):
             )
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks estimate, and the wrapped controller as one."""
+        """Return the block estimate, and the wrapped controller as one block."""
         modelled = self.inner_problem(problem)
         inner = compose_controller(modelled, self.controller)
         believed = Signal(_BELIEVED, modelled.plant.parameter.elements, modelled.plant.parameter.units)
@@ -103,7 +105,7 @@ class Estimating(Controller):
 def _estimate_block(
     problem: Problem, modelled: Problem, estimator: Estimator, believed: Signal, acted: Signal
 ) -> Block:
-    """Block (state, realised, parameters, command of the last cycle) -> (believed parameters, the learned ones)."""
+    """Block (state, realised, parameters, command of the last cycle) -> (corrected parameters, the learned ones among them)."""
     plant, model = problem.plant, modelled.plant
     names = estimator.learned()
     places = [model.parameter.elements.index(n) for n in names]
@@ -114,22 +116,22 @@ def _estimate_block(
     own = memory + Layout((like(estimate, "estimate_change"), scalar("estimate_begun")))
 
     def step(s: Signals) -> dict[str, Value]:
-        given = ca.vertcat(s.parameters[:count], ca.DM(model.approximate[count:]))
+        parameters = ca.vertcat(s.parameters[:count], ca.DM(model.approximate[count:]))
         before = {m: getattr(s, m) for m in memory.names}
-        seen = Seen(s.state, s._acted, s.realised, given, s.estimate_begun)
-        parameter_change, following = correct(seen, before)
-        # What is not finite is not learned: one bad measurement must not spoil the model for ever.
-        finite = ca.mmin(ca.fabs(ca.vertcat(parameter_change, *following.values())) <= FINITE)
-        used = ca.if_else(finite, parameter_change, s.estimate_change)
-        values = given + 0
-        values[places] += used
-        kept = {f"{m}_next": ca.if_else(finite, following[m], before[m]) for m in memory.names}
+        evidence = Seen(s.state, s._acted, s.realised, parameters, s.estimate_begun)
+        parameter_change, next_memory = correct(evidence, before)
+        # A change that is not finite is not learned: one bad measurement must not spoil the model for ever.
+        finite = ca.mmin(ca.fabs(ca.vertcat(parameter_change, *next_memory.values())) <= FINITE)
+        change = ca.if_else(finite, parameter_change, s.estimate_change)
+        values = parameters + 0
+        values[places] += change
+        remembered = {f"{m}_next": ca.if_else(finite, next_memory[m], before[m]) for m in memory.names}
         return {
             believed.name: values,
             "estimate": values[places],
-            "estimate_change_next": used,
+            "estimate_change_next": change,
             "estimate_begun_next": 1,
-            **kept,
+            **remembered,
         }
 
     reads = Layout((plant.state, plant.response_signal("realised"), plant.parameter, acted))

@@ -1,4 +1,4 @@
-"""A controller that is told the exact parameters: the bound that no controller with a wrong model can beat."""
+"""A controller with the exact parameters: the bound for every controller with a wrong model."""
 
 from __future__ import annotations
 
@@ -15,7 +15,11 @@ from fpirhc.task.problem import Problem
 
 @dataclass(frozen=True)
 class ExactModel(Controller):
-    """The wrapped controller, believing the plant's exact parameters."""
+    """The wrapped controller with the plant's exact parameters in its model.
+
+    Args:
+        controller: any controller that uses its model.
+    """
 
     controller: Controller
 
@@ -26,24 +30,24 @@ class ExactModel(Controller):
 
     @property
     def deformation(self) -> Deformation:
-        """The wrapped controller's."""
+        """The deformation of the wrapped controller."""
         return self.controller.deformation
 
     def inner_problem(self, problem: Problem) -> Problem:
-        """The problem as one sees it who knows the plant: what is prepared before a run has the exact parameters too."""
+        """Return the problem with the exact parameters as approximate ones, so that work before a run uses them too."""
         exact = {name: replace(p, approximate=p.exact) for name, p in problem.plant.parameters.items()}
         return replace(problem, plant=replace(problem.plant, parameters=exact))
 
     def linear_around(self, inner: Controller) -> Controller:
-        """The wrapped one: what is believed is given beside."""
+        """Return the inner controller: `parameters` already gives the exact ones."""
         return inner
 
     def parameters(self, plant: Plant) -> np.ndarray:
-        """The exact parameters."""
+        """Return the exact parameters, shape (np,)."""
         return plant.exact
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks of the wrapped controller."""
+        """Return the blocks of the wrapped controller."""
         return self.controller.blocks(self.inner_problem(problem))
 
 

@@ -1,15 +1,19 @@
 """A controller that acts on the state in which its command will act.
 
-With a dead time of the inputs the command of this cycle acts later, and with one of the measurement the measured state is old. The
-wrapper integrates the measured state over both with what it has sent meanwhile, and hands the wrapped controller that state and the
-time at which the command acts (O. J. M. Smith 1957; Z. Artstein 1982). A receding horizon then starts where its first input acts.
+With a dead time of the inputs the command of this cycle acts later, and with a dead time of the measurement the measured state is
+old. The wrapper integrates the measured state over both, with the commands that are on their way. The wrapped controller is given
+the resulting state and the time at which its command acts. So a receding horizon starts where its first input acts.
 
-Two ways to predict, as values:
+There are two ways to predict:
 
-    ByModel    the approximate model integrated over the commands on their way; on request plus its residual, the low-passed
-               difference between the response that was seen and the model's own.
-    ByDesired  the desired responses on their way, integrated: no model is needed, because a deformation makes the realised
-               response the desired one. For plants whose every coordinate is controlled.
+    ByModel    integrates the approximate model over the commands on their way, optionally with the residual: the low-passed
+               difference between the measured response and the model's.
+    ByDesired  integrates the desired responses on their way. It needs no model, because a deformation makes the realised response
+               the desired one. It is for plants in which every coordinate is controlled.
+
+References:
+    O. J. M. Smith, Closer control of loops with dead time, Chemical Engineering Progress 53, 1957.
+    Z. Artstein, Linear systems with delayed controls: a reduction, IEEE Trans. Automatic Control 27(4), 1982.
 """
 
 from __future__ import annotations
@@ -36,37 +40,41 @@ from fpirhc.task.problem import Problem
 
 
 class Predictor(ABC):
-    """Contract: how the state moves over one cycle under what was sent, and what was sent."""
+    """Contract: the signal that is queued while it is on its way, and the motion of the state under it over one cycle."""
 
     @property
     def residual_time(self) -> float | None:
-        """Time constant of the low-passed model residual that `advance` is given, s; None: it is zero."""
+        """Time constant of the low-passed model residual that `advance` is given, s; None: the residual is zero."""
         return None
 
     @abstractmethod
     def check(self, plant: Plant) -> None:
-        """Raise NotSupported where the plant does not fit."""
+        """Raise if the predictor does not support the plant.
+
+        Raises:
+            NotSupported: the plant does not fit.
+        """
 
     @abstractmethod
     def sent(self, plant: Plant) -> Signal:
-        """The signal that is queued: written by the controller."""
+        """Return the signal of the controller that is queued."""
 
     @abstractmethod
     def sent_at_start(self, problem: Problem) -> tuple[float, ...]:
-        """What is on its way when the run begins."""
+        """Return the values that are on their way when the run begins."""
 
     @abstractmethod
     def advance(self, plant: Plant, period: float) -> ca.Function:
-        """Function (state, sent, parameters, residual of the responses) -> state one cycle later."""
+        """Return Function (state, sent, parameters, residual of the responses) -> state one cycle later."""
 
 
 @dataclass(frozen=True)
 class ByModel(Predictor):
     """Integrate the approximate model over the queued commands.
 
-    Parameters:
-        residual_time: add the residual of the responses, low-passed with this time constant, s; None: no residual. Its loop has a
-            dead-time limit of its own: good at moderate rate x dead time (0.4), unstable at long ones.
+    Args:
+        residual_time: time constant of the low-pass on the residual of the responses that is added, s; None: no residual. The loop
+            of the residual has a limit of its own: it is stable at moderate rate x dead time (0.4) and unstable at long dead times.
 
     Raises:
         InvalidValue: a time constant that is not positive.
@@ -81,18 +89,18 @@ class ByModel(Predictor):
             )
 
     def check(self, plant: Plant) -> None:
-        """Every plant fits."""
+        """Accept every plant."""
 
     def sent(self, plant: Plant) -> Signal:
-        """The commands."""
+        """Return the signal of the commands."""
         return plant.input
 
     def sent_at_start(self, problem: Problem) -> tuple[float, ...]:
-        """The commands that the problem says."""
+        """Return the commands of the problem before the run."""
         return problem.dead_time.commands_before(problem.plant)
 
     def advance(self, plant: Plant, period: float) -> ca.Function:
-        """One Runge-Kutta step of the model."""
+        """Return one Runge-Kutta step of the model as a Function."""
         step = RungeKutta4().step(plant, period)
         x, u, p = plant._symbols()
         w = ca.SX.sym("w", len(plant.names))
@@ -107,24 +115,24 @@ class ByDesired(Predictor):
         """Raise if some coordinate is not controlled.
 
         Raises:
-            NotSupported: its motion needs a model.
+            NotSupported: the motion of a coordinate that is not controlled needs a model.
         """
         if len(plant.controlled_names) != len(plant.names):
             raise NotSupported("ByDesired() needs every coordinate to be controlled; use ByModel()")
 
     def sent(self, plant: Plant) -> Signal:
-        """The desired responses."""
+        """Return the signal of the desired responses."""
         return plant.response_signal("desired")
 
     def sent_at_start(self, problem: Problem) -> tuple[float, ...]:
-        """Zero: the plant was at rest or in steady motion."""
+        """Return zeros: before the run the plant was at rest or in steady motion."""
         return (0.0,) * len(problem.plant.controlled_names)
 
     def advance(self, plant: Plant, period: float) -> ca.Function:
-        """Taylor's formula with the highest derivative held."""
+        """Return Taylor's formula with the highest derivative held over the cycle, as a Function."""
         x, _, p = plant._symbols()
         d, w = ca.SX.sym("d", len(plant.names)), ca.SX.sym("w", len(plant.names))
-        elements, following = plant.state.elements, {}
+        elements, state_next = plant.state.elements, {}
         for k, name in enumerate(plant.names):
             chain = [e for e in elements if e.rstrip("'") == name]
             values = [x[elements.index(e)] for e in sorted(chain, key=len)] + [d[k]]
@@ -133,18 +141,19 @@ class ByDesired(Predictor):
                 for j, value in enumerate(values[order:]):
                     series += factor * value
                     factor *= period / (j + 1)
-                following[element] = series
-        return ca.Function("fpirhc_predict", [x, d, p, w], [ca.vertcat(*(following[e] for e in elements))])
+                state_next[element] = series
+        return ca.Function("fpirhc_predict", [x, d, p, w], [ca.vertcat(*(state_next[e] for e in elements))])
 
 
 @dataclass(frozen=True)
 class Predicted(Controller):
     """The wrapped controller on the predicted state.
 
-    Parameters:
+    Args:
         controller: any controller.
-        inputs: dead time of the inputs that it is to bridge, s, rounded to control cycles. measurement: of the measurement, s.
-        by: how to predict.
+        inputs: dead time of the inputs, s; the sum of both dead times is rounded to control cycles.
+        measurement: dead time of the measurement, s.
+        by: how the state is predicted.
 
     Raises:
         InvalidValue: a dead time that is negative or not finite.
@@ -167,32 +176,34 @@ class Predicted(Controller):
 
     @property
     def deformation(self) -> Deformation:
-        """The wrapped controller's."""
+        """The deformation of the wrapped controller."""
         return self.controller.deformation
 
     @property
     def feeds(self) -> Mapping[str, str]:
-        """The wrapped controller reads time and state ahead."""
+        """Time and state ahead in place of time and state."""
         return {"time": "time_ahead", "state": "state_ahead", **self.controller.feeds}
 
     def check(self, problem: Problem) -> None:
-        """Raise what the wrapped controller raises, and if the plant or the dead time does not fit.
+        """Raise if the wrapped controller, the predictor or the dead time does not fit the problem.
 
         Raises:
-            NotSupported: the predictor cannot serve the plant. InvalidValue: a dead time of more than 1000 cycles.
+            FpirhcError: the check of the wrapped controller fails.
+            NotSupported: the predictor does not support the plant, or the controller's own response.
+            InvalidValue: a dead time of more than 1000 cycles.
         """
         self.controller.check(problem)
         self.by.check(problem.plant)
         if self.controller.response(problem) is not None and self.by != ByModel():
             raise NotSupported(
                 f"Predicted: {self.by} compares the responses of the plant's controlled coordinates, but "
-                f"{type(self.controller).__name__} answers others; use by=ByModel()"
+                f"{type(self.controller).__name__} reads others; use by=ByModel()"
             )
         if self._cycles(problem) > MOST:
             raise InvalidValue(f"Predicted: {self._cycles(problem)} cycles of dead time, more than {MOST}")
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        """Blocks predict, and the wrapped controller as one; its own blocks when there is nothing to bridge."""
+        """Return the block predict, and the wrapped controller as one block; without dead time the controller's own blocks."""
         plant, cycles = problem.plant, self._cycles(problem)
         if not cycles:
             return self.controller.blocks(problem)
@@ -212,27 +223,27 @@ def _predict_block(
     problem: Problem, by: Predictor, cycles: int, lead: float, before: Signal, writes: tuple[Signal, ...]
 ) -> Block:
     plant, size = problem.plant, before.size
-    # One more than is on its way: the oldest is what acted while the response was realised.
+    # One value more than is on its way: the oldest acted while the response was realised.
     past = tuple(f"{e}@{k}" for k in range(1, cycles + 2) for e in before.elements)
     queue = Signal("sent", past, start=by.sent_at_start(problem) * (cycles + 1))
     residual = Signal("residual", plant.names, plant.response_units)
     advance = by.advance(plant, problem.period)
     corrected = _residual(plant, by.residual_time, problem.period) if by.residual_time else None
-    seen = (plant.response_signal("realised"),) if corrected else ()
-    reads = (scalar("time", "s"), plant.state, *seen, plant.parameter, before)
+    responses = (plant.response_signal("realised"),) if corrected else ()
+    reads = (scalar("time", "s"), plant.state, *responses, plant.parameter, before)
     own = (queue, residual) if corrected else (queue,)
 
     def step(s: Signals) -> dict[str, Expression]:
-        kept = ca.vertcat(s._sent_before, s.sent[: size * cycles])
-        following = {"sent_next": kept}
+        queued = ca.vertcat(s._sent_before, s.sent[: size * cycles])
+        memory_next = {"sent_next": queued}
         error = expression(ca.MX.zeros(len(plant.names)))
         if corrected:
-            error = corrected(s.residual, s.state, kept[size * cycles :], s.realised, s.parameters)
-            following["residual_next"] = error
-        columns = ca.horzcat(*(kept[size * k : size * (k + 1)] for k in reversed(range(cycles))))
+            error = corrected(s.residual, s.state, queued[size * cycles :], s.realised, s.parameters)
+            memory_next["residual_next"] = error
+        columns = ca.horzcat(*(queued[size * k : size * (k + 1)] for k in reversed(range(cycles))))
         same = ca.repmat(s.parameters, 1, cycles), ca.repmat(error, 1, cycles)
-        moved = advance.mapaccum("fpirhc_predicted", cycles)(s.state, columns, *same)
-        return {"time_ahead": s.time + lead, "state_ahead": moved[:, -1], **following}
+        path = advance.mapaccum("fpirhc_predicted", cycles)(s.state, columns, *same)
+        return {"time_ahead": s.time + lead, "state_ahead": path[:, -1], **memory_next}
 
     return Block("predict", Layout(reads), Layout(writes), step, Layout(own), opaque=True)
 
@@ -241,10 +252,10 @@ def _residual(plant: Plant, time: float, period: float) -> ca.Function:
     """Function (residual, state, command that acted, realised, parameters) -> the low-passed residual one cycle later."""
     x, u, p = plant._symbols()
     old, f = ca.SX.sym("old", len(plant.names)), ca.SX.sym("f", len(plant.controlled_names))
-    seen = ca.SX.zeros(len(plant.names))
-    seen[list(plant.controlled_indices)] = f - plant.controlled_response_function(x, u, p)
+    residual_now = ca.SX.zeros(len(plant.names))
+    residual_now[list(plant.controlled_indices)] = f - plant.controlled_response_function(x, u, p)
     share = 1 - float(np.exp(-period / time))
-    return ca.Function("fpirhc_residual", [old, x, u, f, p], [old + share * (seen - old)])
+    return ca.Function("fpirhc_residual", [old, x, u, f, p], [old + share * (residual_now - old)])
 
 
 def examples(inner: Controller) -> tuple[Example, ...]:

@@ -1,4 +1,4 @@
-"""The contract of deformations that wrap another one: all that they do not say otherwise is the wrapped map's."""
+"""The contract of deformations that wrap another one: a wrapper has the facts of its map unless it overrides them."""
 
 from __future__ import annotations
 
@@ -16,13 +16,17 @@ from fpirhc.symbolic.layout import Expression
 
 @dataclass(frozen=True)
 class Wrapper(Deformation, ABC):
-    """Contract: a deformation around `map`, the first field of every wrapper."""
+    """Contract: a deformation around another one.
+
+    Args:
+        map: the wrapped deformation, the first field of every wrapper.
+    """
 
     map: Deformation
 
     @property
     def inner(self) -> Deformation:
-        """The map."""
+        """The wrapped map."""
         return self.map
 
     @property
@@ -31,19 +35,19 @@ class Wrapper(Deformation, ABC):
         return float(getattr(self.map, self.map.gain_name))
 
     def shown(self) -> Mapping[str, str]:
-        """What the map shows."""
+        """The signals of the map."""
         return self.map.shown()
 
     def effective_gain(self) -> float:
-        """The map's own."""
+        """The effective gain of the map."""
         return self.map.effective_gain()
 
     def secant_gain(self) -> float:
-        """The map's own."""
+        """The secant gain of the map."""
         return self.map.secant_gain()
 
     def largest_step(self) -> float:
-        """The map's own."""
+        """The largest step of the map."""
         return self.map.largest_step()
 
     def with_effective_gain(self, gain: float) -> Self:
@@ -52,12 +56,12 @@ class Wrapper(Deformation, ABC):
 
 
 def of_map(wrapper: Wrapper, memory: Mapping[str, Expression], size: int) -> dict[str, Expression]:
-    """The part of a wrapper's memory that is the map's own; `size` is the number of coordinates."""
+    """Return the part of a wrapper's memory that belongs to the map; `size` is the number of coordinates."""
     own = wrapper.map.memory(tuple(f"q{k}" for k in range(size)))
     return {name: memory[name] for name in own.names}
 
 
 def start_of_map(wrapper: Wrapper, size: int) -> dict[str, Expression]:
-    """What the map remembers at the start."""
+    """Return what the map remembers at the start; `size` is the number of coordinates."""
     own = wrapper.map.memory(tuple(f"q{k}" for k in range(size)))
     return own.split(expression(ca.DM(own.start())))

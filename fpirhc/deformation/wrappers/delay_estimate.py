@@ -1,15 +1,15 @@
 """The dead time between request and response, estimated on line from how changes of one appear in the other.
 
-With r~ and f~ the deviations of request and response from their running means, normalised least mean squares finds the
+With r~ and f~ the deviations of request and response from their running means, normalised least mean squares estimates the
 impulse response w of the loop,
 
     e = f~_k - sum_j w_j r~_{k-1-j},      w_j <- w_j + mu g e' r~_{k-1-j} / |r~|^2,      j = 0 .. most,
 
-and the dead time is where w is largest. A mean squares fit is used and not the plain correlation of changes: a smooth request
-correlates with its own neighbours, and differences of a noisy response correlate with the request that this noise caused.
-g = min(1, R / 0.1) is small while the requests move too smoothly to tell one cycle from the next; R = sum |r~_k - r~_{k-1}|^2 /
-sum |r~_k|^2 is their roughness (2 for white noise, omega^2 for a sine). The confidence is g times the share of sum w^2 that lies
-within one cycle of the peak: near one for a clean delay.
+and the dead time is the place of the largest |w|. A least mean squares fit is used instead of the correlation of changes, because a
+smooth request correlates with its own neighbours, and differences of a noisy response correlate with the request that this noise
+caused. g = min(1, R / 0.1) is small while the requests are too smooth to distinguish one cycle from the next. R =
+sum |r~_k - r~_{k-1}|^2 / sum |r~_k|^2 is their roughness (2 for white noise, omega^2 for a sine). The confidence is g times the
+share of sum w^2 that lies within one cycle of the peak: near one for a clean delay.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 _MEAN = 0.05  # share of a new value in the running means
 _STEP = 0.2  # mu
-_ROUGH = 0.1  # R from which requests are rough enough to tell a cycle from the next
+_ROUGH = 0.1  # R from which requests are rough enough to distinguish a cycle from the next
 _FLOOR = 1e-12  # of |r~|^2 relative to the running mean's square
 SIGNALS = {"dead_time_cycles": "delay_cycles", "dead_time_confidence": "delay_confidence"}
 
@@ -40,7 +40,7 @@ def estimate_memory(elements: tuple[str, ...], most: int) -> Layout:
 def estimated(
     request: Expression, response: Expression, memory: Mapping[str, Expression], most: int
 ) -> dict[str, Expression]:
-    """Return the memory one cycle later, 'delay_cycles' and 'delay_confidence' among it."""
+    """Return the memory one cycle later, which includes 'delay_cycles' and 'delay_confidence'."""
     size = request.numel()
     mean_request = memory["delay_mean_request"] + _MEAN * (request - memory["delay_mean_request"])
     mean_response = memory["delay_mean_response"] + _MEAN * (response - memory["delay_mean_response"])
@@ -48,18 +48,18 @@ def estimated(
     columns = ca.reshape(past, size, most + 1)
     error = response - mean_response - ca.mtimes(columns, memory["delay_weights"])
     energy = ca.sumsqr(past) + _FLOOR * (1 + ca.sumsqr(mean_request))
-    telling = ca.fmin(1, ca.sumsqr(past[size:] - past[: size * most]) / energy / _ROUGH)
-    weights = memory["delay_weights"] + _STEP * telling / energy * ca.mtimes(columns.T, error)
+    roughness = ca.fmin(1, ca.sumsqr(past[size:] - past[: size * most]) / energy / _ROUGH)
+    weights = memory["delay_weights"] + _STEP * roughness / energy * ca.mtimes(columns.T, error)
     cycles, near = _peak(weights, most)
-    total = ca.sumsqr(weights)
-    clean = ca.if_else(total > 0, near / ca.if_else(total > 0, total, 1), 0)
+    squares = ca.sumsqr(weights)
+    clean = ca.if_else(squares > 0, near / ca.if_else(squares > 0, squares, 1), 0)
     return {
         "delay_mean_request": mean_request,
         "delay_mean_response": mean_response,
         "delay_past": past,
         "delay_weights": weights,
         "delay_cycles": cycles,
-        "delay_confidence": telling * clean,
+        "delay_confidence": roughness * clean,
     }
 
 

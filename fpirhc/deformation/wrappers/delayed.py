@@ -1,4 +1,4 @@
-"""Deformation under dead time: the response seen now belongs to a request of d + 1 cycles ago.
+"""Deformation under dead time: the response measured now belongs to the request of d + 1 cycles ago.
 
     unpaired   the map itself: r_k = G(r_{k-1}, f_k, d_k). Stable on f = lambda r only for a lambda < 2 sin(pi / (2 (2 d + 1))).
     Paired     r_k = G(r_{k-1-d}, f_k, d_k): d + 1 interleaved iterations without delay, stable for 0 < a lambda < 2 whatever d is,
@@ -7,17 +7,18 @@
                iteration on the deformation r - d, so that a change of the desired response passes at once, and leaky. Use it where
                the state is predicted over the dead time.
 
-d is in cycles and may be a fraction: then the pair is interpolated between two cycles. It may be a tuple, one dead time for every
+d is in cycles and may be a fraction; the pair is then interpolated between two cycles. It may be a tuple, one dead time for every
 controlled coordinate. Until the first response to a request of this controller arrives, the request is the desired response.
 
-A dead time that is wrong by even one cycle makes the interleaved iterations answer each other: high modes grow at any gain, and
-the command chatters. Two remedies:
+A dead time that is wrong by even one cycle couples the interleaved iterations: high modes grow at any gain, and the command
+chatters. There are two remedies:
 
-    Increment  leaks. With a dead time wrong by at most m cycles it is stable for every d if 4 p / (1 - p)^2 > g (2 + g) m^2, g the
-               effective gain times the plant's largest gain, below 2 (proof: `leaky`). The default is m = max(1, 10 % of d) and
-               the p of g = 1, or of the map's own effective gain where that is larger; so give the map the gain 1 / lambda_max.
+    Increment  leaks. With a dead time wrong by at most m cycles it is stable for every d if 4 p / (1 - p)^2 > g (2 + g) m^2, where
+               g is the effective gain times the plant's largest gain, below 2 (proof: `leaky`). The defaults are m = max(1, 10 %
+               of d) and the p of g = 1, or of the map's own effective gain where that is larger; so give the map the gain
+               1 / lambda_max.
     Paired     with an `uncertainty` of m takes a triangular mean of the requests around the pair. Its modes decay for
-               a lambda <= 0.5 only. It has no leak, because one in the request would make the desired response late.
+               a lambda <= 0.5 only. It has no leak, because a leak in the request would make the desired response late.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ __all__ = ["MOST", "Increment", "Paired"]
 class _Queued(Wrapper):
     """The wrapped map with its own past requests and desired responses.
 
-    Parameters:
+    Args:
         map: any deformation that iterates.
         cycles: dead time d between a request and its response, beyond the one cycle that every loop has; a tuple gives every
             controlled coordinate its own.
@@ -55,26 +56,26 @@ class _Queued(Wrapper):
 
     @property
     def constant(self) -> bool:
-        """What it remembers are pairs; gain and pairing stay."""
+        """As the map: the wrapper remembers pairs, which change neither gain nor pairing."""
         return self.map.constant
 
     @property
     def pairing(self) -> Pairing:
-        """The dead time that it is given."""
+        """The believed dead time, the longest of several."""
         return Pairing(max(every(self.cycles)))
 
     @property
     def channels(self) -> int | None:
-        """One for each dead time, where there are several."""
+        """The number of dead times where there are several."""
         return len(self.cycles) if isinstance(self.cycles, tuple) else self.map.channels
 
     @property
     @abstractmethod
     def _queue(self) -> Queue:
-        """What is remembered, and for how long."""
+        """The delays of the pairs."""
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """The queues, how many pairs they hold, and the map's own memory."""
+        """The queues, the number of pairs in them, and the memory of the map."""
         past = tuple(f"{e}@{k}" for k in range(1, self._queue.length + 1) for e in elements)
         queues = Signal("queue_requests", past), Signal("queue_desired", past), Signal("queue_now", elements)
         return Layout((*queues, scalar("queue_filled"))) + self.map.memory(elements)
@@ -86,36 +87,44 @@ class _Queued(Wrapper):
         inner, queue = of_map(self, memory, request.numel()), self._queue
         first = memory["queue_filled"] < 0.5
         # The first request of a run is the desired response itself.
-        asked = ca.if_else(first, request, memory["queue_now"])
-        requests = queue.pushed(memory["queue_requests"], request)
-        wishes = queue.pushed(memory["queue_desired"], asked)
+        desired_then = ca.if_else(first, request, memory["queue_now"])
+        past_requests = queue.pushed(memory["queue_requests"], request)
+        past_desired = queue.pushed(memory["queue_desired"], desired_then)
         valid = memory["queue_filled"] >= queue.length - 1
-        wanted, following = self._request(requests, wishes, response, desired, inner)
-        remembered = {name: ca.if_else(valid, value, inner[name]) for name, value in following.items()}
+        next_request, next_memory = self._request(past_requests, past_desired, response, desired, inner)
+        remembered = {name: ca.if_else(valid, value, inner[name]) for name, value in next_memory.items()}
         filled = ca.fmin(memory["queue_filled"] + 1, queue.length)
-        queues = {"queue_requests": requests, "queue_desired": wishes, "queue_now": desired, "queue_filled": filled}
-        return ca.if_else(valid, wanted, desired), {**queues, **remembered}
+        queues = {
+            "queue_requests": past_requests,
+            "queue_desired": past_desired,
+            "queue_now": desired,
+            "queue_filled": filled,
+        }
+        return ca.if_else(valid, next_request, desired), {**queues, **remembered}
 
     @abstractmethod
     def _request(
         self,
-        requests: Expression,
-        wishes: Expression,
+        past_requests: Expression,
+        past_desired: Expression,
         response: Expression,
         desired: Expression,
         memory: Mapping[str, Expression],
     ) -> tuple[Expression, dict[str, Expression]]:
-        """The next request from the queues of requests and desired responses, the response and the desired response now."""
+        """The next request, from the queues of requests and desired responses and from the response and desired response now."""
 
 
 @dataclass(frozen=True)
 class Paired(_Queued):
-    """The map on the pair that caused the response; see the module for errors.
+    """The map on the pair that caused the response: r_k = G(r_{k-1-d}, f_k, d_k).
 
-    Parameters:
+    Args:
         map: any deformation that iterates.
         cycles: dead time d, or one for every controlled coordinate.
         uncertainty: half width of the triangular mean over the requests around the pair, whole cycles, at most d.
+
+    Raises:
+        InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time.
     """
 
     uncertainty: int = 0
@@ -131,7 +140,7 @@ class Paired(_Queued):
 
     @property
     def pairing(self) -> Pairing:
-        """The dead time that it is given, and the width of the mean."""
+        """The believed dead time, the longest of several, and the width of the mean."""
         return Pairing(max(every(self.cycles)), self.uncertainty)
 
     @property
@@ -140,26 +149,30 @@ class Paired(_Queued):
 
     def _request(
         self,
-        requests: Expression,
-        wishes: Expression,
+        past_requests: Expression,
+        past_desired: Expression,
         response: Expression,
         desired: Expression,
         memory: Mapping[str, Expression],
     ) -> tuple[Expression, dict[str, Expression]]:
-        del wishes
-        return self.map.step(self._queue.delayed(requests, desired.numel()), response, desired, memory)
+        del past_desired
+        return self.map.step(self._queue.delayed(past_requests, desired.numel()), response, desired, memory)
 
 
 @dataclass(frozen=True)
 class Increment(_Queued):
-    """The map on the deformation r - d of the pair that caused the response, leaky; see the module for errors.
+    """The map on the deformation r - d of the pair that caused the response, with a leak.
 
-    Parameters:
+    Args:
         map: any deformation that iterates; the effective gain 1 / lambda_max is the usual one.
         cycles: dead time d, or one for every controlled coordinate.
         uncertainty: m, by how many cycles the dead time may be wrong, at most d rounded up; None: max(1, 10 % of d), and 0
             without dead time.
         pole: p of the leak, in [0, 1); None: from the uncertainty, by the theorem.
+
+    Raises:
+        InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time; a pole
+            outside [0, 1).
     """
 
     uncertainty: int | None = None
@@ -174,7 +187,7 @@ class Increment(_Queued):
 
     @property
     def slows_desired(self) -> bool:
-        """No: the desired response is added after the map."""
+        """False: the desired response is added after the map."""
         return False
 
     @property
@@ -188,19 +201,19 @@ class Increment(_Queued):
 
     def _request(
         self,
-        requests: Expression,
-        wishes: Expression,
+        past_requests: Expression,
+        past_desired: Expression,
         response: Expression,
         desired: Expression,
         memory: Mapping[str, Expression],
     ) -> tuple[Expression, dict[str, Expression]]:
         size, pole = desired.numel(), self.leak
-        asked, request = self._queue.delayed(wishes, size), self._queue.delayed(requests, size)
-        wanted, following = self.map.step(request, response, asked, memory)
-        deformation = wanted - asked
+        undeformed, request = self._queue.delayed(past_desired, size), self._queue.delayed(past_requests, size)
+        next_request, next_memory = self.map.step(request, response, undeformed, memory)
+        deformation = next_request - undeformed
         if pole:
-            deformation = pole * (requests[:size] - wishes[:size]) + (1 - pole) * deformation
-        return desired + deformation, following
+            deformation = pole * (past_requests[:size] - past_desired[:size]) + (1 - pole) * deformation
+        return desired + deformation, next_memory
 
 
 def examples(inner: Deformation) -> tuple[Deformation, ...]:

@@ -2,8 +2,8 @@
 
     g_k = p g_{k-1} + (1 - p) (f_k - d_k),     r_{k+1} = G(r_k, d_k + g_k, d_k).
 
-The error is filtered, not the response: a filtered response compared with an unfiltered desired one differs from it
-wherever the task moves, and the map would correct what is no error. On f = lambda r with the effective gain a the loop is
+The error is filtered, not the response. A filtered response would differ from an unfiltered desired one wherever the task moves,
+and the map would correct a difference that is no error. On f = lambda r with the effective gain a the loop is
 
     z^2 - (1 + p - a lambda (1 - p)) z + p = 0,
 
@@ -26,7 +26,7 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal
 class Filtered(Wrapper):
     """The wrapped map on a low-passed response error.
 
-    Parameters:
+    Args:
         map: any deformation that iterates.
         pole: p of the filter, from 0 (none) to below 1; exp(-period / time constant).
 
@@ -44,16 +44,16 @@ class Filtered(Wrapper):
 
     @property
     def constant(self) -> bool:
-        """What it remembers changes neither gain nor pairing."""
+        """As the map: the filtered error changes neither gain nor pairing."""
         return self.map.constant
 
     @property
     def error_pole(self) -> float:
-        """The filter's."""
+        """The pole of the filter."""
         return self.pole
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """The filtered error, and the map's own memory."""
+        """The filtered error, and the memory of the map."""
         return Layout((Signal("filter_error", elements),)) + self.map.memory(elements)
 
     def step(
@@ -62,8 +62,8 @@ class Filtered(Wrapper):
         """Return the map's next request for the filtered error."""
         inner = of_map(self, memory, request.numel())
         error = self.pole * memory["filter_error"] + (1 - self.pole) * (response - desired)
-        wanted, following = self.map.step(request, desired + error, desired, inner)
-        return wanted, {"filter_error": error, **following}
+        next_request, next_memory = self.map.step(request, desired + error, desired, inner)
+        return next_request, {"filter_error": error, **next_memory}
 
 
 def examples(inner: Deformation) -> tuple[Deformation, ...]:

@@ -1,16 +1,16 @@
 """Watches an iteration that may leave its basin of attraction, and brings it back.
 
-A trip sets the request to the desired response, halves the step, forgets what the map remembers and pauses. Four things trip:
+A trip sets the request to the desired response, halves the step, forgets what the map remembers and pauses. Four events trip:
 
     1  oscillation  errors alternate in sign while the step is at its limit, for 20 cycles
     2  growth       errors alternate and their mean over 20 cycles is four times that over 200, for 20 cycles
     3  size         the request is further from the desired response than it may be
     4  non-finite   the response or the request is not a number
 
-The first is not watched in a model-referenced form, which is not given its last request. A disturbance step does none of these:
-its errors do not alternate. After 1000 clean cycles the step grows again by 5 % every 8 cycles (6 when it is whole). After the
-third trip within about 1000 cycles the guard gives up adaptation for the rest of the run (5, fallback). Every event is in the run:
-signal `adaptation_event` is its number in the cycle in which it happens, and `EVENTS` has the words.
+The first is not watched in a model-referenced form, which is not given its last request. A disturbance step trips none of them,
+because its errors do not alternate. After 1000 clean cycles the step grows again by 5 % every 8 cycles; event 6 is its full size.
+After the third trip within about 1000 cycles the guard ends adaptation for the rest of the run (event 5, fallback). Every event is
+logged: the signal `adaptation_event` is its number in the cycle in which it happens, and `EVENTS` holds the descriptions.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ _FINITE = 1e300
 
 @dataclass(frozen=True)
 class Guarded(Wrapper):
-    """The wrapped map, watched.
+    """The wrapped map, reset where its iteration leaves the basin of attraction.
 
-    Parameters:
+    Args:
         map: any deformation that iterates.
         largest_deformation: |r - d| beyond which the iteration has left its basin, in units of the response.
 
@@ -59,13 +59,13 @@ class Guarded(Wrapper):
             raise InvalidValue(f"Guarded(largest_deformation={self.largest_deformation!r}): expected a positive number")
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """What the guard has seen, and the map's own memory."""
+        """Factor, mean sign, counts and means of the guard, the last error, and the memory of the map."""
         numbers = ("sign", "oscillating", "growing", "fast", "slow", "pause", "trips", "clean", "event", "fallback")
         own = (scalar("guard_factor", start=1.0), *(scalar(f"guard_{n}") for n in numbers))
         return Layout((*own, Signal("guard_error", elements))) + self.map.memory(elements)
 
     def shown(self) -> Mapping[str, str]:
-        """The event of each cycle and the factor, and what the map shows."""
+        """The event of each cycle, the factor, and the signals of the map."""
         return {"adaptation_event": "guard_event", "adaptation_factor": "guard_factor", **self.map.shown()}
 
     def step(
@@ -74,20 +74,20 @@ class Guarded(Wrapper):
         """Return the map's next request, or the desired response after a trip and in a pause."""
         own = {name.removeprefix("guard_"): v for name, v in memory.items() if name.startswith("guard_")}
         inner = of_map(self, memory, request.numel())
-        wanted, following = self.map.step(request, response, desired, inner)
+        next_request, next_memory = self.map.step(request, response, desired, inner)
         # A model-referenced form begins at the desired response, not at the request that it is given.
         origin = request if self.map.mirror is None else desired
-        candidate = origin + own["factor"] * (wanted - origin)
+        candidate = origin + own["factor"] * (next_request - origin)
         active = ca.logic_not(ca.logic_or(own["pause"] > 0.5, own["fallback"] > 0.5))
-        seen = self._watched(request, response, desired, candidate, own)
-        trip = ca.logic_and(active, seen["event"] > 0.5)
+        watched = self._watched(request, response, desired, candidate, own)
+        trip = ca.logic_and(active, watched["event"] > 0.5)
         trips = _MEMORY * own["trips"] + trip
         fallback = ca.logic_or(own["fallback"] > 0.5, trips > _TRIPS)
-        kept = self._kept(own, seen, trip, active, trips, fallback)
+        guard = self._next_guard(own, watched, trip, active, trips, fallback)
         running = ca.logic_and(active, ca.logic_not(trip))
         start = start_of_map(self, request.numel())
-        forgotten = {name: ca.if_else(running, value, start[name]) for name, value in following.items()}
-        return ca.if_else(running, candidate, desired), {**kept, **forgotten}
+        remembered = {name: ca.if_else(running, value, start[name]) for name, value in next_memory.items()}
+        return ca.if_else(running, candidate, desired), {**guard, **remembered}
 
     def _watched(
         self,
@@ -97,7 +97,7 @@ class Guarded(Wrapper):
         candidate: Expression,
         own: Mapping[str, Expression],
     ) -> dict[str, Expression]:
-        """What this cycle shows: the error, its means, the counts, and the number of the event (0: none)."""
+        """The error of this cycle, its means, the counts, and the number of the event (0: none)."""
         finite = ca.logic_and(_finite(candidate), _finite(response))
         error = ca.if_else(finite, response - desired, 0)
         size = smooth_norm(error, 1e-12)
@@ -118,28 +118,29 @@ class Guarded(Wrapper):
         event = ca.if_else(growing > _PATIENCE, 2, event)
         event = ca.if_else(far, 3, event)
         event = ca.if_else(finite, event, 4)
-        found = {"error": error, "sign": sign, "fast": fast, "slow": slow}
-        return {**found, "oscillating": oscillating, "growing": growing, "event": event}
+        means = {"error": error, "sign": sign, "fast": fast, "slow": slow}
+        return {**means, "oscillating": oscillating, "growing": growing, "event": event}
 
-    def _kept(
+    def _next_guard(
         self,
         own: Mapping[str, Expression],
-        seen: Mapping[str, Expression],
+        watched: Mapping[str, Expression],
         trip: Expression,
         active: Expression,
         trips: Expression,
         fallback: Expression,
     ) -> dict[str, Expression]:
+        """The memory of the guard one cycle later: a trip clears the counts and halves the factor."""
         clean = ca.if_else(trip, 0, own["clean"] + 1)
         due = ca.logic_and(clean > _CLEAN, ca.fmod(clean, _EVERY) < 0.5)
         grown = ca.if_else(ca.logic_and(due, own["factor"] < 1), ca.fmin(1, _REGROW * own["factor"]), own["factor"])
         factor = ca.if_else(trip, 0.5 * own["factor"], grown)
         recovered = ca.logic_and(own["factor"] < 1, factor >= 1)
         first_fallback = ca.logic_and(fallback, own["fallback"] < 0.5)
-        event = ca.if_else(first_fallback, 5, ca.if_else(trip, seen["event"], ca.if_else(recovered, 6, 0)))
+        event = ca.if_else(first_fallback, 5, ca.if_else(trip, watched["event"], ca.if_else(recovered, 6, 0)))
         watching = ca.logic_and(active, ca.logic_not(trip))
         counted = {
-            k: ca.if_else(watching, seen[k], 0) for k in ("sign", "oscillating", "growing", "error", "fast", "slow")
+            k: ca.if_else(watching, watched[k], 0) for k in ("sign", "oscillating", "growing", "error", "fast", "slow")
         }
         pause = ca.if_else(trip, _PAUSE, ca.fmax(own["pause"] - 1, 0))
         whole = {"factor": factor, "pause": pause, "trips": trips, "clean": clean, "event": event, "fallback": fallback}

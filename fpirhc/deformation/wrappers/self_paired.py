@@ -1,14 +1,14 @@
-"""A dead time that is not known: watched, or found and used.
+"""An unknown dead time: estimated and logged, or estimated and used.
 
-    DelayWatched   the wrapped map as it is, with the estimated dead time and its confidence in the run.
-    SelfPaired     pairs each response with the request of as many cycles ago as the estimate says. An estimate is adopted when it
-                   was found, to one cycle, in 100 confident cycles in succession, smooth ones in between not counted; until then
-                   the last one stays, and before the first one the request is the desired response: no adaptation is better
-                   than a wrong pair.
+    DelayWatched   the wrapped map as it is; the estimated dead time and its confidence are logged.
+    SelfPaired     pairs each response with the request of as many cycles ago as the estimated dead time. An estimate is adopted
+                   when it has been the same, to one cycle, in 100 confident cycles in succession; cycles without confidence in
+                   between are not counted. Until then the last adopted estimate stays. Before the first one the request is the
+                   desired response, because no adaptation is better than a wrong pair.
 
-A request that moves smoothly shows no dead time: a task with steps, noise in the measurement, or a restarted plan does.
-Signals: `dead_time_cycles` and `dead_time_confidence` (see `delay_estimate`); `paired_cycles` is what `SelfPaired` uses, -1 before
-the first estimate.
+A request that moves smoothly shows no dead time. A task with steps, noise in the measurement, or a plan that starts anew shows it.
+Signals: `dead_time_cycles` and `dead_time_confidence` (see `delay_estimate`); `paired_cycles` is the dead time that `SelfPaired`
+uses, -1 before the first estimate.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _PATIENCE = 100
 
 @dataclass(frozen=True)
 class DelayWatched(Wrapper):
-    """The wrapped map, with an estimate of the dead time beside it.
+    """The wrapped map as it is, with an estimate of the dead time in the log.
 
-    Parameters:
+    Args:
         map: any deformation.
-        most: longest dead time that is looked for, cycles.
+        most: longest dead time that is searched, cycles.
 
     Raises:
         InvalidValue: a longest dead time outside 1 .. 200.
@@ -47,34 +47,34 @@ class DelayWatched(Wrapper):
 
     @property
     def constant(self) -> bool:
-        """What it remembers serves the estimate alone."""
+        """As the map: the estimate does not change the iteration."""
         return self.map.constant
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """The estimate's memory and the map's own."""
+        """The memory of the estimate and of the map."""
         return estimate_memory(elements, self.most) + self.map.memory(elements)
 
     def shown(self) -> Mapping[str, str]:
-        """The estimate and its confidence, and what the map shows."""
+        """The estimate, its confidence, and the signals of the map."""
         return {**SIGNALS, **self.map.shown()}
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """Return what the map returns."""
+        """Return the next request of the map, unchanged."""
         inner = of_map(self, memory, request.numel())
-        wanted, following = self.map.step(request, response, desired, inner)
-        return wanted, {**estimated(request, response, memory, self.most), **following}
+        next_request, next_memory = self.map.step(request, response, desired, inner)
+        return next_request, {**estimated(request, response, memory, self.most), **next_memory}
 
 
 @dataclass(frozen=True)
 class SelfPaired(Wrapper):
     """The map on the pair of an estimated dead time.
 
-    Parameters:
+    Args:
         map: any deformation that iterates.
-        most: longest dead time that is looked for, cycles.
-        confidence: from which an estimate is trusted, in (0, 1).
+        most: longest dead time that is searched, cycles.
+        confidence: least confidence of an estimate that is used, in (0, 1).
 
     Raises:
         InvalidValue: a longest dead time outside 1 .. 200, a confidence outside (0, 1).
@@ -90,18 +90,18 @@ class SelfPaired(Wrapper):
 
     @property
     def pairing(self) -> Pairing:
-        """Estimated on line."""
+        """A pairing whose dead time is estimated on line."""
         return Pairing(None)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """Past requests, what is believed and for how long the estimate has stood; the estimate's memory and the map's own."""
+        """Past requests, the dead time in use, the candidate and its age; the memory of the estimate and of the map."""
         past = tuple(f"{e}@{k}" for k in range(self.most + 1) for e in elements)
         counts = (scalar("pair_filled"), scalar("pair_stood"), scalar("pair_candidate"))
         own = Layout((Signal("pair_requests", past), scalar("pair_cycles", start=-1.0), *counts))
         return own + estimate_memory(elements, self.most) + self.map.memory(elements)
 
     def shown(self) -> Mapping[str, str]:
-        """The dead time in use, the estimate and its confidence, and what the map shows."""
+        """The dead time in use, the estimate, its confidence, and the signals of the map."""
         return {"paired_cycles": "pair_cycles", **SIGNALS, **self.map.shown()}
 
     def step(
@@ -118,23 +118,23 @@ class SelfPaired(Wrapper):
         for k in range(1, self.most + 1):
             own = ca.if_else(cycles > k - 0.5, requests[size * k : size * (k + 1)], own)
         valid = ca.logic_and(cycles > -0.5, memory["pair_filled"] >= cycles)
-        wanted, following = self.map.step(own, response, desired, inner)
-        kept = {name: ca.if_else(valid, value, inner[name]) for name, value in following.items()}
+        next_request, next_memory = self.map.step(own, response, desired, inner)
+        remembered = {name: ca.if_else(valid, value, inner[name]) for name, value in next_memory.items()}
         filled = ca.fmin(memory["pair_filled"] + 1, self.most + 1)
         pair = {"pair_requests": requests, "pair_cycles": cycles, "pair_filled": filled}
         pair |= {"pair_stood": stood, "pair_candidate": candidate}
-        return ca.if_else(valid, wanted, desired), {**pair, **estimate, **kept}
+        return ca.if_else(valid, next_request, desired), {**pair, **estimate, **remembered}
 
     def _adopted(
         self, estimate: Mapping[str, Expression], memory: Mapping[str, Expression]
     ) -> tuple[Expression, Expression, Expression]:
-        """For how long the estimate has stood, which one it is, and the dead time to use."""
-        found, trusted = estimate["delay_cycles"], estimate["delay_confidence"] > self.confidence
-        same = ca.fabs(found - memory["pair_candidate"]) < 1.5
+        """For how many cycles the candidate has stayed the same, the candidate, and the dead time to use."""
+        newest, trusted = estimate["delay_cycles"], estimate["delay_confidence"] > self.confidence
+        same = ca.fabs(newest - memory["pair_candidate"]) < 1.5
         stood = ca.if_else(trusted, ca.if_else(same, memory["pair_stood"] + 1, 0), memory["pair_stood"])
-        candidate = ca.if_else(ca.logic_or(same, ca.logic_not(trusted)), memory["pair_candidate"], found)
+        candidate = ca.if_else(ca.logic_or(same, ca.logic_not(trusted)), memory["pair_candidate"], newest)
         adopt = ca.logic_and(trusted, stood > _PATIENCE)
-        return stood, candidate, ca.if_else(adopt, found, memory["pair_cycles"])
+        return stood, candidate, ca.if_else(adopt, newest, memory["pair_cycles"])
 
 
 def _check_most(owner: str, most: int) -> None:

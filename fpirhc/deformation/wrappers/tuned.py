@@ -4,21 +4,21 @@
     five errors in a row of alternating sign and growing size, or eight of a two-cycle:   c <- c / 2,
     r+ = r + c (G(r, f, d) - r).
 
-s* is the mean sign that white measurement noise has at the target g* of effective gain times the plant's gain (`expected_sign`).
-So in noise the drift of c is positive below the target, negative above it and zero there, whatever the size of the noise; a smooth
-error (all signs +1) is followed faster and faster up to the cap, and an oscillation (-1) slows down. At the target log c scatters
-by sqrt(gamma / (2 k)), k = -d s / d log g: 0.25 for one component and g* = 0.5.
+s* is the mean sign under white measurement noise at the target g* of effective gain times the plant's gain (`expected_sign`).
+So in noise the drift of c is positive below the target, negative above it and zero at it, whatever the size of the noise. A smooth
+error (all signs +1) raises the gain up to the cap, and an oscillation (-1) lowers it. At the target log c scatters by
+sqrt(gamma / (2 k)), k = -d s / d log g: 0.25 for one component and g* = 0.5.
 
-The map's own gain is the floor, because below it the drift of the task costs more than the noise saves. Only errors that no noise
-makes lead below: alternation that grows, and a two-cycle (each error that of two cycles before), which is what growing ones end in
-where the map saturates. From there the same rule leads back. The cap must come from a model of the plant: without one a
-smooth task would drive the gain until the loop oscillates.
+The map's own gain is the floor, because below it the drift of the task costs more than a lower gain saves in noise. Only two
+patterns, which noise does not make, lower it further: errors that alternate and grow, and a two-cycle (each error equal to the
+error of two cycles before), in which growing errors end where the map saturates. From there the same rule raises the gain again.
+The cap must come from a model of the plant: without a cap a smooth task would raise the gain until the loop oscillates.
 
-The target is that of a response measured at once. Behind a dead time or an estimator errors are correlated otherwise, noise
-leads to the cap, and the cap decides.
+The target holds for a response that is measured at once. Behind a dead time or an estimator errors are correlated otherwise, so
+noise raises the gain to the cap.
 
-The signs are used and not the products, because a saturated two-cycle (small, large, small, large) has no correlation of its
-amplitudes. The price of a larger gain is chatter, up to three times that of a slow fixed gain; a smaller target halves it.
+The rule uses signs and no products, because the amplitudes of a saturated two-cycle (small, large, small, large) are uncorrelated.
+The price of a larger gain is chatter, up to three times that of a slow fixed gain; a smaller target halves it.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 _RATE = 0.02  # gamma
 _GROWING, _RETURNING = 5, 8  # in a row
-_SMALLEST = 1e-3  # factor; what oscillation may lead to
+_SMALLEST = 1e-3  # smallest factor that oscillation may lead to
 
 
 @dataclass(frozen=True)
 class Tuned(Wrapper):
     """The wrapped map with its step scaled on line.
 
-    Parameters:
-        map: any deformation that iterates; its own gain is where the tuner begins, and the smallest that noise leads to.
+    Args:
+        map: any deformation that iterates; the tuner begins at its gain, and noise does not lower the gain below it.
         largest_gain: cap of the effective gain, the bound that the model guarantees (see `assess_gain`: `sector_limit`).
-        target: g*, the product of effective gain and the plant's gain that is sought in noise, in (0, 2). 0.5 weighs tracking,
-            0.3 chatter.
+        target: g*, the product of effective gain and the plant's gain that the rule aims at in noise, in (0, 2). 0.5 favours
+            tracking, 0.3 little chatter.
 
     Raises:
         InvalidValue: a cap that is not positive in the direction of the map's own gain, or below it; a target out of range.
@@ -64,7 +64,7 @@ class Tuned(Wrapper):
         if gain == 0 or not math.isfinite(self.largest_gain) or self.largest_gain / gain < 1:
             raise InvalidValue(
                 f"Tuned(largest_gain={self.largest_gain!r}): expected a bound beyond the map's own effective gain {gain:.4g}; "
-                "assess_gain(...).sector_limit gives one. A tuner without a bound probes until the loop oscillates"
+                "assess_gain(...).sector_limit gives one. Without a bound a tuner raises the gain until the loop oscillates"
             )
         if not 0 < self.target < 2:
             raise InvalidValue(
@@ -72,14 +72,14 @@ class Tuned(Wrapper):
             )
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
-        """The factor, how many errors in a row grew or returned alternating, the last two errors; and the map's own."""
+        """Factor, counts of alternating errors that grew and that returned, the last two errors; and the memory of the map."""
         counts = scalar("tuner_growing"), scalar("tuner_returning")
         errors = Signal("tuner_error", elements), Signal("tuner_earlier", elements)
         own = (scalar("tuner_factor", start=1.0), *counts, *errors)
         return Layout(own) + self.map.memory(elements)
 
     def shown(self) -> Mapping[str, str]:
-        """The factor, and what the map shows."""
+        """The factor, and the signals of the map."""
         return {"gain_factor": "tuner_factor", **self.map.shown()}
 
     def step(
@@ -87,35 +87,37 @@ class Tuned(Wrapper):
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return r + c (G(r, f, d) - r)."""
         inner = of_map(self, memory, request.numel())
-        wanted, of_inner = self.map.step(request, response, desired, inner)
+        next_request, of_inner = self.map.step(request, response, desired, inner)
         factor, error, before = memory["tuner_factor"], response - desired, memory["tuner_error"]
         growing = growing_in_a_row(memory["tuner_growing"], error, before)
         returning = returning_in_a_row(memory["tuner_returning"], error, before, memory["tuner_earlier"])
         oscillates = ca.logic_or(growing > _GROWING - 0.5, returning > _RETURNING - 0.5)
         own = {
-            "tuner_factor": ca.if_else(oscillates, ca.fmax(0.5 * factor, _SMALLEST), self._led(factor, error, before)),
+            "tuner_factor": ca.if_else(
+                oscillates, ca.fmax(0.5 * factor, _SMALLEST), self._tuned(factor, error, before)
+            ),
             "tuner_growing": ca.if_else(oscillates, 0, growing),
             "tuner_returning": ca.if_else(oscillates, 0, returning),
             "tuner_error": error,
             "tuner_earlier": before,
         }
-        return request + factor * (wanted - request), {**own, **of_inner}
+        return request + factor * (next_request - request), {**own, **of_inner}
 
-    def _led(self, factor: Expression, error: Expression, before: Expression) -> Expression:
+    def _tuned(self, factor: Expression, error: Expression, before: Expression) -> Expression:
         """The factor after one step towards the target."""
-        product, rest = ca.dot(error, before), expected_sign(self.target, error.numel())
-        # Without a sign (no error, or none that is a number) nothing is learnt.
-        rise = ca.if_else(product > 0, 1 - rest, ca.if_else(product < 0, -1 - rest, 0))
+        product, target_sign = ca.dot(error, before), expected_sign(self.target, error.numel())
+        # Without a sign (a zero error, or one that is not a number) the factor stays.
+        rise = ca.if_else(product > 0, 1 - target_sign, ca.if_else(product < 0, -1 - target_sign, 0))
         floor = ca.if_else(factor < 1, _SMALLEST, 1)
         largest = self.largest_gain / self.map.effective_gain()
         return ca.fmin(ca.fmax(factor * ca.exp(_RATE * rise), floor), largest)
 
     def largest_step(self) -> float:
-        """The map's, times the largest factor."""
+        """The largest step of the map times the largest factor."""
         return self.map.largest_step() * self.largest_gain / self.map.effective_gain()
 
     def with_effective_gain(self, gain: float) -> Self:
-        """Return the tuner around the map with that gain, with the cap in the same proportion."""
+        """Return the tuner around the map with that gain; the cap changes in the same proportion."""
         return replace(
             self,
             map=self.map.with_effective_gain(gain),
