@@ -16,8 +16,7 @@ from fpirhc.errors import InvalidValue
 
 def after(deformation: Deformation, request, response, desired) -> np.ndarray:
     """The next request."""
-    column = [ca.SX(v) for v in (request, response, desired)]
-    return np.asarray(ca.evalf(deformation.step(*column, {})[0]).full()).ravel()
+    return np.asarray(ca.evalf(deformation.step(ca.SX(request), ca.SX(response), ca.SX(desired), {})[0]).full()).ravel()
 
 
 def zeta(x, shift):
@@ -116,7 +115,7 @@ def test_scale_of_the_sigmoid():
 def test_rotation(fraction, scale):
     """The request, with its dummy component, is turned by a fraction of the angle from f to d in their plane; R outgrows them."""
     r, f, d = (scale * np.array(v) for v in ([1.0, -2.0], [3.0, 1.0], [2.0, 2.5]))
-    radius = max(10.0, 2 * max(np.linalg.norm(v) for v in (r, f, d)))
+    radius = max(10.0, 2 * float(np.linalg.norm([r, f, d], axis=1).max()))
     request, start, end = (np.append(v, math.sqrt(radius**2 - v @ v)) for v in (r, f, d))
     first = start / radius
     second = end / radius - (end @ first / radius) * first
