@@ -340,6 +340,8 @@ def test_a_plan_asks_for_a_jump_between_the_limits():
     for free in ({"u": (-2.0, 3.0)}, {"u": (-2.0, 3.0), "w": (0.0, np.inf)}):
         with pytest.raises(InvalidValue, match="input 'w' has no finite limits"):
             plan_demand(masses(limits=fp.Limits(inputs=free)))
+    with pytest.raises(InvalidValue, match="input 'u' has no finite limits"):
+        plan_demand(masses())
 
 
 def test_a_filtered_command_asks_for_its_largest_change_in_a_cycle():
@@ -356,6 +358,14 @@ def test_demands_count_the_beginning_of_the_reference():
     demand = reference_demand(problem, TRACK)
     assert demand.change == pytest.approx(27.0 * PERIOD, rel=1e-2)
     assert demand.recovery == pytest.approx(step_for_basin(np.hypot(9.0, 3 / 8), 3, 2.0, PERIOD), rel=1e-9)
+
+
+def test_a_small_error_asks_for_a_small_step():
+    """At rest only the model's 3 / 8 is to be recovered from."""
+    problem = replace(masses(), reference=fp.Trajectory(lambda t: {"a": 0 * t, "b": 1 + 0 * t}))
+    demand = reference_demand(problem, TRACK)
+    assert demand.change == 0.0
+    assert demand.recovery == pytest.approx(step_for_basin(3 / 8, 3, 2.0, PERIOD), rel=1e-9)
 
 
 def test_a_jump_is_that_of_the_slope_between_the_limits():

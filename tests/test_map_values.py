@@ -93,6 +93,7 @@ def test_scale_of_the_sigmoid():
         Demand(0.1, sudden=False): 1.0,
         Demand(0.9, sudden=True): 0.9 / step,
     }
+    assert step == pytest.approx(0.81, abs=5e-3)  # with the usual shift of 0.3
     for demand, scale in chosen.items():
         assert free.suited(demand).scale == pytest.approx(scale, rel=5e-3)
     assert (free.automatic, free.with_scale(2.0).automatic) == (("scale",), ())
