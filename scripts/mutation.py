@@ -72,14 +72,12 @@ def main() -> int:
         os.environ |= {"PYTHONPATH": folder, "PYTHONDONTWRITEBYTECODE": "1"}
         # A changed file has a new time, so that its compiled form is not used.
         subprocess.run([options.python, "-m", "compileall", "-q", "fpirhc"], check=True)
-        with subprocess.Popen(
-            [options.python, str(ROOT / "scripts/mutation_worker.py")], stdin=PIPE, stdout=PIPE, text=True
-        ) as process:
-            print(HEAD)
-            for module, tests in targets:
-                row = _try_module(module, tests, options, Worker(process))
-                print(row, flush=True)
-                _write(row)
+        worker = Worker(options.python)
+        print(HEAD)
+        for module, tests in targets:
+            row = _try_module(module, tests, options, worker)
+            print(row, flush=True)
+            _write(row)
     return 0
 
 
@@ -138,19 +136,29 @@ def _survivor(item: WorkItem, arguments: Sequence[str], limit: float, worker: Wo
     return "\n".join(unified_diff(before.splitlines(), after.splitlines(), path, path, n=0, lineterm=""))
 
 
-@dataclass(frozen=True)
 class Worker:
-    """The process that runs the tests; see `mutation_worker`."""
+    """The process that runs the tests, see `mutation_worker`; it is started again where it was ended from outside."""
 
-    process: subprocess.Popen[str]
+    def __init__(self, python: str) -> None:
+        self._command = [python, str(ROOT / "scripts/mutation_worker.py")]
+        self._start()
 
     def run(self, arguments: Sequence[str], limit: float) -> dict[str, Any]:
         """Whether the tests pass within the limit (s), how long they took, and what they printed last."""
-        assert self.process.stdin
-        assert self.process.stdout
-        self.process.stdin.write(json.dumps({"arguments": arguments, "limit": limit}) + "\n")
-        self.process.stdin.flush()
-        return json.loads(self.process.stdout.readline())
+        order = json.dumps({"arguments": arguments, "limit": limit})
+        for _ in range(3):
+            try:
+                print(order, file=self._process.stdin, flush=True)
+                answer = self._process.stdout.readline() if self._process.stdout else ""
+            except BrokenPipeError:
+                answer = ""
+            if answer:
+                return json.loads(answer)
+            self._start()
+        raise SystemExit("the process that runs the tests ended three times")
+
+    def _start(self) -> None:
+        self._process = subprocess.Popen(self._command, stdin=PIPE, stdout=PIPE, text=True)
 
 
 def _faults(module: str) -> list[WorkItem]:
@@ -167,12 +175,12 @@ def _faults(module: str) -> list[WorkItem]:
 def _hints(tree: ast.Module) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
     """Begin and end of annotations and of what stands under `if TYPE_CHECKING`."""
     for node in ast.walk(tree):
-        parts = [getattr(node, "annotation", None), getattr(node, "returns", None)]
-        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
-            parts += [node.test, *node.body]
-        for part in parts:
+        for part in (getattr(node, "annotation", None), getattr(node, "returns", None)):
             if part is not None:
                 yield (part.lineno, part.col_offset), (part.end_lineno, part.end_col_offset)
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            last = node.body[-1]
+            yield (node.lineno, node.col_offset), (last.end_lineno or last.lineno, last.end_col_offset or 0)
 
 
 def _sample(faults: Sequence[WorkItem], size: int, generator: random.Random) -> list[WorkItem]:

@@ -340,6 +340,8 @@ def test_a_plan_asks_for_a_jump_between_the_limits():
     for free in ({"u": (-2.0, 3.0)}, {"u": (-2.0, 3.0), "w": (0.0, np.inf)}):
         with pytest.raises(InvalidValue, match="input 'w' has no finite limits"):
             plan_demand(masses(limits=fp.Limits(inputs=free)))
+    with pytest.raises(InvalidValue, match="input 'u' has no finite limits"):
+        plan_demand(masses())
 
 
 def test_a_filtered_command_asks_for_its_largest_change_in_a_cycle():
@@ -348,3 +350,33 @@ def test_a_filtered_command_asks_for_its_largest_change_in_a_cycle():
     largest = np.hypot(16 * np.cos(2 * TIMES), 4 * np.sin(TIMES)).max()
     assert demand.change == pytest.approx(largest * PERIOD, rel=1e-3)
     assert not demand.sudden
+
+
+def test_demands_count_the_beginning_of_the_reference():
+    """Along e^(-3 t) everything is largest at t = 0: 27 per second, and an error of (9, 3 / 8)."""
+    problem = replace(masses(), reference=fp.Trajectory(lambda t: {"a": ca.exp(-3 * t), "b": 1 + 0 * t}))
+    demand = reference_demand(problem, TRACK)
+    assert demand.change == pytest.approx(27.0 * PERIOD, rel=1e-2)
+    assert demand.recovery == pytest.approx(step_for_basin(np.hypot(9.0, 3 / 8), 3, 2.0, PERIOD), rel=1e-9)
+
+
+def test_a_small_error_asks_for_a_small_step():
+    """At rest only the model's 3 / 8 is to be recovered from."""
+    problem = replace(masses(), reference=fp.Trajectory(lambda t: {"a": 0 * t, "b": 1 + 0 * t}))
+    demand = reference_demand(problem, TRACK)
+    assert demand.change == 0.0
+    assert demand.recovery == pytest.approx(step_for_basin(3 / 8, 3, 2.0, PERIOD), rel=1e-9)
+
+
+def test_a_jump_is_that_of_the_slope_between_the_limits():
+    """With y'' = u^3 / 2 from 1 N to 3 N: slope 3 x 4 / 2 at 2 N, times 2 N."""
+    plant = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "N"},
+        parameters={"m": fp.Parameter(2.0, 1.0, "kg")},
+        response=lambda q, v, u, p: {"y": u.u**3 / p.m},
+        inverse=lambda q, v, r, p: {"u": ca.sign(r.y) * ca.fabs(p.m * r.y) ** (1 / 3)},
+    )
+    reference, limits = fp.Trajectory(lambda t: {"y": 4 * t**2}), fp.Limits(inputs={"u": (1.0, 3.0)})
+    problem = fp.Problem(plant, reference, start={"y": 0.0}, period=PERIOD, duration=1.0, limits=limits)
+    assert plan_demand(problem).change == pytest.approx(12.0)

@@ -249,6 +249,35 @@ def test_a_start_off_the_reference_asks_for_speed():
     assert "after the start" not in near.found
 
 
+def cubed(**settings: Any) -> fp.Problem:
+    """With y'' = u^3 / m with 1 kg, taken for 2 kg, along 4 t^2 + t^3 / 3: 8 + 2 t per second squared, u* = 2 N at first."""
+    plant = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "N"},
+        parameters={"m": fp.Parameter(2.0, 1.0, "kg")},
+        response=lambda q, v, u, p: {"y": u.u**3 / p.m},
+        inverse=lambda q, v, r, p: {"u": ca.sign(r.y) * ca.fabs(p.m * r.y) ** (1 / 3)},
+    )
+    usual: dict[str, Any] = {"start": {"y": 0.0}, "period": PERIOD, "duration": PERIOD * CYCLES}
+    return fp.Problem(plant, fp.Trajectory(lambda t: {"y": 4 * t**2 + t**3 / 3}), **(usual | settings))
+
+
+def test_effects_of_an_input_are_those_at_the_first_command():
+    """A newton more than 2 N is 27 - 8 of the plant; the model's slope is 3 x 4 / 2, so 3 N in a period are 180 per second."""
+    jump = slew(cubed(disturbances={"u": fp.Step(at=1.0, size=1.0)}), 1.0)
+    assert jump.numbers["jump"] == pytest.approx(19.0)
+    plan = LinearLoop(np.diag([0.5, 0.5]), np.eye(2), np.array([[6.0, 0.0]]), np.array([0, 1]), PERIOD)
+    assert slew(cubed(start={"y": 1.0}), 1.0, plan).numbers["needed"] == pytest.approx(180.0)
+
+
+def test_at_rest_nothing_is_asked_for():
+    """Neither by the reference nor after the start."""
+    still = fp.Trajectory(lambda t: {"q": 0 * t})
+    one = slew(replace(mass(start={"q": 0.0}), reference=still), 1.0)
+    assert one.verdict == "yes"
+    assert one.found == "the request changes by up to 0 per second, the map by 10"
+
+
 # The commands
 
 
