@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.deformation.base import Deformation, Mirror
+from fpirhc.deformation.base import Deformation, Mirror, is_finite
 from fpirhc.deformation.queue import Queue, every
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
@@ -34,7 +34,6 @@ from fpirhc.task.problem import Problem
 MEASURED = "_measured_state"  # the state that the response belongs to; a controller may act on a predicted state
 _BEFORE = "_deformation_before"
 _NONE = 1e-9  # a fraction of a cycle below this is none
-_FINITE = 1e300
 
 
 def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
@@ -185,7 +184,7 @@ def _twin_block(path: _Path) -> Block:
         state, response, *memories = estimate.function(late_sample, *(getattr(s, m.name) for m in own))
         away = getattr(s, MEASURED) - state
         # A shift that is not finite must not be remembered.
-        shift = ca.if_else(ca.mmin(ca.fabs(away) <= _FINITE), away, 0)
+        shift = ca.if_else(is_finite(away), away, 0)
         remembered |= {"mirror_state_next": at + shifts.state @ shift, **deformations_next}
         if late:
             remembered["mirror_sample_next"] = sample + shifts.sample @ shift

@@ -27,15 +27,13 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Mirror, Pairing
+from fpirhc.deformation.base import Deformation, Mirror, Pairing, is_finite
 from fpirhc.deformation.leaky import check_pole
 from fpirhc.deformation.queue import Cycles, Queue, check_cycles, check_uncertainty, every
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.deformation.wrappers.delayed import chosen_pole
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-
-_FINITE = 1e300
 
 
 @dataclass(frozen=True)
@@ -129,7 +127,7 @@ class ModelReferenced(Wrapper):
         if pole:
             deformation = pole * before + (1 - pole) * deformation
         # A deformation that is not a number must not be remembered.
-        remembered = ca.if_else(ca.mmin(ca.fabs(deformation) <= _FINITE), deformation, before)
+        remembered = ca.if_else(is_finite(deformation), deformation, before)
         return desired + deformation, {"own_deformation": queue.pushed(past, remembered), **next_memory}
 
     @property

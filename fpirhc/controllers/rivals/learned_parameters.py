@@ -16,7 +16,8 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import FINITE, clip, like
+from fpirhc.controllers.base import clip, like
+from fpirhc.deformation.base import is_finite
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.learning.rules.base import Bounds, Evidence, Pair, Rule
 from fpirhc.plant.regressor import Combination, Regressor
@@ -115,7 +116,7 @@ class Learning:
                 s._clipped_before,
             )
             candidate = old + self.rule.change(evidence, self.bounds, problem.period)
-            good = ca.logic_and(running, ca.mmin(ca.fabs(candidate) <= FINITE))
+            good = ca.logic_and(running, is_finite(candidate))
             new = ca.if_else(good, clip(candidate, lower, upper), old)
             return {"estimate": new, "_believed": ca.vertcat(new, s.parameters[others]), "learned_next": new}
 
