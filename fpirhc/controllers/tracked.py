@@ -12,7 +12,7 @@ from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
 
-def desiring_blocks(problem: Problem, tracking: Tracking) -> list[Block]:
+def desired_blocks(problem: Problem, tracking: Tracking) -> list[Block]:
     """Return the blocks reference, target, nominal and tracking: together they write 'desired'."""
     plant = problem.plant
     return [
@@ -27,5 +27,5 @@ def tracked_blocks(problem: Problem, tracking: Tracking, deformation: Deformatio
     """Return the blocks reference, tracking, deform, invert, limit, judge, running, tracking update, and what they remember."""
     plant = problem.plant
     closing, delays = closing_blocks(problem, deformation)
-    blocks = [*desiring_blocks(problem, tracking), *closing, tracking.update(plant, problem.period)]
+    blocks = [*desired_blocks(problem, tracking), *closing, tracking.update(plant, problem.period)]
     return blocks, [*delays, *tracking.delays(plant)]

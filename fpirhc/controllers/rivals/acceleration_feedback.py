@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, invert_block
-from fpirhc.controllers.tracked import desiring_blocks
+from fpirhc.controllers.tracked import desired_blocks
 from fpirhc.deformation.base import Deformation, is_finite
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
@@ -80,7 +80,7 @@ class AccelerationFeedback(Controller):
         plant = problem.plant
         closing, delays = commanding_blocks(problem)
         blocks = [
-            *desiring_blocks(problem, self.tracking),
+            *desired_blocks(problem, self.tracking),
             self._feedback_block(problem),
             invert_block(plant),
             *closing,

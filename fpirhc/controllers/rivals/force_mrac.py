@@ -26,7 +26,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like
 from fpirhc.controllers.demands import command_demand
-from fpirhc.controllers.tracked import desiring_blocks
+from fpirhc.controllers.tracked import desired_blocks
 from fpirhc.deformation.base import Deformation, Demand, Mirror
 from fpirhc.errors import Mistakes
 from fpirhc.members import Example
@@ -88,7 +88,7 @@ class ForceMRAC(Controller):
         plant = problem.plant
         closing, delays = commanding_blocks(problem)
         blocks = [
-            *desiring_blocks(problem, self.tracking),
+            *desired_blocks(problem, self.tracking),
             self._force_block(plant, problem.warm_up_cycles),
             *closing,
             self.tracking.update(plant, problem.period),
