@@ -20,9 +20,11 @@ from __future__ import annotations
 
 import math
 
+from fpirhc.deformation.queue import Cycles, every
 from fpirhc.errors import InvalidValue
 
 _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped
+_LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists
 
 
 def leaky_pole(product: float, uncertainty: float) -> float:
@@ -61,6 +63,14 @@ def leaky_margin(product: float, pole: float) -> float:
     _check_product("leaky_margin", product)
     check_pole("leaky_margin", pole)
     return 2 * math.sqrt(pole / (product * (2 + product))) / (1 - pole)
+
+
+def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: float | None) -> float:
+    """Return the pole of a leaky pairing: `pole` itself, or for None the one that follows from the gain and the uncertainty."""
+    if pole is not None:
+        return float(pole)
+    error = default_uncertainty(max(every(cycles))) if uncertainty is None else uncertainty
+    return default_pole(min(max(1.0, abs(gain)), _LARGEST_PRODUCT), error)
 
 
 def default_uncertainty(cycles: float) -> int:

@@ -28,10 +28,9 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Mirror, Pairing, is_finite
-from fpirhc.deformation.leaky import check_pole
+from fpirhc.deformation.leaky import check_pole, chosen_pole
 from fpirhc.deformation.queue import Cycles, Queue, check_cycles, check_uncertainty, every
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
-from fpirhc.deformation.wrappers.delayed import chosen_pole
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 

@@ -30,15 +30,13 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Pairing
-from fpirhc.deformation.leaky import check_pole, default_pole, default_uncertainty
+from fpirhc.deformation.leaky import check_pole, chosen_pole
 from fpirhc.deformation.queue import MOST, Cycles, Queue, check_cycles, check_uncertainty, every
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 __all__ = ["MOST", "Increment", "Paired"]
-
-_LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists
 
 
 @dataclass(frozen=True)
@@ -216,14 +214,6 @@ class Increment(_Queued):
         if pole:
             deformation = pole * (past_requests[:size] - past_desired[:size]) + (1 - pole) * deformation
         return desired + deformation, next_memory
-
-
-def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: float | None) -> float:
-    """Return the pole of a leaky pairing: `pole` itself, or for None the one that follows from the gain and the uncertainty."""
-    if pole is not None:
-        return float(pole)
-    error = default_uncertainty(max(every(cycles))) if uncertainty is None else uncertainty
-    return default_pole(min(max(1.0, abs(gain)), _LARGEST_PRODUCT), error)
 
 
 def examples(inner: Deformation) -> tuple[Deformation, ...]:
