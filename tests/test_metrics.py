@@ -178,9 +178,9 @@ def test_a_metric_is_one_value():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"name": "rms_error"}, "is there 2 times"),
-        ({"name": "stop"}, "stands for something else"),
-        ({"name": "solve"}, "stands for something else"),
+        ({"name": "rms_error"}, "is defined 2 times"),
+        ({"name": "stop"}, "another meaning in results"),
+        ({"name": "solve"}, "another meaning in results"),
         ({"name": "My metric"}, "small letters"),
         ({"better": "smallest"}, "Did you mean 'smaller'"),
         ({"compared": "exactly"}, "Did you mean 'exact'"),

@@ -100,10 +100,10 @@ def spectrum_over_run(
         InvalidValue: no finite eigenvalue.
     """
     states, deformed = _checked_rows(plant, states, deformed)
-    thinned = np.unique(np.linspace(0, len(states) - 1, min(len(states), LARGEST_SAMPLE)).astype(int))
+    rows = _thinned(len(states))
     true = plant.exact if exact is None else np.asarray(exact, dtype=float)
-    parameters = np.repeat(true[None, :], len(thinned), axis=0)
-    return _spectrum(plant, states[thinned], deformed[thinned], parameters, approximate)
+    parameters = np.repeat(true[None, :], len(rows), axis=0)
+    return _spectrum(plant, states[rows], deformed[rows], parameters, approximate)
 
 
 def spectrum_over_box(
@@ -160,7 +160,7 @@ def contraction_along(
         InvalidShape: arrays that do not fit the plant or each other.
     """
     states, deformed = _checked_rows(plant, states, deformed)
-    rows = np.unique(np.linspace(0, len(states) - 1, min(len(states), LARGEST_SAMPLE)).astype(int))
+    rows = _thinned(len(states))
     exact = np.repeat(plant.exact[None, :], len(rows), axis=0)
     jacobians = response_jacobians(plant, states[rows], deformed[rows], exact, approximate)
     finite = np.isfinite(jacobians).all(axis=(1, 2))
@@ -184,6 +184,11 @@ def response_jacobians(plant: Plant, states: Array, deformed: Array, exact: Arra
     count = len(states)
     stacked = function.map(count)(states.T, deformed.T, exact.T, np.repeat(model[:, None], count, axis=1))
     return np.asarray(stacked.full()).reshape((n, count, n)).transpose(1, 0, 2)
+
+
+def _thinned(cycles: int) -> Array:
+    """Numbers of at most `LARGEST_SAMPLE` cycles, evenly chosen, with the first and the last."""
+    return np.unique(np.linspace(0, cycles - 1, min(cycles, LARGEST_SAMPLE)).astype(int))
 
 
 def _spectrum(plant: Plant, states: Array, deformed: Array, exact: Array, approximate: Array | None) -> Spectrum:

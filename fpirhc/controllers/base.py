@@ -21,15 +21,13 @@ from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.mirror import measured_state, mirror_blocks, with_measured_state
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, is_finite
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.task.problem import Problem
-
-FINITE = 1e300  # |v| <= FINITE is false for NaN and infinity, and CasADi does not simplify it away
 
 
 def controller_reads(problem: Problem, controller: Controller) -> Layout:
@@ -198,7 +196,7 @@ def _limit_block(problem: Problem) -> Block:
 
     def step(s: Signals) -> dict[str, Expression]:
         # Finiteness is checked before the clamp: fmin and fmax turn NaN into a full-scale command.
-        finite = ca.mmin(ca.fabs(s.command_unclipped) <= FINITE)
+        finite = is_finite(s.command_unclipped)
         safe = ca.if_else(finite, s.command_unclipped, s._command_before)
         command = clip(safe, lower, upper)
         clipped_request = meaning(s.state, command, safe, s._deformed_unclipped, s.parameters)

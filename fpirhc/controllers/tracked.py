@@ -12,17 +12,20 @@ from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
 
+def desired_blocks(problem: Problem, tracking: Tracking) -> list[Block]:
+    """Return the blocks reference, target, nominal and tracking: together they write 'desired'."""
+    plant = problem.plant
+    return [
+        reference_block(problem),
+        rename("target", like(plant.state, "reference"), like(plant.state, "_target")),
+        rename("nominal", plant.response_signal("_reference_response"), plant.response_signal("nominal")),
+        tracking.law(plant, problem.period),
+    ]
+
+
 def tracked_blocks(problem: Problem, tracking: Tracking, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
     """Return the blocks reference, tracking, deform, invert, limit, judge, running, tracking update, and what they remember."""
     plant = problem.plant
     closing, delays = closing_blocks(problem, deformation)
-    response = plant.response_signal("_reference_response")
-    blocks = [
-        reference_block(problem),
-        rename("target", like(plant.state, "reference"), like(plant.state, "_target")),
-        rename("nominal", response, plant.response_signal("nominal")),
-        tracking.law(plant, problem.period),
-        *closing,
-        tracking.update(plant, problem.period),
-    ]
+    blocks = [*desired_blocks(problem, tracking), *closing, tracking.update(plant, problem.period)]
     return blocks, [*delays, *tracking.delays(plant)]

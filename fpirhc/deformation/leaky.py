@@ -24,6 +24,7 @@ from fpirhc.deformation.queue import Cycles, every
 from fpirhc.errors import InvalidValue
 
 _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped
+_LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists
 
 _LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists
 
@@ -66,6 +67,14 @@ def leaky_margin(product: float, pole: float) -> float:
     return 2 * math.sqrt(pole / (product * (2 + product))) / (1 - pole)
 
 
+def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: float | None) -> float:
+    """Return the pole of a leaky pairing: `pole` itself, or for None the one that follows from the gain and the uncertainty."""
+    if pole is not None:
+        return float(pole)
+    error = default_uncertainty(max(every(cycles))) if uncertainty is None else uncertainty
+    return default_pole(min(max(1.0, abs(gain)), _LARGEST_PRODUCT), error)
+
+
 def default_uncertainty(cycles: float) -> int:
     """A tenth of the dead time, at least one cycle; 0 without dead time."""
     return max(1, math.ceil(0.1 * cycles - 1e-9)) if cycles > 0 else 0
@@ -90,11 +99,3 @@ def _check_product(owner: str, product: float) -> None:
             f"{owner}(product={product!r}): expected effective gain times largest eigenvalue in (0, 2); outside it the iteration "
             "diverges with the right dead time too"
         )
-
-
-def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: float | None) -> float:
-    """Return the pole of a leaky pairing: the given one, or that of the uncertainty for a map with this effective gain."""
-    if pole is not None:
-        return float(pole)
-    wrong = default_uncertainty(max(every(cycles))) if uncertainty is None else uncertainty
-    return default_pole(min(max(1.0, abs(gain)), _LARGEST_PRODUCT), wrong)

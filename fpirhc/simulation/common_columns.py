@@ -1,7 +1,7 @@
-"""Columns that every run has, whatever the problem: what the plant did, and the error by which a run is judged.
+"""Columns that every run has, whatever the problem: state and response of the plant, and the error by which a run is judged.
 
-A loop computes them where the controller is given something else than the plant's own state and response. Everywhere else
-they follow from what was logged, so they are added after the run and cost nothing in the loop.
+A loop computes them where the controller is given another state or response than the plant's own. Everywhere else they follow from
+logged signals, so they are added after the run and cost nothing in the loop.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def _true_error(layout: Layout, log: np.ndarray) -> np.ndarray:
     if "reference" not in layout:
         return log[:, layout.slice("error")]  # a controller of a user's own that logs its error alone
     places = [state.elements.index(name) for name in layout["error"].elements]
-    reference, reached = log[:, layout.slice("reference")], log[:, layout.slice(state.name)]
-    return np.asarray(reference[:, places] - reached[:, places])
+    reference, states = log[:, layout.slice("reference")], log[:, layout.slice(state.name)]
+    return np.asarray(reference[:, places] - states[:, places])
 
 
 def _renamed(signal: Signal, name: str) -> Signal:

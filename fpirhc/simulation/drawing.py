@@ -1,4 +1,4 @@
-"""What figures of runs share: colours, lines with units, time slots, responses."""
+"""Parts that figures of runs share: colours, lines with units, time slots, responses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5
 BANDS = ("#7f7f7f", "#e69f00", "#56b4e9", "#cc79a7")  # of time slots, drawn pale
 _RESPONSES = {"nominal": "#009e73", "desired": "#0072b2", "deformed": "#e69f00", "realised": "#d55e00"}
 _POINTS = 2000  # drawn per line
-_TALL = 20  # times the usual size from which a panel's range is cut, so that one spike does not hide the rest
+_TALL = 20  # largest over usual size from which the range of a panel is cut, so that one spike does not hide the rest
 
 
 def new_figure(width: float, height: float, title: str) -> Figure:
@@ -37,7 +37,7 @@ def literal(text: str) -> str:
 
 
 def draw_bands(axis: Axes, run: Run) -> None:
-    """Time slots as shaded bands, named in the legend."""
+    """Draw time slots as shaded bands, named in the legend."""
     named: set[int] = set()
     for start, end, slot in run.spans():
         name = run.layout["desired"].elements[slot]
@@ -52,9 +52,9 @@ def draw_bands(axis: Axes, run: Run) -> None:
         named.add(slot)
 
 
-def thinned(values: np.ndarray) -> np.ndarray:
-    """Return evenly chosen rows, few enough to draw."""
-    return values[:: max(1, values.shape[0] // _POINTS)]
+def thinned(values: np.ndarray, points: int = _POINTS) -> np.ndarray:
+    """Return every n-th row, about `points` in all."""
+    return values[:: max(1, values.shape[0] // points)]
 
 
 def draw_line(axis: Axes, run: Run, column: str, label: str, color: str, style: str = "-") -> None:

@@ -42,9 +42,12 @@ def close_loop(problem: Problem, controller: Controller) -> Composite:
 
 
 def start_memory(loop: Composite, problem: Problem, controller: Controller) -> np.ndarray:
-    """Return the first memory of a loop for a problem that differs from the loop's in its exact parameters only.
+    """Return the first memory of a loop, shape (loop.memory.size,).
 
-    `controller` is the loop's, resolved.
+    Args:
+        loop: from `close_loop`.
+        problem: the problem of the loop, or one that differs from it in the exact parameters only.
+        controller: the controller of the loop, resolved.
     """
     sensing = _sense_blocks(problem, controller.response(problem), predicts=False)
     remembered = [s for block in sensing for s in block.memory.signals]
@@ -75,12 +78,12 @@ def _plant_delays(problem: Problem, controller: Controller) -> list[Delay]:
 
 
 def _forcing(plant: Plant, name: str) -> Signal:
-    """What disturbances add to the response of every coordinate."""
+    """Signal of what disturbances add to the response of every coordinate."""
     return Signal(name, plant.names, plant.response_units)
 
 
 def _clock_block(period: float) -> Block:
-    """Time from a counter: no rounding error grows in a long run."""
+    """Block -> time, computed from a counter so that no rounding error grows in a long run."""
 
     def step(s: Signals) -> dict[str, Expression]:
         return {"time": s.cycle * period, "cycle_next": s.cycle + 1}
@@ -88,10 +91,10 @@ def _clock_block(period: float) -> Block:
     return Block("clock", Layout(), Layout((scalar("time", "s"),)), step, Layout((scalar("cycle"),)))
 
 
-def _sense_blocks(problem: Problem, asked: Response | None, *, predicts: bool) -> list[Block]:
-    """State and response as the controller gets them; where these are not the plant's own, also the true ones and error."""
+def _sense_blocks(problem: Problem, other: Response | None, *, predicts: bool) -> list[Block]:
+    """State and response as the controller is given them; where these are not the plant's own, also the true ones and the error."""
     plant, behind = problem.plant, problem.dead_time.measurement / problem.period
-    response = asked or _own_response(plant)
+    response = other or _own_response(plant)
     if problem.sees_plant:
         sense = [_sense_block(plant, plant.state, response)]
         return [*sense, _truth_block(problem, plant.state)] if predicts or problem.dead_time.inputs else sense
@@ -105,16 +108,16 @@ def _sense_blocks(problem: Problem, asked: Response | None, *, predicts: bool) -
         return [*true, *problem.sensing.blocks(plant, problem.period, problem.start_state, behind, signals)]
     start, calm = tuple(float(v) for v in problem.start_state), np.zeros(len(plant.names))
     resting = response.function(start, np.zeros(plant.input.size), plant.exact, calm).full().ravel()
-    seen = Signal("realised", true_response.elements, true_response.units, tuple(map(float, resting)))
+    delayed = Signal("realised", true_response.elements, true_response.units, tuple(map(float, resting)))
     return [
         *true,
         delay_block("see_state", true_state, replace(plant.state, start=start), [behind] * plant.state.size),
-        delay_block("see_response", true_response, seen, [behind] * seen.size),
+        delay_block("see_response", true_response, delayed, [behind] * delayed.size),
     ]
 
 
 def _truth_block(problem: Problem, state: Signal) -> Block:
-    """Block (time, true state) -> true error of the judged coordinates, by which a run is judged."""
+    """Block (time, true state) -> true error of the judged coordinates."""
     plant, function = problem.plant, problem.reference.function(problem.plant)
     places = [plant.state.elements.index(c) for c in problem.judged_names]
     writes = Layout((error_signal(problem, "true_error"),))
@@ -129,12 +132,12 @@ def _own_response(plant: Plant) -> Response:
     """The response of the controlled coordinates."""
     x, u, p = plant._symbols()
     w = ca.SX.sym("w", len(plant.names))
-    found = plant.controlled_response_function(x, u, p) + w[list(plant.controlled_indices)]
-    return Response(plant.response_signal("realised"), ca.Function("fpirhc_realised", [x, u, p, w], [found]))
+    response = plant.controlled_response_function(x, u, p) + w[list(plant.controlled_indices)]
+    return Response(plant.response_signal("realised"), ca.Function("fpirhc_realised", [x, u, p, w], [response]))
 
 
 def _sense_block(plant: Plant, state: Signal, response: Response) -> Block:
-    """What the controller measures: the true state, and the true response just before this cycle's command.
+    """Block -> the true state, and the true response just before this cycle's command.
 
     The response is computed here and not at the end of the last cycle, because it shares its costly terms with the first
     Runge-Kutta evaluation of this cycle.
@@ -147,14 +150,14 @@ def _sense_block(plant: Plant, state: Signal, response: Response) -> Block:
     )
 
     def step(s: Signals) -> dict[str, Expression]:
-        found = response.function(s._state_before, s._acting_before, s._exact, s._forcing_before)
-        return {state.name: s._state_before, response.signal.name: found}
+        measured = response.function(s._state_before, s._acting_before, s._exact, s._forcing_before)
+        return {state.name: s._state_before, response.signal.name: measured}
 
     return Block("sense", Layout(reads), Layout((state, response.signal)), step)
 
 
 def _actuate(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:
-    """The command's way to the plant, and the plant over one period."""
+    """Blocks of the command's way to the plant, and of the plant over one period."""
     cycles = [problem.dead_time.inputs.get(name, 0.0) / problem.period for name in problem.plant.inputs]
     if not any(cycles):
         return [_advance_block(problem, disturbed, problem.plant.input)]
@@ -167,7 +170,7 @@ def _actuate(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:
 
 
 def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Signal) -> Block:
-    """The exact plant over one period with the arriving command held."""
+    """Block of the exact plant over one period with the arriving command held."""
     plant = problem.plant
     advance = problem.integrator.step(plant, problem.period)
     state = plant.state if problem.sees_plant else like(plant.state, "plant_state")

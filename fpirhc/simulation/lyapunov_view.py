@@ -5,12 +5,13 @@ with the response error h = q^(n) - q^(n),Des, so S' = -rate S - h and
 
     V' <= -2 rate V + |h| (2 V)^(1/2),     ultimately |S| <= sup|h| / rate.
 
-A deformation makes |h| small: it drives V near zero and keeps it there, not to zero for a task that varies in time. Several
-coordinates are taken together, with Euclidean norms. The h of a cycle is the mean over it, from the change of e^(n-1): with a
-small h it matters that the plant moves on between two samples.
-
-References: J.-J. E. Slotine, W. Li, Applied Nonlinear Control, Prentice Hall 1991, ch. 7. In the spirit of the Lyapunov
+A deformation makes |h| small: it brings V near zero and keeps it there; V does not go to zero for a task that varies in time.
+Several coordinates are taken together, with Euclidean norms. The h of a cycle is its mean over the cycle, from the change of
+e^(n-1), because the plant's motion between two samples matters where h is small. The view is in the spirit of the Lyapunov
 interpretations of fixed-point transformations by the group of J. K. Tar.
+
+References:
+    J.-J. E. Slotine, W. Li, Applied Nonlinear Control, Prentice Hall 1991, ch. 7.
 """
 
 from __future__ import annotations
@@ -31,9 +32,11 @@ from fpirhc.tracking.base import Feedback
 class LyapunovView:
     """S and h along a run.
 
-    Parameters:
-        surface: S, shape (cycles, controlled coordinates). response_error: h, shape (cycles - 1, controlled coordinates).
-        rate: of the law, 1/s. since: first cycle of the measured part.
+    Args:
+        surface: S, shape (cycles, controlled coordinates).
+        response_error: h, shape (cycles - 1, controlled coordinates).
+        rate: of the law, 1/s.
+        since: first cycle of the measured part.
     """
 
     surface: np.ndarray
@@ -63,9 +66,10 @@ class LyapunovView:
 
 
 def lyapunov_view(problem: Problem, controller: Controller, run: Run) -> LyapunovView | None:
-    """Return V and its bound along a run; None where the controller does not track the reference with a law of one rate.
+    """Return V and its bound along a run, or None.
 
-    None too where what the law knows is not what the plant does: behind sensors or a late measurement, or on a predicted state.
+    It is None where the controller does not track the reference with a law of one rate, and where the state of the law is not the
+    plant's: behind sensors, behind a late measurement, or with a predicted state.
     """
     laws, since = _feedbacks(problem, controller), round(problem.measure_from / problem.period)
     elsewhere = not problem.sees_plant or controller.feeds.get("state") in run.layout.names
@@ -79,14 +83,14 @@ def lyapunov_view(problem: Problem, controller: Controller, run: Run) -> Lyapuno
 
 
 def _feedbacks(problem: Problem, controller: Controller) -> list[Feedback]:
-    """The law's feedback for every controlled coordinate; nothing where there is no law, or one without constant gains."""
+    """The law's feedback for every controlled coordinate; empty without a law, and for a law without constant gains."""
     law, plant = controller.law, problem.plant
-    found = [law.feedback(plant.orders[k]) for k in plant.controlled_indices] if law is not None else []
-    return [one for one in found if one is not None] if None not in found else []
+    feedbacks = [law.feedback(plant.orders[k]) for k in plant.controlled_indices] if law is not None else []
+    return [one for one in feedbacks if one is not None] if None not in feedbacks else []
 
 
 def _signals(problem: Problem, laws: Sequence[Feedback], rate: float, run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """S and h. The feedback that the run logged is rate S plus what S' has below the highest derivative."""
+    """S and h. The logged feedback is rate S plus the terms of S' below the highest derivative."""
     plant = problem.plant
     errors, feedback = run["reference"] - run["state"], run["desired"] - run["nominal"]
     surface, response_error = [], []

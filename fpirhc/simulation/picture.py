@@ -1,4 +1,4 @@
-"""A figure that shows itself in a notebook, whatever back end is in use there; none is chosen and no window is opened."""
+"""A figure that notebooks show with any back end; it chooses no back end and opens no window."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 
 
 class Drawing(Figure):
-    """A matplotlib Figure that knows its picture."""
+    """A matplotlib Figure with a picture for notebooks."""
 
     def _repr_png_(self) -> bytes:
-        """The picture, as notebooks ask for it."""
+        """The picture as PNG; notebooks call this method."""
         buffer = io.BytesIO()
         self.savefig(buffer, format="png", dpi=88)
         return buffer.getvalue()

@@ -1,4 +1,4 @@
-"""A run: every signal of a closed loop by name and unit, and what became of it."""
+"""A run: every signal of a closed loop by name and unit."""
 
 from __future__ import annotations
 
@@ -27,14 +27,19 @@ FORMAT = 1  # of saved runs
 class Run:
     """The log of one closed-loop run.
 
-    Parameters:
-        problem, controller: their names, '' for a problem without one. seed: of disturbances and noise. period: s.
-        layout: the logged signals. log: shape (cycles, layout.size), read-only. Every run has 'plant_state' and
-            'plant_realised', what the plant did, and 'true_error', the reference minus the plant's state at the same time.
-        stop: why the run ended early, None when it did not.
-        compiled: whether the loop ran as compiled C. settings: of problem and controller, as plain data.
-
     `run["desired"]` has shape (cycles, entries); `run["desired.q1"]` has shape (cycles,).
+
+    Args:
+        problem: its name; '' for a problem without a name.
+        controller: its name.
+        seed: of disturbances and noise.
+        period: of the control cycle, s.
+        layout: the logged signals. Every run has 'plant_state' and 'plant_realised', state and response of the plant, and
+            'true_error', the reference minus the plant's state at the same time.
+        log: values of all signals, shape (cycles, layout.size), read-only.
+        stop: why the run ended early; None for a run that finished.
+        compiled: whether the loop ran as compiled C.
+        settings: of problem and controller, as plain data.
     """
 
     problem: str
@@ -82,7 +87,7 @@ class Run:
         return int(self.log.shape[0])
 
     def spans(self) -> list[tuple[float, float, int]]:
-        """Time slots as (start in s, end in s, number of the slot); empty where the controller has none."""
+        """Return the time slots as (start in s, end in s, number of the slot); empty where the controller has none."""
         if "slot" not in self.layout or not self.cycles:
             return []
         slots = self["slot"][:, 0].astype(int)
@@ -91,17 +96,17 @@ class Run:
         return [(a * self.period, b * self.period, int(slots[a])) for a, b in zip(starts, ends, strict=True)]
 
     def unit(self, column: str) -> str:
-        """Unit of one column."""
+        """Return the unit of one column."""
         return self.layout.units[self.layout.columns.index(column)]
 
     def to_dataframe(self) -> pd.DataFrame:
-        """All signals as a pandas DataFrame with one column per entry, indexed by time."""
+        """Return all signals as a pandas DataFrame with one column per entry, indexed by time."""
         import pandas as pd
 
         return pd.DataFrame(self.log, columns=list(self.layout.columns), index=pd.Index(self.time, name="time [s]"))
 
     def plot(self) -> Figure:
-        """Errors, commands and responses over time as a matplotlib Figure."""
+        """Return errors, commands and responses over time as a matplotlib Figure."""
         from fpirhc.simulation.run_figure import run_figure
 
         return run_figure(self)
@@ -143,7 +148,7 @@ def load_run(path: str | Path) -> Run:
         raise OutputError(f"cannot read a run from '{path}': {error}") from None
     if facts.get("format") != FORMAT:
         raise OutputError(f"'{path}' has format {facts.get('format')}, this version reads {FORMAT}")
-    # A file of an older version lacks columns that follow from the others.
+    # A file of an older version lacks columns; they follow from the others.
     layout, log = with_common_columns(Layout(tuple(Signal(n, tuple(e), tuple(u)) for n, e, u in facts["signals"])), log)
     log.setflags(write=False)
     return Run(

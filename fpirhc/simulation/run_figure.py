@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def run_figure(run: Run) -> Figure:
-    """Errors, positions, commands and responses of one run over time."""
+    """Return a figure with errors, positions, commands and responses of one run over time."""
     figure = new_figure(10, 9, f"{run.controller}" + (f" ({run.stop})" if run.stop else ""))
     names = run.layout["error"].elements
     axes = figure.subplots(4, 1, sharex=True)

@@ -1,4 +1,4 @@
-"""Signals that judge a run and take no part in it: computed afterwards, from what was logged."""
+"""Signals that judge a run and take no part in it: they are computed after the run, from the log."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ Judgement = tuple[Signal, np.ndarray]
 
 def judgements(problem: Problem, controller: Controller, layout: Layout, log: np.ndarray) -> list[Judgement]:
     """Return 'cost' by term where the problem has a cost, and 'contraction' where the controller adapts."""
-    found = []
+    judged = []
     if problem.cost is not None and problem.horizon is not None:
-        found.append(_costs(problem, layout, log))
+        judged.append(_costs(problem, layout, log))
     gain = controller.deformation.effective_gain()
     if gain != 0 and log.shape[0] and controller.response(problem) is None:
         plant = problem.plant
         states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]
         factors = contraction_along(plant, states, deformed, gain, approximate=controller.parameters(plant))
-        found.append((scalar("contraction"), factors[:, None]))
-    return found
+        judged.append((scalar("contraction"), factors[:, None]))
+    return judged
 
 
 def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, np.ndarray]:
     """Return the stage cost of every cycle by term, at the actual state and command, with the exact parameters.
 
-    All controllers of a problem are judged by the same cost, whatever they believe: effort relative to a feedforward
-    means the plant's own.
+    The same cost judges all controllers of a problem, whatever their models: effort relative to a feedforward is relative to the
+    feedforward of the plant.
     """
     assert problem.horizon is not None
     assert problem.cost is not None
@@ -50,15 +50,15 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
     times = log[:, layout.slice("time")]
     function = _cost_function(ocp, data_of, _CHUNK)
     evaluator = Evaluator(function)
-    found = np.empty((log.shape[0], len(ocp.terms)))
+    costs = np.empty((log.shape[0], len(ocp.terms)))
     evaluator.arguments[3][:] = plant.exact
     for at in range(0, log.shape[0], _CHUNK):
         size = min(_CHUNK, log.shape[0] - at)
         for argument, source in zip(evaluator.arguments, (times, states, commands), strict=False):
             argument.reshape(_CHUNK, -1)[:size] = source[at : at + size]
         evaluator.evaluate()
-        found[at : at + size] = evaluator.results[0].reshape(_CHUNK, -1)[:size]
-    return Signal("cost", tuple(ocp.terms)), found
+        costs[at : at + size] = evaluator.results[0].reshape(_CHUNK, -1)[:size]
+    return Signal("cost", tuple(ocp.terms)), costs
 
 
 def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int) -> ca.Function:
@@ -68,5 +68,5 @@ def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int) -> ca.
     one = ca.Function("fpirhc_cost", [t, s, u, p], [ocp.stage_cost(s, u, data_of(t, p)[:, 0])[1]])
     times, states = ca.MX.sym("t", 1, count), ca.MX.sym("s", ocp.state.size, count)
     inputs = ca.MX.sym("u", ocp.input.size, count)
-    given = one.map(count)(times, states, inputs, ca.repmat(p, 1, count))
-    return ca.Function("fpirhc_costs", [times, states, inputs, p], [given])
+    terms = one.map(count)(times, states, inputs, ca.repmat(p, 1, count))
+    return ca.Function("fpirhc_costs", [times, states, inputs, p], [terms])

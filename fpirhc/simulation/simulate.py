@@ -32,9 +32,17 @@ SWITCHED_OFF = "compiled=False was given"  # a reason why a loop is not compiled
 
 @dataclass(frozen=True, eq=False)
 class Simulator:
-    """A closed loop that was built once and runs many times; seeds and exact parameters are its data.
+    """A closed loop that is built once and runs many times, with other seeds and exact parameters.
 
-    Not for threads, and not to be pickled: build one in each process.
+    It works in one thread only and cannot be pickled: build one in each process.
+
+    Args:
+        problem: the task.
+        controller: with its automatic settings chosen.
+        loop: the closed loop as one step.
+        evaluator: of the loop over `CHUNK` cycles.
+        compiled: whether the loop is compiled C.
+        why_not_compiled: reason where it is not; empty where it is.
     """
 
     problem: Problem
@@ -46,7 +54,7 @@ class Simulator:
 
     @property
     def remembers(self) -> bool:
-        """Whether some solver inside keeps what it found for the next run (OSQP does): a run would depend on those before."""
+        """Whether a solver inside starts a run at its last solution (OSQP does), so that a run depends on the runs before."""
         return any(f.class_name() == "OsqpInterface" for f in self.loop.function.find_functions())
 
     def run(
@@ -54,8 +62,11 @@ class Simulator:
     ) -> Run:
         """Run the loop once and return its signals.
 
-        Parameters: `variant` is the simulator's problem with other exact parameters (None: the problem itself); the rest as
-        in `simulate`.
+        Args:
+            seed: of the noise of disturbances and sensors.
+            name: of the controller in the results; '': the name of its class.
+            variant: the simulator's problem with other exact parameters; None: the problem itself.
+            progress: called with (cycles done, cycles in all).
         """
         problem = variant or self.problem
         start = start_memory(self.loop, problem, self.controller)
@@ -82,17 +93,21 @@ class Simulator:
 def simulator(
     problem: Problem, controller: Controller, *, compiled: bool = True, flags: Sequence[str] = ()
 ) -> Simulator:
-    """Build the closed loop of problem and controller, in C when there is a compiler and `compiled` is set.
+    """Return the closed loop of problem and controller, ready to run.
 
-    `flags` go to the compiler after its usual ones.
+    Args:
+        problem: the task.
+        controller: its automatic settings are chosen here.
+        compiled: whether the loop is compiled to C where there is a compiler.
+        flags: for the compiler, after its usual ones.
     """
-    chosen = resolved(problem, controller)
-    loop = close_loop(problem, chosen)
+    ready = resolved(problem, controller)
+    loop = close_loop(problem, ready)
     chunked = loop.function.mapaccum(f"{loop.function.name()}_run", CHUNK)
     backend = native(chunked, flags) if compiled else None
     evaluator = Evaluator(backend.function if backend else chunked)
     reason = backend.reason if backend else SWITCHED_OFF
-    return Simulator(problem, chosen, loop, evaluator, bool(backend and backend.compiled), reason)
+    return Simulator(problem, ready, loop, evaluator, bool(backend and backend.compiled), reason)
 
 
 def simulate(
@@ -107,17 +122,23 @@ def simulate(
 ) -> Run:
     """Run the closed loop of problem and controller and return every signal, also those that judge the run.
 
-    Parameters: `seed` of the noise of disturbances and sensors; `name` of the controller in the results; `compiled`: use C
-    when there is a compiler, with `flags` after its usual ones; `progress` is called with (cycles done, cycles in all).
+    A signal that becomes NaN or infinite ends the run at that cycle. The run keeps its finite part, and `Run.stop` is the reason.
 
-    A signal that becomes NaN or infinite ends the run at that cycle; the finite part is kept and `Run.stop` says why.
+    Args:
+        problem: the task.
+        controller: its automatic settings are chosen here.
+        seed: of the noise of disturbances and sensors.
+        name: of the controller in the results; '': the name of its class.
+        compiled: whether the loop is compiled to C where there is a compiler.
+        flags: for the compiler, after its usual ones.
+        progress: called with (cycles done, cycles in all).
     """
     ready = simulator(problem, controller, compiled=compiled, flags=flags)
     run = ready.run(seed=seed, name=name or type(ready.controller).__name__, progress=progress)
-    found = judgements(problem, ready.controller, run.layout, run.log)
-    log = np.hstack([run.log, *(values for _, values in found)])
+    judged = judgements(problem, ready.controller, run.layout, run.log)
+    log = np.hstack([run.log, *(values for _, values in judged)])
     log.setflags(write=False)
-    return replace(run, layout=run.layout + Layout(tuple(signal for signal, _ in found)), log=log)
+    return replace(run, layout=run.layout + Layout(tuple(signal for signal, _ in judged)), log=log)
 
 
 def disturbance_table(problem: Problem, seed: int, cycles: int) -> np.ndarray:
@@ -141,8 +162,8 @@ def _run_chunks(
 ) -> tuple[np.ndarray, str | None]:
     cycles = problem.cycles
     padded = -(-cycles // CHUNK) * CHUNK
-    drawn = disturbance_table(problem, seed, padded), sensing_table(problem, seed, padded)
-    tables = [table for table in drawn if table.shape[1]]
+    all_tables = disturbance_table(problem, seed, padded), sensing_table(problem, seed, padded)
+    tables = [table for table in all_tables if table.shape[1]]
     log = np.empty((padded, trace.size))
     evaluator.arguments[0][:] = start
     for at in range(0, cycles, CHUNK):
@@ -163,7 +184,7 @@ def _run_chunks(
 
 def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:
     """Row and column of the first value that is not finite."""
-    # A sum is finite only if every summand is, and is found much faster; a sum that overflows is looked at closely.
+    # A sum is finite only if every summand is, and it is fast; where it overflows the entries are checked one by one.
     with np.errstate(all="ignore"):
         if np.isfinite(np.sum(rows)):
             return None
@@ -177,5 +198,5 @@ def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:
 def _why(trace: Layout, cycle: int, column: int, period: float) -> str:
     return (
         f"signal '{trace.columns[column]}' is not finite at t = {cycle * period:g} s (cycle {cycle}); "
-        "the run keeps what came before"
+        "the run keeps the cycles before it"
     )

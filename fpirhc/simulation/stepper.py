@@ -18,13 +18,11 @@ class Stepper:
         memory = stepper.start()
         command, memory = stepper.step(time, state, realised, memory)
 
-    `state` is the measured state (nx,), `realised` the measured response (controlled coordinates) to the command that was
-    last returned; it is ignored in the first cycle. All memory is in the argument: the same arguments give the same
-    command. `trace()` shows every signal of the last step by name.
+    All memory is in the argument: the same arguments give the same command. `trace()` returns every signal of the last step.
     """
 
     def __init__(self, problem: Problem, controller: Controller, *, compiled: bool = True) -> None:
-        """Compose the controller's Function and compile it when asked to and possible."""
+        """Compose the controller's Function, and compile it where `compiled` is set and there is a compiler."""
         composite = compose_controller(problem, controller)
         backend = native(composite.function) if compiled else None
         self.compiled = bool(backend and backend.compiled)
@@ -37,13 +35,20 @@ class Stepper:
         self._evaluate = self._evaluator.evaluate
 
     def start(self) -> np.ndarray:
-        """What the controller remembers before its first cycle."""
+        """Return the memory of the controller before its first cycle."""
         return self.memory.start()
 
     def step(
         self, time: float, state: np.ndarray, realised: np.ndarray, memory: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return (command, memory for the next cycle)."""
+        """Return (command, memory for the next cycle).
+
+        Args:
+            time: s.
+            state: the measured state, shape (nx,).
+            realised: the measured response of the controlled coordinates to the last command; ignored in the first cycle.
+            memory: from `start` or from the step before.
+        """
         self._time[0] = time
         self._state[:] = state
         self._realised[:] = realised
@@ -52,5 +57,5 @@ class Stepper:
         return self._command.copy(), self._memory_next.copy()
 
     def trace(self) -> dict[str, np.ndarray]:
-        """Every signal of the last step by name."""
+        """Return every signal of the last step by name."""
         return {name: value.copy() for name, value in self.signals.unpack(self._trace).items()}

@@ -24,8 +24,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import FINITE, Controller, commanding_blocks, invert_block, like, reference_block, rename
-from fpirhc.deformation.base import Deformation
+from fpirhc.controllers.base import Controller, commanding_blocks, invert_block
+from fpirhc.controllers.tracked import desired_blocks
+from fpirhc.deformation.base import Deformation, is_finite
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
 from fpirhc.members import Example
@@ -79,10 +80,7 @@ class AccelerationFeedback(Controller):
         plant = problem.plant
         closing, delays = commanding_blocks(problem)
         blocks = [
-            reference_block(problem),
-            rename("target", like(plant.state, "reference"), like(plant.state, "_target")),
-            rename("nominal", plant.response_signal("_reference_response"), plant.response_signal("nominal")),
-            self.tracking.law(plant, problem.period),
+            *desired_blocks(problem, self.tracking),
             self._feedback_block(problem),
             invert_block(plant),
             *closing,
@@ -99,7 +97,7 @@ class AccelerationFeedback(Controller):
             error = pole * s.filtered_error + (1 - pole) * (s.realised - s.desired)
             # A measurement that is not finite must not stay in the filter.
             running = s.warm_up > warm_up_cycles - 0.5
-            usable = ca.logic_and(running, ca.mmin(ca.fabs(error) <= FINITE))
+            usable = ca.logic_and(running, is_finite(error))
             request = s.desired - self.gain * ca.if_else(running, error, 0)
             return {"_deformed_unclipped": request, "filtered_error_next": ca.if_else(usable, error, s.filtered_error)}
 

@@ -9,8 +9,10 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
-from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block, rename
+from fpirhc.controllers.base import Controller, closing_blocks, like
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, fed, learning_delays
+from fpirhc.controllers.rivals.reference_model import companion
+from fpirhc.controllers.tracked import desired_blocks
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.learning.rules.base import Pair, Rule
@@ -68,12 +70,8 @@ class AdaptiveInverseDynamics(Controller):
         plant, regressor = problem.plant, self._learning.regressor(problem)
         closing, delays = closing_blocks(replace(problem, plant=regressor.believed), self.deformation)
         believed = like(regressor.believed.parameter, "_believed")
-        response = plant.response_signal("_reference_response")
         blocks = [
-            reference_block(problem),
-            rename("target", like(plant.state, "reference"), like(plant.state, "_target")),
-            rename("nominal", response, plant.response_signal("nominal")),
-            self.tracking.law(plant, problem.period),
+            *desired_blocks(problem, self.tracking),
             self._learn_block(problem),
             *(fed(block, "parameters", believed) for block in closing),
             self.tracking.update(plant, problem.period),
@@ -103,9 +101,8 @@ class AdaptiveInverseDynamics(Controller):
         """Return B^T P: the weights of (e_int, e, e'), or of (e, e') without the integral, in w."""
         gains = self.tracking.gains(2)
         size = len(gains)
-        companion = np.vstack([np.eye(size)[1:], -np.array(gains)])
         weights = np.diag([self.tracking.rate ** (2.0 * (size - 1 - k)) for k in range(size)])
-        return np.asarray(solve_continuous_lyapunov(companion.T, -weights)[-1])
+        return np.asarray(solve_continuous_lyapunov(companion(gains).T, -weights)[-1])
 
 
 EXAMPLES = (

@@ -24,8 +24,9 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block, rename
+from fpirhc.controllers.base import Controller, commanding_blocks, like
 from fpirhc.controllers.demands import command_demand
+from fpirhc.controllers.tracked import desired_blocks
 from fpirhc.deformation.base import Deformation, Demand, Mirror
 from fpirhc.errors import Mistakes
 from fpirhc.members import Example
@@ -87,10 +88,7 @@ class ForceMRAC(Controller):
         plant = problem.plant
         closing, delays = commanding_blocks(problem)
         blocks = [
-            reference_block(problem),
-            rename("target", like(plant.state, "reference"), like(plant.state, "_target")),
-            rename("nominal", plant.response_signal("_reference_response"), plant.response_signal("nominal")),
-            self.tracking.law(plant, problem.period),
+            *desired_blocks(problem, self.tracking),
             self._force_block(plant, problem.warm_up_cycles),
             *closing,
             self.tracking.update(plant, problem.period),

@@ -16,7 +16,8 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import FINITE, clip, like
+from fpirhc.controllers.base import clip, like
+from fpirhc.deformation.base import is_finite
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.learning.rules.base import Bounds, Evidence, Pair, Rule
 from fpirhc.plant.regressor import Combination, Regressor
@@ -25,6 +26,7 @@ from fpirhc.symbolic.expression import Signals, Value, pair
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 
+Gradient = Callable[[Signals, Expression], Pair]  # (signals, estimate) -> (G, w)
 _STATES = 25  # places along the reference at which the mass matrix is tried
 _CORNERS = 4096  # corners of the box that are tried at most
 _DEFINITE = 1e-9  # smallest over largest eigenvalue of a mass matrix that counts as positive definite
@@ -78,9 +80,7 @@ class Learning:
         if inverts or self.rule.reads_response:
             _check_definite(self.bounds, coefficients)
 
-    def block(
-        self, problem: Problem, extra: Sequence[Signal], gradient: Callable[[Signals, Expression], Pair]
-    ) -> Block:
+    def block(self, problem: Problem, extra: Sequence[Signal], gradient: Gradient) -> Block:
         """Return Block (what every controller reads, last command, `extra`) -> (estimate, _believed).
 
         '_believed' holds the parameters of `Regressor.believed`.
@@ -88,7 +88,7 @@ class Learning:
         Args:
             problem: with the plant.
             extra: signals that `gradient` reads.
-            gradient: (signals, estimate) -> (G, w) of the Lyapunov rule.
+            gradient: of the Lyapunov function, for rules that follow it.
         """
         plant, regressor = problem.plant, self.regressor(problem)
         believed = like(regressor.believed.parameter, "_believed")
@@ -115,7 +115,7 @@ class Learning:
                 s._clipped_before,
             )
             candidate = old + self.rule.change(evidence, self.bounds, problem.period)
-            good = ca.logic_and(running, ca.mmin(ca.fabs(candidate) <= FINITE))
+            good = ca.logic_and(running, is_finite(candidate))
             new = ca.if_else(good, clip(candidate, lower, upper), old)
             return {"estimate": new, "_believed": ca.vertcat(new, s.parameters[others]), "learned_next": new}
 

@@ -33,6 +33,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, invert_block, like, reference_block
+from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
@@ -70,7 +71,7 @@ class ResolvedAccelerationRate(Controller):
 
     def gains(self, degree: int) -> tuple[float, ...]:
         """Return the coefficients of (d/dt + rate)^degree below the highest, lowest derivative first."""
-        return tuple(math.comb(degree, s) * self.rate ** (degree - s) for s in range(degree))
+        return decay_gains(self.rate, degree)
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, rate, increment, invert, limit, judge, running."""

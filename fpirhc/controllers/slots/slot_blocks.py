@@ -18,8 +18,9 @@ from collections.abc import Mapping, Sequence
 
 import casadi as ca
 
-from fpirhc.controllers.base import FINITE, clip, error_signal, like
+from fpirhc.controllers.base import clip, error_signal, like
 from fpirhc.controllers.slots.slot import Channel, First
+from fpirhc.deformation.base import is_finite
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, Value, expression
@@ -175,7 +176,7 @@ def command_block(problem: Problem, channels: Sequence[Channel]) -> Block:
         commands = (requests - slot["free"]) / slot["divisor"]
         unclipped = _column_of_inputs(slot["active"], commands, places, s._command_before)
         good = _pick(slot["active"], slot["good"]) > 0.5
-        finite = ca.mmin(ca.fabs(unclipped) <= FINITE)
+        finite = is_finite(unclipped)
         usable = ca.logic_and(finite, good)
         command = clip(ca.if_else(usable, unclipped, s._command_before), lower, upper)
         entries = ca.vertcat(*(command[p] for p in places))
@@ -218,7 +219,7 @@ def _pick(active: Expression, values: Expression, otherwise: Value = 0) -> Expre
 
 def _finite(value: Expression) -> Expression:
     """Zero in place of a number that is not finite: the number would be remembered for the rest of the slot."""
-    return ca.if_else(ca.fabs(value) <= FINITE, value, 0)
+    return ca.if_else(is_finite(value), value, 0)
 
 
 def judge_block() -> Block:

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from fpirhc.controllers.base import FINITE, Controller, compose_controller, embedded, like
-from fpirhc.deformation.base import Deformation
+from fpirhc.controllers.base import Controller, compose_controller, embedded, like
+from fpirhc.deformation.base import Deformation, is_finite
 from fpirhc.errors import NotSupported
 from fpirhc.learning.estimators.base import Estimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
@@ -121,7 +121,7 @@ def _estimate_block(
         evidence = Seen(s.state, s._acted, s.realised, parameters, s.estimate_begun)
         parameter_change, next_memory = correct(evidence, before)
         # A change that is not finite is not learned: one bad measurement must not spoil the model for ever.
-        finite = ca.mmin(ca.fabs(ca.vertcat(parameter_change, *next_memory.values())) <= FINITE)
+        finite = is_finite(ca.vertcat(parameter_change, *next_memory.values()))
         change = ca.if_else(finite, parameter_change, s.estimate_change)
         values = parameters + 0
         values[places] += change

@@ -22,7 +22,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, smooth_norm
+from fpirhc.deformation.base import Deformation, is_finite, smooth_norm
 from fpirhc.deformation.wrappers.base import Wrapper, of_map, start_of_map
 from fpirhc.deformation.wrappers.forgetting import forget
 from fpirhc.errors import InvalidValue
@@ -35,7 +35,6 @@ _FAST, _SLOW, _GROWTH = 1 / 20, 1 / 200, 4.0
 _AT_LIMIT = 0.5  # share of the map's largest step that counts as saturated
 _PAUSE, _CLEAN, _EVERY, _REGROW = 10, 1000, 8, 1.05
 _TRIPS, _MEMORY = 2.5, 1 - 1 / 1000
-_FINITE = 1e300
 
 
 @dataclass(frozen=True)
@@ -98,7 +97,7 @@ class Guarded(Wrapper):
         own: Mapping[str, Expression],
     ) -> dict[str, Expression]:
         """The error of this cycle, its means, the counts, and the number of the event (0: none)."""
-        finite = ca.logic_and(_finite(candidate), _finite(response))
+        finite = ca.logic_and(is_finite(candidate), is_finite(response))
         error = ca.if_else(finite, response - desired, 0)
         size = smooth_norm(error, 1e-12)
         sign = forget(own["sign"], ca.sign(ca.dot(error, own["error"])))
@@ -145,10 +144,6 @@ class Guarded(Wrapper):
         pause = ca.if_else(trip, _PAUSE, ca.fmax(own["pause"] - 1, 0))
         whole = {"factor": factor, "pause": pause, "trips": trips, "clean": clean, "event": event, "fallback": fallback}
         return {f"guard_{name}": value for name, value in {**counted, **whole}.items()}
-
-
-def _finite(value: Expression) -> Expression:
-    return ca.mmin(ca.fabs(value) <= _FINITE)
 
 
 def examples(inner: Deformation) -> tuple[Deformation, ...]:

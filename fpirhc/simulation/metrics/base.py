@@ -1,4 +1,4 @@
-"""The contract of metrics: one value says what a number is, how it is computed, shown and compared."""
+"""The contract of metrics: one value holds a number's name, function, appearance and comparison."""
 
 from __future__ import annotations
 
@@ -35,23 +35,28 @@ class Metric:
 
         overshoot = Metric("overshoot", function, by="coordinate", unit=lambda problem, name: problem.plant.coordinates[name])
 
-    Parameters:
+    Args:
         name: small letters, digits and '_'; one dot may put it in a group, 'solve.worst_iterations'.
-        function: (problem, run) -> a number, or a mapping with one number for every element where `by` is given; None where
-            the run has no such number. NaN says that the run did not reach it.
-        by: what the elements are ('coordinate', 'input', 'term', ...); None for one number.
+        function: (problem, run) -> a number, or with `by` a mapping with one number for every element; None where the run has no
+            such number. NaN means that the run did not reach it.
+        by: kind of the elements ('coordinate', 'input', 'term', ...); None for one number.
         unit: of every element: text, or a function (problem, element) -> text; the element of a single number is ''.
-        better: which direction is an improvement: 'smaller', 'larger' or 'neither'.
-        title, short: headings in a report and on a terminal; the name when not given. text: how a finite number is written.
-        headline: whether it stands in short tables; its best value is marked in the report.
-        report: whether it stands in the report's table. shown: the elements that do; None: all.
+        better: direction of an improvement: 'smaller', 'larger' or 'neither'.
+        title: heading in a report; '': the name.
+        short: heading on a terminal; '': the heading in a report.
+        text: function that writes a finite number.
+        headline: whether the metric stands in short tables; its best value is marked in the report.
+        report: whether the metric stands in the report's table.
+        shown: the elements that stand in the report's table; None: all.
         compared: how baselines compare it: 'banded' (inside a computed band), 'tight' (to 1e-6), 'exact', 'not'.
-        finite: whether a run that finished must have a finite number. floor: differences of this size mean nothing.
+        finite: whether a run that finished must have a finite number.
+        floor: size of a difference up to which two numbers count as equal.
         step: (period in s, number of cycles) -> the smallest step of a number that counts cycles.
         order: place among the columns, smallest first.
 
     Raises:
-        InvalidName: a name that cannot be a key. InvalidValue: an unknown direction or comparison.
+        InvalidName: a name that cannot be a key.
+        InvalidValue: an unknown direction or comparison.
     """
 
     name: str
@@ -92,30 +97,32 @@ class Metric:
         return self.title or self.name.replace("_", " ").replace(".", " ")
 
     def key(self, element: str) -> str:
-        """Name of one number in files: 'rms_error.q1', or the metric's name."""
+        """Return the name of one number in files: 'rms_error.q1', or the metric's name."""
         return f"{self.name}.{element}" if element else self.name
 
     def unit_of(self, problem: Problem, element: str) -> str:
-        """Unit of one element."""
+        """Return the unit of one element."""
         return self.unit if isinstance(self.unit, str) else self.unit(problem, element)
 
     def values(self, problem: Problem, run: Run) -> dict[str, float]:
-        """Return the numbers of a run by element, under '' where there is one only; empty where the run has none.
+        """Return the numbers of a run by element, a single number under ''; empty where the run has none.
 
         Raises:
-            InvalidValue: the function returned something else.
+            InvalidValue: the function did not return numbers, or not in the form that `by` announces.
         """
         result = self.function(problem, run)
         if result is None:
             return {}
         if isinstance(result, Mapping) != (self.by is not None):
-            wanted = "one number" if self.by is None else f"a mapping with a number for every {self.by}"
-            raise InvalidValue(f"metric '{self.name}': its function must return {wanted}, got {type(result).__name__}")
+            expected = "one number" if self.by is None else f"a mapping with a number for every {self.by}"
+            raise InvalidValue(
+                f"metric '{self.name}': its function must return {expected}, got {type(result).__name__}"
+            )
         items = result.items() if isinstance(result, Mapping) else [("", result)]
         return {str(element): self._number(value) for element, value in items}
 
     def _number(self, value: object) -> float:
-        """A count stays whole, so that files show it as one."""
+        """The value as a number; a count stays whole, so that files show a whole number."""
         if isinstance(value, Integral):
             return int(value)
         if isinstance(value, Real):

@@ -12,7 +12,13 @@ from fpirhc.simulation.metrics.measuring import Metrics
 
 @dataclass(frozen=True)
 class Column:
-    """One number of every run: a metric, the element, and its unit."""
+    """One number of every run.
+
+    Args:
+        metric: the metric.
+        element: of the metric; '' for a single number.
+        unit: of the number.
+    """
 
     metric: Metric
     element: str
@@ -29,17 +35,17 @@ class Column:
         return self._with_unit(self.metric.short or self.metric.heading)
 
     def number(self, metrics: Metrics) -> float | None:
-        """The number of one run; None where the run has none, NaN where it did not reach it."""
+        """Return the number of one run; None where the run has none, NaN where the run did not reach it."""
         return metrics[self.metric.name].get(self.element)
 
     def text(self, value: float | None, *, missing: str, none: str) -> str:
-        """A number as text; `missing` for None, `none` for NaN."""
+        """Return a number as text; `missing` for None, `none` for NaN."""
         if value is None:
             return missing
         return none if math.isnan(value) else self.metric.text(value)
 
     def best(self, values: Iterable[float | None]) -> float | None:
-        """The best number; None where no direction is better or there is no number."""
+        """Return the best number; None where no direction is better or there is no number."""
         finite = [v for v in values if v is not None and math.isfinite(v)]
         if not finite or self.metric.better == "neither":
             return None
@@ -51,11 +57,11 @@ class Column:
 
 
 def columns(runs: Sequence[Metrics], *, headline: bool = False) -> list[Column]:
-    """Return the columns that a report shows of these runs, or only those of short tables; numbers that no run has are left out."""
-    found: dict[tuple[str, str], Column] = {}
+    """Return the columns of a report on these runs, or with `headline` those of short tables, without numbers that no run has."""
+    shown: dict[tuple[str, str], Column] = {}
     for metrics in runs:
         for metric, element, _ in metrics:
-            wanted = metric.headline if headline else metric.report
-            if wanted and (metric.shown is None or element in metric.shown):
-                found.setdefault((metric.name, element), Column(metric, element, metrics.units[metric.name][element]))
-    return sorted(found.values(), key=lambda column: column.metric.order)
+            in_table = metric.headline if headline else metric.report
+            if in_table and (metric.shown is None or element in metric.shown):
+                shown.setdefault((metric.name, element), Column(metric, element, metrics.units[metric.name][element]))
+    return sorted(shown.values(), key=lambda column: column.metric.order)

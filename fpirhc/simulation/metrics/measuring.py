@@ -16,13 +16,14 @@ from fpirhc.task.problem import Problem
 
 @dataclass(frozen=True)
 class Metrics:
-    """What a run achieved.
+    """The metrics of one run.
 
         metrics["overshoot"]["q1"], metrics["clipped_share"][""], metrics.rms_error["q1"]
 
-    Parameters:
-        values: numbers by metric and element; a metric with one number has the element ''. A metric that the run does not have is
-            not there. units: the same for units. entries: the metrics that were asked for, by name.
+    Args:
+        values: numbers by metric and element; a single number has the element ''. Metrics that the run does not have are left out.
+        units: units by metric and element.
+        entries: the metrics that were measured, by name.
     """
 
     values: Mapping[str, Mapping[str, float]]
@@ -35,13 +36,13 @@ class Metrics:
         raise InvalidName(f"metric '{name}' is unknown.{nearest(name, self.entries)}")
 
     def __iter__(self) -> Iterator[tuple[Metric, str, float]]:
-        """Every number as (metric, element, number)."""
+        """Yield every number as (metric, element, number)."""
         for name, numbers in self.values.items():
             for element, value in numbers.items():
                 yield self.entries[name], element, value
 
     def text(self, name: str, element: str = "") -> str:
-        """One number as its metric writes it."""
+        """Return one number as text, as its metric writes it."""
         return self.entries[name].text(self[name][element])
 
     @property
@@ -61,7 +62,7 @@ class Metrics:
 
     @property
     def settling(self) -> Mapping[str, float]:
-        """Settling time by coordinate, s; NaN: it never settled."""
+        """Settling time by coordinate, s; NaN where the run did not settle."""
         return self["settling"]
 
     @property
@@ -81,13 +82,13 @@ class Metrics:
 
     @property
     def solve(self) -> Mapping[str, float]:
-        """Median and worst iterations, stationarity and feasibility, and plans; empty without an optimiser."""
+        """Median and worst values of iterations, stationarity and feasibility, and number of plans; empty without an optimiser."""
         group = {n.partition(".")[2]: v[""] for n, v in self.values.items() if n.startswith("solve.")}
         return {**group, "plans": self["plans"][""]} if group else {}
 
     @property
     def statuses(self) -> Mapping[str, int]:
-        """Cycles by status, those that occurred."""
+        """Number of cycles by status, of the statuses that occurred."""
         return {name: int(count) for name, count in self["status"].items() if count}
 
     @property
@@ -108,10 +109,15 @@ class Metrics:
 
 
 def measure(problem: Problem, run: Run, metrics: Sequence[Metric] | None = None) -> Metrics:
-    """Return the metrics of a run; those of a task are `task.metrics`, None: the shipped and the installed ones.
+    """Return the metrics of a run.
 
-    Errors are reference minus the plant's state of the judged coordinates. Numbers are taken from `problem.measure_from` on
-    unless the metric says otherwise; a run that ended before has NaN errors.
+    Errors are reference minus the plant's state of the judged coordinates. Metrics use the cycles from `problem.measure_from` on
+    unless the metric states otherwise; a run that ended before has NaN errors.
+
+    Args:
+        problem: that ran.
+        run: of the problem.
+        metrics: to measure, for a problem file its `task.metrics`; None: the shipped and the installed ones.
 
     Raises:
         InvalidValue: a metric's function returned no numbers.

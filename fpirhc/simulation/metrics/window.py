@@ -1,4 +1,4 @@
-"""What metrics of errors and commands have in common: the measured part of a run, and numbers by name."""
+"""Parts that metrics of errors and commands share: the measured part of a run, and numbers by name."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def by_name(names: Sequence[str], values: np.ndarray) -> dict[str, float]:
 
 
 def coordinate_unit(problem: Problem, coordinate: str) -> str:
-    """Unit of a coordinate."""
+    """Return the unit of a coordinate."""
     return problem.plant.coordinates[coordinate]
 
 
 def input_unit(problem: Problem, name: str) -> str:
-    """Unit of an input."""
+    """Return the unit of an input."""
     return problem.plant.inputs[name]

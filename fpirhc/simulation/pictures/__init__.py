@@ -1,1 +1,1 @@
-"""Pictures that a problem wants in its report, beyond those of every report: frozen values that draw runs."""
+"""Pictures that a problem adds to those of every report: frozen values that draw runs."""

@@ -1,7 +1,7 @@
-"""What a picture of a report is: a title, a caption, the controllers that it shows, and a way to draw their runs.
+"""The contract of pictures of a report: a title, a caption, the controllers that it shows, and a way to draw their runs.
 
-A problem file names the pictures it wants: `pictures = (fp.Portrait(...), fp.Raster(...))`. A picture draws into a figure that
-it is given, so that no plotting library is imported here.
+A problem file names its pictures: `pictures = (fp.Portrait(...), fp.Raster(...))`. A picture draws into an existing figure, so this
+module imports no plotting library.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fpirhc.simulation import drawing
 from fpirhc.simulation.run import Run
 
 if TYPE_CHECKING:
@@ -25,10 +26,12 @@ INTERVALS = 2000  # of a line over time, each drawn by its two extremes
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """Something that a run does not log but implies: a name, a unit, and a function of the run.
+    """A quantity that a run does not log but that follows from its signals.
 
-    Parameters:
-        name, unit: of the axis. values: function of a Run that returns one number per cycle, shape (cycles,).
+    Args:
+        name: on the axis.
+        unit: on the axis.
+        values: function of a Run that returns one number per cycle, shape (cycles,).
     """
 
     name: str
@@ -39,7 +42,7 @@ class Quantity:
 class Picture(ABC):
     """Contract of a picture.
 
-    Every picture has the attributes `title`, `caption` and `controllers` (names of those that it shows; all when empty).
+    Every picture has the attributes `title`, `caption` and `controllers`, the names of the controllers that it shows (empty: all).
     """
 
     title: str
@@ -48,22 +51,22 @@ class Picture(ABC):
 
     @abstractmethod
     def size(self, count: int) -> tuple[float, float]:
-        """Return width and height in inches for so many controllers."""
+        """Return width and height in inches for `count` controllers."""
 
     @abstractmethod
     def draw(self, figure: Figure, runs: Mapping[str, Run]) -> None:
         """Draw the runs, by name of their controller, into an empty figure.
 
         Raises:
-            InvalidName: a signal that a run does not have, with the nearest one.
+            InvalidName: a run does not have a signal; the message names the nearest one.
         """
 
 
 def numbers(run: Run, what: str | Quantity) -> np.ndarray:
-    """Return a signal's or a quantity's values, shape (cycles,).
+    """Return the values of a signal or a quantity, shape (cycles,).
 
     Raises:
-        InvalidName: a signal that the run does not have.
+        InvalidName: the run does not have the signal.
     """
     return run[what] if isinstance(what, str) else np.asarray(what.values(run), dtype=float)
 
@@ -71,7 +74,7 @@ def numbers(run: Run, what: str | Quantity) -> np.ndarray:
 def label(run: Run, what: str | Quantity) -> str:
     """Return the axis label 'name [unit]' of a signal or a quantity."""
     name, unit = (what.partition(".")[2] or what, run.unit(what)) if isinstance(what, str) else (what.name, what.unit)
-    return _literal(f"{name} [{unit}]")
+    return drawing.literal(f"{name} [{unit}]")
 
 
 def extremes(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -88,12 +91,7 @@ def extremes(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def caption_axes(axis: Axes, across: str, up: str) -> None:
-    """Label an axis' two directions and draw a pale grid."""
-    axis.set_xlabel(_literal(across))
-    axis.set_ylabel(_literal(up))
+    """Label the two directions of an axis and draw a pale grid."""
+    axis.set_xlabel(drawing.literal(across))
+    axis.set_ylabel(drawing.literal(up))
     axis.grid(visible=True, alpha=0.25)
-
-
-def _literal(text: str) -> str:
-    """A pair of dollar signs would be read as a formula."""
-    return text.replace("$", r"\$")

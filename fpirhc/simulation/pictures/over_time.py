@@ -1,4 +1,4 @@
-"""Signals over time, one panel each, the controllers in one panel on each other."""
+"""Signals over time: one panel for each signal, with the lines of all controllers."""
 
 from __future__ import annotations
 
@@ -19,10 +19,14 @@ if TYPE_CHECKING:
 class OverTime(Picture):
     """Panels below each other that share the time axis.
 
-    Parameters:
-        title, caption: of the picture. panels: a signal's name ("command.u") or a Quantity for each.
+    Args:
+        title: of the picture.
+        panels: one entry for each panel: the name of a signal ("command.u"), or a Quantity.
+        caption: of the picture.
         levels: values at which a panel has a dashed line (thresholds, limits), by the panel's signal or quantity name.
-        time: unit of the problem's time. since: time from which it is drawn. controllers: those shown; all when empty.
+        time: unit of the problem's time.
+        since: time from which the lines are drawn, in that unit.
+        controllers: names of those shown; empty: all.
     """
 
     title: str
@@ -34,7 +38,7 @@ class OverTime(Picture):
     controllers: tuple[str, ...] = ()
 
     def size(self, count: int) -> tuple[float, float]:
-        """Two inches and a half for each panel."""
+        """Return a height of 2.3 inches for each panel, whatever the number of controllers."""
         del count
         return 11.0, 2.3 * len(self.panels) + 0.6
 
@@ -42,7 +46,7 @@ class OverTime(Picture):
         """Draw the panels.
 
         Raises:
-            InvalidName: a signal that a run does not have.
+            InvalidName: a run does not have a signal.
         """
         axes = np.atleast_1d(figure.subplots(len(self.panels), 1, sharex=True))
         for axis, what in zip(axes, self.panels, strict=True):

@@ -19,9 +19,13 @@ if TYPE_CHECKING:
 class Portrait(Picture):
     """A panel for each controller with the same axes: `y` over `x`.
 
-    Parameters:
-        title, caption: of the picture. x, y: a signal's name ("state.q") or a Quantity.
-        since: time from which it is drawn, to leave a transient out. controllers: those shown; all when empty.
+    Args:
+        title: of the picture.
+        x: the name of a signal ("state.q"), or a Quantity.
+        y: the name of a signal, or a Quantity.
+        caption: of the picture.
+        since: time from which the lines are drawn, in the problem's unit; a later time leaves a transient out.
+        controllers: names of those shown; empty: all.
     """
 
     title: str
@@ -32,14 +36,14 @@ class Portrait(Picture):
     controllers: tuple[str, ...] = ()
 
     def size(self, count: int) -> tuple[float, float]:
-        """As wide as the panels beside each other need it."""
+        """Return a width of 3.7 inches for each panel."""
         return max(5.5, 3.7 * count), 3.6
 
     def draw(self, figure: Figure, runs: Mapping[str, Run]) -> None:
         """Draw the panels.
 
         Raises:
-            InvalidName: a signal that a run does not have.
+            InvalidName: a run does not have a signal.
         """
         panels = figure.subplots(1, len(runs), sharex=True, sharey=True, squeeze=False)[0]
         for axis, (name, run) in zip(np.atleast_1d(panels), runs.items(), strict=True):

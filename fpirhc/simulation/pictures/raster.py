@@ -1,4 +1,4 @@
-"""When a signal passes a threshold upwards: the spike raster of neurons, one row for each controller."""
+"""Times at which a signal passes a threshold upwards: the spike raster of neurons, one row for each controller."""
 
 from __future__ import annotations
 
@@ -19,9 +19,13 @@ if TYPE_CHECKING:
 class Raster(Picture):
     """A row of ticks for each controller, one tick where the signal passes the threshold upwards.
 
-    Parameters:
-        title, caption: of the picture. signal: a signal's name ("state.V") or a Quantity. threshold: in its unit.
-        time: unit of the problem's time. controllers: those shown; all when empty.
+    Args:
+        title: of the picture.
+        signal: the name of a signal ("state.V"), or a Quantity.
+        threshold: in the unit of the signal.
+        caption: of the picture.
+        time: unit of the problem's time.
+        controllers: names of those shown; empty: all.
     """
 
     title: str
@@ -32,14 +36,14 @@ class Raster(Picture):
     controllers: tuple[str, ...] = ()
 
     def size(self, count: int) -> tuple[float, float]:
-        """A third of an inch for each row."""
+        """Return a height of a third of an inch for each row."""
         return 11.0, 0.33 * count + 1.1
 
     def draw(self, figure: Figure, runs: Mapping[str, Run]) -> None:
         """Draw the rows, the first controller on top.
 
         Raises:
-            InvalidName: a signal that a run does not have.
+            InvalidName: a run does not have the signal.
         """
         axis = figure.subplots()
         events = [passages(run.time, numbers(run, self.signal), self.threshold) for run in runs.values()]
@@ -52,6 +56,6 @@ class Raster(Picture):
 
 
 def passages(times: np.ndarray, values: np.ndarray, threshold: float) -> np.ndarray:
-    """Return the times from which the values are above the threshold after having been at it or below."""
+    """Return the first times at which the values are above the threshold, after values at or below it."""
     above = values > threshold
     return times[1:][above[1:] & ~above[:-1]]

@@ -1,4 +1,4 @@
-"""What the commands cost and how often they were clipped."""
+"""The size of the commands, and the share of the cycles in which they were clipped."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from fpirhc.task.problem import Problem
 
 
 def effort(problem: Problem, run: Run) -> dict[str, float]:
-    """Rms command of every input, from `measure_from` on; NaN where the run ended before."""
+    """Return the rms command of every input, from `measure_from` on; NaN where the run ended before."""
     commands = run["command"][measured_cycles(problem, run)]
     squares = np.mean(commands**2, axis=0) if commands.shape[0] else np.full(commands.shape[1], np.nan)
     return by_name(run.layout["command"].elements, np.sqrt(squares))
 
 
 def clipped_share(problem: Problem, run: Run) -> float:  # noqa: ARG001 -- every metric is given the problem
-    """Share of the cycles of the whole run with a clipped command."""
+    """Return the share of the cycles of the whole run with a clipped command."""
     return float(np.mean(run["clipped"])) if run.cycles else float("nan")
 
 

@@ -9,7 +9,7 @@ from fpirhc.task.problem import Problem
 
 
 def cost(problem: Problem, run: Run) -> dict[str, float]:
-    """Sum of the problem's stage cost by term, and 'total', from `measure_from` on; none for a run that ended early."""
+    """Return the sum of the problem's stage cost by term, and 'total', from `measure_from` on; empty for a run that ended early."""
     if "cost" not in run.layout or run.stop is not None:
         return {}
     terms = by_name(run.layout["cost"].elements, run["cost"][measured_cycles(problem, run)].sum(axis=0))

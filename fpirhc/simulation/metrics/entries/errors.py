@@ -11,17 +11,17 @@ from fpirhc.task.problem import Problem
 
 
 def rms_error(problem: Problem, run: Run) -> dict[str, float]:
-    """Root mean square of the error over the cycles."""
+    """Return the root mean square of the error over the cycles, by coordinate."""
     return by_name(run.layout["error"].elements, np.sqrt(np.mean(measured_errors(problem, run) ** 2, axis=0)))
 
 
 def max_error(problem: Problem, run: Run) -> dict[str, float]:
-    """Largest size of the error."""
+    """Return the largest size of the error, by coordinate."""
     return by_name(run.layout["error"].elements, np.max(np.abs(measured_errors(problem, run)), axis=0))
 
 
 def iae(problem: Problem, run: Run) -> dict[str, float]:
-    """Integral of the error's size over time: the sum over the cycles times the period."""
+    """Return the integral of the error's size over time, the sum over the cycles times the period, by coordinate."""
     sums = np.sum(np.abs(measured_errors(problem, run)), axis=0)
     return by_name(run.layout["error"].elements, sums * problem.period)
 

@@ -1,4 +1,4 @@
-"""When a run settled."""
+"""The time at which a run settled."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from fpirhc.simulation.metrics.base import Metric
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
 
-SETTLED = 0.02  # share of the reference's range, or of the first error where that is larger, that counts as settled
+SETTLED = 0.02  # half width of the band, as a share of the reference's range or of the first error, whichever is larger
 
 
 def settling(problem: Problem, run: Run) -> dict[str, float]:  # noqa: ARG001 -- every metric is given the problem
-    """Time in the whole run from which |error| stays within the band; 0 when it never left it, NaN when it ends outside."""
+    """Return the time from which |error| stays within the band; 0 where it always is, NaN where the run ends outside it."""
     return {name: _settling(run, name) for name in run.layout["error"].elements}
 
 

@@ -1,4 +1,4 @@
-"""How the optimiser did over the whole run; nothing where the controller has none."""
+"""Iterations, residuals and plans of the optimiser over the whole run; none where the controller has no optimiser."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fpirhc.task.problem import Problem
 
 
 def iterations(value: float) -> str:
-    """Return a number of iterations as text; an optimiser that does not tell it logs -1."""
+    """Return a number of iterations as text; an optimiser that does not report the number logs -1."""
     return f"{value:.0f}" if value >= 0 else "-"
 
 
@@ -26,13 +26,13 @@ def _over(column: str, summary: Callable[[np.ndarray], np.floating]) -> Function
 
 
 def plans(problem: Problem, run: Run) -> int | None:  # noqa: ARG001 -- every metric is given the problem
-    """Number of different plans."""
+    """Return the number of different plans."""
     if "solve" not in run.layout or not run.cycles:
         return None
-    told = run["solve"]
-    # A plan that is held for some cycles is one; what is left is few enough to sort.
-    first = np.concatenate([[True], (np.diff(told, axis=0) != 0).any(axis=1)])
-    return int(np.unique(told[first], axis=0).shape[0])
+    solves = run["solve"]
+    # A plan that is held for several cycles counts once; the remaining rows are few enough to sort.
+    first = np.concatenate([[True], (np.diff(solves, axis=0) != 0).any(axis=1)])
+    return int(np.unique(solves[first], axis=0).shape[0])
 
 
 def residual(value: float) -> str:

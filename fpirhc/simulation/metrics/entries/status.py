@@ -1,4 +1,4 @@
-"""How many cycles a run had, and what became of them."""
+"""The number of cycles of a run, and their status."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fpirhc.task.problem import Problem
 
 
 def status(problem: Problem, run: Run) -> dict[str, float]:  # noqa: ARG001 -- every metric is given the problem
-    """Cycles of the whole run by status; the cycle in which a run ended early counts as NON_FINITE."""
+    """Return the number of cycles of the whole run by status; the cycle in which a run ended early counts as NON_FINITE."""
     values, counts = np.unique(run["status"].astype(int), return_counts=True)
     cycles = dict.fromkeys((s.name for s in Status), 0)
     cycles |= {Status(int(v)).name: int(c) for v, c in zip(values, counts, strict=True)}
@@ -21,7 +21,7 @@ def status(problem: Problem, run: Run) -> dict[str, float]:  # noqa: ARG001 -- e
 
 
 def cycles(problem: Problem, run: Run) -> int:  # noqa: ARG001 -- every metric is given the problem
-    """Number of cycles."""
+    """Return the number of cycles."""
     return run.cycles
 
 
