@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
-from typing import Any
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
+
+Value = TypeVar("Value")
 
 
 def describe(value: Any) -> Any:
@@ -26,3 +28,11 @@ def describe(value: Any) -> Any:
     if value is None or isinstance(value, bool | int | float | str):
         return value
     return getattr(value, "__name__", type(value).__name__)
+
+
+def replaced(value: Value, field: str, content: object) -> Value | None:
+    """Return the same frozen value with another content of a field; None where it is no dataclass or has no such field."""
+    if not is_dataclass(value) or field not in [f.name for f in fields(value)]:
+        return None
+    changed: Value = replace(value, **{field: content})  # type: ignore[type-var]  # mypy does not narrow type variables
+    return changed

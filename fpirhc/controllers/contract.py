@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, Self
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
 
 import casadi as ca
 import numpy as np
@@ -19,6 +19,7 @@ from fpirhc.controllers.form_check import check_form
 from fpirhc.controllers.gain_check import check_gain_sign, check_response_delay
 from fpirhc.deformation.base import Deformation, Demand, Mirror, with_inner
 from fpirhc.deformation.identity import Identity
+from fpirhc.describe import replaced
 from fpirhc.errors import NotSupported
 from fpirhc.horizon.cost import Cost
 from fpirhc.optimisers.base import Optimiser
@@ -143,9 +144,9 @@ class Controller(ABC):
         Raises:
             NotSupported: neither it nor an inner controller has a field `deformation`.
         """
-        own: Any = self
-        if "deformation" in ([f.name for f in fields(own)] if is_dataclass(type(own)) else []):
-            return replace(own, deformation=deformation)
+        changed = replaced(self, "deformation", deformation)
+        if changed is not None:
+            return changed
         if self.inner is not None:
             return self.around(self.inner.with_deformation(deformation))
         raise NotSupported(f"{type(self).__name__} has no deformation that can be replaced")

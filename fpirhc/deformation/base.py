@@ -11,15 +11,19 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
 
 import casadi as ca
 
+from fpirhc.describe import replaced
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.symbolic.layout import Expression, Layout
 
 _FINITE = 1e300  # |v| <= 1e300 is false for NaN and infinity
+
+
+Wrapping = TypeVar("Wrapping")
 
 
 @dataclass(frozen=True)
@@ -211,20 +215,20 @@ class Deformation(ABC):
         """Return the same map with another effective gain."""
 
 
-def with_inner(wrapper: Any, inner: object) -> Any:
+def with_inner(wrapper: Wrapping, inner: object) -> Wrapping:
     """Return a frozen dataclass with another value in the field that holds its `inner`.
 
     Raises:
         NotSupported: no field holds it.
     """
-    current = wrapper.inner
-    own = fields(wrapper) if is_dataclass(type(wrapper)) else ()
-    names = [f.name for f in own if getattr(wrapper, f.name) is current]
-    if not names or current is None:
+    current = getattr(wrapper, "inner", None)
+    names = [name for name, value in vars(wrapper).items() if value is current]
+    changed = replaced(wrapper, names[0], inner) if names and current is not None else None
+    if changed is None:
         raise NotSupported(
             f"{type(wrapper).__name__} has no field that holds its `inner`, so the inner one cannot be replaced; override around()"
         )
-    return replace(wrapper, **{names[0]: inner})
+    return changed
 
 
 def innermost(deformation: Deformation) -> Deformation:
