@@ -109,7 +109,7 @@ def test_a_loop_that_changes_on_line_is_unknown(grid):
         (convergence(grid, loops(0.5), tuned), "Tuned changes its map"),
         (convergence(grid, loops(0.5, learns=True)), "ComputedTorque changes its model"),
     ):
-        assert (one.verdict, one.change) == ("unknown", f"{name} on line; the factor is that of its start.")
+        assert (one.verdict, one.change) == ("unknown", f"{name} on line; the factor is that of the first cycle.")
     none = convergence(grid, Loops((), (), None, reason="the inverse does not exist"))
     assert (none.verdict, none.found) == ("unknown", "no linear loop: the inverse does not exist")
 
@@ -120,7 +120,7 @@ def test_doubts_and_steep_maps_speak_against_convergence(grid):
     steep = convergence(grid, loops(0.5), fp.Affine(-5.36), ["the map is too slow"])
     assert steep.verdict == "unknown"
     assert steep.found.endswith(
-        ", but its steepest secant makes 2.01 of the 2 that converge near the reference; the map is too slow"
+        "near the reference its steepest secant times an eigenvalue reaches 2.01, and the limit is 2; the map is too slow"
     )
     wrong = convergence(grid, loops(0.5), fp.Affine(0.5))
     assert wrong.found.endswith("but near the reference the response Jacobian changes its sign")
@@ -233,7 +233,7 @@ def test_disturbances_ask_for_speed_as_well():
     assert one.numbers["needed"] == pytest.approx(14.0 + 10.0, rel=1e-3)
     two = slew(mass(disturbances={"u": fp.Step(at=1.0, size=-3.0)}), 0.7)
     assert two.numbers["jump"] == pytest.approx(1.5)
-    assert two.found.endswith("; a jump of a disturbance takes it 3 cycles")
+    assert two.found.endswith("; a jump of a disturbance takes the map 3 cycles")
     both = {"u": fp.Step(at=1.0, size=3.0), "q": fp.Step(at=1.0, size=2.0)}
     assert slew(mass(disturbances=both), 0.7).numbers["jump"] == pytest.approx(2.0)
 

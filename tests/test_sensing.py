@@ -12,7 +12,7 @@ import pytest
 from plants import chain, linear
 
 import fpirhc as fp
-from fpirhc.controllers import base
+from fpirhc.controllers import contract
 from fpirhc.errors import InvalidProblem, InvalidValue, NotContractive
 from fpirhc.simulation.loop import close_loop
 from fpirhc.symbolic.layout import Signal
@@ -318,7 +318,7 @@ def test_filtered_error(pole, share):
 @pytest.mark.parametrize("paired", [False, True])
 def test_limit_is_that_of_the_loop(estimator, paired, monkeypatch):
     """3 % below the computed limit no mode of the real closed loop grows, 3 % above one does."""
-    monkeypatch.setattr(base, "check_response_delay", lambda *_: None)
+    monkeypatch.setattr(contract, "check_response_delay", lambda *_: None)
     problem = resting(linear(1.0, 0.8), period=1e-3, duration=1e-2, sensing=fp.Sensing(estimator=estimator))
     cycles = problem.response_delay if paired else 0.0
     weights = estimator.weights(2, problem.period)
@@ -356,7 +356,13 @@ def test_delay_that_makes_the_loop_unstable_is_refused():
     with pytest.raises(NotContractive) as refused:
         run(problem, fp.ComputedTorque(tracking, fp.Affine(gain=-2 * gain)))
     text = str(refused.value)
-    for part in ("14.5 cycles late", f"below {limit:.3g}", "this is 0.3", "Paired(map, cycles=14.5)", "shorter window"):
+    for part in (
+        "14.5 cycles late",
+        f"below {limit:.3g}",
+        "this one is 0.3",
+        "Paired(map, cycles=14.5)",
+        "shorter window",
+    ):
         assert part in text
     smaller = fp.Affine(gain=-2 * 0.9 * limit)
     paired = fp.Paired(fp.Affine(gain=-2 * gain), cycles=problem.response_delay)

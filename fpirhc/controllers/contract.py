@@ -119,6 +119,11 @@ class Controller(ABC):
         return False if self.inner is None else self.inner.learns
 
     @property
+    def deforms_response(self) -> bool:
+        """Whether its deformation acts on the desired response; False where it acts on another signal, such as a command."""
+        return True if self.inner is None else self.inner.deforms_response
+
+    @property
     def law(self) -> Tracking | None:
         """The law with which the controller tracks the reference: its field `tracking`; None without this field."""
         return getattr(self, "tracking", None) if self.inner is None else self.inner.law

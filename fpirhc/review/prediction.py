@@ -24,6 +24,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, like
 from fpirhc.controllers.contract import resolved, without_deformation
+from fpirhc.controllers.mirror import with_measured_state
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotSupported
 from fpirhc.plant.plant import Plant
@@ -120,7 +121,8 @@ def _recursion(nominal: NominalRun, deformation: Deformation, exact: np.ndarray)
         ),
         Delay(Signal("_exact", plant.parameter.elements, plant.parameter.units, tuple(map(float, exact))), "_exact"),
     ]
-    return compose("prediction", reads, [_answer_block(plant), *closing, _judge_block(plant)], [*delays, *held])
+    blocks = with_measured_state(plant, [_answer_block(plant), *closing, _judge_block(plant)])
+    return compose("prediction", reads, blocks, [*delays, *held])
 
 
 def _answer_block(plant: Plant) -> Block:
@@ -162,7 +164,8 @@ def _exactly(plant: Plant, values: np.ndarray) -> Plant:
 
 
 def _check(problem: Problem, controller: Controller) -> None:
-    if controller.learns or controller.feeds or (controller.law is None and controller.planner is None):
+    follows = controller.law is not None or controller.planner is not None
+    if controller.learns or controller.feeds or not controller.deforms_response or not follows:
         raise NotSupported(
             f"no prediction for {type(controller).__name__}: it needs a controller that tracks or plans with one model and one "
             "map, and is given the measured state"

@@ -60,6 +60,11 @@ class ForceMRAC(Controller):
         """Return the parameters of the reference model, shape (np,)."""
         return np.array([self.model.get(n, p.approximate) for n, p in plant.parameters.items()], dtype=float)
 
+    @property
+    def deforms_response(self) -> bool:
+        """No: it deforms a command."""
+        return False
+
     def unusable(self, problem: Problem, mirror: Mirror) -> str:
         """Return a reason unless sensing is ideal and nothing is late: only then the last command equals the modelled one."""
         late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
