@@ -51,10 +51,10 @@ from .learning.rules.lyapunov_rule import LyapunovRule
 from .learning.rules.projection import Projection
 from .optimisers.anderson import Anderson
 from .optimisers.certificate import Certificate, certify
-from .optimisers.ladder import Ladder
 from .optimisers.fixed_point import FixedPoint
 from .optimisers.full_space import FullSpaceFixedPoint
 from .optimisers.gradient_fixed_point import GradientFixedPoint
+from .optimisers.ladder import Ladder
 from .optimisers.nlp import Fatrop, Ipopt, Osqp, Qrqp, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.reduced_gradient import ReducedGradient

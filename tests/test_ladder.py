@@ -56,7 +56,7 @@ def test_the_second_is_asked_where_the_first_has_no_usable_plan_and_counted():
     ocp, data = horizon()
     ladder = fp.Ladder(NEVER, FIXED)
     first, layout = np.array([0.1, 0.0]), ladder.memory(ocp)
-    bounds, memory = (ocp.input_lower, ocp.input_upper), layout.start()
+    bounds, memory = (ocp.input_lower, ocp.input_upper), ca.DM(layout.start())
     for _ in range(2):
         inputs, told, memory = ladder.step(ocp)(first, data, *bounds, memory)
     assert int(told[4]) == fp.Status.OK

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
+from foreign import FOREIGN, first_states
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from judging import Judge
 
 import fpirhc as fp
 from fpirhc.horizon.problem import stage_data, transcribe
 from fpirhc.optimisers.limited import limited_step
 from fpirhc.optimisers.scales import scales
 from fpirhc.symbolic.native import find_compiler, native
-
-from foreign import FOREIGN, first_states
-from judging import Judge
 
 # The horizon's first state as in the recorded loops, and IPOPT's cost there at an accuracy of 1e-9; its limits are relaxed by 1e-8.
 OPTIMA = {

@@ -21,7 +21,6 @@ import numpy as np
 
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, linear_stage, stage_symbols
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.symbolic.layout import Expression
 
 _SCALAR_CODE = 1000  # multiplications of one stage up to which scalar code beats matrix calls
 PIVOT = 1e-13  # relative size of a pivot below which a matrix does not count as positive definite
@@ -30,16 +29,16 @@ PIVOT = 1e-13  # relative size of a pivot below which a matrix does not count as
 class Expansion(NamedTuple):
     """A plan and its derivatives, stage by stage side by side."""
 
-    inputs: Expression  # (nu, N)
-    states: Expression  # (ns, N + 1)
-    following: Expression  # F (ns, N)
-    a: Expression  # (ns, ns N)
-    b: Expression  # (ns, nu N)
-    by_state: Expression  # (ns, N)
-    by_input: Expression  # (nu, N)
-    tail: Expression  # T_s (ns)
-    final: Expression  # T_ss (ns, ns)
-    value: Expression
+    inputs: ca.MX  # (nu, N)
+    states: ca.MX  # (ns, N + 1)
+    following: ca.MX  # F (ns, N)
+    a: ca.MX  # (ns, ns N)
+    b: ca.MX  # (ns, nu N)
+    by_state: ca.MX  # (ns, N)
+    by_input: ca.MX  # (nu, N)
+    tail: ca.MX  # T_s (ns)
+    final: ca.MX  # T_ss (ns, ns)
+    value: ca.MX
 
 
 def expansion_shapes(ocp: OptimalControl) -> Expansion:

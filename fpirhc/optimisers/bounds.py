@@ -84,7 +84,7 @@ class Limited:
         kept = ca.if_else(self.present, values, 0)
         return kept[:, : self._n] + kept[:, self._n :]
 
-    def pushes(self, z: ca.MX, counted: ca.MX) -> ca.MX:
+    def pushes(self, z: ca.MX, counted: ca.MX | float) -> ca.MX:
         """Multipliers of states as they enter the gradient, (rows, N), where `counted`."""
         return self.both(-self.sign * self.of_states * counted * ca.fmin(ca.fmax(z, 0), self.rho))
 

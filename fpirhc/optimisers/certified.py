@@ -53,7 +53,7 @@ def certified(ocp: OptimalControl, limits: Limited, scales: Scales, p: Expansion
     return Certified(slope, told[0], ca.mmax(beyond * limits.hard), ca.mmax(broken), told[1])
 
 
-def certify(ocp: OptimalControl, limits: Limited, p: Expansion, z: ca.MX, counted: ca.MX = 1) -> ca.MX:
+def certify(ocp: OptimalControl, limits: Limited, p: Expansion, z: ca.MX, counted: ca.MX | float = 1) -> ca.MX:
     """Return the reduced gradient g (nu, N) with the multipliers of states that are `counted`."""
     return adjoint(ocp, limits, p, limits.pushes(z, counted))
 

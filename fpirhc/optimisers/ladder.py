@@ -117,9 +117,7 @@ class Ladder(Optimiser):
         layout = optimiser.memory(ocp)
         return layout.join({n: kept[n if n == _PLAN else f"{name}_{n}"] for n in layout.names})
 
-    def _joined(
-        self, ocp: OptimalControl, plan: ca.MX, one: ca.MX, other: ca.MX, asked: ca.MX
-    ) -> ca.MX:
+    def _joined(self, ocp: OptimalControl, plan: ca.MX, one: ca.MX, other: ca.MX, asked: ca.MX) -> ca.MX:
         parts: dict[str, ca.MX] = {_PLAN: plan, _ASKED: asked}
         for name, optimiser, memory in (("first", self.first, one), ("second", self.second, other)):
             split = optimiser.memory(ocp).split(memory)
