@@ -14,13 +14,14 @@ References: D. Q. Mayne, Int. J. Control 3(1), 1966; H. G. Bock, K. J. Plitt, IF
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, linear_stage, stage_symbols
 from fpirhc.horizon.problem import OptimalControl
+from fpirhc.symbolic.expression import kind
 
 _SCALAR_CODE = 1000  # multiplications of one stage up to which scalar code beats matrix calls
 PIVOT = 1e-13  # relative size of a pivot below which a matrix does not count as positive definite
@@ -41,11 +42,10 @@ class Expansion(NamedTuple):
     value: ca.MX
 
 
-def expansion_shapes(ocp: OptimalControl) -> Expansion:
-    """Return the shapes of all parts."""
+def expansion_shapes(ocp: OptimalControl) -> tuple[tuple[int, int], ...]:
+    """Return the shapes of all parts, in the order of `Expansion`."""
     n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
-    shapes: list[Any] = [(nu, n), (ns, n + 1), (ns, n), (ns, ns * n), (ns, nu * n), (ns, n), (nu, n), (ns, 1), (ns, ns)]
-    return Expansion._make([*shapes, (1, 1)])
+    return ((nu, n), (ns, n + 1), (ns, n), (ns, ns * n), (ns, nu * n), (ns, n), (nu, n), (ns, 1), (ns, ns), (1, 1))
 
 
 def expand(ocp: OptimalControl) -> ca.Function:
@@ -108,17 +108,17 @@ def sweep(
     return ca.Function("fpirhc_sweep", arguments, [v, k, dx, du, after_costates, fine])
 
 
-def _turned(stacked: Any, stages: int) -> Any:
+def _turned(stacked: ca.MX, stages: int) -> ca.MX:
     return ca.horzcat(*reversed(ca.horzsplit(stacked, stacked.shape[1] // stages))) if stages > 1 else stacked
 
 
 def _backward(ocp: OptimalControl, scales: tuple[np.ndarray, np.ndarray]) -> ca.Function:
     """Function (P, p, A, B, l_s, l_u, c, Q, S, R, W_x, w_x, W_u, w_u, mu) -> (P, p, v, K, P', p + w, ok)."""
     ns, nu = ocp.state.size, ocp.input.size
-    kind: Any = ca.SX if ns * ns * (ns + nu) <= _SCALAR_CODE else ca.MX
+    matrix = kind(ns * ns * (ns + nu) > _SCALAR_CODE)
     shapes = {"P": (ns, ns), "p": (ns, 1), "A": (ns, ns), "B": (ns, nu), "ls": (ns, 1), "lu": (nu, 1), "c": (ns, 1)}
     shapes |= {"Q": (ns, ns), "S": (nu, ns), "R": (nu, nu), "Wx": (ns, 1), "wx": (ns, 1), "Wu": (nu, 1), "wu": (nu, 1)}
-    y = {name: kind.sym(name, *shape) for name, shape in (shapes | {"mu": (1, 1)}).items()}
+    y = {name: matrix.sym(name, *shape) for name, shape in (shapes | {"mu": (1, 1)}).items()}
     by_input, by_state = scales
     value, slope = y["P"] + ca.diag(y["Wx"] + y["mu"] * ca.DM(by_state)), y["p"] + y["wx"]
     pushed, ahead = slope + ca.mtimes(value, y["c"]), ca.mtimes(value, y["A"])

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+import casadi as ca
 import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
@@ -15,7 +14,13 @@ _SHRINKING = 0.9  # a violation counts as shrinking below this share of the last
 
 
 def improved(
-    optimiser: Optimiser, ocp: OptimalControl, state: np.ndarray, data: Any, memory: np.ndarray, *, calls: int
+    optimiser: Optimiser,
+    ocp: OptimalControl,
+    state: np.ndarray,
+    data: np.ndarray | ca.DM,
+    memory: np.ndarray,
+    *,
+    calls: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Return (plan (nu, N), diagnostics with the iterations of all calls, memory, calls).
 

@@ -9,15 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.base import FINITE, Optimiser
-from fpirhc.optimisers.fixed_point import FixedPoint
-from fpirhc.optimisers.nlp import SequentialQuadratic
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 
@@ -85,7 +82,7 @@ class Ladder(Optimiser):
         symbols = [ca.MX.sym(first.name_in(k), *first.size_in(k)) for k in range(4)]
         arguments = [*symbols, ca.MX.sym("memory", layout.size)]
         kept = layout.split(arguments[4])
-        begun: Any = first(*symbols, self._part(ocp, self.first, "first", kept))
+        begun = first(*symbols, self._part(ocp, self.first, "first", kept))
         names, shapes = ("U", "told", "after"), [first.size_out(k) for k in range(3)]
         results = [ca.MX.sym(name, *shape) for name, shape in zip(names, shapes, strict=True)]
         work = ca.Function("fpirhc_second", [*arguments, *results], self._second(ocp, second, arguments, results))
@@ -100,7 +97,9 @@ class Ladder(Optimiser):
         usable = ca.if_else(ca.fabs(arguments[4]) <= FINITE, arguments[4], 0)
         return ca.Function("fpirhc_ladder", arguments, list(inner(*symbols, usable)))
 
-    def _second(self, ocp: OptimalControl, second: ca.Function, arguments: list[Any], results: list[Any]) -> list[Any]:
+    def _second(
+        self, ocp: OptimalControl, second: ca.Function, arguments: list[ca.MX], results: list[ca.MX]
+    ) -> list[ca.MX]:
         """The better one of both answers."""
         kept = self.memory(ocp).split(arguments[4])
         inputs, told, after = second(*arguments[:4], self._part(ocp, self.second, "second", kept))
@@ -125,4 +124,6 @@ class Ladder(Optimiser):
         return self.memory(ocp).join(parts)
 
 
-EXAMPLES = (Ladder(FixedPoint(iterations=20, tolerance=1e-6), SequentialQuadratic(tolerance=1e-6)),)
+def examples(inner: Optimiser) -> tuple[Optimiser, ...]:
+    """Values for the laws, around any optimiser."""
+    return (Ladder(inner, inner),)

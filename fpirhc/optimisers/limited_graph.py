@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import casadi as ca
 import numpy as np
 
@@ -14,7 +12,7 @@ from fpirhc.optimisers.certified import certified, certify
 from fpirhc.optimisers.guess import guesses
 from fpirhc.optimisers.limited_memory import limited_memory
 from fpirhc.optimisers.limited_settings import FILTER, MU_END, MU_WARM, LimitedSettings
-from fpirhc.optimisers.turn import BEGINS, PURE, WARM, State, Turn, as_point, choose, point
+from fpirhc.optimisers.turn import BEGINS, PURE, WARM, State, Turn, as_point, choose, constant, fixed, point
 from fpirhc.status import Status
 
 _SCALARS = (
@@ -62,7 +60,7 @@ def _unpacked(column: ca.MX, shapes: dict[str, tuple[int, int]]) -> list[ca.MX]:
     return [ca.reshape(part, *shape) for part, shape in zip(parts, shapes.values(), strict=True)]
 
 
-def _begun(ocp: OptimalControl, settings: LimitedSettings, given: list[Any], memory: ca.MX) -> State:
+def _begun(ocp: OptimalControl, settings: LimitedSettings, given: list[ca.MX], memory: ca.MX) -> State:
     """The state of the iteration before its first turn: the remembered plan, or a first guess."""
     s0, data, lower, upper = given
     n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
@@ -84,9 +82,9 @@ def _begun(ocp: OptimalControl, settings: LimitedSettings, given: list[Any], mem
         "point_states": ca.horzcat(s0, ca.reshape(kept["plan_states"], ns, n)),
         "z": ca.reshape(kept["plan_multipliers"], rows, 2 * n),
         "mu": kept["plan_barrier"] * turn.scales.cost,
-        "floor": MU_END * turn.scales.cost,
+        "floor": constant(MU_END * turn.scales.cost),
         "delta": kept["plan_damping"],
-        **{"phase": PURE, "place_of": BEGINS, "fresh": 1, "slacks": WARM, "bent": 1, "start": -1},
+        **fixed(phase=PURE, place_of=BEGINS, fresh=1, slacks=WARM, bent=1, start=-1),
     }
     told = ca.norm_inf(ca.vec(memory[: nu * n])) <= FINITE
     first = ca.if_else(told, ca.reshape(memory[: nu * n], nu, n), 0)
@@ -97,7 +95,7 @@ def _begun(ocp: OptimalControl, settings: LimitedSettings, given: list[Any], mem
 
 
 def _finished(
-    ocp: OptimalControl, settings: LimitedSettings, s: State, given: list[Any], memory: ca.MX, posed: ca.MX
+    ocp: OptimalControl, settings: LimitedSettings, s: State, given: list[ca.MX], memory: ca.MX, posed: ca.MX
 ) -> list[ca.MX]:
     """Roll the last plan out where it is not, judge it, and remember."""
     s0, data, lower, upper = given
@@ -127,7 +125,7 @@ def _finished(
             "plan_costates": ca.vec(s["costates"]),
             "plan_gains": ca.vec(s["gains"]),
             "plan_multipliers": ca.vec(s["z"]),
-            "plan_barrier": s["mu"] / turn.scales.cost if settings.realtime else MU_WARM,
+            "plan_barrier": s["mu"] / turn.scales.cost if settings.realtime else ca.MX(MU_WARM),
             "plan_damping": s["delta"],
         }
     )

@@ -6,8 +6,6 @@ The plain iteration is fast where it contracts. Where it does not, its plan is t
 
 from __future__ import annotations
 
-from typing import Any
-
 import casadi as ca
 
 from fpirhc.horizon.problem import OptimalControl
@@ -30,8 +28,8 @@ def rescue(ocp: OptimalControl, plain: ca.Function, layout: Layout, limited: ca.
 
 
 def _better(
-    ocp: OptimalControl, layout: Layout, limited: ca.Function, arguments: list[Any], first: list[Any]
-) -> list[Any]:
+    ocp: OptimalControl, layout: Layout, limited: ca.Function, arguments: list[ca.MX], first: list[ca.MX]
+) -> list[ca.MX]:
     """The results of both, the better one of them, in the plain iteration's memory."""
     n, ns = ocp.stages, ocp.state.size
     before, plan, kept = layout.split(arguments[4]), limited_memory(ocp), layout.split(first[2])
@@ -42,18 +40,18 @@ def _better(
     states = ca.vec(shift(ca.reshape(kept["plan_states"], ns, n)))
     begin |= {"plan_states": ca.if_else(warm, states, 0), "plan_gains": ca.if_else(warm, kept["plan_gains"], 0)}
     begin["plan_barrier"] = ca.if_else(warm, MU_WARM, 0)
-    second: Any = limited(*arguments[:4], plan.join(begin))
+    second = limited(*arguments[:4], plan.join(begin))
     inputs, told, after = second
     found = plan.split(after)
 
-    nodes: Any = ca.reshape(found["plan_states"], ns, n)
+    nodes = ca.reshape(found["plan_states"], ns, n)
     earlier = ca.horzcat(arguments[0], nodes[:, : n - 1])
-    memory = {
+    memory: dict[str, ca.MX] = {
         "plan_inputs": ca.vec(inputs),
         "plan_states": ca.vec(earlier),
         "plan_gains": found["plan_gains"],
-        "plan_gamma": 0,
-        "plan_step": 1,
+        "plan_gamma": ca.MX(0),
+        "plan_step": ca.MX(1),
     }
     usable = told[4] < int(Status.INFEASIBLE)
     closer = ca.logic_or(told[4] == int(Status.OK), ca.logic_or(ca.logic_not(evaluated), told[1] < first[1][1]))

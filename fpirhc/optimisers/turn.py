@@ -12,7 +12,7 @@ References: R. Fletcher, S. Leyffer, Math. Program. 91, 2002; A. Waechter, L. T.
 
 from __future__ import annotations
 
-from typing import Any
+from functools import cache
 
 import casadi as ca
 import numpy as np
@@ -44,12 +44,23 @@ from fpirhc.optimisers.limited_settings import (
 from fpirhc.optimisers.scales import scales
 from fpirhc.optimisers.search import deformed_move
 
-State = dict[str, Any]
+State = dict[str, ca.MX]
 PURE, INTERIOR = 0, 1
 BEGINS, ENDS = 0, 1
 KEPT, COLD, WARM = 0, 1, 2
 _POINT = tuple(f"point_{name}" for name in Expansion._fields)
 _LEAST_MOVE = 1e-300
+
+
+@cache
+def constant(value: float) -> ca.MX:
+    """The number as an expression, the same object every time, so that `choose` leaves it alone."""
+    return ca.MX(value)
+
+
+def fixed(**values: float) -> State:
+    """Entries of the state that are numbers."""
+    return {name: constant(value) for name, value in values.items()}
 
 
 def point(s: State) -> Expansion:
@@ -126,15 +137,15 @@ class Turn:
 
     def _judge_fresh(self, s: State, p: Expansion, rolled: ca.MX, usable: ca.MX) -> State:
         """A plan that was not made by a sweep: first guesses, remembered plans, and the last one again."""
-        new = {**s, **as_point(p), "fresh": 0}
+        new = {**s, **as_point(p), **fixed(fresh=0)}
         far = ca.mmax(ca.fabs(p.states) - 100 * ca.horzcat(self._spread[:, 0], self._spread)) > 0
         fit = ca.logic_and(usable, ca.logic_not(ca.logic_and(rolled, far)))
         pure = self._enter_pure(new, BEGINS)
         if self.settings.realtime and self.settings.iterations < SEVERAL:
             pure = choose(pure, pure["error"] > NEAR, self._enter_interior(pure), pure)
         begun = choose(new, new["phase"] == PURE, pure, new)
-        first = choose(s, fit, begun, {**self._restarted(new), "accepted": 1})
-        again = choose(s, usable, new, {**s, "fresh": 0})
+        first = choose(s, fit, begun, {**self._restarted(new), **fixed(accepted=1)})
+        again = choose(s, usable, new, {**s, **fixed(fresh=0)})
         retried = s["fresh"] == 2
         told = choose(s, retried, again, first)
         return {**told, "accepted": ca.if_else(retried, usable, 1)}
@@ -153,7 +164,7 @@ class Turn:
         taken["error"] = ca.if_else(halved, c.error, s["error"])
         better = ca.logic_and(halved, s["place_of"] == BEGINS)
         taken = choose(taken, better, {**taken, **_kept(taken)}, taken)
-        return choose(s, ok, {**taken, "accepted": 1}, {**self._enter_interior(s), "accepted": 0})
+        return choose(s, ok, {**taken, **fixed(accepted=1)}, {**self._enter_interior(s), **fixed(accepted=0)})
 
     def _judge_interior(self, s: State, p: Expansion, usable: ca.MX) -> State:
         y = self._trial(s)
@@ -168,7 +179,7 @@ class Turn:
         taken = self._advanced(taken)
         # What the filter learned is kept where the plan is rejected for another reason, as in the loops in C.
         failed = {**s, **choose(s, ca.logic_and(usable, finite), {**s, **filtered}, s)}
-        return choose(s, ok, {**taken, "accepted": 1}, {**self._shortened(failed), "accepted": 0})
+        return choose(s, ok, {**taken, **fixed(accepted=1)}, {**self._shortened(failed), **fixed(accepted=0)})
 
     def _advanced(self, s: State) -> State:
         """After an accepted interior plan: mu, and whether pure steps may end the phase."""
@@ -188,7 +199,7 @@ class Turn:
             going = ca.logic_and(going, ca.logic_not(ca.logic_or(worst > 10 * mu / cost, mu <= s["floor"])))
             lower = ca.fmax(s["floor"], ca.fmin(0.2 * mu, mu * ca.sqrt(mu / cost)))
             mu, filtered = ca.if_else(going, lower, mu), ca.if_else(going, 0, filtered)
-        s = {**s, "mu": mu, "filtered": filtered, "delta": delta, "halvings": 0, "raises": 0}
+        s = {**s, "mu": mu, "filtered": filtered, "delta": delta, **fixed(halvings=0, raises=0)}
         close = ca.fmax(rest, most / cost) <= 0.3 * ca.sqrt(s["floor"] / cost)
         return choose(s, ca.logic_and(mu <= s["floor"], close), self._enter_pure(s, ENDS), s)
 
@@ -203,11 +214,12 @@ class Turn:
     def _shortened(self, s: State) -> State:
         """After a rejected interior plan: a shorter step, then more damping, then another first plan."""
         halved = {**s, "halvings": s["halvings"] + 1, "alpha": 0.5 * s["alpha"]}
-        raised = {**s, "halvings": 0, "filtered": 0, "delta": ca.fmax(10 * s["delta"], 1e-3), "raises": s["raises"] + 1}
+        more = {"delta": ca.fmax(10 * s["delta"], 1e-3), "raises": s["raises"] + 1}
+        raised = {**s, **fixed(halvings=0, filtered=0), **more}
         if self.settings.realtime:
             return self._restarted(raised)
         gives_up = ca.logic_or(raised["raises"] > MOST_RAISES, raised["delta"] > 1e8)
-        raised = choose(s, gives_up, self._restarted(raised), {**raised, "again": 1})
+        raised = choose(s, gives_up, self._restarted(raised), {**raised, **fixed(again=1)})
         return choose(s, s["halvings"] + 1 <= 8, halved, raised)
 
     def _passes(self, s: State, theta: ca.MX, phi: ca.MX) -> tuple[ca.MX, State]:
@@ -260,34 +272,33 @@ class Turn:
 
     def _enter_pure(self, s: State, place: int) -> State:
         c = self._certified(point(s), s["z"])
-        return {
-            **s,
-            **_kept(s),
-            **_told(c),
-            "error": c.error,
-            "phase": PURE,
-            "place_of": place,
-            "misses": 0,
-            "steps": 0,
-        }
+        return {**s, **_kept(s), **_told(c), "error": c.error, **fixed(phase=PURE, place_of=place, misses=0, steps=0)}
 
     def _enter_interior(self, s: State) -> State:
         """Leave the pure phase: for an interior phase near its best plan, or back to the interior plan it came from."""
         cost = self.scales.cost
-        s = {**s, "phase": INTERIOR, "again": 1, "filtered": 0, "raises": 0, "halvings": 0}
-        back = {**s, "point_inputs": s["kept_inputs"], "point_states": s["kept_states"], "z": s["kept_z"], "fresh": 1}
-        warm = MU_WARM * cost
+        s = {**s, **fixed(phase=INTERIOR, again=1, filtered=0, raises=0, halvings=0)}
+        back = {
+            **s,
+            "point_inputs": s["kept_inputs"],
+            "point_states": s["kept_states"],
+            "z": s["kept_z"],
+            **fixed(fresh=1),
+        }
+        warm = constant(MU_WARM * cost)
         mu = ca.fmin(ca.fmax(s["mu"], warm), MU_MOST * cost) if self.settings.realtime else warm
-        near = {"slacks": WARM, "mu": mu, "floor": MU_END * cost}
+        near = {"mu": mu, **fixed(slacks=WARM, floor=MU_END * cost)}
         starts = choose(s, s["misses"] == 0, {**s, **near}, {**back, **near})
         floor = 0.01 * s["floor"]
         stuck = ca.logic_or(s["stuck"], floor < MU_LEAST * cost)
-        return choose(s, s["place_of"] == BEGINS, starts, {**back, "floor": floor, "slacks": KEPT, "stuck": stuck})
+        return choose(
+            s, s["place_of"] == BEGINS, starts, {**back, "floor": floor, "stuck": stuck, **fixed(slacks=KEPT)}
+        )
 
     def _restarted(self, s: State) -> State:
         start = s["start"] + 1
         cold = self.cold({**s, "start": start}, None)
-        return choose(s, start > REFERENCE, {**s, "start": start, "stuck": 1}, cold)
+        return choose(s, start > REFERENCE, {**s, "start": start, **fixed(stuck=1)}, cold)
 
     def cold(self, s: State, inputs: ca.MX | None) -> State:
         """Begin without a memory: the inputs given or fed forward; the state held, rolled out, or the reference."""
@@ -300,9 +311,9 @@ class Turn:
         low, high = ca.repmat(lower, 1, n) + hair, ca.repmat(upper, 1, n) - hair
         none = {"gains": 0 * s["gains"], "costates": 0 * s["costates"]}
         held = {"point_inputs": ca.fmin(ca.fmax(begun, low), high), "point_states": states}
-        zeros = dict.fromkeys(("filtered", "raises", "halvings", "delta", "bent"), 0)
-        mu = {"mu": self.scales.cost, "floor": MU_END * self.scales.cost}
-        return {**s, **none, **held, **zeros, **mu, "phase": INTERIOR, "slacks": COLD, "fresh": 1}
+        zeros = fixed(filtered=0, raises=0, halvings=0, delta=0, bent=0)
+        mu = fixed(mu=self.scales.cost, floor=MU_END * self.scales.cost)
+        return {**s, **none, **held, **zeros, **mu, **fixed(phase=INTERIOR, slacks=COLD, fresh=1)}
 
     def _directed(self, s: State, needed: ca.MX) -> State:
         """Sweep for the next plan where it is needed: pure, or interior with the largest step that stays inside."""
@@ -316,10 +327,10 @@ class Turn:
         weight, lean = (ca.if_else(pure, a, b) for a, b in zip((weights, leans), barrier, strict=True))
         v, gains, dx, du, swept, ok = self._swept(s, p, weight, lean, needed)
         moved = {"v": v, "gains": gains, "dx": dx, "du": du, "swept": swept}
-        now = {**s, "again": 0, "bent": 1, "z": ca.if_else(pure, held, y.z)}
-        now = choose(now, pure, now, {**now, "t": y.t, "e": y.e, "slacks": KEPT})
+        now = {**s, "z": ca.if_else(pure, held, y.z), **fixed(again=0, bent=1)}
+        now = choose(now, pure, now, {**now, "t": y.t, "e": y.e, **fixed(slacks=KEPT)})
         delta = ca.fmax(10 * s["delta"], 1e-6)
-        failed = {**now, "delta": delta, "stuck": ca.logic_or(s["stuck"], delta > 1e8), "fresh": 2}
+        failed = {**now, "delta": delta, "stuck": ca.logic_or(s["stuck"], delta > 1e8), **fixed(fresh=2)}
         after = {**now, **moved}
         steps = {**after, "next_z": self.limits.pure_multipliers(p, held, du, dx)}
         by = self.limits.moves(p, y, s["mu"], du, dx)
@@ -331,7 +342,7 @@ class Turn:
         found = choose(now, ok, choose(after, pure, steps, inside), failed)
         return choose(s, needed, found, s)
 
-    def _swept(self, s: State, p: Expansion, weight: ca.MX, lean: ca.MX, needed: ca.MX) -> Any:
+    def _swept(self, s: State, p: Expansion, weight: ca.MX, lean: ca.MX, needed: ca.MX) -> list[ca.MX]:
         arguments = [*p, weight, lean, s["costates"], s["delta"], self._given[1]]
         exact, plain = self._sweeps
         none = _refusing(exact)
@@ -343,10 +354,10 @@ class Turn:
 
 def choose(base: State, condition: ca.MX, yes: State, no: State) -> State:
     """Return the state that is `yes` or `no`; what is the same object in both is left alone."""
-    told = {}
-    for name in {**base, **yes, **no}:
-        one: Any = yes.get(name, base.get(name))
-        other: Any = no.get(name, base.get(name))
+    told: State = {}
+    yes, no = {**base, **yes}, {**base, **no}
+    for name in {**yes, **no}:
+        one, other = yes[name], no[name]
         told[name] = one if one is other else ca.if_else(condition, one, other)
     return told
 
