@@ -1,6 +1,7 @@
 """Speed of optimisers on the same horizons: fixed-point iteration against fatrop, IPOPT and SQP, side by side in one run.
 
     python benchmarks/optimisers.py [PROBLEM ...] [--write]      --write puts the tables into docs/performance.md
+    python benchmarks/optimisers.py --constrained [PLANT ...]    horizons of other people's plants with limits of states
 
 A closed loop of 200 plans is recorded once: the plant with its exact parameters, planned for with the approximate ones, from the
 shipped problem. Every optimiser then solves the same 200 horizons, warm-started with its own last plan shifted by one stage.
@@ -93,7 +94,9 @@ def follow(optimiser: Optimiser, ocp: OptimalControl, function: ca.Function) -> 
     evaluator.arguments[2][...], evaluator.arguments[3][...] = ocp.input_lower, ocp.input_upper
     evaluator.arguments[4][...] = layout.start()
 
-    def solve(s0: np.ndarray, data: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+    def solve(s0: np.ndarray, data: np.ndarray, *, cold: bool = False) -> tuple[np.ndarray, float, np.ndarray]:
+        if cold:
+            evaluator.arguments[4][...] = layout.start()
         evaluator.arguments[0][...], evaluator.arguments[1][...] = s0, data.T
         begin = time.perf_counter_ns()
         evaluator.evaluate()
@@ -121,7 +124,9 @@ def rival(optimiser: _MultipleShooting, ocp: OptimalControl, options: dict[str, 
         column = ca.horzcat(ca.DM(s0), ca.repmat(ca.DM(states), 1, n))
         return np.asarray(interleave(column, ca.repmat(ca.DM(inputs), 1, n)).full()).ravel()
 
-    def solve(s0: np.ndarray, data: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+    def solve(s0: np.ndarray, data: np.ndarray, *, cold: bool = False) -> tuple[np.ndarray, float, np.ndarray]:
+        if cold:
+            memory.update(w=None, lam_x=np.zeros(variables), lam_g=np.zeros(constraints))
         guess = np.zeros((ocp.input.size, n)) if memory["w"] is None else separated(memory["w"])[1].full()
         states = predict(s0, guess, data)[0]
         given = {
@@ -137,7 +142,11 @@ def rival(optimiser: _MultipleShooting, ocp: OptimalControl, options: dict[str, 
         for name, value in given.items():
             solver.arguments[place[name]][...] = np.asarray(ca.DM(value).full()).ravel()
         begin = time.perf_counter_ns()
-        solver.evaluate()
+        try:
+            solver.evaluate()
+        except RuntimeError:  # a solver that raises has no plan
+            memory.update(w=None, lam_x=np.zeros(variables), lam_g=np.zeros(constraints))
+            return np.asarray(guess, dtype=float), (time.perf_counter_ns() - begin) / 1e9, np.full(5, np.nan)
         taken = time.perf_counter_ns() - begin
         found = {name: solver.results[result[name]].copy() for name in ("x", "lam_x", "lam_g")}
         state["inputs"] = separated(found["x"])[1].full()
@@ -206,6 +215,11 @@ def rows_of(name: str) -> list[tuple[str, ...]]:
 
 def main() -> None:
     """Measure the problems named on the command line, or all."""
+    if "--constrained" in sys.argv:
+        import constrained
+
+        constrained.main()
+        return
     names = [a for a in sys.argv[1:] if not a.startswith("--")] or PROBLEMS
     rows = [row for name in names for row in rows_of(name)]
     heads = (

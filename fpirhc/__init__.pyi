@@ -54,9 +54,11 @@ from .optimisers.certificate import Certificate, certify
 from .optimisers.fixed_point import FixedPoint
 from .optimisers.full_space import FullSpaceFixedPoint
 from .optimisers.gradient_fixed_point import GradientFixedPoint
+from .optimisers.ladder import Ladder
 from .optimisers.nlp import Fatrop, Ipopt, Osqp, Qrqp, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.reduced_gradient import ReducedGradient
+from .plant.implicit import ImplicitMidpoint, RadauIIA
 from .plant.integrators import Cvodes, Euler, RungeKutta4
 from .plant.plant import Parameter, Plant, structural_order
 from .plant.regressor import Combination, Regressor, linear_parameters
@@ -150,9 +152,11 @@ __all__ = [
     "HoldPlan",
     "Horizon",
     "Identity",
+    "ImplicitMidpoint",
     "Increment",
     "Ipopt",
     "LQRTerminal",
+    "Ladder",
     "Limits",
     "LogSpan",
     "LowPassDifference",
@@ -185,6 +189,7 @@ __all__ = [
     "Quadratic",
     "Quantity",
     "RFPTVector",
+    "RadauIIA",
     "Raster",
     "RecedingHorizon",
     "RecursiveLeastSquares",

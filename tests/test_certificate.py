@@ -96,3 +96,31 @@ def test_a_saddle_is_not_certified():
     certificate = fp.certify(replace(plan, inputs=0 * plan.inputs))
     assert certificate.factor > 0
     assert np.isfinite(certificate.curvature)
+
+
+def test_bounds_hold_with_active_limits_of_states():
+    """On plans near the optimum on a limit of the speed: no bound is below the true error; the limits are counted and priced."""
+    limits = fp.Limits(inputs={"torque": (-8.0, 8.0)}, states={"angle'": (-0.3, 0.6)})
+    ocp, data = pendulum_problem(limits=limits)
+    first = np.array([0.6, 0.0])
+    best = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-9), first, data)
+    exact = fp.certify(best)
+    assert exact.active == np.count_nonzero(best.state_multipliers) > 3
+    assert exact.free == best.inputs.size - exact.active
+    assert exact.factor < 1
+    assert exact.input_error < 1e-6
+    assert exact.complementarity < 1e-6
+    assert "active limits of states" in exact._repr_html_()
+    rough = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-3, feasible=1e-6), first, data)
+    for plan in (rough, fp.solve(ocp, fp.Ipopt(accuracy=1e-5), first, data)):
+        certificate = fp.certify(plan)
+        assert np.abs(plan.inputs - best.inputs).max() <= certificate.input_error + 1e-8
+
+
+def test_violated_limits_are_named_in_the_certificate():
+    """A horizon that no input can keep: the limit, its stage, and by how much."""
+    limits = fp.Limits(inputs={"torque": (-0.1, 0.1)}, states={"angle": (0.9, 1.0)})
+    ocp, data = pendulum_problem(limits=limits)
+    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6), np.array([0.6, 0.0]), data)
+    assert plan.status == fp.Status.INFEASIBLE
+    assert "below 0.9, at stage" in fp.certify(plan).broken[1]

@@ -9,7 +9,6 @@ from plants import pendulum
 
 import fpirhc as fp
 from fpirhc.errors import FpirhcError, NotSupported
-from fpirhc.horizon.augmented_lagrangian import augmented, bounded_states, penalty_weights
 from fpirhc.horizon.problem import stage_data, transcribe
 from fpirhc.horizon.rollout import rollout
 
@@ -64,7 +63,7 @@ def test_limits_are_kept_at_the_same_optimum_as_ipopt(case):
 
 
 def test_multipliers_are_those_of_ipopt():
-    """The augmented Lagrangian's multipliers, fitted and found, agree with an independent fit at IPOPT's plan."""
+    """Multipliers fitted to the plan agree with an independent fit at IPOPT's plan."""
     ocp, data, first = horizon_of(CASES["state"][0])
     plan, other = fp.solve(ocp, FIXED, first, data), fp.solve(ocp, IPOPT, first, data)
     np.testing.assert_allclose(
@@ -115,19 +114,6 @@ def test_violations_are_named_with_values_the_first_state_first():
     assert "below 0.9, at stage" in told[1]
 
 
-def test_augmented_problem_has_no_state_bounds_and_the_same_optimum_cost_inside():
-    """Inside the bounds and without multipliers the penalty is zero."""
-    ocp, data, _ = horizon_of(fp.Limits(states={"angle'": (-5.0, 5.0)}))
-    moved = augmented(ocp)
-    assert not moved.bounds_states
-    assert bounded_states(ocp) == [1]
-    assert penalty_weights(ocp)[0] > 0
-    inputs, none = np.zeros((1, ocp.stages)), np.vstack([np.ones(ocp.stages + 1), np.zeros(ocp.stages + 1)])
-    still = np.array([0.05, 0.0])
-    values = rollout(ocp)(still, inputs, data)[1], rollout(moved)(still, inputs, np.vstack([data, none]))[1]
-    assert float(values[0]) == pytest.approx(float(values[1]), rel=1e-12)
-
-
 LOOPS = {
     "state": (fp.Limits(states={"angle'": (-1.0, 1.0)}), ()),
     "rate": (fp.Limits(rates={"torque": (-30.0, 30.0)}), ()),
@@ -137,7 +123,7 @@ LOOPS = {
 
 @pytest.mark.parametrize("case", LOOPS)
 def test_limits_in_a_closed_loop(case):
-    """A few updates of the multipliers per cycle keep the limit closely, although it moves along the plan."""
+    """A few iterations per cycle keep the limit closely, although it moves along the plan."""
     limits, terminal = LOOPS[case]
     problem = fp.Problem(
         plant=pendulum(),
@@ -223,3 +209,56 @@ def test_tolerances_below_rounding_are_refused():
     ocp, data, first = horizon_of(fp.Limits(inputs={"torque": (-1e6, 1e6)}))
     with pytest.raises(FpirhcError, match="rounded to 1e-09; use 1e-06"):
         fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-12), first, data)
+
+
+def priced(price):
+    limits = fp.Limits(states={"angle'": (-0.5, 0.5)}, prices={"angle'": price})
+    return horizon_of(limits)
+
+
+def test_priced_limits_are_kept_exactly_below_their_price_and_given_up_beyond():
+    """A price above every multiplier gives the plan of the hard limit; below, the limit is violated, at that price."""
+    ocp, data, first = horizon_of(fp.Limits(states={"angle'": (-0.5, 0.5)}))
+    strict = fp.solve(ocp, FIXED, first, data)
+    largest = np.abs(strict.state_multipliers).max() / ocp.step
+    kept = fp.solve(*swapped(priced(1.1 * largest)))
+    assert kept.status == fp.Status.OK
+    np.testing.assert_allclose(kept.inputs, strict.inputs, atol=1e-6)
+    assert kept.slacks() == {"angle'": pytest.approx(0.0, abs=1e-6)}
+    given_up = fp.solve(*swapped(priced(0.3 * largest)))
+    assert given_up.status == fp.Status.OK
+    assert given_up.states[1, 1:].min() < -0.51
+    assert given_up.slacks()["angle'"] > 0
+    assert given_up.feasibility == 0
+    assert given_up.cost + given_up.slacks()["angle'"] < strict.cost
+    assert np.abs(given_up.state_multipliers).max() == pytest.approx(0.3 * largest * ocp.step, rel=1e-3)
+
+
+def test_priced_limits_have_the_optimum_of_a_problem_with_slacks():
+    """SLSQP of scipy on the inputs and one slack per node finds the same sum of cost and prices."""
+    from scipy.optimize import minimize
+
+    ocp, data, first = priced(3.0)
+    plan, n = fp.solve(ocp, FIXED, first, data), ocp.stages
+
+    def states(v):
+        return ca.DM(rollout(ocp)(first, v[:n][None], data)[0]).full()[1, 1:]
+
+    rows = {"type": "ineq", "fun": lambda v: np.concatenate([states(v) + 0.5 + v[n:], 0.5 + v[n:] - states(v), v[n:]])}
+    total = minimize(
+        lambda v: float(rollout(ocp)(first, v[:n][None], data)[1]) + 3.0 * ocp.step * v[n:].sum(),
+        np.concatenate([plan.inputs[0] + 0.1, np.ones(n)]),
+        method="SLSQP",
+        constraints=rows,
+        options={"ftol": 1e-12, "maxiter": 500},
+    )
+    assert plan.cost + plan.slacks()["angle'"] == pytest.approx(total.fun, rel=1e-5)
+
+
+def test_prices_are_refused_by_who_cannot_take_them():
+    """A solver that keeps limits must not turn a priced one into a hard one."""
+    ocp, data, first = priced(1.0)
+    with pytest.raises(NotSupported, match="takes no prices"):
+        fp.solve(ocp, IPOPT, first, data)
+    with pytest.raises(FpirhcError, match="both soft and priced"):
+        horizon_of(fp.Limits(states={"angle": (0, 1)}, soft={"angle": 1.0}, prices={"angle": 1.0}))

@@ -132,7 +132,8 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         like(plant.input, "_command_shift_last"),
         like(plant.input, "_command_before"),
     )
-    writes = (like(plant.input, "planned"), Signal("solve", _SOLVE), scalar("_solve_status"))
+    logged = tuple(scalar(name) for name in optimiser.logged)
+    writes = (like(plant.input, "planned"), Signal("solve", _SOLVE), scalar("_solve_status"), *logged)
 
     def step(s: Signals) -> dict[str, Value]:
         data = data_of(s.time, s.parameters)
@@ -144,13 +145,16 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         status = diagnostics[_SOLVE.index("status")]
         failed = status > int(Status.NOT_CONVERGED) + 0.5
         planned, judged = on_failure.choose(failed, inputs[:, 0], feedforward_of(s.time, s.parameters), status)
-        remembered_next = {f"{m}_next": v for m, v in memory.split(next_memory).items()}
+        after = memory.split(next_memory)
+        remembered_next = {f"{m}_next": v for m, v in after.items()}
+        shown = {name: after[source] for name, source in optimiser.logged.items()}
         return {
             "planned": planned,
             "solve": diagnostics,
             "_solve_status": judged,
             "plan_begun_next": 1,
             **remembered_next,
+            **shown,
         }
 
     own = memory + Layout((scalar("plan_begun"),))

@@ -15,7 +15,7 @@ import numpy as np
 from fpirhc.horizon.cost import View
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Value, expression
-from fpirhc.symbolic.layout import Expression
+from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.task.limits import Limits
 
 _GAP = 1e-9  # half width of the bounds of a terminal equality
@@ -100,6 +100,12 @@ def hard_state_bounds(limits: Limits, plant: Plant) -> tuple[np.ndarray, np.ndar
     lower, upper = limits.state_bounds(plant)
     free = np.array([e in limits.soft for e in plant.state.elements])
     return np.where(free, -math.inf, lower), np.where(free, math.inf, upper)
+
+
+def state_prices(limits: Limits, state: Signal, plant: Plant, step: float) -> np.ndarray:
+    """Price of a violation of every entry's limits at one node (ns,), in cost per unit; infinite where limits are hard."""
+    prices = {_entry(name, plant): step * price for name, price in limits.prices.items()}
+    return np.array([prices.get(e, math.inf) for e in state.elements])
 
 
 def soft_names(limits: Limits, plant: Plant) -> frozenset[str]:

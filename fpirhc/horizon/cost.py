@@ -194,7 +194,9 @@ class Quadratic(Cost):
 class LQRTerminal(Terminal):
     """The infinite-horizon weight: P of the discrete algebraic Riccati equation, from the linearised model.
 
-    Near the reference a short horizon then acts like an infinite one. The package `control` solves the equation.
+    Near the reference a short horizon then acts like an infinite one. The package `control` solves the equation. With weights of
+    rates the equation is that of (x, u before), and P is its least value over the input before the end,
+    P_xx - P_xu P_uu^-1 P_ux: the remaining cost where that input is chosen best.
     """
 
     def weight(self, cost: Quadratic, plant: Plant, linearisation: Linearisation) -> np.ndarray:
@@ -208,13 +210,31 @@ class LQRTerminal(Terminal):
         h = linearisation.step
         q = np.diag([h * cost.states.get(e, 0.0) for e in plant.state.elements])
         r = np.diag([h * (cost.effort.get(i, 0.0) + cost.deviation.get(i, 0.0)) for i in plant.input.elements])
-        if np.any(np.diag(r) <= 0):
-            raise InvalidProblem("LQRTerminal needs a positive effort or deviation weight for every input")
+        rates = np.diag([h * cost.rate.get(i, 0.0) for i in plant.input.elements])
+        if np.any(np.diag(r + rates) <= 0):
+            raise InvalidProblem("LQRTerminal needs a positive effort, correction or rate weight for every input")
         try:
+            if rates.any():
+                return _least_over_inputs(linearisation, q, r, rates)
             weight, _, _ = control.dare(linearisation.a, linearisation.b, q, r)
         except (np.linalg.LinAlgError, control.ControlArgument, ValueError) as error:
             raise InvalidProblem(f"LQRTerminal: the linearised model has no stabilising solution ({error})") from None
         return np.asarray(weight)
+
+
+def _least_over_inputs(model: Linearisation, q: np.ndarray, r: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """Solve the equation of (x, u before) and minimise over the input before."""
+    import control
+
+    nx, nu = model.b.shape
+    a = np.zeros((nx + nu, nx + nu))
+    a[:nx, :nx] = model.a
+    b = np.vstack([model.b, np.eye(nu)])
+    both = np.block([[q, np.zeros((nx, nu))], [np.zeros((nu, nx)), rates]])
+    cross = np.vstack([np.zeros((nx, nu)), -rates])
+    weight, _, _ = control.dare(a, b, both, r + rates, cross)
+    p = np.asarray(weight)
+    return np.asarray(p[:nx, :nx] - p[:nx, nx:] @ np.linalg.lstsq(p[nx:, nx:], p[nx:, :nx], rcond=None)[0])
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,7 @@ from fpirhc.horizon.constraint_states import (
     rates,
     soft_names,
     softened,
+    state_prices,
 )
 from fpirhc.horizon.cost import Cost, Linearisation, View
 from fpirhc.horizon.reference_expansion import ReferenceExpansion, expand_along, input_curvature
@@ -43,11 +44,13 @@ class Horizon:
     Args:
         stages: number of stages N.
         step: length of one stage, s, over which the input is constant.
-        discretisation: integrator of the model over one stage: RungeKutta4(), Euler().
+        discretisation: integrator of the model over one stage: RungeKutta4(), Euler(), ImplicitMidpoint(), RadauIIA().
         terminal: names of states that must meet the reference at the end of the horizon.
+        blocks: lengths of blocks of stages over which the inputs are held (move blocking); they add up to the stages. Empty: every
+            stage has inputs of its own.
 
     Raises:
-        InvalidValue: fewer than one stage, or a step that is not positive.
+        InvalidValue: fewer than one stage, a step that is not positive, or blocks that do not add up.
         NotSupported: an integrator that is not made of plain expressions.
     """
 
@@ -55,14 +58,21 @@ class Horizon:
     step: float
     discretisation: Integrator = field(default_factory=RungeKutta4)
     terminal: tuple[str, ...] = ()
+    blocks: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.stages, int) or self.stages < 1:
             raise InvalidValue(f"a horizon needs at least 1 stage, got {self.stages!r}")
         if not (math.isfinite(self.step) and self.step > 0):
             raise InvalidValue(f"the horizon step must be a positive number of seconds, got {self.step!r}")
+        if self.blocks and (sum(self.blocks) != self.stages or min(self.blocks) < 1):
+            raise InvalidValue(
+                f"horizon: blocks {self.blocks} add up to {sum(self.blocks)}, expected {self.stages} stages"
+            )
         if self.discretisation.opaque:
-            raise NotSupported("a horizon needs an integrator of plain expressions: RungeKutta4() or Euler()")
+            raise NotSupported(
+                "a horizon needs an integrator of plain expressions, such as RungeKutta4() or RadauIIA()"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +99,7 @@ class OptimalControl:
         nodes: states, inputs and data along the reference from t = 0.
         along: quadratic model of the cost along the reference.
         written: number of the last entries of the state, which are limits of rates, paths and the end; they are zero in s_0.
+        state_price: cost of a violation of a state's bounds per unit and node, shape (ns,); infinite where they are hard.
     """
 
     stages: int
@@ -109,6 +120,12 @@ class OptimalControl:
     nodes: tuple[np.ndarray, np.ndarray, np.ndarray]
     along: ReferenceExpansion
     written: int
+    state_price: np.ndarray
+
+    @property
+    def hard(self) -> np.ndarray:
+        """Which states have bounds without a price (ns,)."""
+        return np.isinf(self.state_price)
 
     @property
     def bounds_states(self) -> bool:
@@ -117,12 +134,17 @@ class OptimalControl:
 
 
 def data_layout(plant: Plant, horizon: Horizon) -> Layout:
-    """Layout of one stage's data; a terminal equality adds whether the stage is the last, and the reference after it."""
+    """Layout of one stage's data.
+
+    A terminal equality adds whether the stage is the last, and the reference after it; blocks add whether the inputs are free.
+    """
+    free = (scalar("free"),) if horizon.blocks else ()
     signals = (
         scalar("time", "s"),
         Signal("reference", plant.state.elements, plant.state.units),
         Signal("feedforward", plant.input.elements, plant.input.units),
         plant.parameter,
+        *free,
     )
     if not horizon.terminal:
         return Layout(signals)
@@ -145,10 +167,11 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
     _check_finite(tuple(stage.terms), stage_cost, terminal_cost, nodes, cost)
     along = expand_along(dynamics, stage_cost, terminal_cost, nodes)
     lower, upper = hard_state_bounds(limits, plant)
+    state = _stage_state(plant, bool(free), binding)
     return OptimalControl(
         stages=horizon.stages,
         step=horizon.step,
-        state=_stage_state(plant, bool(free), binding),
+        state=state,
         input=plant.input,
         data=data_layout(plant, horizon),
         dynamics=dynamics,
@@ -164,6 +187,7 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
         nodes=nodes,
         along=along,
         written=len(binding),
+        state_price=state_prices(limits, state, plant, horizon.step),
     )
 
 
@@ -181,6 +205,10 @@ def stage_data(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost)
     nodes = horizon.stages + 1
     times = start + ca.DM(np.arange(nodes) * horizon.step).T
     table = one.map(nodes)(times, ca.repmat(parameters, 1, nodes))
+    if horizon.blocks:
+        free = np.zeros((1, nodes))
+        free[0, [0, *np.cumsum(horizon.blocks)]] = 1.0
+        table = ca.vertcat(table, free)
     if horizon.terminal:
         last, after = np.zeros((1, nodes)), [*range(1, nodes), nodes - 1]
         last[0, nodes - 2] = 1.0
@@ -196,6 +224,7 @@ class _Stage:
     x: Expression
     before: Expression
     u: Expression
+    applied: Expression
     theta: Expression
     x_next: Expression
     terms: dict[str, Expression]
@@ -205,36 +234,49 @@ class _Stage:
 
 def _stage_expressions(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits) -> _Stage:
     layout = data_layout(plant, horizon)
-    keeps_input = cost.uses_rate or bool(limits.rates)
+    keeps_input = cost.uses_rate or bool(limits.rates) or bool(horizon.blocks)
     x, before = ca.SX.sym("x", plant.state.size), ca.SX.sym("before", plant.input.size * keeps_input)
     u, theta = ca.SX.sym("u", plant.input.size), ca.SX.sym("theta", layout.size)
     data = layout.split(theta)
-    view = _view(plant, ca.vertcat(x, before), u, data, cost, keeps_input)
+    applied = data["free"] * u + (1 - data["free"]) * before if horizon.blocks else u
+    view = _view(plant, ca.vertcat(x, before), applied, data, cost, keeps_input)
     try:
         advance = _advance(plant, horizon)
-        x_next = advance(x, u, view.parameters.vector)
+        x_next = advance(x, applied, view.parameters.vector)
         written = _written(plant, horizon, limits, view, x_next, data)
         soft = softened(written, limits, plant, x)
         terms = {**_scalar_terms(cost.stage(view)), **soft}
+        if horizon.blocks:
+            # Inputs that have no effect are drawn to those that are held, so that a plan states what is applied.
+            terms["held"] = (1 - data["free"]) * ca.sumsqr((u - before) / _reach(limits, plant))
         terminal = cost.terminal_cost(view, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.step)
         end = sum((soft[f"soft {e}"] for e in limits.soft if e in limits.states), start=ca.SX(0))
         final = _scalar_terms({"terminal": terminal})["terminal"] + horizon.step * end
     except InvalidName as error:
         raise InvalidProblem(f"cost: {error}") from None
-    return _Stage(x, before, u, theta, x_next, terms, final, hard(written, soft_names(limits, plant)))
+    return _Stage(x, before, u, applied, theta, x_next, terms, final, hard(written, soft_names(limits, plant)))
 
 
 def _stage_functions(stage: _Stage, step: float) -> tuple[ca.Function, ca.Function, ca.Function]:
     """Functions of the dynamics, the stage cost and the terminal cost."""
     u, theta, binding = stage.u, stage.theta, stage.binding
     s = ca.vertcat(stage.x, stage.before, ca.SX.sym("z", len(binding)))
-    s_next = ca.vertcat(stage.x_next, *([u] if stage.before.numel() else []), *(w.expression for w in binding))
+    s_next = ca.vertcat(
+        stage.x_next, *([stage.applied] if stage.before.numel() else []), *(w.expression for w in binding)
+    )
     costs = step * ca.vertcat(*stage.terms.values())
     return (
         ca.Function("fpirhc_dynamics", [s, u, theta], [ca.densify(s_next)]),
         ca.Function("fpirhc_stage_cost", [s, u, theta], [ca.sum1(costs), ca.densify(costs)]),
         ca.Function("fpirhc_terminal_cost", [s, theta], [ca.densify(stage.final)]),
     )
+
+
+def _reach(limits: Limits, plant: Plant) -> ca.DM:
+    """Half the range of every input, 1 where it is free."""
+    lower, upper = limits.input_bounds(plant)
+    half = 0.5 * (upper - lower)
+    return ca.DM(np.where(np.isfinite(half) & (half > 0), half, 1.0))
 
 
 def _check_terminal(plant: Plant, horizon: Horizon) -> None:

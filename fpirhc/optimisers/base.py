@@ -14,6 +14,7 @@ out plan (inputs are inside their box by construction).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 
 import casadi as ca
 import numpy as np
@@ -38,6 +39,11 @@ class Optimiser(ABC):
         """Whether the step can leave CasADi's virtual machine as C code."""
         return True
 
+    @property
+    def logged(self) -> Mapping[str, str]:
+        """Scalars of the memory that a run logs: signal -> name in the memory."""
+        return {}
+
     def check(self, ocp: OptimalControl) -> None:  # noqa: B027 -- most optimisers serve every problem
         """Raise NotSupported when the problem has something this optimiser cannot keep."""
 
@@ -60,6 +66,10 @@ class Optimiser(ABC):
     def converging(self, ocp: OptimalControl) -> ca.Function:
         """Like `step`, but may stop as soon as the plan is converged, and may work longer: for open-loop solves."""
         return self.step(ocp)
+
+    def rescue(self, ocp: OptimalControl) -> ca.Function | None:  # noqa: ARG002
+        """Function (arguments of `converging`, its results) -> better results, for calls that do not end OK; or None."""
+        return None
 
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:  # noqa: ARG002
         """Memory to begin a run with, for a first horizon that is known beforehand; nothing unless an optimiser says otherwise."""
@@ -106,9 +116,9 @@ def stationarity(ocp: OptimalControl, inputs: ca.MX, gradient: ca.MX, lower: ca.
 
 
 def state_violation(ocp: OptimalControl, states: ca.MX) -> ca.MX:
-    """Largest violation of a state bound by s_1 ... s_N; zero without bounds."""
+    """Largest violation of a hard state bound by s_1 ... s_N; zero without bounds."""
     worst: ca.MX = ca.MX(0)
-    for k in range(ocp.state.size):
+    for k in np.flatnonzero(ocp.hard).tolist():
         row = states[k, 1:]
         if ocp.state_lower[k] > -FINITE:
             worst = ca.fmax(worst, ca.mmax(ocp.state_lower[k] - row))

@@ -14,6 +14,9 @@ Both hold where H varies little between U and U* and the same bounds stay active
 K is the larger of both plus their difference, and where the sets of free inputs differ nothing is said. The ratio of the last two
 steps is not such a bound and is not offered as one.
 
+Active limits of states, those with a multiplier, are equations J U = const to first order. H is then the Hessian of the Lagrangian,
+and H, M and g are restricted to the directions Z with J Z = 0; the shortest move back onto the limits is added to the error.
+
 References: S. Banach, Fund. Math. 3, 1922; J. M. Ortega, W. C. Rheinboldt, Iterative Solution of Nonlinear Equations, 1970, ch. 12.
 """
 
@@ -26,6 +29,7 @@ import numpy as np
 
 from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stage, linear_stage
 from fpirhc.horizon.rollout import reduced_gradient
+from fpirhc.optimisers.active import active_limits, directions, largest_return
 from fpirhc.optimisers.plan import Plan
 from fpirhc.summary import line, number, table
 
@@ -39,8 +43,10 @@ class Certificate:
 
     stationarity, feasibility: as of the plan, recomputed. factor: K, infinite where nothing can be said.
     error: bound of the distance to the optimum in the M-norm (square root of cost), NaN where K >= 1. input_error: bound of the
-    error of any input, in its unit. suboptimality: bound of V(U) - V(U*). free: number of free inputs. curvature: least
-    eigenvalue of M^-1 H; a plan where it is not positive is no strict minimum.
+    error of any input, in its unit. suboptimality: bound of V(U) - V(U*). free: number of free directions. curvature: least
+    eigenvalue of M^-1 H; a plan where it is not positive is no strict minimum. active: number of limits of states with a
+    multiplier. complementarity: largest product of a multiplier and the distance of its limit, in units of the cost. broken: the
+    worst violations of limits in words.
     """
 
     stationarity: float
@@ -51,6 +57,9 @@ class Certificate:
     suboptimality: float
     free: int
     curvature: float
+    active: int = 0
+    complementarity: float = 0.0
+    broken: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return line(self, *(f"{name} {value}" for name, value in self._facts()))
@@ -64,14 +73,20 @@ class Certificate:
 
     def _facts(self) -> list[tuple[str, str]]:
         """What is known, by name."""
+        limits = [
+            ("active limits of states", str(self.active)),
+            ("complementarity", number(self.complementarity)),
+            *(("violated limit", text) for text in self.broken),
+        ]
         return [
             ("contraction factor", number(self.factor)),
             ("error of any input at most", number(self.input_error)),
             ("cost above the optimum at most", number(self.suboptimality)),
             ("stationarity", number(self.stationarity)),
             ("feasibility", number(self.feasibility)),
-            ("free inputs", str(self.free)),
+            ("free directions" if self.active else "free inputs", str(self.free)),
             ("least relative curvature", number(self.curvature)),
+            *(limits if self.active or self.broken else []),
         ]
 
 
@@ -79,26 +94,29 @@ def certify(plan: Plan, *, gain: float = 1.0) -> Certificate:
     """Return what is known about a plan for an iteration of effective gain `gain` (1: full Gauss-Newton steps)."""
     _, stationarity, feasibility = plan.verify()
     slope, hessian = _second_order(plan, plan.inputs)
-    free = _free(plan, plan.inputs, slope)
-    if not free.any():
-        return Certificate(stationarity, feasibility, 0.0, 0.0, 0.0, 0.0, 0, float("inf"))
-    model = _model(plan)[np.ix_(free, free)]
+    free, held = _free(plan, plan.inputs, slope), active_limits(plan)
+    about = held.count, held.complementarity, plan.violations()
+    basis = directions(free, held)
+    if not basis.shape[1]:
+        return Certificate(stationarity, feasibility, 0.0, 0.0, 0.0, 0.0, 0, float("inf"), *about)
+    model, pull = basis.T @ _model(plan) @ basis, basis.T @ slope
     root = np.linalg.cholesky(model + _ROUNDING * np.trace(model) * np.eye(model.shape[0]))
-    move = np.linalg.solve(model, slope[free])
-    values = _relative_eigenvalues(root, hessian[np.ix_(free, free)])
-    further = plan.inputs.ravel(order="F").copy()
-    further[free] -= gain * move
-    inputs = np.clip(further.reshape(plan.inputs.shape, order="F"), *(b[:, None] for b in plan.bounds))
+    move = np.linalg.solve(model, pull)
+    values = _relative_eigenvalues(root, basis.T @ hessian @ basis)
+    further = (plan.inputs.ravel(order="F") - gain * basis @ move).reshape(plan.inputs.shape, order="F")
+    inputs = np.clip(further, *(b[:, None] for b in plan.bounds))
     slope_there, hessian_there = _second_order(plan, inputs)
     same = bool(np.all(_free(plan, inputs, slope_there) == free))
-    beyond = _relative_eigenvalues(root, hessian_there[np.ix_(free, free)])
+    beyond = _relative_eigenvalues(root, basis.T @ hessian_there @ basis)
     factor, unit = (_over_both(a, values, beyond) if same else float("inf") for a in (gain, 1.0))
-    length = float(np.sqrt(max(slope[free] @ move, 0.0)))
+    length = float(np.sqrt(max(pull @ move, 0.0)))
     error = gain * length / (1 - factor) if factor < 1 else float("nan")
-    spread = float(np.sqrt(np.linalg.inv(model).diagonal().max()))
-    suboptimality = length**2 / (2 * (1 - unit)) if unit < 1 else float("nan")
-    least = float(values.min())
-    return Certificate(stationarity, feasibility, factor, error, spread * error, suboptimality, int(free.sum()), least)
+    spread = float(np.sqrt(np.einsum("ij,jk,ik->i", basis, np.linalg.inv(model), basis).max()))
+    suboptimality = length**2 / (2 * (1 - unit)) + held.complementarity * held.count if unit < 1 else float("nan")
+    least, back = float(values.min()), largest_return(held, free)
+    return Certificate(
+        *(stationarity, feasibility, factor, error, spread * error + back, suboptimality, basis.shape[1], least), *about
+    )
 
 
 def _over_both(gain: float, here: np.ndarray, there: np.ndarray) -> float:

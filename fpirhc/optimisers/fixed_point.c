@@ -6,15 +6,6 @@
    search, and ENTRY, the name of the function. Matrices are column-major, stages follow each other. Nothing is allocated:
    everything lies on the stack. */
 
-#if defined(__GNUC__)
-#define INLINE static inline __attribute__((always_inline)) /* so that sizes are constants in every loop */
-#else
-#define INLINE static inline
-#endif
-
-typedef const casadi_real* In;
-typedef casadi_real* Out;
-
 typedef struct {
   casadi_real u[N * NU], x[(N + 1) * NS], g[N * NU], value;
 } Plan;
@@ -29,43 +20,6 @@ typedef struct {
 } Search;
 
 static const casadi_real scale[NU] = SCALE;
-
-INLINE int all_finite(In v, int n) {
-  int i, ok = 1;
-  for (i = 0; i < n; ++i) ok &= v[i] <= FINITE && v[i] >= -FINITE; /* false for NaN */
-  return ok;
-}
-
-INLINE casadi_real between(casadi_real v, casadi_real low, casadi_real high) {
-  return fmin(fmax(v, low), high);
-}
-
-/* c (rows, columns) += a (rows, inner) b (inner, columns) */
-INLINE void multiply(Out restrict c, In restrict a, In restrict b, int rows, int inner, int columns) {
-  int i, j, k;
-  for (j = 0; j + 1 < columns; j += 2) {
-    Out c0 = c + j * rows, c1 = c0 + rows;
-    for (k = 0; k < inner; ++k) {
-      casadi_real f0 = b[j * inner + k], f1 = b[(j + 1) * inner + k];
-      In column = a + k * rows;
-      for (i = 0; i < rows; ++i) {
-        c0[i] += f0 * column[i];
-        c1[i] += f1 * column[i];
-      }
-    }
-  }
-  for (; j < columns; ++j)
-    for (k = 0; k < inner; ++k) {
-      casadi_real f = b[j * inner + k];
-      for (i = 0; i < rows; ++i) c[j * rows + i] += f * a[k * rows + i];
-    }
-}
-
-INLINE void transpose(Out restrict to, In restrict from, int rows, int columns) {
-  int i, j;
-  for (j = 0; j < columns; ++j)
-    for (i = 0; i < rows; ++i) to[i * columns + j] = from[j * rows + i];
-}
 
 /* Roll out the next plan, expanded, with its cost and gradient; 0 when something is not finite. */
 INLINE int try_next(Search* s, const Plan* best, Plan* plan, In s0, In data, In lower, In upper) {
@@ -327,25 +281,21 @@ INLINE void remember(const Search* s, const Plan* best, Out memory) {
   memory[MEMORY - 1] = s->tau;
 }
 
-INLINE int sane(In s0, In data, In lower, In upper) {
-  int l, ok = all_finite(s0, NS) && all_finite(data, (N + 1) * NT);
-  for (l = 0; l < NU; ++l) ok &= lower[l] <= upper[l] && lower[l] <= FINITE && upper[l] >= -FINITE;
-  return ok;
-}
-
 INLINE int run(const casadi_real** arg, casadi_real** res) {
   static const casadi_real nothing[(N + 1) * NT + MEMORY + NS + NU]; /* CasADi passes no address for zeros */
   In s0 = arg[0] ? arg[0] : nothing, data = arg[1] ? arg[1] : nothing, memory = arg[4] ? arg[4] : nothing;
   In lower = arg[2] ? arg[2] : nothing, upper = arg[3] ? arg[3] : nothing;
   Search s;
   Plan *best = s.plans, *plan = s.plans + 1, *other;
-  int i, posed = sane(s0, data, lower, upper), count = 0, empty = 0, evaluated, status;
+  int i, posed = sane(s0, data, lower, upper), count = 0, plain = 0, empty = 0, evaluated, status;
   casadi_real left = 0;
   begin(&s, best, memory, lower, upper);
   for (;; ++count) {
+    int bold = s.tau >= SHORTEST;
     int ok = try_next(&s, best, plan, s0, data, lower, upper), accepted = judged(&s, best, plan, ok, lower, upper);
+    plain += !bold;
     if (accepted) other = best, best = plan, plan = other;
-    if (count == ITERATIONS) break;
+    if (count == ITERATIONS || (STOP_EARLY && plain == PLAIN)) break;
     if (STOP_EARLY && best->value < UNTRIED && residual(best, lower, upper) <= TOLERANCE) break;
     if (accepted && direct(&s, best, data, lower, upper)) return 1;
   }
@@ -366,20 +316,4 @@ INLINE int run(const casadi_real** arg, casadi_real** res) {
     else for (i = 0; i < MEMORY; ++i) res[2][i] = posed ? 0 : memory[i];
   }
   return 0;
-}
-
-/* One library runs on every machine of its architecture: wider registers are used where there are some. Without fused
-   multiply-add both round alike. */
-#if defined(__GNUC__) && defined(__x86_64__)
-__attribute__((target("avx2"))) static int run_wide(const casadi_real** arg, casadi_real** res) { return run(arg, res); }
-static int can_run_wide(void) { return __builtin_cpu_supports("avx2"); }
-#else
-static int run_wide(const casadi_real** arg, casadi_real** res) { return 1; }
-static int can_run_wide(void) { return 0; }
-#endif
-static int run_plain(const casadi_real** arg, casadi_real** res) { return run(arg, res); }
-
-int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {
-  (void)iw, (void)w, (void)mem;
-  return can_run_wide() ? run_wide(arg, res) : run_plain(arg, res);
 }

@@ -25,13 +25,15 @@ A call evaluates the remembered plan, rolled out with its remembered feedback, w
 state; an iteration finds a direction by one Riccati sweep and evaluates the plan there: one rollout with Jacobians and one
 adjoint sweep, whatever happens. So every plan that is returned has been evaluated.
 
+With limits of states the iteration is that of `fpirhc.optimisers.limited`: the same step with the active limits as equalities, and
+interior steps where it does not contract. An open-loop solve without limits of states falls back on it too.
+
 References: H. Khan, J. K. Tar, I. J. Rudas on fixed-point iteration in place of the reduced gradient (2017-2018); H. Issa,
 J. K. Tar, Electronics 11, 1243, 2022, for the transition between gradient descent and Newton (`damping`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import resources
 
@@ -42,7 +44,6 @@ from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import require_own_requests
 from fpirhc.errors import InvalidValue, NotSupported
-from fpirhc.horizon.augmented_lagrangian import augmented
 from fpirhc.horizon.hessian_models import GaussNewton, HessianModel, hessian_end, hessian_stage, linear_stage
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import PIVOT, rounds
@@ -57,7 +58,11 @@ from fpirhc.optimisers.base import (
     stationarity,
     status_of,
 )
-from fpirhc.optimisers.constrained import constrained_step, shifted_multipliers, with_multipliers
+from fpirhc.optimisers.improved import improved
+from fpirhc.optimisers.limited import limited_step, shifted_limited
+from fpirhc.optimisers.limited_memory import limited_memory
+from fpirhc.optimisers.limited_settings import LimitedSettings
+from fpirhc.optimisers.rescue import rescue
 from fpirhc.optimisers.search import (
     ARMIJO,
     DRAWN_IN,
@@ -78,6 +83,8 @@ from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 _DIGITS = 1e-15  # relative rounding of a number
 MOST = 100  # iterations of one converging call
+_MOST_LIMITED = 300
+_PLAIN = 30  # plain steps after which a converging call without limits of states gives up
 _FIRST_CALLS = 5  # of `converging`, before a run
 _CONVEX = 1e-6  # relative eigenvalue below zero that is taken for rounding
 
@@ -89,10 +96,9 @@ class FixedPoint(Optimiser):
     Parameters:
         iterations: per call; 1 is the spirit of the method, one step per control cycle.
         tolerance: of the stationarity (in the unit of the inputs), below which a plan is converged.
-        updates: of the multipliers of state bounds per call, each after `iterations`; without state bounds there are none.
         feasible: violation of a state bound (in its unit) below which a plan counts as converged.
         map: the deformation that makes the next plan; Affine(gain=-2.0) is the full step, a Sigmoid's scale limits it.
-        bend: GaussNewton() or ExactHessian().
+        hessian: GaussNewton() or ExactHessian(); None is Gauss-Newton without limits of states and the exact Hessian with them.
         damping: mu >= 0 added to the input's curvature, in units of it: 0 is Gauss-Newton, large values are gradient descent.
 
     Raises:
@@ -102,15 +108,12 @@ class FixedPoint(Optimiser):
     iterations: int
     tolerance: float
     map: Deformation = field(default_factory=lambda: Affine(gain=-2.0))
-    hessian: HessianModel = field(default_factory=GaussNewton)
+    hessian: HessianModel | None = None
     damping: float = 0.0
-    updates: int = 5
     feasible: float = 1e-8
 
     def __post_init__(self) -> None:
         require_settings("FixedPoint", self.iterations, self.tolerance)
-        if self.updates < 1:
-            raise InvalidValue(f"FixedPoint needs at least 1 update, got {self.updates}")
         if not 0 <= self.damping < float("inf"):
             raise InvalidValue(f"FixedPoint(damping={self.damping!r}): expected a finite number of at least 0")
 
@@ -137,9 +140,11 @@ class FixedPoint(Optimiser):
             )
 
     def memory(self, ocp: OptimalControl) -> Layout:
-        """The plan, its states and feedback, the line search's step lengths, and the multipliers of state bounds."""
+        """The plan, its states and feedback, and the line search's step lengths; or what limits of states need."""
+        if ocp.bounds_states:
+            return limited_memory(ocp)
         n, state, inputs = ocp.stages, ocp.state.elements, ocp.input.elements
-        own = Layout(
+        return Layout(
             (
                 Signal("plan_inputs", tuple(f"{i}@{k}" for k in range(n) for i in inputs)),
                 Signal("plan_states", tuple(f"{s}@{k}" for k in range(n) for s in state)),
@@ -148,10 +153,11 @@ class FixedPoint(Optimiser):
                 scalar("plan_step", start=0.0),
             )
         )
-        return with_multipliers(ocp, own) if ocp.bounds_states else own
 
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         """The memory one stage later; the last stage, which is repeated, has no feedback."""
+        if ocp.bounds_states:
+            return shifted_limited(ocp, memory)
         kept = self.memory(ocp).split(memory)
         ns, nu, n = ocp.state.size, ocp.input.size, ocp.stages
         gains = ca.vertcat(kept["plan_gains"][nu * ns :], ca.MX.zeros(nu * ns))
@@ -160,8 +166,6 @@ class FixedPoint(Optimiser):
             "plan_states": ca.vec(shift(ca.reshape(kept["plan_states"], ns, n))),
             "plan_gains": gains,
         }
-        if ocp.bounds_states:
-            moved |= shifted_multipliers(ocp, kept)
         return self.memory(ocp).join({**kept, **moved})
 
     def step(self, ocp: OptimalControl) -> ca.Function:
@@ -170,44 +174,49 @@ class FixedPoint(Optimiser):
         Every call does the same `iterations`; as C it runs as the loops of fixed_point.c.
         """
         if ocp.bounds_states:
-            return self._constrained(ocp, self.step, self.updates)
+            return limited_step(ocp, self._limited(self.iterations, realtime=True))
         driver = self._driver(ocp, iterations=self.iterations, stop_early=0)
         return with_driver("fpirhc_fixed_point", driver, lambda name: self._graph(ocp, name))
 
     def converging(self, ocp: OptimalControl) -> ca.Function:
-        """The same, but stops where the tolerance is met, after at most 100 iterations."""
+        """The same, but stops where the tolerance is met, or where the iteration does not contract."""
         if ocp.bounds_states:
-            return self._constrained(ocp, self.converging, 1)
+            return limited_step(ocp, self._limited(_MOST_LIMITED, realtime=False))
         driver = self._driver(ocp, iterations=MOST, stop_early=1)
         return with_driver("fpirhc_fixed_point_converging", driver, lambda name: self._converging_graph(ocp, name))
 
+    def rescue(self, ocp: OptimalControl) -> ca.Function | None:
+        """Interior steps for a plan without limits of states that did not converge."""
+        if ocp.bounds_states:
+            return None
+        limited = limited_step(ocp, self._limited(_MOST_LIMITED, realtime=False))
+        return rescue(ocp, self.converging(ocp), self.memory(ocp), limited)
+
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:
         """The memory after solving the first horizon to the tolerance, as far as that succeeds."""
-        step, memory = self.converging(ocp), self.memory(ocp).start()
-        for _ in range(_FIRST_CALLS):
-            _, told, following = step(state, data, ocp.input_lower, ocp.input_upper, memory)
-            memory = np.asarray(following.full()).ravel()
-            if int(told[4]) == Status.OK:
-                break
+        memory = improved(self, ocp, state, data, self.memory(ocp).start(), calls=_FIRST_CALLS)[2]
         return memory if np.isfinite(memory).all() else self.memory(ocp).start()
 
-    def _constrained(
-        self, ocp: OptimalControl, build: Callable[[OptimalControl], ca.Function], updates: int
-    ) -> ca.Function:
-        moved = augmented(ocp)
+    def _limited(self, iterations: int, *, realtime: bool) -> LimitedSettings:
+        return LimitedSettings(
+            self.tolerance,
+            self.feasible,
+            self.map,
+            self.hessian,
+            self.damping,
+            iterations=iterations,
+            realtime=realtime,
+        )
 
-        def prepare(memory: dict[str, ca.MX], steeper: ca.MX) -> dict[str, ca.MX]:
-            # A call starts with twice the remembered gamma.
-            return {**memory, "plan_gamma": 0.5 * first_gamma(moved) / steeper}
-
-        inner = self.memory(moved)
-        return constrained_step(ocp, build, inner, prepare, updates, self.tolerance, self.feasible)
+    @property
+    def _plain_hessian(self) -> HessianModel:
+        return self.hessian or GaussNewton()
 
     def _driver(self, ocp: OptimalControl, *, iterations: int, stop_early: int) -> Driver:
         nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
         leaves = {
             "linear": linear_stage(ocp),
-            "bent": hessian_stage(ocp, self.hessian),
+            "bent": hessian_stage(ocp, self._plain_hessian),
             "end": hessian_end(ocp),
             "deformed": deformed_move(self.map, nu * n),
         }
@@ -230,6 +239,7 @@ class FixedPoint(Optimiser):
             "SHORTEST": SHORTEST,
             "DRAWN_IN": DRAWN_IN,
             "ROUNDING": ROUNDING,
+            "PLAIN": _PLAIN,
             "UNTRIED": UNTRIED,
             "FINITE": FINITE,
             "PIVOT": PIVOT,
@@ -239,12 +249,15 @@ class FixedPoint(Optimiser):
             "INFEASIBLE": int(Status.INFEASIBLE),
             "NON_FINITE": int(Status.NON_FINITE),
         }
-        text = resources.files("fpirhc.optimisers").joinpath("fixed_point.c").read_text(encoding="utf-8")
-        return Driver(text, leaves, constants)
+        folder = resources.files("fpirhc.optimisers")
+        texts = [
+            folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in ("kernels", "fixed_point", "entry")
+        ]
+        return Driver("\n".join(texts), leaves, constants)
 
     def _graph(self, ocp: OptimalControl, name: str) -> ca.Function:
         """The composed Function: what the driver is tested against, and what runs without a compiler."""
-        search = Search(ocp, self.hessian, self.map, self.damping)
+        search = Search(ocp, self._plain_hessian, self.map, self.damping)
         given, memory = self._arguments(ocp)
         anchor = self._begin(ocp, given, memory)
         for _ in range(self.iterations):
@@ -254,9 +267,9 @@ class FixedPoint(Optimiser):
         return ca.Function(name, [*given, memory], self._finish(ocp, given, memory, anchor, self.iterations))
 
     def _converging_graph(self, ocp: OptimalControl, name: str) -> ca.Function:
-        search = Search(ocp, self.hessian, self.map, self.damping)
+        search = Search(ocp, self._plain_hessian, self.map, self.damping)
         given, memory = self._arguments(ocp)
-        anchor, count = self._begin(ocp, given, memory), ca.MX(0)
+        anchor, count, plain = self._begin(ocp, given, memory), ca.MX(0), ca.MX(0)
         symbols = Anchor(*(ca.MX.sym(name, *v.shape) for name, v in zip(Anchor._fields, anchor, strict=True)))
         tried, plan = search.tried(symbols, given)
         work = ca.Function("fpirhc_iteration", [*given, *symbols], list(search.directed(tried, plan, given)))
@@ -265,6 +278,8 @@ class FixedPoint(Optimiser):
         for _ in range(MOST + 1):
             residual = stationarity(ocp, anchor.inputs, anchor.slope, given.lower, given.upper)
             needed = ca.logic_not(ca.logic_and(anchor.value < UNTRIED, residual <= self.tolerance))
+            needed = ca.logic_and(needed, plain < _PLAIN)
+            plain += ca.logic_and(needed, anchor.step < SHORTEST)
             anchor, count = Anchor(*choice(needed, *given, *anchor)), count + needed
         return ca.Function(name, [*given, memory], self._finish(ocp, given, memory, anchor, count - 1))
 

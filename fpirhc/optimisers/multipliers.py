@@ -23,7 +23,7 @@ def fit_multipliers(
     none = np.zeros((ocp.state.size, ocp.stages))
     if not ocp.bounds_states:
         return none
-    slope, states, sensitivity = (np.asarray(v.full()) for v in _sensitivity(ocp)(state, inputs, data))
+    slope, states, sensitivity = (np.asarray(v.full()) for v in sensitivity_of(ocp)(state, inputs, data))
     flat = states[:, 1:].ravel(order="F")
     upper = flat >= np.tile(ocp.state_upper, ocp.stages) - FEASIBLE
     lower = flat <= np.tile(ocp.state_lower, ocp.stages) + FEASIBLE
@@ -53,8 +53,8 @@ def _at_bound(inputs: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> np.n
     return (inputs <= bounds[0][:, None] + near) | (inputs >= bounds[1][:, None] - near)
 
 
-def _sensitivity(ocp: OptimalControl) -> ca.Function:
-    """Function (s0, U, data) -> (g, S, d vec(s_1 ... s_N) / d vec(U))."""
+def sensitivity_of(ocp: OptimalControl) -> ca.Function:
+    """Return the Function (s0, U, data) -> (g, S, d vec(s_1 ... s_N) / d vec(U))."""
     s0, data = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size, ocp.stages + 1)
     inputs = ca.MX.sym("U", ocp.input.size, ocp.stages)
     states, _, _ = rollout(ocp)(s0, inputs, data)

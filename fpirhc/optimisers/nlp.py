@@ -144,6 +144,18 @@ class _MultipleShooting(Optimiser):
         """Solver libraries are called, not written out."""
         return False
 
+    def check(self, ocp: OptimalControl) -> None:
+        """Raise if limits have a price.
+
+        Raises:
+            NotSupported: they would be kept as hard ones.
+        """
+        if not ocp.hard.all():
+            names = ", ".join(e for e, hard in zip(ocp.state.elements, ocp.hard, strict=True) if not hard)
+            raise NotSupported(
+                f"{type(self).__name__} keeps limits or weighs them (soft), but takes no prices ({names}); use FixedPoint()"
+            )
+
     def memory(self, ocp: OptimalControl) -> Layout:
         """The plan, and the multipliers of variables and constraints."""
         variables, constraints = sizes(ocp)

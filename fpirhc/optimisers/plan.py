@@ -11,13 +11,12 @@ import numpy as np
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.base import FEASIBLE, Optimiser, judge
+from fpirhc.optimisers.improved import improved
 from fpirhc.optimisers.multipliers import fit_multipliers
 from fpirhc.status import Status
 from fpirhc.summary import line, number, table
 
 _WORST = 5  # violations told
-_PATIENCE = 4  # calls in a row that may leave the violation as it is
-_SHRINKING = 0.9  # a violation counts as shrinking below this share of the last one
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +72,7 @@ class Plan:
             for stage, value in enumerate(self.states[k]):
                 by = max(low - value, value - high)
                 means_something = stage > 0 or k < ocp.state.size - ocp.written
-                if by > FEASIBLE and means_something:
+                if by > FEASIBLE and means_something and ocp.hard[k]:
                     side = f"below {low:g}" if value < low else f"above {high:g}"
                     found.append((stage > 0, -by, f"'{name}' is {value:.6g} {unit}, {side}, at stage {stage}"))
         return tuple(text for _, _, text in sorted(found)[:_WORST])
@@ -97,10 +96,16 @@ class Plan:
         return "" if np.isfinite(final) else f"the terminal cost is {final} at stage {ocp.stages}"
 
     def slacks(self) -> dict[str, float]:
-        """Cost of every soft limit over the horizon by name, zero where it is kept."""
+        """Cost of every soft limit and price of every priced one over the horizon by name, zero where it is kept."""
         _, _, terms = rollout(self.problem)(self.states[:, 0], self.inputs, self.data)
         values = zip(self.problem.terms, np.asarray(terms.full()).ravel(), strict=True)
-        return {name.removeprefix("soft "): float(v) for name, v in values if name.startswith("soft ")}
+        found = {name.removeprefix("soft "): float(v) for name, v in values if name.startswith("soft ")}
+        ocp = self.problem
+        for k in np.flatnonzero(~ocp.hard).tolist():
+            row = self.states[k, 1:]
+            beyond = np.maximum(row - ocp.state_upper[k], 0) + np.maximum(ocp.state_lower[k] - row, 0)
+            found[ocp.state.elements[k]] = float(ocp.state_price[k] * beyond.sum())
+        return found
 
     def verify(self) -> tuple[float, float, float]:
         """Recompute (cost, stationarity, feasibility) from the problem's own functions."""
@@ -129,23 +134,11 @@ def solve(
         NotSupported: the optimiser cannot serve the problem.
     """
     optimiser.check(ocp)
-    step, layout = optimiser.converging(ocp), optimiser.memory(ocp)
+    layout = optimiser.memory(ocp)
     memory = layout.start()
-    bounds = (ocp.input_lower, ocp.input_upper)
     inputs = np.zeros((ocp.input.size, ocp.stages)) if start is None else np.asarray(start, dtype=float)
     memory[layout.slice("plan_inputs")] = inputs.ravel(order="F")
-    status, count = Status.NOT_CONVERGED, 0
-    diagnostics = np.zeros(5)
-    iterations = 0.0
-    violation, stuck = np.inf, 0
-    while status in (Status.NOT_CONVERGED, Status.INFEASIBLE) and stuck < _PATIENCE and count < calls:
-        given = step(state, data, *bounds, memory)
-        inputs, diagnostics, memory = (np.asarray(v.full()) for v in given)
-        diagnostics, memory = diagnostics.ravel(), memory.ravel()
-        iterations += diagnostics[3]
-        status, count = Status(int(diagnostics[4])), count + 1
-        better = status == Status.NOT_CONVERGED or diagnostics[2] < _SHRINKING * violation
-        stuck, violation = (0 if better else stuck + 1), min(violation, diagnostics[2])
+    inputs, diagnostics, _, count = improved(optimiser, ocp, state, data, memory, calls=calls)
     states = np.asarray(rollout(ocp)(state, inputs, data)[0].full())
     return Plan(
         inputs,
@@ -153,10 +146,10 @@ def solve(
         float(diagnostics[0]),
         float(diagnostics[1]),
         float(diagnostics[2]),
-        iterations if diagnostics[3] >= 0 else -1.0,
+        float(diagnostics[3]) if diagnostics[3] >= 0 else -1.0,
         count,
-        status,
+        Status(int(diagnostics[4])),
         ocp,
         np.asarray(ca.DM(data).full()),
-        bounds,
+        (ocp.input_lower, ocp.input_upper),
     )

@@ -1,7 +1,7 @@
 """Integrators: the plant's state one control cycle later, with the command held.
 
-Runge-Kutta 4 with sub-steps consists of plain expressions, so it can be compiled and exported. CVODES controls its own error, runs
-in CasADi's virtual machine, and is the reference for the methods with a fixed step.
+Runge-Kutta 4 and Euler with sub-steps consist of plain expressions, so they can be compiled and exported. CVODES controls its own
+error, runs in CasADi's virtual machine, and is the reference for the methods with a fixed step.
 """
 
 from __future__ import annotations
@@ -68,13 +68,28 @@ class RungeKutta4(Integrator):
 
 @dataclass(frozen=True)
 class Euler(Integrator):
-    """Explicit Euler in one step: x+ = x + h f(x, u). First order, as in the horizons of the original papers."""
+    """Explicit Euler with equal sub-steps: x+ = x + h f(x, u). First order, as in the horizons of the original papers.
+
+    Args:
+        substeps: number of equal steps per period.
+
+    Raises:
+        InvalidValue: fewer than one sub-step.
+    """
+
+    substeps: int = 1
+
+    def __post_init__(self) -> None:
+        if self.substeps < 1:
+            raise InvalidValue(f"Euler needs at least 1 sub-step, got {self.substeps}")
 
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period` seconds."""
         rate = plant.forced_derivative_function
         x, u, p, w = _symbols(rate)
-        x_next = x + period * rate(x, u, p, w)
+        h, x_next = period / self.substeps, x
+        for _ in range(self.substeps):
+            x_next = x_next + h * rate(x_next, u, p, w)
         return ca.Function("fpirhc_euler", [x, u, p, w], [x_next], ["x", "u", "p", "w"], ["x_next"])
 
 

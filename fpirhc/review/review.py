@@ -12,6 +12,7 @@ from fpirhc.review.answer import Answer, Review, Verdict
 from fpirhc.review.chatter import chatter_small
 from fpirhc.review.commands import commands_inside
 from fpirhc.review.convergence import box_converges, converges
+from fpirhc.review.discretisation import discretisation_follows
 from fpirhc.review.form import right_form
 from fpirhc.review.gain import gain_admissible
 from fpirhc.review.grid import ReviewGrid, review_grid
@@ -53,8 +54,7 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
     grid = review_grid(problem, mismatch, seed)
     general = [well_posed(grid), relative_orders(grid), inverse_exists(grid), commands_inside(grid)]
     reach = horizon_long_enough(grid)
-    if reach is not None:
-        general.append(reach)
+    general += [answer for answer in (reach, discretisation_follows(grid)) if answer is not None]
     return Review(tuple(general), {name: _of(grid, one, general) for name, one in controllers.items()}, mismatch)
 
 

@@ -17,9 +17,10 @@ import casadi as ca
 _SIGNATURE = "(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem)"
 _FUNCTION = re.compile(r"^/\*[^\n]*\*/\nstatic int (casadi_f\d+)\([^\n]*\{\n.*?^\}\n", re.MULTILINE | re.DOTALL)
 _CALL = re.compile(r"\bcasadi_f\d+\b")
-# Large leaves are compiled without much optimising; the loops around them never are.
+# Large leaves are compiled without much optimising; the loops around them never are. The loops use wider registers than the
+# leaves: with registers allocated across calls GCC forgets to clear their upper halves, and every leaf then runs at half speed.
 _FAST = """#if defined(__GNUC__) && !defined(__clang__)
-#pragma GCC optimize ("O3")
+#pragma GCC optimize ("O3", "no-ipa-ra")
 #endif"""
 _drivers: dict[str, str] = {}
 

@@ -45,6 +45,9 @@ class Limits:
         paths: named limits on expressions of state and input in stages 0 ... N-1.
         soft: weights, in cost per second and unit squared, of limits that may be violated at that price, by name of a state or
             path, or by name of an input for its rate. The cost then has the term 'soft NAME'.
+        prices: prices, in cost per second and unit, of limits that are kept wherever that is worth its price (exact penalties, L1);
+            by the same names. Such a limit is kept exactly while its multiplier is below the price. The price is not part of the
+            cost's terms; `Plan.slacks` gives what was paid.
     """
 
     inputs: Mapping[str, Interval] = field(default_factory=dict)
@@ -52,6 +55,7 @@ class Limits:
     rates: Mapping[str, Interval] = field(default_factory=dict)
     paths: Mapping[str, PathConstraint] = field(default_factory=dict)
     soft: Mapping[str, float] = field(default_factory=dict)
+    prices: Mapping[str, float] = field(default_factory=dict)
 
     def check(self, plant: Plant) -> None:
         """Raise if a name is unknown or an interval is empty.
@@ -73,6 +77,12 @@ class Limits:
                 mistakes.add(f"paths: '{name}' must be a PathConstraint(expression, lower, upper), got {path!r}")
             else:
                 _check_interval(name, (path.lower, path.upper), mistakes)
+        mistakes.unknown("prices: limit of", self.prices, [*self.states, *self.paths, *self.rates])
+        for name in sorted(self.prices.keys() & self.soft.keys()):
+            mistakes.add(f"'{name}' is both soft and priced; choose one")
+        for name, price in self.prices.items():
+            if not isinstance(price, int | float) or not 0 < price < math.inf:
+                mistakes.add(f"prices: the price of '{name}' must be a positive number, got {price!r}")
         for name, weight in self.soft.items():
             if not isinstance(weight, int | float) or not 0 < weight < math.inf:
                 mistakes.add(f"soft: the weight of '{name}' must be a positive number, got {weight!r}")

@@ -35,6 +35,13 @@ def plans(problem: Problem, run: Run) -> int | None:  # noqa: ARG001 -- every me
     return int(np.unique(solves[first], axis=0).shape[0])
 
 
+def second_plans(problem: Problem, run: Run) -> int | None:  # noqa: ARG001 -- every metric is given the problem
+    """Number of plans of a ladder's second optimiser; None without one."""
+    if "second_plans" not in run.layout or not run.cycles:
+        return None
+    return int(run["second_plans"].max())
+
+
 def residual(value: float) -> str:
     """Return a residual by its power of ten."""
     return f"{value:.0e}"
@@ -60,5 +67,6 @@ METRICS = (
     ),
     Metric("solve.worst_stationarity", _over("stationarity", np.max), title="worst residual", compared="not", order=93),
     Metric("solve.worst_feasibility", _over("feasibility", np.max), report=False, compared="not", order=94),
+    Metric("solve.second_plans", second_plans, report=False, compared="exact", finite=True, order=94.5),
     Metric("plans", plans, better="neither", report=False, compared="exact", finite=True, order=95),
 )

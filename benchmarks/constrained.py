@@ -1,0 +1,169 @@
+"""Optimisers on horizons of other people's plants with active limits of states: who solves them, how exactly, how fast.
+
+Called by `python benchmarks/optimisers.py --constrained [PLANT ...] [--plans=200] [--write]`. Warm: a closed loop is recorded, the
+plant with its exact parameters and a little noise, planned for with the approximate ones; every optimiser solves its horizons one
+after the other, warm-started with its own last plan shifted by one stage. Cold: horizons from random first states, each from
+nothing. All plans are judged by the one judge of `judging.py`: solved is a plan with a residual of 1e-6 and a violation of 1e-6 of
+the range at most; counted are horizons that some optimiser solved. An optimiser whose solved plan costs more than the best one by
+1e-4 or more has ended in a worse local optimum.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from foreign import FOREIGN, Foreign, first_states
+from judging import Judge, Judgement
+from table import write_table
+
+import fpirhc as fp
+from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
+from fpirhc.symbolic.native import native
+
+SOLVED, ROUGHLY = 1e-6, 1e-4
+WORSE = 1e-4  # IPOPT relaxes limits by 1e-8, which alone is worth up to 1e-5 of a cost
+NOISE = 1e-3  # of the limits' half ranges
+
+Solve = Callable[..., tuple[np.ndarray, float, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What one optimiser made of a set: judgements, seconds, iterations (NaN where it does not tell), and plans called OK."""
+
+    judged: list[Judgement]
+    seconds: np.ndarray
+    iterations: np.ndarray
+    claimed: np.ndarray
+
+    @property
+    def solved(self) -> np.ndarray:
+        """Which horizons are solved."""
+        return np.array([j.residual <= SOLVED and j.violation <= SOLVED for j in self.judged])
+
+    @property
+    def roughly(self) -> np.ndarray:
+        """Which are solved to 1e-4."""
+        return np.array([j.rough <= ROUGHLY and j.violation <= ROUGHLY for j in self.judged])
+
+    @property
+    def costs(self) -> np.ndarray:
+        """The costs."""
+        return np.array([j.cost for j in self.judged])
+
+
+def problem_of(case: Foreign) -> OptimalControl:
+    """The horizon in standard form."""
+    return transcribe(case.plant, case.reference, case.horizon, case.cost, case.limits)
+
+
+def tolerance_of(ocp: OptimalControl) -> float:
+    """A tenth of what counts as solved, in the unit of the inputs."""
+    return 0.1 * SOLVED * float((0.5 * (ocp.input_upper - ocp.input_lower)).min())
+
+
+def warm_set(case: Foreign, ocp: OptimalControl, count: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """First states and data along a loop in which the first input of a converged plan is applied."""
+    from optimisers import follow
+
+    optimiser = fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp))
+    solve = follow(optimiser, ocp, native(optimiser.converging(ocp)).function)
+    data_of = stage_data(case.plant, case.reference, case.horizon, case.cost)
+    advance = fp.RungeKutta4(4).step(case.plant, case.horizon.step)
+    random, x = np.random.default_rng(0), np.array([case.start.get(e, 0.0) for e in case.plant.state.elements])
+    unit = _noise_unit(case)
+    s0, horizons = case.first(ocp, x), []
+    for k in range(count):
+        data = np.asarray(data_of(k * case.horizon.step, case.plant.approximate).full())
+        horizons.append((s0, data))
+        u = solve(s0, data)[0][:, 0]
+        x = np.asarray(advance(x, u, case.plant.exact, np.zeros(len(case.plant.names))).full()).ravel()
+        x += NOISE * unit * random.standard_normal(x.size)
+        s0 = np.asarray(ocp.start(x, u).full()).ravel()
+    return horizons
+
+
+def _noise_unit(case: Foreign) -> np.ndarray:
+    lower, upper = case.limits.state_bounds(case.plant)
+    half = 0.5 * (upper - lower)
+    return np.where(np.isfinite(half), half, 0.1)
+
+
+def cold_set(case: Foreign, ocp: OptimalControl, count: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Random first states at t = 0."""
+    data = stage_data(case.plant, case.reference, case.horizon, case.cost)(0.0, case.plant.approximate)
+    given = np.asarray(data.full())
+    return [(case.first(ocp, x), given) for x in first_states(case, count, 1).T]
+
+
+def answered(
+    ocp: OptimalControl, solve: Solve, horizons: list[tuple[np.ndarray, np.ndarray]], *, cold: bool
+) -> Answers:
+    """Let one optimiser solve a set."""
+    judge, rows = Judge(ocp), []
+    for s0, data in horizons:
+        inputs, seconds, told = solve(s0, data, cold=cold)
+        inputs = np.clip(inputs, ocp.input_lower[:, None], ocp.input_upper[:, None])
+        rows.append((judge(inputs, s0, data), seconds, told[3], told[4] == 0))
+    judged, seconds, iterations, claimed = zip(*rows, strict=True)
+    return Answers(list(judged), np.array(seconds), np.array(iterations), np.array(claimed))
+
+
+def ways(ocp: OptimalControl) -> dict[str, Callable[[], Solve]]:
+    """Every optimiser; built when it is its turn."""
+    from optimisers import JIT, follow, rival
+
+    fixed, accuracy = fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp)), 1e-9
+    return {
+        "FixedPoint": lambda: follow(fixed, ocp, native(fixed.converging(ocp)).function),
+        "IPOPT": lambda: rival(fp.Ipopt(accuracy=accuracy), ocp, {}),
+        "fatrop, functions compiled": lambda: rival(fp.Fatrop(accuracy=accuracy), ocp, JIT),
+        "SQP (Gauss-Newton) with qrqp": lambda: rival(fp.SequentialQuadratic(), ocp, {}),
+    }
+
+
+def rows_of(name: str, count: int) -> list[tuple[str, ...]]:
+    """One row per set and optimiser."""
+    case, rows = FOREIGN[name](), []
+    ocp = problem_of(case)
+    title = f"{name} (N = {ocp.stages}, {ocp.state.size} states)"
+    for cold in (False, True):
+        horizons = (cold_set if cold else warm_set)(case, ocp, count)
+        told = {way: answered(ocp, build(), horizons, cold=cold) for way, build in ways(ocp).items()}
+        costs = np.array([np.where(a.solved, a.costs, np.inf) for a in told.values()])
+        best = costs.min(axis=0)
+        counted = np.isfinite(best)
+        for way, answers in told.items():
+            rows.append((title, "cold" if cold else "warm", way, *_row(answers, best, counted)))
+            print(" | ".join(rows[-1]), flush=True)
+    return rows
+
+
+def _row(answers: Answers, best: np.ndarray, counted: np.ndarray) -> tuple[str, ...]:
+    solved = answers.solved & counted
+    worse = int((answers.costs[solved] > best[solved] + WORSE * np.abs(best[solved])).sum())
+    violations = [j.violation for j, c in zip(answers.judged, answers.claimed, strict=True) if c]
+    its = answers.iterations
+    return (
+        f"{solved.sum()} of {counted.sum()}",
+        str((answers.roughly & counted).sum()),
+        str(worse),
+        f"{max(violations):.0e}" if violations else "",
+        f"{1e6 * np.median(answers.seconds):.3g}",
+        f"{1e6 * np.quantile(answers.seconds, 0.95):.3g}",
+        f"{np.median(its):.0f} / {its.max():.0f}" if np.isfinite(its).all() else "",
+    )
+
+
+def main() -> None:
+    """Measure the plants named on the command line, or all."""
+    names = [a for a in sys.argv[1:] if not a.startswith("--")] or list(FOREIGN)
+    count = next((int(a.partition("=")[2]) for a in sys.argv if a.startswith("--plans=")), 200)
+    heads = (
+        *("plant", "set", "optimiser", "solved", "to 1e-4", "in a worse optimum", "worst violation called OK"),
+        *("median us", "p95 us", "iterations, median / most"),
+    )
+    write_table("constrained", heads, [row for name in names for row in rows_of(name, count)])

@@ -1,0 +1,57 @@
+"""The active limits of states of a plan, as equations in the inputs to first order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fpirhc.optimisers.multipliers import sensitivity_of
+from fpirhc.optimisers.plan import Plan
+
+_RANK = 1e-9  # relative singular value below which active limits depend on each other
+
+
+@dataclass(frozen=True, eq=False)
+class Active:
+    """rows: J (count, N nu). distances: of the states beyond their limits, positive where violated (count,)."""
+
+    rows: np.ndarray
+    distances: np.ndarray
+    complementarity: float
+
+    @property
+    def count(self) -> int:
+        """How many limits are active."""
+        return self.rows.shape[0]
+
+
+def active_limits(plan: Plan) -> Active:
+    """Return the limits of states that have a multiplier at this plan."""
+    ocp, multipliers = plan.problem, plan.state_multipliers
+    chosen = multipliers.ravel(order="F") != 0
+    if not chosen.any():
+        return Active(np.zeros((0, plan.inputs.size)), np.zeros(0), 0.0)
+    _, _, moved = sensitivity_of(ocp)(plan.states[:, 0], plan.inputs, plan.data)
+    limits = np.where(multipliers > 0, ocp.state_upper[:, None], ocp.state_lower[:, None]).ravel(order="F")[chosen]
+    active = multipliers.ravel(order="F")[chosen]
+    beyond = np.sign(active) * (plan.states[:, 1:].ravel(order="F")[chosen] - limits)
+    products = np.abs(beyond * active)
+    return Active(np.asarray(moved.full())[chosen], beyond, float(products.max()))
+
+
+def directions(free: np.ndarray, active: Active) -> np.ndarray:
+    """Return an orthonormal basis (N nu, k) of the moves of free inputs along which no active limit changes."""
+    selected = np.eye(free.size)[:, free]
+    if not active.count or not free.any():
+        return selected
+    _, sizes, turned = np.linalg.svd(active.rows[:, free])
+    rank = int((sizes > _RANK * sizes.max()).sum())
+    return np.asarray(selected @ turned[rank:].T)
+
+
+def largest_return(active: Active, free: np.ndarray) -> float:
+    """Return the largest entry of the shortest move of free inputs that puts the active limits right, to first order."""
+    if not active.count or not free.any():
+        return 0.0
+    return float(np.abs(np.linalg.pinv(active.rows[:, free], rcond=_RANK) @ active.distances).max())

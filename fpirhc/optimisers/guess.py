@@ -1,0 +1,21 @@
+"""What a horizon's data say about a first plan: the reference and the feedforward."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from fpirhc.horizon.problem import OptimalControl
+
+
+def guess(ocp: OptimalControl) -> ca.Function:
+    """Function theta -> (reference as a stage's state (ns), feedforward (nu))."""
+    theta = ca.SX.sym("theta", ocp.data.size)
+    reference, forward = (theta[ocp.data.slice(name)] for name in ("reference", "feedforward"))
+    rest = ocp.state.size - reference.numel() - ocp.written
+    state = ca.vertcat(reference, *([forward] if rest else []), ca.SX.zeros(ocp.written))
+    return ca.Function("fpirhc_guess", [theta], [ca.densify(state), ca.densify(forward)])
+
+
+def guesses(ocp: OptimalControl) -> ca.Function:
+    """Function data (ntheta, N + 1) -> (ns, N + 1), (nu, N + 1)."""
+    return guess(ocp).map(ocp.stages + 1)

@@ -1,0 +1,46 @@
+"""Calls of an optimiser's converging step until a plan is solved, rescued where it does not converge."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.optimisers.base import Optimiser
+from fpirhc.status import Status
+
+_PATIENCE = 4  # calls in a row that may leave the violation as it is
+_SHRINKING = 0.9  # a violation counts as shrinking below this share of the last one
+
+
+def improved(
+    optimiser: Optimiser,
+    ocp: OptimalControl,
+    state: np.ndarray,
+    data: np.ndarray | ca.DM,
+    memory: np.ndarray,
+    *,
+    calls: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Return (plan (nu, N), diagnostics with the iterations of all calls, memory, calls).
+
+    A plan that violates a limit of a state is improved further as long as the violation shrinks.
+    """
+    step, bounds, rescue = optimiser.converging(ocp), (ocp.input_lower, ocp.input_upper), None
+    status, count, iterations, violation, stuck = Status.NOT_CONVERGED, 0, 0.0, np.inf, 0
+    inputs, diagnostics = np.zeros((ocp.input.size, ocp.stages)), np.zeros(5)
+    while status in (Status.NOT_CONVERGED, Status.INFEASIBLE) and stuck < _PATIENCE and count < calls:
+        given = (state, data, *bounds, memory)
+        results = step(*given)
+        if int(results[1][4]) != Status.OK:
+            # Built only here: most horizons never need it.
+            rescue = rescue or optimiser.rescue(ocp)
+            results = rescue(*given, *results) if rescue else results
+        inputs, diagnostics, memory = (np.asarray(v.full()) for v in results)
+        diagnostics, memory = diagnostics.ravel(), memory.ravel()
+        iterations += diagnostics[3]
+        status, count = Status(int(diagnostics[4])), count + 1
+        better = status == Status.NOT_CONVERGED or diagnostics[2] < _SHRINKING * violation
+        stuck, violation = (0 if better else stuck + 1), min(violation, diagnostics[2])
+    diagnostics[3] = iterations if diagnostics[3] >= 0 else diagnostics[3]
+    return inputs, diagnostics, memory, count

@@ -1,0 +1,53 @@
+/* What the loops of the optimisers share: small matrix products and tests of numbers. Matrices are column-major. */
+
+#if defined(__GNUC__)
+#define INLINE static inline __attribute__((always_inline)) /* so that sizes are constants in every loop */
+#else
+#define INLINE static inline
+#endif
+
+typedef const casadi_real* In;
+typedef casadi_real* Out;
+
+INLINE int all_finite(In v, int n) {
+  int i, ok = 1;
+  for (i = 0; i < n; ++i) ok &= v[i] <= FINITE && v[i] >= -FINITE; /* false for NaN */
+  return ok;
+}
+
+INLINE casadi_real between(casadi_real v, casadi_real low, casadi_real high) {
+  return fmin(fmax(v, low), high);
+}
+
+/* c (rows, columns) += a (rows, inner) b (inner, columns) */
+INLINE void multiply(Out restrict c, In restrict a, In restrict b, int rows, int inner, int columns) {
+  int i, j, k;
+  for (j = 0; j + 1 < columns; j += 2) {
+    Out c0 = c + j * rows, c1 = c0 + rows;
+    for (k = 0; k < inner; ++k) {
+      casadi_real f0 = b[j * inner + k], f1 = b[(j + 1) * inner + k];
+      In column = a + k * rows;
+      for (i = 0; i < rows; ++i) {
+        c0[i] += f0 * column[i];
+        c1[i] += f1 * column[i];
+      }
+    }
+  }
+  for (; j < columns; ++j)
+    for (k = 0; k < inner; ++k) {
+      casadi_real f = b[j * inner + k];
+      for (i = 0; i < rows; ++i) c[j * rows + i] += f * a[k * rows + i];
+    }
+}
+
+INLINE void transpose(Out restrict to, In restrict from, int rows, int columns) {
+  int i, j;
+  for (j = 0; j < columns; ++j)
+    for (i = 0; i < rows; ++i) to[i * columns + j] = from[j * rows + i];
+}
+
+INLINE int sane(In s0, In data, In lower, In upper) {
+  int l, ok = all_finite(s0, NS) && all_finite(data, (N + 1) * NT);
+  for (l = 0; l < NU; ++l) ok &= lower[l] <= upper[l] && lower[l] <= FINITE && upper[l] >= -FINITE;
+  return ok;
+}

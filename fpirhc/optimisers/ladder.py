@@ -1,0 +1,129 @@
+"""Two optimisers in a row: the second is asked when the first ends without a usable plan.
+
+A plan is usable when its status is OK or NOT_CONVERGED. Both start from the last plan that was used, whoever found it: when the
+second is asked, the first begins its next call from that plan's inputs alone. How often the second was asked is logged by a run as
+`second_plans` and told by its metrics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.optimisers.base import FINITE, Optimiser
+from fpirhc.status import Status
+from fpirhc.symbolic.layout import Layout, Signal, scalar
+
+_PLAN, _ASKED = "plan_inputs", "plan_second_plans"
+
+
+@dataclass(frozen=True)
+class Ladder(Optimiser):
+    """The first optimiser, and a second one for horizons that the first leaves without a usable plan.
+
+    Parameters:
+        first: asked in every call. second: asked in the same call when the first's status is INFEASIBLE or NON_FINITE. A horizon
+        that no optimiser can keep is asked of both; of two plans without use the one that is finite is returned, else the first's.
+    """
+
+    first: Optimiser
+    second: Optimiser
+
+    @property
+    def exportable(self) -> bool:
+        """Whether both are."""
+        return self.first.exportable and self.second.exportable
+
+    @property
+    def logged(self) -> Mapping[str, str]:
+        """How many plans the second has found since the run began."""
+        return {"second_plans": _ASKED}
+
+    def check(self, ocp: OptimalControl) -> None:
+        """Raise what either raises: a second optimiser that cannot serve the problem is no help."""
+        self.first.check(ocp)
+        self.second.check(ocp)
+
+    def memory(self, ocp: OptimalControl) -> Layout:
+        """The plan, what each remembers beside it, and how often the second was asked."""
+        first, second = self.first.memory(ocp), self.second.memory(ocp)
+        own = [Signal(f"first_{s.name}", s.elements, s.units, s.start) for s in first.signals if s.name != _PLAN]
+        other = [Signal(f"second_{s.name}", s.elements, s.units, s.start) for s in second.signals if s.name != _PLAN]
+        return Layout((first[_PLAN], *own, *other, scalar(_ASKED)))
+
+    def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
+        """Both memories one stage later."""
+        kept = self.memory(ocp).split(memory)
+        one = self.first.shifted(ocp, self._part(ocp, self.first, "first", kept))
+        other = self.second.shifted(ocp, self._part(ocp, self.second, "second", kept))
+        plan = self.first.memory(ocp).split(one)[_PLAN]
+        return self._joined(ocp, plan, one, other, kept[_ASKED])
+
+    def step(self, ocp: OptimalControl) -> ca.Function:
+        """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
+        return self._laddered(ocp, self.first.step(ocp), self.second.step(ocp))
+
+    def converging(self, ocp: OptimalControl) -> ca.Function:
+        """The same with both converging."""
+        return self._laddered(ocp, self.first.converging(ocp), self.second.converging(ocp))
+
+    def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:
+        """The memory with which the first begins; the second begins from its plan."""
+        layout, one = self.memory(ocp), self.first.first_memory(ocp, state, data)
+        found = self.first.memory(ocp).unpack(one)
+        return layout.pack({(n if n == _PLAN else f"first_{n}"): value for n, value in found.items()})
+
+    def _laddered(self, ocp: OptimalControl, first: ca.Function, second: ca.Function) -> ca.Function:
+        layout = self.memory(ocp)
+        symbols = [ca.MX.sym(first.name_in(k), *first.size_in(k)) for k in range(4)]
+        arguments = [*symbols, ca.MX.sym("memory", layout.size)]
+        kept = layout.split(arguments[4])
+        begun = first(*symbols, self._part(ocp, self.first, "first", kept))
+        names, shapes = ("U", "told", "after"), [first.size_out(k) for k in range(3)]
+        results = [ca.MX.sym(name, *shape) for name, shape in zip(names, shapes, strict=True)]
+        work = ca.Function("fpirhc_second", [*arguments, *results], self._second(ocp, second, arguments, results))
+        before = self._part(ocp, self.second, "second", kept)
+        plan = ca.vec(results[0])
+        after = self._joined(ocp, plan, results[2], before, kept[_ASKED])
+        rest = ca.Function("fpirhc_no_second", [*arguments, *results], [*results[:2], after])
+        choice = ca.Function.if_else("fpirhc_second_if_needed", work, rest)
+        chosen = choice(begun[1][4] > int(Status.NOT_CONVERGED) + 0.5, *arguments, *begun)
+        inner = ca.Function("fpirhc_ladder_step", arguments, list(chosen))
+        # What is poisoned in the memory of the one that is not asked would stay for ever.
+        usable = ca.if_else(ca.fabs(arguments[4]) <= FINITE, arguments[4], 0)
+        return ca.Function("fpirhc_ladder", arguments, list(inner(*symbols, usable)))
+
+    def _second(
+        self, ocp: OptimalControl, second: ca.Function, arguments: list[ca.MX], results: list[ca.MX]
+    ) -> list[ca.MX]:
+        """The better one of both answers."""
+        kept = self.memory(ocp).split(arguments[4])
+        inputs, told, after = second(*arguments[:4], self._part(ocp, self.second, "second", kept))
+        usable = told[4] < int(Status.INFEASIBLE) - 0.5
+        only = ca.logic_and(results[1][4] == int(Status.NON_FINITE), told[4] < int(Status.NON_FINITE) - 0.5)
+        better = ca.logic_or(usable, only)
+        plan = ca.if_else(better, inputs, results[0])
+        # The first has nothing to go on from but the inputs that will be used.
+        forgotten = ca.if_else(better, ca.MX(self.first.memory(ocp).start()), results[2])
+        memory = self._joined(ocp, ca.vec(plan), forgotten, after, kept[_ASKED] + better)
+        return [plan, ca.if_else(better, told, results[1]), memory]
+
+    def _part(self, ocp: OptimalControl, optimiser: Optimiser, name: str, kept: Mapping[str, ca.MX]) -> ca.MX:
+        layout = optimiser.memory(ocp)
+        return layout.join({n: kept[n if n == _PLAN else f"{name}_{n}"] for n in layout.names})
+
+    def _joined(self, ocp: OptimalControl, plan: ca.MX, one: ca.MX, other: ca.MX, asked: ca.MX) -> ca.MX:
+        parts: dict[str, ca.MX] = {_PLAN: plan, _ASKED: asked}
+        for name, optimiser, memory in (("first", self.first, one), ("second", self.second, other)):
+            split = optimiser.memory(ocp).split(memory)
+            parts |= {f"{name}_{n}": value for n, value in split.items() if n != _PLAN}
+        return self.memory(ocp).join(parts)
+
+
+def examples(inner: Optimiser) -> tuple[Optimiser, ...]:
+    """Values for the laws, around any optimiser."""
+    return (Ladder(inner, inner),)

@@ -1,0 +1,384 @@
+/* FixedPoint with limits of states, or where its plain iteration does not contract: pure and interior steps.
+
+   The same mathematics as the composed graph in limited.py, which is the reference it is tested against. Before this text stand
+   kernels.c, limited_sweep.c, limited_bounds.c, what they need, and the stage function guess, the sizes ITERATIONS and MEMORY, the
+   settings and the constants of the search. One turn of the loop expands one plan, judges it, and finds the next by a sweep. */
+
+enum { PURE, INTERIOR };
+enum { BEGINS, ENDS };                   /* where a pure phase stands: before an interior one, or after it */
+enum { KEPT, COLD, WARM };               /* how an interior phase gets its slacks */
+
+typedef struct {
+  Point points[2];
+  Duals y, by;
+  Direction move;
+  Limits limits;
+  casadi_real next_z[2][COUNT], kept_u[N * NU], kept_x[(N + 1) * NS], kept_z[2][COUNT];
+  casadi_real weight[COUNT], lean[COUNT], costates[(N + 1) * NS], g[N * NU], filter[FILTER][2];
+  casadi_real mu, floor, delta, error, alpha, alpha_dual, theta, phi, dphi;
+  Certificate last;
+  int phase, place_of, fresh, again, slacks, misses, steps, halvings, raises, filtered, start, bent, stuck, rolled, ahead;
+  Scratch scratch;
+} Machine;
+
+static void log_terms(const Machine* m, const Point* p, const Duals* y, casadi_real* theta, casadi_real* phi) {
+  int side, i, r, k;
+  *theta = 0, *phi = p->value;
+  for (k = 0; k < N * NS; ++k) *theta += fabs(p->f[k] - p->x[k + NS]) / spread[k % NS];
+  EACH_LIMIT(&m->limits) {
+    casadi_real t = y->t[side][k], e = y->e[side][k];
+    *theta += fabs(distance(&m->limits, p, side, i, r) - t + e) / unit[r];
+    *phi -= m->mu * log(t);
+    if (r >= NU) *phi += capacity(r) * e - m->mu * log(e);
+  }
+}
+
+/* Change of phi along the move, to first order. */
+static casadi_real log_slope(const Machine* m, const Point* p) {
+  int side, i, r, k, j;
+  casadi_real sum = 0;
+  for (k = 0; k < N * NU; ++k) sum += p->lu[k] * m->move.du[k];
+  for (k = 0; k < N * NS; ++k) sum += p->ls[k] * m->move.dx[k];
+  for (j = 0; j < NS; ++j) sum += p->tail[j] * m->move.dx[N * NS + j];
+  EACH_LIMIT(&m->limits) {
+    sum -= m->mu * m->by.t[side][k] / m->y.t[side][k];
+    if (r >= NU) sum += (capacity(r) - m->mu / m->y.e[side][k]) * m->by.e[side][k];
+  }
+  return sum;
+}
+
+/* Scaled residual of the barrier problem without complementarity, whose products are between *least and *most. */
+static casadi_real barrier_error(const Machine* m, const Point* p, casadi_real* least, casadi_real* most) {
+  int side, i, r, k, j, l;
+  casadi_real worst = largest_gap(p), push[COUNT];
+  *least = 10 * FINITE, *most = 0;
+  for (k = 0; k < COUNT; ++k) push[k] = 0;
+  EACH_LIMIT(&m->limits) {
+    casadi_real t = m->y.t[side][k], z = m->y.z[side][k], e = m->y.e[side][k];
+    push[k] -= SIGN(side) * z;
+    worst = fmax(worst, fabs(distance(&m->limits, p, side, i, r) - t + e) / unit[r]);
+    *least = fmin(*least, t * z), *most = fmax(*most, t * z);
+    if (r < NU) continue;
+    *least = fmin(*least, e * (capacity(r) - z)), *most = fmax(*most, e * (capacity(r) - z));
+  }
+  for (i = 0; i < N; ++i) {
+    In after = m->costates + (i + 1) * NS;
+    casadi_real rest[NS];
+    for (l = 0; l < NU; ++l) {
+      casadi_real sum = p->lu[i * NU + l] + push[i * ROWS + l];
+      for (j = 0; j < NS; ++j) sum += p->b[(i * NU + l) * NS + j] * after[j];
+      worst = fmax(worst, fabs(sum) * unit[l] / COST);
+    }
+    for (l = 0; l < NS; ++l) {
+      rest[l] = -after[l];
+      if (i + 1 == N) rest[l] += p->tail[l];
+      else for (rest[l] += p->ls[(i + 1) * NS + l], j = 0; j < NS; ++j)
+        rest[l] += p->a[((i + 1) * NS + l) * NS + j] * after[NS + j];
+    }
+    for (l = 0; l < NB; ++l) rest[place[l]] += push[i * ROWS + NU + l];
+    for (l = 0; l < NS; ++l) worst = fmax(worst, fabs(rest[l]) * spread[l] / COST);
+  }
+  return worst;
+}
+
+static int is_done(const Certificate* c) {
+  return c->left <= TOLERANCE && c->broken <= FEASIBLE && c->error <= SCALED_TOLERANCE;
+}
+
+/* Begin without a memory: the inputs given or fed forward; the state held, rolled out, or the reference. */
+static void begin_cold(Machine* m, Point* p, In s0, In data, In lower, In upper, In inputs) {
+  int i, j, l;
+  casadi_real x[NS], u[NU];
+  for (i = 0; i <= N; ++i) {
+    In arg[8];
+    Out res[8];
+    arg[0] = data + i * NT, res[0] = x, res[1] = u;
+    guess(arg, res, m->scratch.iw, m->scratch.w, 0);
+    for (j = 0; j < NS; ++j) p->x[i * NS + j] = m->start == REFERENCE ? x[j] : s0[j];
+    for (l = 0; l < NU && i < N; ++l) {
+      casadi_real hair = fmin(0.01 * unit[l], 0.25 * (upper[l] - lower[l]));
+      p->u[i * NU + l] = between(inputs && m->start == 0 ? inputs[i * NU + l] : u[l], lower[l] + hair, upper[l] - hair);
+    }
+  }
+  for (j = 0; j < N * NU * NS; ++j) m->move.k[j] = 0;
+  for (j = 0; j < (N + 1) * NS; ++j) m->costates[j] = 0;
+  m->phase = INTERIOR, m->slacks = COLD, m->fresh = 1, m->bent = 0;
+  m->mu = COST, m->floor = MU_END * COST, m->delta = 0;
+  m->filtered = m->raises = m->halvings = 0;
+}
+
+static void restart(Machine* m, Point* p, In s0, In data, In lower, In upper) {
+  if (++m->start > REFERENCE) m->stuck = 1;
+  else begin_cold(m, p, s0, data, lower, upper, 0);
+}
+
+static void keep(Machine* m, const Point* p) {
+  int k;
+  for (k = 0; k < N * NU; ++k) m->kept_u[k] = p->u[k];
+  for (k = 0; k < (N + 1) * NS; ++k) m->kept_x[k] = p->x[k];
+  for (k = 0; k < COUNT; ++k) m->kept_z[0][k] = m->y.z[0][k], m->kept_z[1][k] = m->y.z[1][k];
+}
+
+/* Leave the pure phase: for an interior phase near its best plan, or back to the interior plan it came from. */
+static void enter_interior(Machine* m, Point* p) {
+  int k;
+  m->phase = INTERIOR, m->again = 1, m->filtered = m->raises = m->halvings = 0;
+  if (m->place_of == BEGINS) {
+    m->slacks = WARM;
+    m->mu = REALTIME ? between(m->mu, MU_WARM * COST, MU_MOST * COST) : MU_WARM * COST, m->floor = MU_END * COST;
+    if (m->misses == 0) return;
+  }
+  for (k = 0; k < N * NU; ++k) p->u[k] = m->kept_u[k];
+  for (k = 0; k < (N + 1) * NS; ++k) p->x[k] = m->kept_x[k];
+  for (k = 0; k < COUNT; ++k) m->y.z[0][k] = m->kept_z[0][k], m->y.z[1][k] = m->kept_z[1][k];
+  m->fresh = 1;
+  if (m->place_of == BEGINS) return;
+  m->floor *= 0.01, m->slacks = KEPT;
+  m->stuck |= m->floor < MU_LEAST * COST;
+}
+
+static void enter_pure(Machine* m, const Point* p, int place_of) {
+  m->phase = PURE, m->place_of = place_of, m->misses = m->steps = 0;
+  keep(m, p);
+  m->last = certified(&m->limits, p, m->y.z, m->g);
+  m->error = m->last.error;
+}
+
+/* After an accepted interior plan: lower mu, and see whether pure steps can end it. */
+static void advance_interior(Machine* m, const Point* p) {
+  int k;
+  casadi_real least, most, rest = barrier_error(m, p, &least, &most);
+  for (k = 0; k < MU_ROUNDS; ++k) {
+    casadi_real worst = fmax(rest, fmax(most - m->mu, least < FINITE ? m->mu - least : 0) / COST);
+    if (worst > 10 * m->mu / COST || m->mu <= m->floor) break;
+    m->mu = fmax(m->floor, fmin(0.2 * m->mu, m->mu * sqrt(m->mu / COST)));
+    m->filtered = 0;
+  }
+  if (m->mu <= m->floor && fmax(rest, most / COST) <= 0.3 * sqrt(m->floor / COST)) enter_pure(m, p, ENDS);
+}
+
+static int passes(Machine* m, casadi_real theta, casadi_real phi) {
+  int k, falls, descends;
+  casadi_real slack = 1e-12 * (COST + fabs(m->phi));
+  for (k = 0; k < m->filtered; ++k)
+    if (theta > (1 - 1e-5) * m->filter[k][0] && phi > m->filter[k][1] - 1e-5 * m->filter[k][0] * COST) return 0;
+  if (theta <= m->theta && phi <= m->phi + slack) return 1;
+  descends = m->dphi < 0 && m->theta <= 1e-4 * N && pow(m->alpha * -m->dphi / COST, 2.3) > pow(m->theta, 1.1);
+  if (descends) return phi <= m->phi + 1e-4 * m->alpha * m->dphi + slack;
+  falls = theta <= (1 - 1e-5) * m->theta || phi <= m->phi - 1e-5 * m->theta * COST;
+  if (falls && m->filtered < FILTER) m->filter[m->filtered][0] = m->theta, m->filter[m->filtered++][1] = m->phi;
+  return falls;
+}
+
+static void trial_duals(const Machine* m, Duals* y) {
+  int side, i, r, k;
+  EACH_LIMIT(&m->limits) {
+    y->t[side][k] = m->y.t[side][k] + m->alpha * m->by.t[side][k];
+    y->e[side][k] = m->y.e[side][k] + m->alpha * m->by.e[side][k];
+    y->z[side][k] = m->y.z[side][k] + m->alpha_dual * m->by.z[side][k];
+    y->z[side][k] = between(y->z[side][k], m->mu / (1e8 * y->t[side][k]), 1e8 * m->mu / y->t[side][k]);
+    (void)i, (void)r;
+  }
+}
+
+static void adopt_costates(Machine* m, casadi_real share) {
+  int k;
+  for (k = NS; k < (N + 1) * NS; ++k) m->costates[k] += share * (m->move.costates[k] - m->costates[k]);
+}
+
+/* mu of a real-time iteration follows how well the last step went. */
+static void adapt_mu(Machine* m, casadi_real rest) {
+  if (m->alpha < 0.5 || rest > 0.3) m->mu = fmin(10 * m->mu, MU_MOST * COST);
+  else if (m->alpha > 0.9 && rest < 0.05) m->mu = fmax(m->mu / 5, MU_WARM * COST);
+}
+
+/* Judge the plan that was expanded; returns whether it is the new one. */
+static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, In data, In lower, In upper) {
+  Duals y;
+  casadi_real theta, phi;
+  int k;
+  if (m->fresh) {
+    m->fresh = 0;
+    for (k = 0; k < (N + 1) * NS && rolled; ++k) ok &= fabs(p->x[k]) <= 100 * spread[k % NS];
+    if (!ok) { restart(m, p, s0, data, lower, upper); return 1; }
+    if (m->phase == PURE) enter_pure(m, p, BEGINS);
+    if (m->phase == PURE && REALTIME && m->error > NEAR && ITERATIONS < SEVERAL) enter_interior(m, p);
+    return 1;
+  }
+  if (m->phase == PURE) {
+    casadi_real g[N * NU];
+    Certificate c;
+    int halved, waits;
+    ok = ok && (c = certified(&m->limits, p, m->next_z, g), c.error < FINITE);
+    halved = ok && c.error <= 0.5 * m->error;
+    /* A call of few iterations must have two left to get back inside. */
+    waits = m->misses < PATIENCE && c.error < HOPELESS && (!REALTIME || m->ahead > 2);
+    ok = ok && (halved || waits) && ++m->steps <= PURE_STEPS;
+    if (!ok) { enter_interior(m, old); return 0; }
+    m->misses = halved ? 0 : m->misses + 1;
+    for (k = 0; k < COUNT; ++k) m->y.z[0][k] = m->next_z[0][k], m->y.z[1][k] = m->next_z[1][k];
+    for (k = 0; k < N * NU; ++k) m->g[k] = g[k];
+    m->last = c;
+    adopt_costates(m, 1);
+    if (halved) {
+      m->error = c.error;
+      if (m->place_of == BEGINS) keep(m, p);
+    }
+    return 1;
+  }
+  y = m->y;
+  if (ok) {
+    trial_duals(m, &y);
+    log_terms(m, p, &y, &theta, &phi);
+    ok = fabs(phi) <= FINITE && fabs(theta) <= FINITE && (REALTIME || passes(m, theta, phi));
+  }
+  if (ok) {
+    adopt_costates(m, m->alpha);
+    m->y = y;
+    if (REALTIME) {
+      casadi_real least, most, rest = barrier_error(m, p, &least, &most);
+      adapt_mu(m, rest);
+      m->last = certified(&m->limits, p, y.z, m->g);
+      if (m->last.error < NEAR) enter_pure(m, p, BEGINS);
+      return 1;
+    }
+    m->delta = m->halvings >= 3 ? fmax(4 * m->delta, 1e-4) : m->halvings ? m->delta : m->delta > 5e-7 ? m->delta / 5 : 0;
+    m->halvings = m->raises = 0;
+    advance_interior(m, p);
+    return 1;
+  }
+  if (++m->halvings <= 8 && !REALTIME) { m->alpha *= 0.5; return 0; }
+  m->halvings = m->filtered = 0;
+  m->delta = fmax(10 * m->delta, 1e-3);
+  if (++m->raises > MOST_RAISES || m->delta > 1e8 || REALTIME) { restart(m, old, s0, data, lower, upper); return 0; }
+  m->again = 1; /* the same plan, a shorter step */
+  return 0;
+}
+
+/* One sweep for the next plan: pure, or interior with the largest step that stays inside. */
+static void direct(Machine* m, Point* p, In data) {
+  int ok;
+  if (m->phase == PURE) {
+    pure_terms(&m->limits, p, &m->y, m->g, m->weight, m->lean);
+  } else {
+    if (m->slacks != KEPT) put_inside(&m->limits, p, &m->y, m->mu, m->slacks == WARM);
+    interior_terms(&m->limits, p, &m->y, m->mu, m->weight, m->lean);
+    m->slacks = KEPT;
+  }
+  ok = m->bent && swept(&m->move, p, m->weight, m->lean, m->costates, m->delta, 1, data, &m->scratch);
+  ok = ok || swept(&m->move, p, m->weight, m->lean, m->costates, m->delta, 0, data, &m->scratch);
+  m->bent = 1;
+  if (!ok) {
+    m->delta = fmax(10 * m->delta, 1e-6);
+    m->stuck |= m->delta > 1e8;
+    m->fresh = 2; /* try again from the same plan */
+  } else if (m->phase == PURE) {
+    pure_multipliers(&m->limits, p, &m->y, &m->move, m->next_z);
+  } else {
+    interior_moves(&m->limits, p, &m->y, &m->by, &m->move, m->mu, &m->alpha, &m->alpha_dual);
+    log_terms(m, p, &m->y, &m->theta, &m->phi);
+    m->dphi = log_slope(m, p);
+  }
+}
+
+static void begin(Machine* m, Point* p, In memory, In s0, In data, In lower, In upper) {
+  int k, known = all_finite(memory, MEMORY) && memory[MEMORY - 2] > 0, given = 0;
+  In z = memory + N * NU + 2 * N * NS + N * NU * NS;
+  set_limits(&m->limits, lower, upper);
+  m->stuck = m->again = m->rolled = m->filtered = m->raises = m->halvings = m->misses = m->steps = 0;
+  m->alpha = m->alpha_dual = m->dphi = m->theta = m->phi = m->error = 0;
+  m->last.error = m->last.left = m->last.violation = m->last.broken = 10 * FINITE;
+  for (k = 0; k < COUNT; ++k) m->y.z[0][k] = known ? z[k] : 0, m->y.z[1][k] = known ? z[COUNT + k] : 0;
+  for (k = 0; k < COUNT; ++k) m->y.t[0][k] = m->y.t[1][k] = 1, m->y.e[0][k] = m->y.e[1][k] = 0;
+  for (k = 0; k < COUNT; ++k) m->next_z[0][k] = m->next_z[1][k] = 0; /* limits that are not there stay so */
+  m->start = known ? -1 : 0;
+  if (!known) {
+    for (k = 0; k < N * NU; ++k) given |= memory[k] != 0;
+    begin_cold(m, p, s0, data, lower, upper, given && all_finite(memory, N * NU) ? memory : 0);
+    return;
+  }
+  for (k = 0; k < N * NU; ++k) p->u[k] = between(memory[k], lower[k % NU], upper[k % NU]);
+  for (k = 0; k < NS; ++k) p->x[k] = s0[k];
+  for (k = 0; k < N * NS; ++k) p->x[NS + k] = memory[N * NU + k], m->costates[NS + k] = memory[N * NU + N * NS + k];
+  for (k = 0; k < N * NU * NS; ++k) m->move.k[k] = memory[N * NU + 2 * N * NS + k];
+  m->mu = memory[MEMORY - 2] * COST, m->delta = memory[MEMORY - 1], m->floor = MU_END * COST;
+  m->phase = PURE, m->place_of = BEGINS, m->fresh = 1, m->slacks = WARM, m->bent = 1;
+}
+
+static void remember(const Machine* m, const Point* p, Out memory) {
+  int k;
+  Out z = memory + N * NU + 2 * N * NS + N * NU * NS;
+  for (k = 0; k < N * NU; ++k) memory[k] = p->u[k];
+  for (k = 0; k < N * NS; ++k) memory[N * NU + k] = p->x[NS + k], memory[N * NU + N * NS + k] = m->costates[NS + k];
+  for (k = 0; k < N * NU * NS; ++k) memory[N * NU + 2 * N * NS + k] = m->move.k[k];
+  for (k = 0; k < COUNT; ++k) z[k] = m->y.z[0][k], z[COUNT + k] = m->y.z[1][k];
+  memory[MEMORY - 2] = REALTIME ? m->mu / COST : MU_WARM;
+  memory[MEMORY - 1] = m->delta;
+}
+
+/* The next plan to expand stands in p; returns whether it is rolled out. */
+static int next_plan(Machine* m, const Point* best, Point* p, int final) {
+  int k, pure = !m->fresh && m->phase == PURE;
+  casadi_real share = m->fresh || pure ? 0 : m->alpha;
+  for (k = 0; k < N * NU; ++k) p->u[k] = best->u[k] + (share > 0 ? share * m->move.du[k] : 0);
+  for (k = 0; k < (N + 1) * NS; ++k) p->x[k] = best->x[k] + (share > 0 ? share * m->move.dx[k] : 0);
+  if (pure) {
+    casadi_real made[N * NU];
+    In arg[8];
+    Out res[8];
+    arg[0] = m->move.v, res[0] = made;
+    deformed(arg, res, m->scratch.iw, m->scratch.w, 0);
+    for (k = 0; k < N * NU; ++k) p->u[k] += made[k];
+  }
+  return m->fresh ? m->fresh == 1 && m->slacks == COLD && m->start == ROLLED : pure || (REALTIME && final);
+}
+
+int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {
+  static const casadi_real nothing[(N + 1) * NT + MEMORY + NS + NU]; /* CasADi passes no address for zeros */
+  In s0 = arg[0] ? arg[0] : nothing, data = arg[1] ? arg[1] : nothing, memory = arg[4] ? arg[4] : nothing;
+  In lower = arg[2] ? arg[2] : nothing, upper = arg[3] ? arg[3] : nothing;
+  Machine m;
+  Point *best = m.points, *p = m.points + 1, *other;
+  Certificate c = {0, 0, 0, 0};
+  int i, posed = sane(s0, data, lower, upper), count = 0, empty = 0, status, ok = 0;
+  (void)iw, (void)w, (void)mem;
+  for (i = 0; i < NU; ++i) empty |= lower[i] > upper[i];
+  begin(&m, best, memory, s0, data, lower, upper);
+  for (; posed; ++count) {
+    int final = count == ITERATIONS, rolled = next_plan(&m, best, p, final), accepted;
+    m.ahead = ITERATIONS - count;
+    ok = expand(p, m.move.k, rolled, s0, data, lower, upper, &m.scratch);
+    accepted = judged(&m, best, p, ok, rolled, s0, data, lower, upper);
+    if (accepted) other = best, best = p, p = other, m.rolled = rolled;
+    if (final || m.stuck || (!m.fresh && m.phase == PURE && is_done(&m.last))) break;
+    if (!m.fresh && (accepted || m.again)) m.again = 0, direct(&m, best, data);
+  }
+  ok = posed;
+  if (posed && (!m.rolled || m.fresh)) {
+    *p = *best;
+    ok = expand(p, m.move.k, 1, s0, data, lower, upper, &m.scratch);
+    if (ok) best = p;
+  }
+  if (ok) {
+    casadi_real push[COUNT], g[N * NU];
+    c = certified(&m.limits, best, m.y.z, g);
+    pushes(push, &m.limits, best, m.y.z, NEAR_LIMIT);
+    adjoint(best, push, g);
+    for (c.left = 0, i = 0; i < N * NU; ++i)
+      c.left = fmax(c.left, fabs(best->u[i] - between(best->u[i] - g[i] / curvature[i % NU], lower[i % NU], upper[i % NU])));
+    ok = c.error < FINITE;
+  }
+  status = empty ? INFEASIBLE : !ok ? NON_FINITE : !is_done(&c) ? NOT_CONVERGED : c.violation > NEAR_LIMIT ? INFEASIBLE : CONVERGED;
+  if (res[0])
+    for (i = 0; i < N * NU; ++i)
+      res[0][i] = between(ok ? best->u[i] : all_finite(memory, MEMORY) ? memory[i] : 0, lower[i % NU], upper[i % NU]);
+  if (res[1]) {
+    res[1][0] = ok ? best->value : 0, res[1][1] = ok ? c.left : 0, res[1][2] = ok ? fmax(c.violation, 0) : 0;
+    res[1][3] = count, res[1][4] = status;
+  }
+  if (res[2]) {
+    if (ok) remember(&m, best, res[2]);
+    else for (i = 0; i < MEMORY; ++i) res[2][i] = posed ? 0 : memory[i];
+  }
+  return 0;
+}

@@ -1,0 +1,132 @@
+"""The iteration of `FixedPoint` on horizons with limits of states, and where its plain iteration does not contract.
+
+Two settings of one Riccati sweep (`fpirhc.horizon.sweep`). The pure step is the fixed-point step with the active limits as
+equalities of the sweep, rolled out with its feedback. The interior step keeps all limits by a barrier, on a plan whose states are
+free (multiple shooting), with limits of states that give way at a price (exact L1 penalty); it runs only where pure steps do not
+contract, and ends as soon as they do. A plan is OK by its own first-order conditions once it is rolled out, never by the barrier's
+residual; where the limits cannot be kept it is the plan of least violation near by, INFEASIBLE.
+
+With `realtime` a call does a fixed number of iterations without a search: interior steps by the fraction to the boundary, with a
+barrier that follows how well they go, and pure steps near a solution.
+"""
+
+from __future__ import annotations
+
+from importlib import resources
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.horizon.hessian_models import ExactHessian, GaussNewton, hessian_end, hessian_stage, linear_stage
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.sweep import PIVOT
+from fpirhc.optimisers import limited_settings as numbers
+from fpirhc.optimisers.base import FEASIBLE, FINITE, shift
+from fpirhc.optimisers.bounds import BOUNDARY, ENOUGH, STIFF
+from fpirhc.optimisers.guess import guess
+from fpirhc.optimisers.limited_graph import limited_graph
+from fpirhc.optimisers.limited_memory import limited_memory
+from fpirhc.optimisers.limited_settings import LimitedSettings
+from fpirhc.optimisers.scales import Scales, scales
+from fpirhc.optimisers.search import deformed_move
+from fpirhc.status import Status
+from fpirhc.symbolic.driver import Driver, with_driver
+
+_TEXTS = ("kernels", "limited_sweep", "limited_bounds", "limited")
+
+
+def limited_step(ocp: OptimalControl, settings: LimitedSettings) -> ca.Function:
+    """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
+    return with_driver("fpirhc_limited", _driver(ocp, settings), lambda name: limited_graph(ocp, settings, name))
+
+
+def shifted_limited(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
+    """The memory one stage later; the last stage, which is repeated, has no feedback."""
+    layout, n, nu, ns = limited_memory(ocp), ocp.stages, ocp.input.size, ocp.state.size
+    kept = layout.split(memory)
+    rows = layout["plan_multipliers"].size // (2 * n)
+    sides = ca.horzsplit(ca.reshape(kept["plan_multipliers"], rows, 2 * n), n)
+    moved: dict[str, ca.MX] = {
+        name: ca.vec(shift(ca.reshape(kept[name], size, n)))
+        for name, size in (("plan_inputs", nu), ("plan_states", ns), ("plan_costates", ns))
+    }
+    moved["plan_gains"] = ca.vertcat(kept["plan_gains"][nu * ns :], ca.MX.zeros(nu * ns))
+    moved["plan_multipliers"] = ca.vec(ca.horzcat(*(shift(side) for side in sides)))
+    return layout.join({**kept, **moved})
+
+
+def _driver(ocp: OptimalControl, settings: LimitedSettings) -> Driver:
+    measures = scales(ocp)
+    leaves = {
+        "linear": linear_stage(ocp),
+        "exact": hessian_stage(ocp, settings.hessian or ExactHessian()),
+        "plain": hessian_stage(ocp, GaussNewton()),
+        "end": hessian_end(ocp),
+        "deformed": deformed_move(settings.map, ocp.input.size * ocp.stages),
+        "guess": guess(ocp),
+    }
+    folder = resources.files("fpirhc.optimisers")
+    texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
+    return Driver("\n".join(texts), leaves, {**_sizes(ocp, measures), **_constants(settings, measures)})
+
+
+def _sizes(ocp: OptimalControl, measures: Scales) -> dict[str, object]:
+    places = list(measures.bounded)
+    return {
+        "NS": ocp.state.size,
+        "NU": ocp.input.size,
+        "NT": ocp.data.size,
+        "N": ocp.stages,
+        "NB": len(places),
+        "MEMORY": limited_memory(ocp).size,
+        "PLACES": _row(np.array([*places, 0])),
+        "CURVATURE": _row(ocp.step * ocp.curvature),
+        "UNITS": _row(np.append(measures.rows, 1.0)),
+        "SPREADS": _row(measures.states),
+        "CAPACITIES": _row(np.append(measures.capacity, 0.0)),
+        "HARD": _row(np.append(measures.hard.astype(float), 0.0)),
+        "STATE_LOWER": _row(np.append(ocp.state_lower[places], 0.0)),
+        "STATE_UPPER": _row(np.append(ocp.state_upper[places], 0.0)),
+    }
+
+
+def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]:
+    names = (
+        "NEAR",
+        "SEVERAL",
+        "PATIENCE",
+        "HOPELESS",
+        "PURE_STEPS",
+        "MU_WARM",
+        "MU_MOST",
+        "MU_END",
+        "MU_LEAST",
+        "MU_ROUNDS",
+        "FILTER",
+    )
+    statuses = {
+        "CONVERGED": Status.OK,
+        **{s.name: s for s in (Status.NOT_CONVERGED, Status.INFEASIBLE, Status.NON_FINITE)},
+    }
+    return {
+        **{name: getattr(numbers, name) for name in (*names, "MOST_RAISES", "ROLLED", "REFERENCE")},
+        **{name: int(status) for name, status in statuses.items()},
+        "COST": repr(float(measures.cost)),
+        "ENOUGH": ENOUGH,
+        "STIFF": STIFF,
+        "BOUNDARY": BOUNDARY,
+        "PIVOT": PIVOT,
+        "FINITE": FINITE,
+        "NEAR_LIMIT": FEASIBLE,
+        "DAMPING": repr(float(settings.damping)),
+        "TOLERANCE": repr(float(settings.tolerance)),
+        "FEASIBLE": repr(float(settings.feasible)),
+        "SCALED_TOLERANCE": repr(settings.scaled_tolerance(measures)),
+        "ITERATIONS": settings.iterations,
+        "REALTIME": int(settings.realtime),
+    }
+
+
+def _row(values: np.ndarray) -> str:
+    """A C initialiser; infinities become numbers beyond every finite one."""
+    return "{" + ", ".join(repr(v) for v in np.clip(values, -10 * FINITE, 10 * FINITE).tolist()) + "}"

@@ -1,0 +1,41 @@
+"""Numbers of the iteration with limits, for the loops in C and for the composed graph: chosen once, not per problem."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fpirhc.deformation.base import Deformation
+from fpirhc.horizon.hessian_models import HessianModel
+from fpirhc.optimisers.scales import Scales
+
+NEAR = 1e-3  # scaled error below which a remembered plan is improved by pure steps at once
+SEVERAL = 3  # iterations per call from which on pure steps are tried first in any case
+PATIENCE = 3  # pure steps in a row that may fail to halve the error: the active limits are changing
+HOPELESS = 1e2  # scaled error from which on they are not waited for: multipliers are at their largest value
+PURE_STEPS = 10
+MU_WARM, MU_MOST = (
+    1e-4,
+    0.1,
+)  # barrier parameter of a remembered plan, and most of a real-time iteration, in units of the cost
+MU_END, MU_LEAST = 1e-5, 1e-11  # where pure steps are tried first, and last
+MU_ROUNDS = 8  # reductions after one accepted plan
+FILTER = 64  # pairs that the filter holds
+MOST_RAISES = 12  # of the Levenberg-Marquardt term before another first plan is tried
+ROLLED, REFERENCE = 1, 2  # first plans after the state held: the inputs rolled out, and the reference
+
+
+@dataclass(frozen=True)
+class LimitedSettings:
+    """tolerance of the stationarity, feasible violation, map of pure steps, hessian, damping; iterations; realtime: no search."""
+
+    tolerance: float
+    feasible: float
+    map: Deformation
+    hessian: HessianModel | None
+    damping: float
+    iterations: int
+    realtime: bool
+
+    def scaled_tolerance(self, scales: Scales) -> float:
+        """The tolerance in units of the inputs' half ranges."""
+        return float(max(self.tolerance / scales.inputs.min(), 1e-12))

@@ -1,0 +1,88 @@
+"""Move blocking, and the terminal weight of costs on rates."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from plants import pendulum
+
+import fpirhc as fp
+from fpirhc.errors import InvalidValue
+from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.horizon.rollout import rollout
+
+PLANT, REFERENCE = pendulum(), fp.Trajectory(lambda t: {"angle": ca.sin(2 * t)})
+COST = fp.Quadratic(states={"angle": 10.0, "angle'": 0.1}, effort={"torque": 0.05})
+LIMITS = fp.Limits(inputs={"torque": (-20.0, 20.0)}, states={"angle'": (-0.4, 1.5)})
+BLOCKS = (1, 1, 2, 4, 4)
+HORIZON = fp.Horizon(stages=12, step=0.05)
+
+
+def horizon(blocks, limits=LIMITS):
+    one = replace(HORIZON, blocks=blocks)
+    ocp = transcribe(PLANT, REFERENCE, one, COST, limits)
+    return ocp, stage_data(PLANT, REFERENCE, one, COST)(0.0, PLANT.approximate).full()
+
+
+@pytest.mark.parametrize("limits", [fp.Limits(inputs=LIMITS.inputs), LIMITS], ids=["inputs", "states"])
+def test_inputs_are_held_over_blocks_at_the_best_values(limits):
+    """The plan is constant in every block, and is the best such plan of the horizon without blocks, found by scipy."""
+    from scipy.optimize import minimize
+
+    ocp, data = horizon(BLOCKS, limits)
+    first = ocp.start([0.4, 0.0], [0.0]).full().ravel()
+    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-7), first, data)
+    assert plan.status == fp.Status.OK
+    ends = np.cumsum(BLOCKS)
+    parts = np.split(plan.inputs[0], ends[:-1])
+    assert max(np.ptp(part) for part in parts) < 1e-6
+    free, free_data = horizon((), limits)
+    roll = rollout(free)
+
+    def cost(values):
+        return float(roll([0.4, 0.0], np.repeat(values, BLOCKS)[None], free_data)[1])
+
+    def inside(values):
+        speeds = roll([0.4, 0.0], np.repeat(values, BLOCKS)[None], free_data)[0].full()[1, 1:]
+        low, high = (v[1] for v in (free.state_lower, free.state_upper))
+        return np.concatenate([speeds - low, high - speeds]) if np.isfinite(high) else np.ones(1)
+
+    rows = {"type": "ineq", "fun": inside}
+    best = minimize(cost, np.zeros(5), method="SLSQP", constraints=rows, options={"ftol": 1e-13, "maxiter": 300})
+    assert plan.cost == pytest.approx(best.fun, rel=1e-6)
+    without = fp.solve(free, fp.FixedPoint(iterations=1, tolerance=1e-7), np.array([0.4, 0.0]), free_data)
+    assert plan.cost > without.cost
+
+
+def test_blocks_must_add_up():
+    with pytest.raises(InvalidValue, match="add up to 5, expected 12"):
+        fp.Horizon(stages=12, step=0.05, blocks=(2, 3))
+
+
+def test_terminal_weight_with_rates_is_what_is_left_to_pay():
+    """On a linear plant: the value of a long horizon, minimised over the input before, which the weight makes a short one equal."""
+    plant = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "N"},
+        order=2,
+        response=lambda q, v, u, p: {"y": -p.k * q.y - 0.1 * v.y + u.u},
+        parameters={"k": fp.Parameter(1.0, 1.0, "1/s^2")},
+    )
+    still = fp.Trajectory(lambda t: {"y": 0 * t})
+    rates = fp.Quadratic(states={"y": 2.0}, rate={"u": 0.3}, terminal=fp.LQRTerminal())
+    ocp = transcribe(plant, still, fp.Horizon(stages=1, step=0.1), rates, fp.Limits())
+    theta = stage_data(plant, still, fp.Horizon(stages=1, step=0.1), rates)(0.0, plant.approximate).full()
+    weighed = float(ocp.terminal_cost([0.7, -0.4, 0.0], theta[:, 0]))
+    far = fp.Horizon(stages=300, step=0.1)
+    free = replace(rates, terminal=None)
+    long = transcribe(plant, still, far, free, fp.Limits())
+    data = stage_data(plant, still, far, free)(0.0, plant.approximate).full()
+    values = []
+    for before in (-1.0, 0.0, 1.0):
+        plan = fp.solve(long, fp.FixedPoint(iterations=1, tolerance=1e-8), np.array([0.7, -0.4, before]), data)
+        values.append(plan.cost)
+    fit = np.polyfit([-1.0, 0.0, 1.0], values, 2)
+    assert weighed == pytest.approx(np.polyval(fit, -fit[1] / (2 * fit[0])), rel=1e-4)

@@ -1,0 +1,225 @@
+"""Fixed-point iteration with limits of states: other people's plants, random linear plants, infeasible horizons."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import pytest
+from foreign import FOREIGN, first_states
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from judging import Judge
+
+import fpirhc as fp
+from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.optimisers.limited import limited_step
+from fpirhc.optimisers.scales import scales
+from fpirhc.symbolic.native import find_compiler, native
+
+# The horizon's first state as in the recorded loops, and IPOPT's cost there at an accuracy of 1e-9; its limits are relaxed by 1e-8.
+OPTIMA = {
+    "quadrotor": 5.135754,
+    "arm": 8.4693284,
+    "reactor": 0.2374208,
+    "tanks": 5.2403801,
+    "bicycle": 0.69842594,
+    "body": 5.7773322,
+    "crane": 5.1111266,
+    "pendulum": 1.3459087,
+    "servo": 28.432632,
+    "double_tank": 47.481817,
+}
+
+
+def first_horizon(name):
+    case = FOREIGN[name]()
+    ocp = transcribe(case.plant, case.reference, case.horizon, case.cost, case.limits)
+    data = stage_data(case.plant, case.reference, case.horizon, case.cost)(0.0, case.plant.approximate)
+    start = np.array([case.start.get(e, 0.0) for e in case.plant.state.elements])
+    return ocp, np.asarray(data.full()), case.first(ocp, start)
+
+
+def tolerance_of(ocp):
+    return 1e-7 * float((0.5 * (ocp.input_upper - ocp.input_lower)).min())
+
+
+@pytest.mark.parametrize("name", OPTIMA)
+def test_horizons_of_other_people_are_solved_from_nothing(name):
+    """IPOPT's cost, inside all limits, and stationary to a judge that knows neither sweeps nor multipliers."""
+    ocp, data, first = first_horizon(name)
+    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp)), first, data)
+    assert plan.status == fp.Status.OK
+    assert plan.calls == 1
+    judged = Judge(ocp)(plan.inputs, first, data)
+    assert judged.residual <= 1e-6
+    assert judged.violation <= 1e-6
+    assert plan.cost == pytest.approx(OPTIMA[name], rel=3e-5)
+
+
+@cache
+def linear_horizon():
+    """Two states and two inputs whose every coefficient is a parameter: one horizon serves all plants."""
+    names = [f"a{i}{j}" for i in range(2) for j in range(2)] + [f"b{i}{j}" for i in range(2) for j in range(2)]
+
+    def response(q, u, p):
+        x, v = [q.x1, q.x2], [u.u1, u.u2]
+        rows = [sum(p[f"a{i}{j}"] * x[j] + p[f"b{i}{j}"] * v[j] for j in range(2)) for i in range(2)]
+        return {"x1": rows[0], "x2": rows[1]}
+
+    plant = fp.Plant(
+        coordinates={"x1": "m", "x2": "m"},
+        inputs={"u1": "N", "u2": "N"},
+        order=1,
+        response=response,
+        parameters={n: fp.Parameter(float(n in ("b00", "b11")), 0.0, "1") for n in names},
+    )
+    cost = fp.Quadratic(states={"x1": 1.0, "x2": 0.3}, effort={"u1": 0.1, "u2": 0.3})
+    limits = fp.Limits(inputs={"u1": (-1.0, 1.0), "u2": (-0.7, 0.9)}, states={"x1": (-0.5, 0.6), "x2": (-0.8, 0.5)})
+    reference = fp.Trajectory(lambda t: {"x1": 0.7 * ca.sin(2 * t), "x2": 0.6 * ca.cos(3 * t)})
+    horizon = fp.Horizon(stages=12, step=0.1)
+    ocp = transcribe(plant, reference, horizon, cost, limits)
+    data_of = stage_data(plant, reference, horizon, cost)
+    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-9)
+    return ocp, data_of, native(optimiser.converging(ocp)).function, optimiser.memory(ocp).start()
+
+
+def condensed(ocp, first, data):
+    """The horizon as a quadratic program in the inputs, by automatic differentiation: solution of CasADi's active-set method."""
+    n, nu = ocp.stages, ocp.input.size
+    inputs, s, total, states = ca.MX.sym("U", nu * n), ca.MX(first), 0, []
+    for i in range(n):
+        u = inputs[i * nu : (i + 1) * nu]
+        total += ocp.stage_cost(s, u, data[:, i])[0]
+        s = ocp.dynamics(s, u, data[:, i])
+        states.append(s)
+    total += ocp.terminal_cost(s, data[:, n])
+    hessian, slope = ca.hessian(total, inputs)
+    rows = ca.vertcat(*states)
+    values = ca.Function("f", [inputs], [hessian, slope, ca.jacobian(rows, inputs), rows, total])
+    h, g, a, at, _ = (np.asarray(v.full()) for v in values(np.zeros(nu * n)))
+    solver = ca.conic("qp", "qrqp", {"h": ca.DM(h).sparsity(), "a": ca.DM(a).sparsity()}, QUIET)
+    found = solver(
+        h=h,
+        g=g,
+        a=a,
+        lba=np.tile(ocp.state_lower, n) - at.ravel(),
+        uba=np.tile(ocp.state_upper, n) - at.ravel(),
+        lbx=np.tile(ocp.input_lower, n),
+        ubx=np.tile(ocp.input_upper, n),
+    )
+    return solver.stats()["success"], np.asarray(found["x"].full()).ravel(), float(values(found["x"])[4])
+
+
+QUIET = {"print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False}
+
+
+@settings(deadline=None, derandomize=True, max_examples=60)
+@given(seed=st.integers(0, 10**6))
+def test_random_linear_plants_have_the_optimum_of_a_quadratic_program(seed):
+    """Stable and unstable plants, boxes of states and inputs: the same cost to 1e-7; where no plan fits, it is said."""
+    ocp, data_of, step, start = linear_horizon()
+    random = np.random.default_rng(seed)
+    parameters = np.concatenate([random.normal(size=4) * 1.5, np.eye(2).ravel() + 0.4 * random.normal(size=4)])
+    data = np.asarray(data_of(0.0, parameters).full())
+    first = random.uniform([-0.5, -0.8], [0.6, 0.5])
+    inputs, told, _ = (np.asarray(v.full()) for v in step(first, data, ocp.input_lower, ocp.input_upper, start))
+    solvable, best, value = condensed(ocp, first, data)
+    MET.append(solvable)
+    if solvable:
+        assert int(told[4, 0]) == fp.Status.OK
+        assert told[0, 0] == pytest.approx(value, rel=1e-7, abs=1e-9)
+        np.testing.assert_allclose(inputs.ravel(order="F"), best, atol=1e-5)
+    else:
+        assert int(told[4, 0]) != fp.Status.OK
+
+
+MET: list[bool] = []
+
+
+def test_random_linear_plants_were_of_both_kinds():
+    """The property above met plants with a plan and plants without."""
+    assert 20 < sum(MET) < len(MET)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
+@pytest.mark.parametrize(("iterations", "realtime"), [(300, False), (1, True), (5, True)])
+def test_driver_and_graph_agree_with_limits(iterations, realtime):
+    """The loops in C and the composed graph do the same turns: cold, warm, and from a first state outside its limits."""
+    ocp, data, first = first_horizon("reactor")
+    graph = limited_step(ocp, fp.FixedPoint(1, tolerance_of(ocp))._limited(iterations, realtime=realtime))
+    compiled = native(graph)
+    assert compiled.compiled
+    memories = [np.zeros(graph.size1_in(4))] * 2
+    for k in range(4):
+        given = first + np.array([0.0, 0.6 * k, 0.0]), data, ocp.input_lower, ocp.input_upper
+        results = [f(*given, m) for f, m in zip((graph, compiled.function), memories, strict=True)]
+        (one, told, _), (other, said, _) = results
+        np.testing.assert_array_equal(told.full()[3:], said.full()[3:])
+        np.testing.assert_allclose(told.full()[:3], said.full()[:3], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(one.full(), other.full(), atol=1e-5)
+        memories = [r[2] for r in results]
+
+
+def test_a_horizon_that_cannot_be_kept_ends_with_the_least_violation():
+    """The reactor begins above its limit and cannot cool at once: INFEASIBLE, and no plan violates the limit less in sum."""
+    ocp, data, first = first_horizon("reactor")
+    hot = first + np.array([0.0, 10.0, 0.0])
+    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp)), hot, data)
+    assert plan.status == fp.Status.INFEASIBLE
+    beyond = np.maximum(plan.states[1, 1:] - 351.5, 0).sum()
+    assert beyond > 1e-3
+    assert "'T' is" in plan.violations()[0]
+    coldest = np.asarray(ocp.dynamics(hot, 280.0, data[:, 0]).full()).ravel()
+    assert plan.states[1, 1] == pytest.approx(coldest[1], abs=1e-6)
+    assert plan.inputs[0, 0] == pytest.approx(280.0, abs=1e-6)
+
+
+def test_scales_do_not_grow_with_the_horizon_of_an_unstable_plant():
+    """C is the curvature with later inputs answering: for the pendulum it stays, where the open-loop one is 1e4 times as large."""
+    ocp, _, _ = first_horizon("pendulum")
+    assert scales(ocp).cost < 1e-3 * float(ocp.step * ocp.curvature[0]) * 15.0**2
+
+
+@pytest.mark.parametrize("start", [3, 13])
+def test_horizons_with_limits_of_inputs_only_are_rescued(start):
+    """An unstable reactor, cold: the plain iteration ends at a hundred times the cost, the solve at IPOPT's."""
+    case = FOREIGN["reactor"]()
+    ocp = transcribe(case.plant, case.reference, case.horizon, case.cost, fp.Limits(inputs=case.limits.inputs))
+    data = stage_data(case.plant, case.reference, case.horizon, case.cost)(0.0, case.plant.approximate)
+    first, optimiser = case.first(ocp, first_states(case, 40, 3)[:, start]), fp.FixedPoint(1, tolerance_of(ocp))
+    plain = optimiser.converging(ocp)(first, data, ocp.input_lower, ocp.input_upper, optimiser.memory(ocp).start())
+    plan = fp.solve(ocp, optimiser, first, data)
+    other = fp.solve(ocp, fp.Ipopt(accuracy=1e-9), first, data, calls=2)
+    assert int(plain[1][4]) != fp.Status.OK
+    assert float(plain[1][0]) > 100 * plan.cost
+    assert plan.status == fp.Status.OK
+    assert plan.cost <= other.cost * (1 + 3e-5)
+    assert Judge(ocp)(plan.inputs, first, np.asarray(data.full())).residual <= 1e-6
+
+
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_a_few_iterations_per_cycle_stay_near_the_limits_with_a_wrong_model(iterations):
+    """The quadrotor, 13 % lighter than its model: its limits are left by a fifth at most, and no plan is held.
+
+    Converged SQP leaves them by .12: the model is wrong. Pure steps alone turn it over.
+    """
+    case = FOREIGN["quadrotor"]()
+    problem = fp.Problem(
+        plant=case.plant,
+        reference=case.reference,
+        start={"x": 0.0, "z": 0.0, "tilt": 0.0},
+        period=case.horizon.step,
+        duration=3.0,
+        limits=case.limits,
+        horizon=case.horizon,
+        cost=case.cost,
+    )
+    run = fp.simulate(problem, fp.RecedingHorizon(fp.FixedPoint(iterations, tolerance=1e-4)), seed=0)
+    assert run.stop is None
+    assert set(fp.measure(problem, run).statuses) <= {"OK", "NOT_CONVERGED"}
+    lower, upper = case.limits.state_bounds(case.plant)
+    half = 0.5 * (upper - lower)
+    beyond = np.maximum(run["state"] - upper, lower - run["state"]) / np.where(np.isfinite(half), half, 1.0)
+    assert beyond.max() <= 0.2
