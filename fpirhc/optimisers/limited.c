@@ -368,7 +368,9 @@ int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_rea
       c.left = fmax(c.left, fabs(best->u[i] - between(best->u[i] - g[i] / curvature[i % NU], lower[i % NU], upper[i % NU])));
     ok = c.error < FINITE;
   }
-  status = empty ? INFEASIBLE : !ok ? NON_FINITE : !is_done(&c) ? NOT_CONVERGED : c.violation > NEAR_LIMIT ? INFEASIBLE : CONVERGED;
+  /* A call of few iterations may still get inside; one that has tried everything has not. */
+  status = c.violation > NEAR_LIMIT && (is_done(&c) || !REALTIME) ? INFEASIBLE : is_done(&c) ? CONVERGED : NOT_CONVERGED;
+  status = empty ? INFEASIBLE : !ok ? NON_FINITE : status;
   if (res[0])
     for (i = 0; i < N * NU; ++i)
       res[0][i] = between(ok ? best->u[i] : all_finite(memory, MEMORY) ? memory[i] : 0, lower[i % NU], upper[i % NU]);

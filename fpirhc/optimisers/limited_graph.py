@@ -110,7 +110,9 @@ def _finished(
     c = c._replace(left=stationarity(ocp, p.inputs, slope, lower, upper))
     ok = ca.logic_and(ca.logic_and(posed, usable), c.error < FINITE)
     solved = ca.if_else(c.violation > FEASIBLE, int(Status.INFEASIBLE), int(Status.OK))
-    judged = ca.if_else(turn.is_done(c), solved, int(Status.NOT_CONVERGED))
+    # A call of few iterations may still get inside; one that has tried everything has not.
+    unsolved = int(Status.NOT_CONVERGED) if settings.realtime else ca.fmax(solved, int(Status.NOT_CONVERGED))
+    judged = ca.if_else(turn.is_done(c), solved, unsolved)
     status = ca.if_else(ok, judged, int(Status.NON_FINITE))
     status = ca.if_else(ca.mmax(lower - upper) > 0, int(Status.INFEASIBLE), status)
     told = ca.if_else(ok, ca.vertcat(p.value, c.left, c.violation), ca.MX.zeros(3))
