@@ -71,6 +71,7 @@ from .review.answer import Answer, Review
 from .review.response_prediction import Prediction, predict_response
 from .review.review import review
 from .review.suggest import Suggestion, suggest
+from .review.tightening import state_margins, tightened
 from .sensing import (
     LowPassDifference,
     Measured,
@@ -257,8 +258,10 @@ __all__ = [
     "solve",
     "spectrum_over_box",
     "spectrum_over_run",
+    "state_margins",
     "structural_order",
     "suggest",
+    "tightened",
     "tune",
     "with_settings",
     "write_report",

@@ -7,8 +7,8 @@ controller is built for, unless it overrides them. So the facts pass through any
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
 import casadi as ca
@@ -56,12 +56,21 @@ class Planner:
         restarts: whether every plan starts from the measured state.
         tracking: the law that keeps the plant on the planned motion between plans; None: the plan's first response is the desired
             one.
+        margins: distances that plans keep from limits of states; None: those of the problem's horizon.
     """
 
     optimiser: Optimiser
     cost: Cost | None
     restarts: bool
     tracking: Tracking | None
+    margins: Mapping[str, Sequence[float]] | None = None
+
+    def planned(self, problem: Problem) -> Problem:
+        """Return the problem with the cost and the margins of the plans."""
+        costed = problem if self.cost is None else replace(problem, cost=self.cost)
+        if self.margins is None or costed.horizon is None:
+            return costed
+        return replace(costed, horizon=replace(costed.horizon, margins=self.margins))
 
 
 class Controller(ABC):
@@ -142,6 +151,19 @@ class Controller(ABC):
         if self.inner is not None:
             return self.around(self.inner.with_optimiser(optimiser))
         raise NotSupported(f"{type(self).__name__} has no optimiser that can be replaced")
+
+    def with_margins(self, margins: Mapping[str, Sequence[float]]) -> Self:
+        """Return the controller whose plans keep these distances from limits of states; see `Horizon`.
+
+        Raises:
+            NotSupported: it does not plan over the problem's horizon.
+        """
+        changed = replaced(self, "margins", margins)
+        if changed is not None:
+            return changed
+        if self.inner is not None:
+            return self.around(self.inner.with_margins(margins))
+        raise NotSupported(f"{type(self).__name__} has no plan that could keep margins")
 
     def with_deformation(self, deformation: Deformation) -> Self:
         """Return the controller with another deformation.

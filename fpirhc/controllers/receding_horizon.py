@@ -13,6 +13,7 @@ The first plan is computed before the run, for the problem's start, so that one 
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -49,6 +50,7 @@ class RecedingHorizon(Controller):
         replanning: where each horizon starts and what is tracked in between (FromMeasurement, FromMeasurementTracked, FromPlan).
         on_failure: what is applied when a solve fails (HoldPlan, Feedforward, StopRun).
         cost: of the plan; None: the problem's.
+        margins: by name of a state, the distances that plans keep from the state's limits; see `Horizon`. None: the horizon's.
     """
 
     optimiser: Optimiser
@@ -56,11 +58,12 @@ class RecedingHorizon(Controller):
     replanning: Replanning = field(default_factory=FromMeasurement)
     on_failure: OnFailure = field(default_factory=HoldPlan)
     cost: Cost | None = None
+    margins: Mapping[str, Sequence[float]] | None = field(default=None, hash=False)
 
     @property
     def planner(self) -> Planner:
-        """Optimiser, cost, start of the plans, and the tracking law between plans."""
-        return Planner(self.optimiser, self.cost, self.replanning.restarts, self.replanning.law)
+        """Optimiser, cost, start and margins of the plans, and the tracking law between plans."""
+        return Planner(self.optimiser, self.cost, self.replanning.restarts, self.replanning.law, self.margins)
 
     def with_optimiser(self, optimiser: Optimiser) -> RecedingHorizon:
         """Return the controller with another optimiser."""
@@ -77,11 +80,11 @@ class RecedingHorizon(Controller):
             raise InvalidProblem("RecedingHorizon needs Problem(horizon=...), which this problem does not have")
         if self.cost is None and problem.cost is None:
             raise InvalidProblem("RecedingHorizon needs Problem(cost=...) or a cost of its own")
-        self.optimiser.check(_optimal_control(self._planned(problem)))
+        self.optimiser.check(_optimal_control(self.planner.planned(problem)))
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, plan (every n-th cycle), nominal, deform, invert, limit, judge, running, command shift."""
-        problem = self._planned(problem)
+        problem = self.planner.planned(problem)
         assert problem.horizon is not None
         plant = problem.plant
         cycles = cycles_per_stage(problem.horizon, problem.period)
@@ -93,10 +96,6 @@ class RecedingHorizon(Controller):
         blocks.append(_command_shift_block(problem, self.deformation))
         delays.append(Delay(like(plant.input, "_command_shift_last"), "command_shift"))
         return blocks, delays
-
-    def _planned(self, problem: Problem) -> Problem:
-        """The problem with the cost that this controller plans with."""
-        return problem if self.cost is None else replace(problem, cost=self.cost)
 
 
 def _optimal_control(problem: Problem) -> OptimalControl:
@@ -137,7 +136,8 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
 
     def step(s: Signals) -> dict[str, Value]:
         data = data_of(s.time, s.parameters)
-        first = ocp.start(s._plan_state, s._command_before)
+        # The shift of the last cycle is added to the plan's inputs, so their rate counts from the last command without it.
+        first = ocp.start(s._plan_state, s._command_before - s._command_shift_last)
         lower, upper = ocp.input_lower - s._command_shift_last, ocp.input_upper - s._command_shift_last
         before = graph(memory.join({m: getattr(s, m) for m in memory.names}))
         remembered = expression(ca.if_else(graph(s.plan_begun) > 0.5, optimiser.shifted(ocp, before), before))

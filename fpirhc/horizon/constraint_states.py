@@ -7,6 +7,7 @@ of states keeps these limits too, and they are verified and named like states.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import casadi as ca
@@ -80,6 +81,31 @@ def ends(
     ]
 
 
+def narrowed(
+    limits: Limits, plant: Plant, next_state: Expression, margin: Mapping[str, Expression]
+) -> list[ConstraintState]:
+    """Limits of states with a margin m that changes along the horizon, as entries with constant bounds.
+
+    A state between two limits c - h and c + h keeps |x - c| <= h - m, which is |z - c| <= h for z = c + (x - c) h / (h - m).
+    With one limit only, the entry is x + m or x - m.
+    """
+    places = {e: k for k, e in enumerate(plant.state.elements)}
+    units = dict(zip(plant.state.elements, plant.state.units, strict=True))
+
+    def value(x: Expression, m: Expression, lower: float, upper: float) -> Expression:
+        if math.isinf(lower) or math.isinf(upper):
+            return x + m if math.isfinite(upper) else x - m
+        centre, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
+        return centre + (x - centre) * (half / (half - m))
+
+    return [
+        ConstraintState(
+            f"{e} with margin", units[e], value(next_state[places[e]], m, *limits.states[e]), *limits.states[e]
+        )
+        for e, m in margin.items()
+    ]
+
+
 def hard(written: list[ConstraintState], soft: frozenset[str]) -> list[ConstraintState]:
     """The entries whose limits are not soft."""
     return [w for w in written if w.name not in soft]
@@ -95,10 +121,10 @@ def softened(written: list[ConstraintState], limits: Limits, plant: Plant, state
     }
 
 
-def hard_state_bounds(limits: Limits, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the plant's states without the soft ones."""
+def hard_state_bounds(limits: Limits, plant: Plant, replaced: Collection[str] = ()) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of the plant's states without the soft ones and without those that stand in entries of their own."""
     lower, upper = limits.state_bounds(plant)
-    free = np.array([e in limits.soft for e in plant.state.elements])
+    free = np.array([e in limits.soft or e in replaced for e in plant.state.elements])
     return np.where(free, -math.inf, lower), np.where(free, math.inf, upper)
 
 

@@ -9,7 +9,7 @@ theta_i are the data of stage i: its time, the reference, the feedforward and th
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import casadi as ca
@@ -21,6 +21,7 @@ from fpirhc.horizon.constraint_states import (
     ends,
     hard,
     hard_state_bounds,
+    narrowed,
     paths,
     rates,
     soft_names,
@@ -48,9 +49,13 @@ class Horizon:
         terminal: names of states that must meet the reference at the end of the horizon.
         blocks: lengths of blocks of stages over which the inputs are held (move blocking); they add up to the stages. Empty: every
             stage has inputs of its own.
+        margins: by name of a state, the distances by which a plan stays inside the state's limits after stages 1 ... N, in the
+            state's unit: room for what the model does not predict (`tightened` computes them). The problem's limits stay as they
+            are for the run and its metrics.
 
     Raises:
-        InvalidValue: fewer than one stage, a step that is not positive, or blocks that do not add up.
+        InvalidValue: fewer than one stage, a step that is not positive, blocks that do not add up, or margins that are not one
+            finite number of at least 0 for every stage.
         NotSupported: an integrator that is not made of plain expressions.
     """
 
@@ -59,6 +64,7 @@ class Horizon:
     discretisation: Integrator = field(default_factory=RungeKutta4)
     terminal: tuple[str, ...] = ()
     blocks: tuple[int, ...] = ()
+    margins: Mapping[str, Sequence[float]] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         if not isinstance(self.stages, int) or self.stages < 1:
@@ -69,6 +75,12 @@ class Horizon:
             raise InvalidValue(
                 f"horizon: blocks {self.blocks} add up to {sum(self.blocks)}, expected {self.stages} stages"
             )
+        for name, margin in self.margins.items():
+            if len(margin) != self.stages or not all(0 <= m < math.inf for m in margin):
+                raise InvalidValue(
+                    f"horizon: margins of '{name}' must be {self.stages} finite numbers of at least 0, one for every stage, got "
+                    f"{margin!r}"
+                )
         if self.discretisation.opaque:
             raise NotSupported(
                 "a horizon needs an integrator of plain expressions, such as RungeKutta4() or RadauIIA()"
@@ -139,12 +151,16 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
     A terminal equality adds whether the stage is the last, and the reference after it; blocks add whether the inputs are free.
     """
     free = (scalar("free"),) if horizon.blocks else ()
+    units = dict(zip(plant.state.elements, plant.state.units, strict=True))
+    names = tuple(horizon.margins)
+    margin = (Signal("margin", names, tuple(units[e] for e in names)),) if names else ()
     signals = (
         scalar("time", "s"),
         Signal("reference", plant.state.elements, plant.state.units),
         Signal("feedforward", plant.input.elements, plant.input.units),
         plant.parameter,
         *free,
+        *margin,
     )
     if not horizon.terminal:
         return Layout(signals)
@@ -159,14 +175,14 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
     """
     cost.check(plant)
     limits.check(plant)
-    _check_terminal(plant, horizon)
+    _check_names(plant, horizon, limits)
     stage = _stage_expressions(plant, reference, horizon, cost, limits)
     binding, free = stage.binding, stage.before.numel()
     dynamics, stage_cost, terminal_cost = _stage_functions(stage, horizon.step)
     nodes = _nodes(plant, reference, horizon, cost, (free, len(binding)))
     _check_finite(tuple(stage.terms), stage_cost, terminal_cost, nodes, cost)
     along = expand_along(dynamics, stage_cost, terminal_cost, nodes)
-    lower, upper = hard_state_bounds(limits, plant)
+    lower, upper = hard_state_bounds(limits, plant, horizon.margins)
     state = _stage_state(plant, bool(free), binding)
     return OptimalControl(
         stages=horizon.stages,
@@ -209,6 +225,9 @@ def stage_data(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost)
         free = np.zeros((1, nodes))
         free[0, [0, *np.cumsum(horizon.blocks)]] = 1.0
         table = ca.vertcat(table, free)
+    if horizon.margins:
+        rows = np.array([[*horizon.margins[e], 0.0] for e in horizon.margins], dtype=float)
+        table = ca.vertcat(table, rows)
     if horizon.terminal:
         last, after = np.zeros((1, nodes)), [*range(1, nodes), nodes - 1]
         last[0, nodes - 2] = 1.0
@@ -279,9 +298,17 @@ def _reach(limits: Limits, plant: Plant) -> ca.DM:
     return ca.DM(np.where(np.isfinite(half) & (half > 0), half, 1.0))
 
 
-def _check_terminal(plant: Plant, horizon: Horizon) -> None:
+def _check_names(plant: Plant, horizon: Horizon, limits: Limits) -> None:
     mistakes = Mistakes("horizon")
     mistakes.unknown("terminal: state", horizon.terminal, plant.state.elements)
+    mistakes.unknown("margins: limit of state", horizon.margins, list(limits.states))
+    for name in horizon.margins.keys() & limits.states.keys():
+        lower, upper = limits.states[name]
+        if 2 * max(horizon.margins[name]) >= upper - lower:
+            mistakes.add(
+                f"margins of '{name}' reach {max(horizon.margins[name]):.6g}, which leaves nothing between its limits "
+                f"{lower:g} and {upper:g}; widen the limits, or adapt faster"
+            )
     mistakes.raise_if_any()
 
 
@@ -308,6 +335,9 @@ def _written(
     for entry in entries:
         if ca.SX(entry.expression).numel() != 1:
             raise InvalidProblem(f"limits: path '{entry.name}' must be one scalar, got {entry.expression.shape}")
+    if horizon.margins:
+        margin = dict(zip(horizon.margins, ca.vertsplit(data["margin"]), strict=True))
+        entries += narrowed(limits, plant, x_next, margin)
     if horizon.terminal:
         entries += ends(horizon.terminal, plant, x_next, data["target"], data["last"])
     return entries

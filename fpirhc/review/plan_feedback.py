@@ -72,6 +72,7 @@ def plan_gains(
         NotSupported: the stage's state holds more than the plant's (rates of inputs, an end that must be met).
     """
     plant = problem.plant
+    horizon = replace(horizon, margins={})
     ocp = transcribe(plant, problem.reference, horizon, cost, Limits())
     if ocp.state.size != plant.state.size:
         raise NotSupported(

@@ -66,10 +66,12 @@ class ResponseErrors:
     Args:
         error: response errors e_k just after each update, shape (cycles, n).
         force: w_k, which acts on the deviation over each cycle, shape (cycles, n).
+        command: u_k, shape (cycles, nu).
     """
 
     error: np.ndarray
     force: np.ndarray
+    command: np.ndarray
 
 
 def nominal_run(problem: Problem, controller: Controller, *, compiled: bool = True) -> NominalRun:
@@ -107,7 +109,8 @@ def response_errors(
     reads = (nominal.states[:-1], nominal.desired, nominal.states[1:])
     run: Any = step.function.mapaccum(f"{step.function.name()}_run", nominal.cycles)
     log = np.asarray(run(step.memory.start(), *(rows.T for rows in reads))[1].full()).T
-    return ResponseErrors(log[:, step.trace.slice("response_error")], log[:, step.trace.slice("response_force")])
+    columns = ("response_error", "response_force", "command")
+    return ResponseErrors(*(log[:, step.trace.slice(name)] for name in columns))
 
 
 def _recursion(nominal: NominalRun, deformation: Deformation, exact: np.ndarray) -> Composite:

@@ -41,7 +41,7 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
     assert problem.horizon is not None
     assert problem.cost is not None
     plant = problem.plant
-    one_cycle = replace(problem.horizon, stages=1, step=problem.period, terminal=())
+    one_cycle = replace(problem.horizon, stages=1, step=problem.period, terminal=(), blocks=(), margins={})
     ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits)
     data_of = stage_data(plant, problem.reference, one_cycle, problem.cost)
     states = log[:, layout.slice("plant_state")]

@@ -52,21 +52,22 @@ def measure_optimality(
     if ready.learns or "parameters" in feeds:
         return None
     times, states = (run[feeds[n] if feeds.get(n) in run.layout.names else n] for n in ("time", "state"))
-    cost = planner.cost or problem.cost
-    assert cost is not None
-    ocp = transcribe(problem.plant, problem.reference, problem.horizon, cost, problem.limits)
+    planned = planner.planned(problem)
+    assert planned.horizon is not None
+    assert planned.cost is not None
+    ocp = transcribe(planned.plant, planned.reference, planned.horizon, planned.cost, planned.limits)
     try:
         solve = _Solver(ocp, compiled)
     except FpirhcError:
         return None
-    data_of = stage_data(problem.plant, problem.reference, problem.horizon, cost)
+    data_of = stage_data(planned.plant, planned.reference, planned.horizon, planned.cost)
     stride = cycles_per_stage(problem.horizon, problem.period)
-    planned = np.arange(stride, run.cycles, stride)
-    rows = planned[np.unique(np.linspace(0, planned.size - 1, SAMPLES).astype(int))] if planned.size else planned
+    plans = np.arange(stride, run.cycles, stride)
+    rows = plans[np.unique(np.linspace(0, plans.size - 1, SAMPLES).astype(int))] if plans.size else plans
     parameters, excess = controller.parameters(problem.plant), []
     for row in rows:
         shift = run["command_shift"][row - 1]
-        first = ocp.start(states[row], run["command"][row - 1]).full().ravel()
+        first = ocp.start(states[row], run["command"][row - 1] - shift).full().ravel()
         data = np.asarray(data_of(np.ravel(times)[row], parameters).full())
         best = solve(first, data, ocp.input_lower - shift, ocp.input_upper - shift)
         cost_of_plan = run["solve.cost"][row]

@@ -1,0 +1,158 @@
+"""Plans that keep a margin from limits of states: margins along the horizon, and margins computed for a wrong model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
+from fpirhc.horizon.problem import stage_data, transcribe
+
+LIMIT = 0.8
+
+
+def carriage(mass: float = 1.0, believed: float = 1.3) -> fp.Problem:
+    """A carriage on a track that is shorter than what it is to follow."""
+    plant = fp.Plant(
+        coordinates={"q": "m"},
+        inputs={"F": "N"},
+        response=lambda q, v, u, p: {"q": (u.F - 2.0 * q.q - 0.4 * v.q) / p.m},
+        parameters={"m": fp.Parameter(believed, mass, "kg")},
+    )
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"q": ca.sin(2 * t)}),
+        start={"q": 0.0, "q'": 2.0},
+        period=0.01,
+        duration=5.0,
+        measure_from=1.0,
+        limits=fp.Limits(inputs={"F": (-20.0, 20.0)}, states={"q": (-LIMIT, LIMIT), "q'": (-2.5, 2.5)}),
+        horizon=fp.Horizon(stages=20, step=0.05),
+        cost=fp.Quadratic(states={"q": 100.0, "q'": 1.0}, effort={"F": 1e-3}),
+    )
+
+
+def adaptive(gain: float = -1.0) -> fp.RecedingHorizon:
+    return fp.RecedingHorizon(fp.FixedPoint(iterations=200, tolerance=1e-7), fp.Affine(gain))
+
+
+def plain() -> fp.RecedingHorizon:
+    return replace(adaptive(), deformation=fp.Identity())
+
+
+def beyond(problem: fp.Problem, controller: Any) -> float:
+    """The largest violation of the track's end after the first second."""
+    run = fp.simulate(problem, controller, seed=0)
+    assert run.stop is None
+    return float(np.abs(run["state"][100:, 0]).max() - LIMIT)
+
+
+def test_a_margin_narrows_the_plan_by_its_number_at_every_stage():
+    """On the bound of the stage where the margin is active, like IPOPT's plan with the same margins."""
+    margins = tuple(0.01 * (i + 1) for i in range(20))
+    problem = carriage()
+    assert problem.horizon is not None
+    horizon = replace(problem.horizon, margins={"q": margins})
+    assert problem.cost is not None
+    ocp = transcribe(problem.plant, problem.reference, horizon, problem.cost, problem.limits)
+    data = np.asarray(stage_data(problem.plant, problem.reference, horizon, problem.cost)(0.3, [1.3]).full())
+    first = np.asarray(ocp.start([0.55, 1.4], [0.0]).full()).ravel()
+    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-7), first, data)
+    assert plan.status == fp.Status.OK
+    room = LIMIT - np.array(margins) - np.asarray(plan.states)[0, 1:]
+    assert room.min() == pytest.approx(0.0, abs=1e-5)
+    other = fp.solve(ocp, fp.Ipopt(tolerance=1e-9), first, data)
+    assert plan.cost == pytest.approx(other.cost, rel=1e-4)
+
+
+def test_with_the_right_model_there_is_no_margin():
+    """Nothing deviates without adaptation; plain adaptation takes the drift within a cycle for an error of the model."""
+    margins = fp.state_margins(carriage(1.0, 1.0), plain())
+    assert set(margins) == {"q", "q'"}
+    assert max(max(m) for m in margins.values()) < 1e-9
+
+
+def test_margins_grow_along_the_horizon_and_with_the_error_of_the_model():
+    near, far = (fp.state_margins(carriage(1.0, m), plain()) for m in (1.1, 1.4))
+    for name in ("q", "q'"):
+        assert np.all(np.diff(near[name]) >= 0)
+        assert far[name][-1] > near[name][-1] > 0
+
+
+def test_a_limit_that_the_wrong_model_breaks_is_kept_with_margins():
+    """Plain control leaves its track, adaptation leaves it by less, and with margins the plant stays inside."""
+    problem = carriage()
+    alone, adapted = beyond(problem, plain()), beyond(problem, adaptive())
+    assert alone > 1e-3
+    assert 0 < adapted < 0.5 * alone
+    assert beyond(problem, fp.tightened(problem, adaptive())) <= 1e-6
+
+
+def test_margins_for_a_box_of_parameters_are_at_least_those_of_the_plant():
+    own, boxed = (fp.state_margins(carriage(), adaptive(), mismatch=m) for m in (None, 20.0))
+    assert boxed["q"][-1] >= own["q"][-1]
+
+
+def test_mistakes_are_named():
+    problem = carriage()
+    free = replace(problem, limits=fp.Limits())
+    with pytest.raises(InvalidProblem, match="no hard limits of states"):
+        fp.tightened(free, adaptive())
+    with pytest.raises(NotSupported, match="does not plan"):
+        fp.tightened(problem, fp.ComputedTorque(fp.Exponential(rate=6.0)))
+    with pytest.raises(InvalidValue, match="widen=0"):
+        fp.tightened(problem, adaptive(), widen=0)
+    with pytest.raises(InvalidProblem, match="leaves nothing between its limits"):
+        fp.tightened(problem, adaptive(), widen=1000.0)
+    with pytest.raises(InvalidValue, match="one for every stage"):
+        fp.Horizon(stages=3, step=0.1, margins={"q": (0.1,)})
+    with pytest.raises(InvalidProblem, match="margins: limit of state 'p'"):
+        replace(adaptive(), margins={"p": (0.0,) * 20}).check(problem)
+
+
+@pytest.mark.parametrize("weights", [{"rate": {"F": 1.0}}, {}])
+def test_the_rate_of_a_plan_counts_from_the_command_without_its_shift(weights):
+    """A constant force that the model lacks: with the shift in its rate, a plan would pay for it for ever and stay off.
+
+    Without a weight of the rate the error is that of the horizon alone, and the same.
+    """
+    plant = fp.Plant(
+        coordinates={"q": "m"},
+        inputs={"F": "N"},
+        order=1,
+        response=lambda q, u, p: {"q": u.F - q.q + p.d},
+        parameters={"d": fp.Parameter(0.0, 2.0, "N")},
+    )
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"q": 0 * t}),
+        start={"q": 0.0},
+        period=0.01,
+        duration=6.0,
+        limits=fp.Limits(),
+        horizon=fp.Horizon(stages=20, step=0.05),
+        cost=fp.Quadratic(states={"q": 10.0}, **weights),
+    )
+    run = fp.simulate(
+        problem, fp.RecedingHorizon(fp.FixedPoint(iterations=50, tolerance=1e-9), fp.Affine(-1.0)), seed=0
+    )
+    assert np.abs(run["state"][-50:, 0]).max() < 1e-6
+
+
+def test_a_run_with_blocks_and_margins_is_measured():
+    """Its cost is that of the problem's stage, which has neither."""
+    problem = carriage()
+    assert problem.horizon is not None
+    shaped = replace(
+        problem,
+        duration=0.3,
+        measure_from=0.0,
+        horizon=replace(problem.horizon, blocks=(1,) * 10 + (5, 5), margins={"q": (0.01,) * 20}),
+    )
+    run = fp.simulate(shaped, adaptive(), seed=0)
+    assert np.isfinite(run["cost"]).all()
