@@ -32,7 +32,7 @@ class Expansion(NamedTuple):
 
     inputs: ca.MX  # (nu, N)
     states: ca.MX  # (ns, N + 1)
-    following: ca.MX  # F (ns, N)
+    next_states: ca.MX  # F (ns, N)
     a: ca.MX  # (ns, ns N)
     b: ca.MX  # (ns, nu N)
     by_state: ca.MX  # (ns, N)
@@ -92,7 +92,7 @@ def sweep(
     for column, row in enumerate(places):
         chosen[row, column] = 1
     by_limit = [ca.mtimes(chosen, m[nu:, :]) for m in (weight, lean)]
-    gaps = p.following - p.states[:, 1:]
+    gaps = p.next_states - p.states[:, 1:]
     bent = hessian_stage(ocp, bend).map(n)(p.states[:, :n], p.inputs, data[:, :n], costates)
     columns = [p.a, p.b, p.by_state, p.by_input, gaps, *bent, *by_limit, weight[:nu, :], lean[:nu, :]]
     turned = [_turned(c, n) for c in [*columns, ca.repmat(mu, 1, n)]]

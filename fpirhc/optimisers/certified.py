@@ -72,7 +72,7 @@ def adjoint(ocp: OptimalControl, limits: Limited, p: Expansion, push: ca.MX) -> 
 
 def largest_gap(p: Expansion, scales: Scales) -> ca.MX:
     """Return the largest |F(X, U) - X+| in units of the states."""
-    gaps = ca.fabs(p.following - p.states[:, 1:])
+    gaps = ca.fabs(p.next_states - p.states[:, 1:])
     return ca.mmax(gaps / ca.repmat(ca.DM(scales.states), 1, gaps.shape[1]))
 
 
@@ -87,7 +87,7 @@ def barrier_error(
     pairs = [(limits.present, y.t * z), (states, y.e * (limits.rho - z))]
     least = ca.fmin(*(ca.mmin(ca.if_else(c, v, 10 * FINITE)) for c, v in pairs))
     most = ca.fmax(*(ca.mmax(ca.if_else(c, v, 0)) for c, v in pairs))
-    nu, ns = p.inputs.shape[0], p.following.shape[0]
+    nu, ns = p.inputs.shape[0], p.next_states.shape[0]
     rest_u = p.by_input + push[:nu, :] + _stage_product(p.b, costates, nu, ns, n)
     before = ca.horzcat(p.by_state[:, 1:] + _stage_product(p.a, costates, ns, ns, n)[:, 1:], p.tail)
     rest_x = before - costates + limits.on_states(push)

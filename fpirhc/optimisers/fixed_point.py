@@ -132,7 +132,7 @@ class FixedPoint(Optimiser):
                 f"FixedPoint(tolerance={self.tolerance:g}): inputs of this size are rounded to {rounding:.1g}; "
                 f"use {1e3 * rounding:.0g}"
             )
-        least = ocp.along.least_bend()
+        least = ocp.along.least_curvature()
         if least < -_CONVEX:
             raise NotSupported(
                 f"FixedPoint needs a cost that bends upwards; along the reference the stage or terminal cost has an eigenvalue of "
@@ -216,7 +216,7 @@ class FixedPoint(Optimiser):
         nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
         leaves = {
             "linear": linear_stage(ocp),
-            "bent": hessian_stage(ocp, self._plain_hessian),
+            "hessian": hessian_stage(ocp, self._plain_hessian),
             "end": hessian_end(ocp),
             "deformed": deformed_move(self.map, nu * n),
         }
