@@ -50,19 +50,19 @@ def cycles(name: str, across: bool) -> tuple[float, float]:
 
 def _measured(library: ctypes.CDLL, optimiser: fp.FixedPoint, recorded: optimisers.Horizons) -> tuple[float, float]:
     ocp, size = recorded.ocp, optimiser.memory(recorded.ocp).size
-    given = (recorded.first[0], recorded.data[0].T.copy(), ocp.input_lower, ocp.input_upper, np.zeros(size))
+    values = (recorded.first[0], recorded.data[0].T.copy(), ocp.input_lower, ocp.input_upper, np.zeros(size))
     results = (np.zeros(ocp.input.size * ocp.stages), np.zeros(5), np.zeros(size))
     pointer = ctypes.POINTER(ctypes.c_double)
     arguments, places = (
         (pointer * len(arrays))(*(np.ascontiguousarray(a, dtype=float).ctypes.data_as(pointer) for a in arrays))
-        for arrays in (given, results)
+        for arrays in (values, results)
     )
-    pair, told = (ctypes.c_double(), ctypes.c_double()), []
+    pair, times = (ctypes.c_double(), ctypes.c_double()), []
     for _ in range(CALLS):
         library.entry(arguments, places, None, None, 0)
         library.cycles(*(ctypes.byref(v) for v in pair))
-        told.append([v.value for v in pair])
-    first, second = np.median(told, axis=0)
+        times.append([v.value for v in pair])
+    first, second = np.median(times, axis=0)
     return float(first), float(second)
 
 

@@ -147,12 +147,12 @@ def _valid_multipliers(ocp: OptimalControl, states: ca.MX, multipliers: ca.MX) -
     """Keep what can be a multiplier: positive at the upper bound, negative at the lower one, zero elsewhere."""
     rows = []
     for k in range(ocp.state.size):
-        row, given = states[k, 1:], multipliers[k, :]
+        row, values = states[k, 1:], multipliers[k, :]
         at_upper = row >= ocp.state_upper[k] - FEASIBLE if ocp.state_upper[k] < FINITE else ca.MX.zeros(1, ocp.stages)
         at_lower = row <= ocp.state_lower[k] + FEASIBLE if ocp.state_lower[k] > -FINITE else ca.MX.zeros(1, ocp.stages)
-        kept = ca.if_else(at_upper, ca.fmax(given, 0), 0) + ca.if_else(at_lower, ca.fmin(given, 0), 0)
+        valid = ca.if_else(at_upper, ca.fmax(values, 0), 0) + ca.if_else(at_lower, ca.fmin(values, 0), 0)
         # fmax and fmin would hide NaN.
-        rows.append(kept + ca.if_else(ca.fabs(given) <= FINITE, 0, given))
+        rows.append(valid + ca.if_else(ca.fabs(values) <= FINITE, 0, values))
     return ca.vertcat(*rows)
 
 

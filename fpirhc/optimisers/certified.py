@@ -37,20 +37,20 @@ def certified(ocp: OptimalControl, limits: Limited, scales: Scales, p: Expansion
         ca.repmat(ca.DM(v), 1, n) for v in (scales.inputs, scales.inputs**2 / scales.cost, ocp.step * ocp.curvature)
     ]
     low, high = limits.inputs()
-    moved = ca.fabs(p.inputs - clip(p.inputs - units[1] * slope, low, high)) / units[0]
+    step = ca.fabs(p.inputs - clip(p.inputs - units[1] * slope, low, high)) / units[0]
     left = ca.norm_inf(ca.vec(p.inputs - clip(p.inputs - slope / units[2], low, high)))
     d = limits.distance(p)
     counted = ca.logic_and(limits.present, limits.of_states)
     given_up = z >= ENOUGH * limits.rho
-    kept = ca.fabs(ca.fmin(d, limits.reach * ca.fmin(ca.fmax(z, 0), limits.rho)))
-    error = ca.if_else(given_up, ca.fmax(d, 0), kept)
+    complementarity = ca.fabs(ca.fmin(d, limits.reach * ca.fmin(ca.fmax(z, 0), limits.rho)))
+    error = ca.if_else(given_up, ca.fmax(d, 0), complementarity)
     error = ca.if_else(counted, ca.fmax(error, limits.reach * ca.fmax(-z, 0)) / limits.unit, 0)
     beyond = ca.if_else(counted, ca.fmax(-d, 0), 0)
     broken = ca.if_else(given_up, 0, beyond)
-    worst = ca.fmax(ca.fmax(ca.mmax(moved), largest_gap(p, scales)), ca.mmax(error))
+    worst = ca.fmax(ca.fmax(ca.mmax(step), largest_gap(p, scales)), ca.mmax(error))
     finite = is_finite(ca.vec(slope))
-    told = [ca.if_else(finite, v, 10 * FINITE) for v in (left, worst)]
-    return Certified(slope, told[0], ca.mmax(beyond * limits.hard), ca.mmax(broken), told[1])
+    numbers = [ca.if_else(finite, v, 10 * FINITE) for v in (left, worst)]
+    return Certified(slope, numbers[0], ca.mmax(beyond * limits.hard), ca.mmax(broken), numbers[1])
 
 
 def certify(ocp: OptimalControl, limits: Limited, p: Expansion, z: ca.MX, counted: ca.MX | float = 1) -> ca.MX:

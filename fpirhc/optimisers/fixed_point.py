@@ -72,7 +72,7 @@ from fpirhc.optimisers.search import (
     SHORTEST,
     UNTRIED,
     Anchor,
-    Given,
+    Arguments,
     Search,
     deformed_move,
     first_gamma,
@@ -158,15 +158,15 @@ class FixedPoint(Optimiser):
         """The memory one stage later; the last stage, which is repeated, has no feedback."""
         if ocp.bounds_states:
             return shifted_limited(ocp, memory)
-        kept = self.memory(ocp).split(memory)
+        parts = self.memory(ocp).split(memory)
         ns, nu, n = ocp.state.size, ocp.input.size, ocp.stages
-        gains = ca.vertcat(kept["plan_gains"][nu * ns :], ca.MX.zeros(nu * ns))
-        moved = {
-            "plan_inputs": ca.vec(shift(ca.reshape(kept["plan_inputs"], nu, n))),
-            "plan_states": ca.vec(shift(ca.reshape(kept["plan_states"], ns, n))),
+        gains = ca.vertcat(parts["plan_gains"][nu * ns :], ca.MX.zeros(nu * ns))
+        shifted_parts = {
+            "plan_inputs": ca.vec(shift(ca.reshape(parts["plan_inputs"], nu, n))),
+            "plan_states": ca.vec(shift(ca.reshape(parts["plan_states"], ns, n))),
             "plan_gains": gains,
         }
-        return self.memory(ocp).join({**kept, **moved})
+        return self.memory(ocp).join({**parts, **shifted_parts})
 
     def step(self, ocp: OptimalControl) -> ca.Function:
         """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory).
@@ -258,54 +258,54 @@ class FixedPoint(Optimiser):
     def _graph(self, ocp: OptimalControl, name: str) -> ca.Function:
         """The composed Function: what the driver is tested against, and what runs without a compiler."""
         search = Search(ocp, self._plain_hessian, self.map, self.damping)
-        given, memory = self._arguments(ocp)
-        anchor = self._begin(ocp, given, memory)
+        arguments, memory = self._arguments(ocp)
+        anchor = self._begin(ocp, arguments, memory)
         for _ in range(self.iterations):
-            anchor, plan = search.tried(anchor, given)
-            anchor = search.directed(anchor, plan, given)
-        anchor, _ = search.tried(anchor, given)
-        return ca.Function(name, [*given, memory], self._finish(ocp, given, memory, anchor, self.iterations))
+            anchor, plan = search.tried(anchor, arguments)
+            anchor = search.directed(anchor, plan, arguments)
+        anchor, _ = search.tried(anchor, arguments)
+        return ca.Function(name, [*arguments, memory], self._finish(ocp, arguments, memory, anchor, self.iterations))
 
     def _converging_graph(self, ocp: OptimalControl, name: str) -> ca.Function:
         search = Search(ocp, self._plain_hessian, self.map, self.damping)
-        given, memory = self._arguments(ocp)
-        anchor, count, plain = self._begin(ocp, given, memory), ca.MX(0), ca.MX(0)
+        arguments, memory = self._arguments(ocp)
+        anchor, count, plain = self._begin(ocp, arguments, memory), ca.MX(0), ca.MX(0)
         symbols = Anchor(*(ca.MX.sym(name, *v.shape) for name, v in zip(Anchor._fields, anchor, strict=True)))
-        tried, plan = search.tried(symbols, given)
-        work = ca.Function("fpirhc_iteration", [*given, *symbols], list(search.directed(tried, plan, given)))
-        rest = ca.Function("fpirhc_rest", [*given, *symbols], list(symbols))
+        tried, plan = search.tried(symbols, arguments)
+        work = ca.Function("fpirhc_iteration", [*arguments, *symbols], list(search.directed(tried, plan, arguments)))
+        rest = ca.Function("fpirhc_rest", [*arguments, *symbols], list(symbols))
         choice = ca.Function.if_else("fpirhc_iteration_if_needed", work, rest)
         for _ in range(MOST + 1):
-            residual = stationarity(ocp, anchor.inputs, anchor.slope, given.lower, given.upper)
+            residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper)
             needed = ca.logic_not(ca.logic_and(anchor.value < UNTRIED, residual <= self.tolerance))
             needed = ca.logic_and(needed, plain < _PLAIN)
             plain += ca.logic_and(needed, anchor.step < SHORTEST)
-            anchor, count = Anchor(*choice(needed, *given, *anchor)), count + needed
-        return ca.Function(name, [*given, memory], self._finish(ocp, given, memory, anchor, count - 1))
+            anchor, count = Anchor(*choice(needed, *arguments, *anchor)), count + needed
+        return ca.Function(name, [*arguments, memory], self._finish(ocp, arguments, memory, anchor, count - 1))
 
-    def _arguments(self, ocp: OptimalControl) -> tuple[Given, ca.MX]:
+    def _arguments(self, ocp: OptimalControl) -> tuple[Arguments, ca.MX]:
         nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
         s0, data = ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
         lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
-        return Given(s0, data, lower, upper), ca.MX.sym("memory", self.memory(ocp).size)
+        return Arguments(s0, data, lower, upper), ca.MX.sym("memory", self.memory(ocp).size)
 
-    def _begin(self, ocp: OptimalControl, given: Given, memory: ca.MX) -> Anchor:
+    def _begin(self, ocp: OptimalControl, arguments: Arguments, memory: ca.MX) -> Anchor:
         """The remembered plan, not evaluated yet; a poisoned memory is forgotten."""
         nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
-        kept = self.memory(ocp).split(ca.if_else(is_finite(memory), memory, 0))
-        inputs = clip(ca.reshape(kept["plan_inputs"], nu, n), given.lower, given.upper)
+        remembered = self.memory(ocp).split(ca.if_else(is_finite(memory), memory, 0))
+        inputs = clip(ca.reshape(remembered["plan_inputs"], nu, n), arguments.lower, arguments.upper)
         none = ca.MX.zeros(nu, n)
         first = first_gamma(ocp)
-        resume = ca.if_else(kept["plan_step"] > 0, ca.fmin(kept["plan_step"], 1), 1)
+        resume = ca.if_else(remembered["plan_step"] > 0, ca.fmin(remembered["plan_step"], 1), 1)
         # After a rejected T a longer gamma would be rejected again, in every call of one iteration.
-        longer = ca.if_else(resume < SHORTEST, 1, 2) * kept["plan_gamma"]
-        gamma = ca.if_else(kept["plan_gamma"] > 0, ca.fmin(longer, first), first)
+        longer = ca.if_else(resume < SHORTEST, 1, 2) * remembered["plan_gamma"]
+        gamma = ca.if_else(remembered["plan_gamma"] > 0, ca.fmin(longer, first), first)
         return Anchor(
             inputs=inputs,
-            states=ca.reshape(kept["plan_states"], ns, n),
+            states=ca.reshape(remembered["plan_states"], ns, n),
             move=none,
-            gains=ca.reshape(kept["plan_gains"], nu, ns * n),
-            plain=clip(none, given.lower, given.upper),
+            gains=ca.reshape(remembered["plan_gains"], nu, ns * n),
+            plain=clip(none, arguments.lower, arguments.upper),
             slope=none,
             value=ca.MX(10 * UNTRIED),
             envelope=ca.MX(10 * UNTRIED),
@@ -315,18 +315,18 @@ class FixedPoint(Optimiser):
         )
 
     def _finish(
-        self, ocp: OptimalControl, given: Given, memory: ca.MX, anchor: Anchor, iterations: ca.MX | int
+        self, ocp: OptimalControl, arguments: Arguments, memory: ca.MX, anchor: Anchor, iterations: ca.MX | int
     ) -> list[ca.MX]:
-        posed, evaluated = sane(*given), anchor.value < UNTRIED
+        posed, evaluated = sane(*arguments), anchor.value < UNTRIED
         finite = ca.logic_and(posed, evaluated)
-        residual = stationarity(ocp, anchor.inputs, anchor.slope, given.lower, given.upper)
+        residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper)
         status = ca.if_else(
-            ca.mmax(given.lower - given.upper) > 0,
+            ca.mmax(arguments.lower - arguments.upper) > 0,
             int(Status.INFEASIBLE),
             status_of(finite, residual, 0, self.tolerance),
         )
-        told = ca.if_else(finite, ca.vertcat(anchor.value, residual), ca.MX.zeros(2))
-        found = self.memory(ocp).join(
+        numbers = ca.if_else(finite, ca.vertcat(anchor.value, residual), ca.MX.zeros(2))
+        solved = self.memory(ocp).join(
             {
                 "plan_inputs": ca.vec(anchor.inputs),
                 "plan_states": ca.vec(anchor.states),
@@ -336,8 +336,8 @@ class FixedPoint(Optimiser):
             }
         )
         # A remembered plan under which a well-posed problem overflows is given up, so that the next call can succeed.
-        kept = ca.if_else(finite, found, ca.if_else(posed, ca.MX.zeros(found.shape), memory))
-        return [anchor.inputs, ca.vertcat(told, 0, iterations, status), kept]
+        next_memory = ca.if_else(finite, solved, ca.if_else(posed, ca.MX.zeros(solved.shape), memory))
+        return [anchor.inputs, ca.vertcat(numbers, 0, iterations, status), next_memory]
 
 
 EXAMPLES = (FixedPoint(iterations=20, tolerance=1e-6), FixedPoint(iterations=1, tolerance=1e-6))

@@ -170,13 +170,13 @@ class _MultipleShooting(Optimiser):
 
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         """The plan and the multipliers one stage later."""
-        kept = self.memory(ocp).split(memory)
-        moved = {
-            "plan_inputs": ca.vec(shift(ca.reshape(kept["plan_inputs"], ocp.input.size, ocp.stages))),
-            "plan_variable_multipliers": shift_variables(ocp, kept["plan_variable_multipliers"]),
-            "plan_dynamics_multipliers": shift_dynamics(ocp, kept["plan_dynamics_multipliers"]),
+        parts = self.memory(ocp).split(memory)
+        shifted_parts = {
+            "plan_inputs": ca.vec(shift(ca.reshape(parts["plan_inputs"], ocp.input.size, ocp.stages))),
+            "plan_variable_multipliers": shift_variables(ocp, parts["plan_variable_multipliers"]),
+            "plan_dynamics_multipliers": shift_dynamics(ocp, parts["plan_dynamics_multipliers"]),
         }
-        return self.memory(ocp).join(moved)
+        return self.memory(ocp).join(shifted_parts)
 
     def step(self, ocp: OptimalControl) -> ca.Function:
         """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory).
@@ -206,8 +206,8 @@ class _MultipleShooting(Optimiser):
         status = ca.if_else(ca.mmax(lower - upper) > 0, int(Status.INFEASIBLE), int(Status.NON_FINITE))
         diagnostics = ca.vertcat(ca.MX.zeros(3), UNKNOWN_ITERATIONS, status)
         forgotten = {name: ca.MX.zeros(layout[name].size) for name in layout.names}
-        kept = layout.join({**forgotten, "plan_inputs": ca.vec(start)})
-        return ca.Function("fpirhc_shooting_skip", arguments, [start, diagnostics, kept])
+        next_memory = layout.join({**forgotten, "plan_inputs": ca.vec(start)})
+        return ca.Function("fpirhc_shooting_skip", arguments, [start, diagnostics, next_memory])
 
     def _guess(self, ocp: OptimalControl) -> ca.Function:
         """Function of the step's arguments -> (U, S): the remembered plan, or one that the model survives."""
@@ -224,7 +224,7 @@ class _MultipleShooting(Optimiser):
     def _solve(self, ocp: OptimalControl, name: str) -> ca.Function:
         n, layout = ocp.stages, self.memory(ocp)
         s0, data, lower, upper, memory = arguments = self._arguments(ocp)
-        kept = layout.split(memory)
+        remembered = layout.split(memory)
         start, states = self._guess(ocp)(*arguments)
         solution = ca.nlpsol("fpirhc_shooting_solver", self.plugin, program(ocp), self.options(ocp))(
             x0=interleave(states, start),
@@ -233,24 +233,24 @@ class _MultipleShooting(Optimiser):
             ubx=interleave(stage_bounds(ocp, s0, ocp.state_upper), ca.repmat(upper, 1, n)),
             lbg=0,
             ubg=0,
-            lam_x0=_usable(kept["plan_variable_multipliers"]),
-            lam_g0=_usable(kept["plan_dynamics_multipliers"]),
+            lam_x0=_usable(remembered["plan_variable_multipliers"]),
+            lam_g0=_usable(remembered["plan_dynamics_multipliers"]),
         )
-        found = clip(separate(ocp, solution["x"])[1], lower, upper)
+        inputs = clip(separate(ocp, solution["x"])[1], lower, upper)
         multipliers = separate(ocp, solution["lam_x"])[0][:, 1:] * int(ocp.bounds_states)
-        cost, residual, violation = judge(ocp)(found, s0, data, lower, upper, multipliers)
-        finite = is_finite(ca.vertcat(ca.vec(found), cost, residual, violation, solution["lam_x"], solution["lam_g"]))
-        plan = ca.if_else(finite, found, start)
-        told = ca.if_else(finite, ca.vertcat(cost, residual, violation), ca.MX.zeros(3))
+        cost, residual, violation = judge(ocp)(inputs, s0, data, lower, upper, multipliers)
+        finite = is_finite(ca.vertcat(ca.vec(inputs), cost, residual, violation, solution["lam_x"], solution["lam_g"]))
+        plan = ca.if_else(finite, inputs, start)
+        numbers = ca.if_else(finite, ca.vertcat(cost, residual, violation), ca.MX.zeros(3))
         status = status_of(finite, residual, violation, self.tolerance)
-        following = {
+        next_parts = {
             "plan_inputs": ca.vec(plan),
             # A solve that was not finite must not poison the next warm start.
             "plan_variable_multipliers": ca.if_else(finite, solution["lam_x"], 0),
             "plan_dynamics_multipliers": ca.if_else(finite, solution["lam_g"], 0),
         }
-        diagnostics = ca.vertcat(told, UNKNOWN_ITERATIONS, status)
-        return ca.Function(name, arguments, [plan, diagnostics, layout.join(following)])
+        diagnostics = ca.vertcat(numbers, UNKNOWN_ITERATIONS, status)
+        return ca.Function(name, arguments, [plan, diagnostics, layout.join(next_parts)])
 
 
 @dataclass(frozen=True)

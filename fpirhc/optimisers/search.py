@@ -26,7 +26,7 @@ TINY = 1e-300
 UNTRIED = 1e299  # a cost from which on an anchor counts as not evaluated
 
 
-class Given(NamedTuple):
+class Arguments(NamedTuple):
     """The arguments of one call."""
 
     s0: ca.MX
@@ -78,18 +78,18 @@ class Search:
         self._judge = _judgement(ocp)
         self._direct = _direction(ocp, hessian, map, damping)
 
-    def tried(self, anchor: Anchor, given: Given) -> tuple[Anchor, Expanded]:
+    def tried(self, anchor: Anchor, arguments: Arguments) -> tuple[Anchor, Expanded]:
         """Try the anchor's next plan: the new anchor, and the plan expanded."""
-        tried = self._try(given.s0, given.data, given.lower, given.upper, *anchor[:5], anchor.step)
+        tried = self._try(arguments.s0, arguments.data, arguments.lower, arguments.upper, *anchor[:5], anchor.step)
         inputs, states, costs, a, b, by_state, by_input = tried
-        value, slope, costates = self._expand(states, inputs, costs, given.data, a, b, by_state, by_input)
-        kept = self._judge(inputs, states, value, slope, given.lower, given.upper, *anchor)
-        *fields, accepted = kept
+        value, slope, costates = self._expand(states, inputs, costs, arguments.data, a, b, by_state, by_input)
+        judged = self._judge(inputs, states, value, slope, arguments.lower, arguments.upper, *anchor)
+        *fields, accepted = judged
         return Anchor(*fields), Expanded(inputs, states, a, b, by_state, by_input, costates, accepted)
 
-    def directed(self, anchor: Anchor, plan: Expanded, given: Given) -> Anchor:
+    def directed(self, anchor: Anchor, plan: Expanded, arguments: Arguments) -> Anchor:
         """The anchor with the sweep's direction, renewed where the last plan was accepted."""
-        move, gains = self._direct(*plan[:7], given.data, given.lower, given.upper)
+        move, gains = self._direct(*plan[:7], arguments.data, arguments.lower, arguments.upper)
         return anchor._replace(
             move=ca.if_else(plan.accepted, move, anchor.move), gains=ca.if_else(plan.accepted, gains, anchor.gains)
         )
@@ -103,12 +103,12 @@ def _trial(ocp: OptimalControl) -> ca.Function:
     planned, gain, step = ca.SX.sym("x", ns), ca.SX.sym("K", nu, ns), ca.SX.sym("tau")
     low, high = ca.SX.sym("low", nu), ca.SX.sym("high", nu)
     newton = ca.fmin(ca.fmax(inputs + step * move + gain @ (s - planned), low), high)
-    chosen = ca.if_else(step >= SHORTEST, newton, plain)
-    following, cost, *rest = linear_stage(ocp)(s, chosen, theta)
+    used = ca.if_else(step >= SHORTEST, newton, plain)
+    next_state, cost, *rest = linear_stage(ocp)(s, used, theta)
     stage = ca.Function(
         "fpirhc_trial_stage",
         [s, theta, low, high, inputs, planned, move, gain, plain, step],
-        [following, chosen, cost, *rest],
+        [next_state, used, cost, *rest],
     )
     sweep = stage.mapaccum("fpirhc_trial_stages", n)
     s0, data = ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
@@ -213,8 +213,8 @@ def _judgement(ocp: OptimalControl) -> ca.Function:
     advance = Anchor(
         inputs, states[:, :n], old.move, old.gains, plain, slope, value, envelope, step, old.gamma, old.resume
     )
-    kept = [ca.if_else(accepted, new, back) for new, back in zip(advance, retreat, strict=True)]
-    return ca.Function("fpirhc_judgement", [inputs, states, value, slope, lower, upper, *old], [*kept, accepted])
+    next_anchor = [ca.if_else(accepted, new, back) for new, back in zip(advance, retreat, strict=True)]
+    return ca.Function("fpirhc_judgement", [inputs, states, value, slope, lower, upper, *old], [*next_anchor, accepted])
 
 
 def _stage_shapes(ns: int, nu: int) -> tuple[tuple[int, int], ...]:

@@ -83,10 +83,10 @@ def _step(
     slope = ca.Function("fpirhc_slope", [at, u, p, w], [ca.densify(ca.jacobian(rate(at, u, p, w), at))])
     one = _implicit(lambda s: rate(s, u, p, w), lambda s: slope(s, u, p, w), x, h, method, newton)
     advance = ca.Function(name, [x, u, p, w], [ca.cse(one)], ["x", "u", "p", "w"], ["x_next"])
-    following: Expression = x
+    next_state: Expression = x
     for _ in range(substeps):
-        following = advance(following, u, p, w)
-    return advance if substeps == 1 else ca.Function(name, [x, u, p, w], [following], ["x", "u", "p", "w"], ["x_next"])
+        next_state = advance(next_state, u, p, w)
+    return advance if substeps == 1 else ca.Function(name, [x, u, p, w], [next_state], ["x", "u", "p", "w"], ["x_next"])
 
 
 def _implicit(
@@ -105,8 +105,8 @@ def _implicit(
         at = [x + h * sum((a[i, j] * k[j] for j in range(stages)), start=ca.SX.zeros(n)) for i in range(stages)]
         left = ca.vertcat(*(k[i] - rate(at[i]) for i in range(stages)))
         blocks = [[(i == j) * ca.SX.eye(n) - h * a[i, j] * slope(at[i]) for j in range(stages)] for i in range(stages)]
-        moved = _solved(ca.densify(ca.vertcat(*(ca.horzcat(*row) for row in blocks))), left)
-        k = [k[i] - moved[i * n : (i + 1) * n] for i in range(stages)]
+        newton_step = _solved(ca.densify(ca.vertcat(*(ca.horzcat(*row) for row in blocks))), left)
+        k = [k[i] - newton_step[i * n : (i + 1) * n] for i in range(stages)]
     return x + h * sum((b[i] * k[i] for i in range(stages)), start=ca.SX.zeros(n))
 
 
@@ -118,8 +118,8 @@ def _solved(matrix: ca.SX, right: ca.SX) -> ca.SX:
         for i in range(k + 1, n):
             factor = rows[i][k] / rows[k][k]
             rows[i] = [rows[i][j] - factor * rows[k][j] if j > k else rows[i][j] for j in range(n + 1)]
-    found: list[ca.SX] = []
+    solution: list[ca.SX] = []
     for i in reversed(range(n)):
-        known = sum((rows[i][n - 1 - j] * found[j] for j in range(len(found))), start=ca.SX(0))
-        found.append((rows[i][n] - known) / rows[i][i])
-    return ca.vertcat(*reversed(found))
+        known = sum((rows[i][n - 1 - j] * solution[j] for j in range(len(solution))), start=ca.SX(0))
+        solution.append((rows[i][n] - known) / rows[i][i])
+    return ca.vertcat(*reversed(solution))
