@@ -21,12 +21,11 @@ from fpirhc.controllers.mirror_path import MEASURED, Path
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals, expression, total
+from fpirhc.symbolic.expression import Signals, expression, is_finite, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
 
 BEFORE = "_deformation_before"
-_FINITE = 1e300
 
 
 def twin_block(path: Path) -> Block:
@@ -55,7 +54,7 @@ def twin_block(path: Path) -> Block:
         state, response, *memories = estimate.function(arrived, *(getattr(s, m.name) for m in own))
         away = getattr(s, MEASURED) - state
         # What is not finite must not be remembered.
-        move = ca.if_else(ca.mmin(ca.fabs(away) <= _FINITE), away, 0)
+        move = ca.if_else(is_finite(away), away, 0)
         remembered |= {"mirror_state_next": at + moves.state @ move, **next_deformations}
         if late:
             remembered["mirror_sample_next"] = sample + moves.sample @ move
@@ -105,7 +104,7 @@ class _Deformations:
 def _seen(problem: Problem, names: Sequence[str]) -> ca.Function:
     """Function (state, command that acted, parameters, forcing) -> what the sensors show without noise, rounded as they round."""
     plant = problem.plant
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
     values = dict(zip(plant.state.elements, ca.vertsplit(x), strict=True))
     answered = plant.controlled_response_function(x, u, p) + w[list(plant.controlled_indices)]

@@ -21,7 +21,7 @@ import numpy as np
 
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, linear_stage, stage_symbols
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.symbolic.expression import kind
+from fpirhc.symbolic.expression import is_finite, kind
 
 _SCALAR_CODE = 1000  # multiplications of one stage up to which scalar code beats matrix calls
 PIVOT = 1e-13  # relative size of a pivot below which a matrix does not count as positive definite
@@ -103,7 +103,7 @@ def sweep(
     after, du, after_costates = ahead
     dx = ca.horzcat(ca.MX.zeros(ns), after)
     numbers = ca.vertcat(ca.vec(du), ca.vec(dx), ca.vec(after_costates))
-    fine = ca.logic_and(ca.mmin(ok) > 0, ca.mmin(ca.fabs(numbers) <= 1e300))
+    fine = ca.logic_and(ca.mmin(ok) > 0, is_finite(numbers))
     arguments = [*p, weight, lean, costates, mu, data]
     return ca.Function("fpirhc_sweep", arguments, [v, k, dx, du, after_costates, fine])
 

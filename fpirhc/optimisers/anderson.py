@@ -18,7 +18,7 @@ import casadi as ca
 
 from fpirhc.errors import InvalidValue
 from fpirhc.horizon.riccati import solve_free
-from fpirhc.optimisers.base import FINITE
+from fpirhc.symbolic.expression import is_finite
 
 _RIDGE = 1e-12  # of the normal equations with columns of length one
 _GROWTH = 2.0  # growth of |F| after which the memory is dropped
@@ -75,7 +75,7 @@ def _advance(function: ca.Function, memory: int) -> ca.Function:
     images = ca.if_else(ca.logic_or(first, tripped), 0, recorded_images)
     weights = _least_squares(memory)(ca.mtimes(errors.T, errors), ca.mtimes(errors.T, error))
     wanted = image - ca.mtimes(images, weights)
-    usable = ca.mmin(ca.fabs(wanted) <= FINITE)
+    usable = is_finite(wanted)
     next_x = ca.if_else(tripped, image_before, ca.if_else(ca.logic_and(usable, ca.logic_not(first)), wanted, image))
     last_image, last_error = ca.if_else(tripped, image_before, image), ca.if_else(tripped, error_before, error)
     count = ca.if_else(tripped, 0, known + 1)

@@ -23,10 +23,9 @@ from fpirhc.errors import InvalidValue
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient, rollout
 from fpirhc.status import Status
-from fpirhc.symbolic.expression import Matrix
+from fpirhc.symbolic.expression import FINITE, Matrix, is_finite
 from fpirhc.symbolic.layout import Layout
 
-FINITE = 1e300  # |v| <= FINITE is false for NaN and infinity
 FEASIBLE = 1e-4  # largest violation of a state bound that still counts as kept
 UNKNOWN_ITERATIONS = -1.0  # solver call-outs do not tell their iterations inside a graph
 
@@ -97,11 +96,6 @@ def clip(columns: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
     """Clip every stage's input to its box."""
     stages = columns.shape[1]
     return ca.fmin(ca.fmax(columns, ca.repmat(lower, 1, stages)), ca.repmat(upper, 1, stages))
-
-
-def is_finite(value: Matrix) -> Matrix:
-    """1 when every entry is finite, 0 otherwise (NaN included, which fmax and fmin would hide)."""
-    return ca.mmin(ca.fabs(ca.vec(value)) <= FINITE)
 
 
 def largest(value: ca.MX) -> ca.MX:

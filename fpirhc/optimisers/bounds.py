@@ -22,8 +22,8 @@ import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.sweep import Expansion
-from fpirhc.optimisers.base import FINITE
 from fpirhc.optimisers.scales import Scales
+from fpirhc.symbolic.expression import FINITE
 
 ENOUGH = 0.99  # share of it from which a limit counts as given up
 STIFF = 1e8  # weight of an equality, in units of 1 / gamma

@@ -14,9 +14,10 @@ import casadi as ca
 
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.sweep import Expansion
-from fpirhc.optimisers.base import FINITE, clip, is_finite
+from fpirhc.optimisers.base import clip
 from fpirhc.optimisers.bounds import ENOUGH, Interior, Limited
 from fpirhc.optimisers.scales import Scales
+from fpirhc.symbolic.expression import FINITE, is_finite
 
 
 class Certified(NamedTuple):

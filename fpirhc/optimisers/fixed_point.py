@@ -47,17 +47,7 @@ from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.horizon.hessian_models import GaussNewton, HessianModel, hessian_end, hessian_stage, linear_stage
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import PIVOT, rounds
-from fpirhc.optimisers.base import (
-    FINITE,
-    Optimiser,
-    clip,
-    is_finite,
-    require_settings,
-    sane,
-    shift,
-    stationarity,
-    status_of,
-)
+from fpirhc.optimisers.base import Optimiser, clip, require_settings, sane, shift, stationarity, status_of
 from fpirhc.optimisers.improved import improved
 from fpirhc.optimisers.limited import limited_step, shifted_limited
 from fpirhc.optimisers.limited_memory import limited_memory
@@ -79,6 +69,7 @@ from fpirhc.optimisers.search import (
 )
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, with_driver
+from fpirhc.symbolic.expression import FINITE, is_finite
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 _DIGITS = 1e-15  # relative rounding of a number

@@ -27,9 +27,9 @@ from fpirhc.horizon.auxiliary import auxiliary_gradient, auxiliary_hessian
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.anderson import Anderson, iterated
-from fpirhc.optimisers.base import Optimiser, is_finite, judge, require_settings, sane, shift, status_of
+from fpirhc.optimisers.base import Optimiser, judge, require_settings, sane, shift, status_of
 from fpirhc.status import Status
-from fpirhc.symbolic.expression import expression, graph
+from fpirhc.symbolic.expression import expression, graph, is_finite
 from fpirhc.symbolic.layout import Layout, Signal
 
 _SAFE = 0.95

@@ -25,19 +25,9 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.reference_expansion import steepest_curvature
 from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.anderson import Anderson, iterated
-from fpirhc.optimisers.base import (
-    Optimiser,
-    clip,
-    is_finite,
-    judge,
-    remembered_plan,
-    require_settings,
-    sane,
-    shift,
-    status_of,
-)
+from fpirhc.optimisers.base import Optimiser, clip, judge, remembered_plan, require_settings, sane, shift, status_of
 from fpirhc.status import Status
-from fpirhc.symbolic.expression import expression, graph
+from fpirhc.symbolic.expression import expression, graph, is_finite
 from fpirhc.symbolic.layout import Layout, Signal
 
 _SAFE = 0.95  # share of the largest gain, for the map that is chosen automatically

@@ -14,8 +14,9 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.base import FINITE, Optimiser
+from fpirhc.optimisers.base import Optimiser
 from fpirhc.status import Status
+from fpirhc.symbolic.expression import FINITE
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 _PLAN, _ASKED = "plan_inputs", "plan_second_plans"

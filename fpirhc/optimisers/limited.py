@@ -21,7 +21,7 @@ from fpirhc.horizon.hessian_models import ExactHessian, GaussNewton, hessian_end
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.sweep import PIVOT
 from fpirhc.optimisers import limited_settings as numbers
-from fpirhc.optimisers.base import FEASIBLE, FINITE, shift
+from fpirhc.optimisers.base import FEASIBLE, shift
 from fpirhc.optimisers.bounds import BOUNDARY, ENOUGH, STIFF
 from fpirhc.optimisers.guess import guess
 from fpirhc.optimisers.limited_graph import limited_graph
@@ -31,6 +31,7 @@ from fpirhc.optimisers.scales import Scales, scales
 from fpirhc.optimisers.search import deformed_move
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, with_driver
+from fpirhc.symbolic.expression import FINITE
 
 _TEXTS = ("kernels", "limited_sweep", "limited_bounds", "limited")
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.sweep import Expansion, expand, expansion_shapes
-from fpirhc.optimisers.base import FEASIBLE, FINITE, clip, is_finite, sane, stationarity
+from fpirhc.optimisers.base import FEASIBLE, clip, sane, stationarity
 from fpirhc.optimisers.certified import Certified, certify
 from fpirhc.optimisers.guess import guesses
 from fpirhc.optimisers.limited_memory import limited_memory
@@ -17,6 +17,7 @@ from fpirhc.optimisers.limited_turn.phases import begin_cold
 from fpirhc.optimisers.limited_turn.state import BEGINS, PURE, WARM, State, as_point, choose, constant, fixed, point
 from fpirhc.optimisers.limited_turn.turn import Turn, is_usable
 from fpirhc.status import Status
+from fpirhc.symbolic.expression import FINITE, is_finite
 
 _SCALARS = (
     *("mu", "floor", "delta", "error", "alpha", "alpha_dual", "theta", "phi", "dphi"),

@@ -20,17 +20,7 @@ import casadi as ca
 from fpirhc.errors import InvalidValue, NotSupported, nearest
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
-from fpirhc.optimisers.base import (
-    UNKNOWN_ITERATIONS,
-    Optimiser,
-    clip,
-    is_finite,
-    judge,
-    remembered_plan,
-    sane,
-    shift,
-    status_of,
-)
+from fpirhc.optimisers.base import UNKNOWN_ITERATIONS, Optimiser, clip, judge, remembered_plan, sane, shift, status_of
 from fpirhc.optimisers.shooting import (
     gauss_newton_hessian,
     interleave,
@@ -43,6 +33,7 @@ from fpirhc.optimisers.shooting import (
     stage_bounds,
 )
 from fpirhc.status import Status
+from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Layout, Signal
 
 Setting: TypeAlias = "bool | int | float | str | Sequence[bool] | ca.Function | Mapping[str, Setting]"

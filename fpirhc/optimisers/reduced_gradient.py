@@ -21,18 +21,9 @@ import casadi as ca
 from fpirhc.errors import NotSupported
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient
-from fpirhc.optimisers.base import (
-    Optimiser,
-    clip,
-    is_finite,
-    judge,
-    remembered_plan,
-    require_settings,
-    sane,
-    shift,
-    status_of,
-)
+from fpirhc.optimisers.base import Optimiser, clip, judge, remembered_plan, require_settings, sane, shift, status_of
 from fpirhc.status import Status
+from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 _HISTORY = 5  # values that the non-monotone line search compares with

@@ -14,7 +14,8 @@ from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_sta
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.reference_expansion import steepest_curvature
 from fpirhc.horizon.riccati import backward_sweep
-from fpirhc.optimisers.base import clip, is_finite
+from fpirhc.optimisers.base import clip
+from fpirhc.symbolic.expression import is_finite
 
 SHARE = 0.95  # gamma L, and the share of the guaranteed decrease that is asked for
 ARMIJO = 1e-2  # share of the first-order decrease that is asked of a short step

@@ -5,7 +5,6 @@ from __future__ import annotations
 import casadi as ca
 
 from fpirhc.horizon.sweep import Expansion
-from fpirhc.optimisers.base import FINITE
 from fpirhc.optimisers.bounds import Interior
 from fpirhc.optimisers.certified import barrier_error
 from fpirhc.optimisers.limited_settings import MOST_RAISES, MU_MOST, MU_ROUNDS, MU_WARM, NEAR
@@ -14,6 +13,7 @@ from fpirhc.optimisers.limited_turn.filter import passes_filter
 from fpirhc.optimisers.limited_turn.merit import merit, trial
 from fpirhc.optimisers.limited_turn.phases import enter_pure, restart
 from fpirhc.optimisers.limited_turn.state import BEGINS, ENDS, State, as_last, as_point, choose, fixed, point
+from fpirhc.symbolic.expression import FINITE
 
 
 def judge_interior(call: Call, s: State, p: Expansion, usable: ca.MX) -> State:

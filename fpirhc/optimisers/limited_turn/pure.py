@@ -5,11 +5,11 @@ from __future__ import annotations
 import casadi as ca
 
 from fpirhc.horizon.sweep import Expansion
-from fpirhc.optimisers.base import FINITE
 from fpirhc.optimisers.limited_settings import HOPELESS, PATIENCE, PURE_STEPS
 from fpirhc.optimisers.limited_turn.call import Call
 from fpirhc.optimisers.limited_turn.phases import enter_interior
 from fpirhc.optimisers.limited_turn.state import BEGINS, State, as_best, as_last, as_point, choose, fixed
+from fpirhc.symbolic.expression import FINITE
 
 
 def judge_pure(call: Call, s: State, p: Expansion, usable: ca.MX) -> State:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import casadi as ca
 
 from fpirhc.horizon.sweep import Expansion, expand
-from fpirhc.optimisers.base import is_finite
 from fpirhc.optimisers.certified import Certified
 from fpirhc.optimisers.limited_settings import NEAR, ROLLED, SEVERAL
 from fpirhc.optimisers.limited_turn.call import Call
@@ -24,6 +23,7 @@ from fpirhc.optimisers.limited_turn.phases import enter_interior, enter_pure, re
 from fpirhc.optimisers.limited_turn.pure import judge_pure
 from fpirhc.optimisers.limited_turn.state import BEGINS, COLD, PURE, State, as_point, choose, fixed, point
 from fpirhc.optimisers.search import deformed_move
+from fpirhc.symbolic.expression import is_finite
 
 
 class Turn:
