@@ -26,7 +26,7 @@ import fpirhc as fp
 from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.base import Optimiser, judge
-from fpirhc.optimisers.nlp import _MultipleShooting
+from fpirhc.optimisers.multiple_shooting import MultipleShooting
 from fpirhc.optimisers.shooting import interleave, program, separate, shift_dynamics, shift_variables, sizes
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import native
@@ -107,7 +107,7 @@ def follow(optimiser: Optimiser, ocp: OptimalControl, function: ca.Function) -> 
     return solve
 
 
-def rival(optimiser: _MultipleShooting, ocp: OptimalControl, options: dict[str, object]) -> Callable:
+def rival(optimiser: MultipleShooting, ocp: OptimalControl, options: dict[str, object]) -> Callable:
     """The same around CasADi's solver alone, warm-started with its shifted variables and multipliers."""
     made = ca.nlpsol("fpirhc_rival", optimiser.plugin, program(ocp), {**optimiser.options(ocp), **options})
     solver = Evaluator(made)

@@ -20,6 +20,9 @@ import numpy as np
 import optimisers
 
 import fpirhc as fp
+from fpirhc.horizon.hessian_models import GaussNewton
+from fpirhc.optimisers.plain import plain_driver
+from fpirhc.optimisers.plain_settings import PlainSettings
 from fpirhc.symbolic.native import find_compiler
 
 CALLS = 2000
@@ -36,7 +39,8 @@ def cycles(name: str, across: bool) -> tuple[float, float]:
     p = optimisers.problem_of(name)
     recorded = optimisers.recorded(p)
     optimiser = fp.FixedPoint(iterations=1, tolerance=recorded.tolerance)
-    source = optimiser._driver(recorded.ocp, iterations=1, stop_early=0).source()
+    settings = PlainSettings(optimiser.tolerance, optimiser.map, GaussNewton(), optimiser.damping, 1, converging=False)
+    source = plain_driver(recorded.ocp, settings).source()
     assert source.count(_CALL) == 1
     source = source.replace(_CALL, f"TIMED(count, {_CALL})")
     source = source.replace(', "no-ipa-ra"', "") if across else source
