@@ -9,20 +9,11 @@ import casadi as ca
 from fpirhc.horizon.hessian_models import hessian_end, hessian_stage, linear_stage
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import PIVOT, rounds
+from fpirhc.optimisers.anchor import ARMIJO, DRAWN_IN, ROUNDING, SHARE, SHORTER, SHORTEST, UNTRIED
 from fpirhc.optimisers.base import shift
 from fpirhc.optimisers.plain_graph import plain_graph
 from fpirhc.optimisers.plain_settings import MOST_PLAIN, PlainSettings, plain_memory
-from fpirhc.optimisers.search import (
-    ARMIJO,
-    DRAWN_IN,
-    ROUNDING,
-    SHARE,
-    SHORTER,
-    SHORTEST,
-    UNTRIED,
-    deformed_move,
-    first_gamma,
-)
+from fpirhc.optimisers.search import deformed_move, first_gamma
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, with_driver
 from fpirhc.symbolic.expression import FINITE

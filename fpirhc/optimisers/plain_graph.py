@@ -5,9 +5,10 @@ from __future__ import annotations
 import casadi as ca
 
 from fpirhc.horizon.problem import OptimalControl
+from fpirhc.optimisers.anchor import SHORTEST, UNTRIED, Anchor, Arguments
 from fpirhc.optimisers.base import clip, sane, stationarity, status_of
 from fpirhc.optimisers.plain_settings import MOST_PLAIN, PlainSettings, plain_memory
-from fpirhc.optimisers.search import SHORTEST, UNTRIED, Anchor, Arguments, Search, first_gamma
+from fpirhc.optimisers.search import Search, first_gamma
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import is_finite
 
