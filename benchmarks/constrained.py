@@ -95,8 +95,8 @@ def _noise_unit(case: Foreign) -> np.ndarray:
 def cold_set(case: Foreign, ocp: OptimalControl, count: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """Random first states at t = 0."""
     data = stage_data(case.plant, case.reference, case.horizon, case.cost)(0.0, case.plant.approximate)
-    given = np.asarray(data.full())
-    return [(case.first(ocp, x), given) for x in first_states(case, count, 1).T]
+    values = np.asarray(data.full())
+    return [(case.first(ocp, x), values) for x in first_states(case, count, 1).T]
 
 
 def answered(
@@ -105,9 +105,9 @@ def answered(
     """Let one optimiser solve a set."""
     judge, rows = Judge(ocp), []
     for s0, data in horizons:
-        inputs, seconds, told = solve(s0, data, cold=cold)
+        inputs, seconds, diagnostics = solve(s0, data, cold=cold)
         inputs = np.clip(inputs, ocp.input_lower[:, None], ocp.input_upper[:, None])
-        rows.append((judge(inputs, s0, data), seconds, told[3], told[4] == 0))
+        rows.append((judge(inputs, s0, data), seconds, diagnostics[3], diagnostics[4] == 0))
     judged, seconds, iterations, claimed = zip(*rows, strict=True)
     return Answers(list(judged), np.array(seconds), np.array(iterations), np.array(claimed))
 
@@ -132,11 +132,11 @@ def rows_of(name: str, count: int) -> list[tuple[str, ...]]:
     title = f"{name} (N = {ocp.stages}, {ocp.state.size} states)"
     for cold in (False, True):
         horizons = (cold_set if cold else warm_set)(case, ocp, count)
-        told = {way: answered(ocp, build(), horizons, cold=cold) for way, build in ways(ocp).items()}
-        costs = np.array([np.where(a.solved, a.costs, np.inf) for a in told.values()])
+        answers_by_way = {way: answered(ocp, build(), horizons, cold=cold) for way, build in ways(ocp).items()}
+        costs = np.array([np.where(a.solved, a.costs, np.inf) for a in answers_by_way.values()])
         best = costs.min(axis=0)
         counted = np.isfinite(best)
-        for way, answers in told.items():
+        for way, answers in answers_by_way.items():
             rows.append((title, "cold" if cold else "warm", way, *_row(answers, best, counted)))
             print(" | ".join(rows[-1]), flush=True)
     return rows

@@ -182,12 +182,12 @@ def error(problem: Problem, run: Run, without: Run) -> float:
 def measured(one: Task, judge: Callable[[Problem, Run, Run], float]) -> list[float]:
     """Numbers of all forms and gains; NaN where there is no run."""
     without = one.runs(fp.Identity())
-    found = []
+    rows = []
     for form in FORMS.values():
         for gain in GAINS:
             run = one.runs(form(one.problem, one.map(gain))) if without is not None else None
-            found.append(judge(one.problem, run, without) if run is not None and without is not None else float("nan"))
-    return found
+            rows.append(judge(one.problem, run, without) if run is not None and without is not None else float("nan"))
+    return rows
 
 
 def shown(name: str, values: list[float], *, mark: bool) -> list[str]:

@@ -47,9 +47,9 @@ def compiled(function: ca.Function) -> tuple[Evaluator, float, float]:
     """The compiled Function, kilobytes of C, and the seconds that compiling took."""
     size = sum(map(len, generate(function))) / 1e3
     begin = time.perf_counter()
-    found = native(function)
-    assert found.compiled, found.reason
-    return Evaluator(found.function), size, time.perf_counter() - begin
+    library = native(function)
+    assert library.compiled, library.reason
+    return Evaluator(library.function), size, time.perf_counter() - begin
 
 
 def iteration(p: fp.Problem) -> tuple[str, ...]:

@@ -46,15 +46,15 @@ class Judge:
         states, value, _ = rollout(ocp)(s0, inputs, data)
         limited = ca.vec(states[list(self._scales.bounded), 1:])
         flat = ca.vec(inputs)
-        moved = ca.jacobian(limited, flat)
-        results = [value, ca.vec(states[:, 1:]), ca.gradient(value, flat), ca.densify(moved)]
+        sensitivity = ca.jacobian(limited, flat)
+        results = [value, ca.vec(states[:, 1:]), ca.gradient(value, flat), ca.densify(sensitivity)]
         self._values = ca.Function("values", [s0, inputs, data], results)
 
     def __call__(self, inputs: np.ndarray, s0: np.ndarray, data: np.ndarray) -> Judgement:
         """Return what is known about a plan (nu, N)."""
         ocp, measures = self._ocp, self._scales
-        value, states, slope, moved = (np.asarray(v.full()) for v in self._values(s0, inputs, data))
-        if not (np.isfinite(states).all() and np.isfinite(slope).all() and np.isfinite(moved).all()):
+        value, states, slope, sensitivity = (np.asarray(v.full()) for v in self._values(s0, inputs, data))
+        if not (np.isfinite(states).all() and np.isfinite(slope).all() and np.isfinite(sensitivity).all()):
             return Judgement(np.inf, np.inf, np.inf, np.inf)
         places, n = list(measures.bounded), ocp.stages
         rows = states.reshape(n, -1)[:, places].ravel()
@@ -63,7 +63,7 @@ class Judge:
         lower = np.concatenate([np.tile(ocp.input_lower, n), np.tile(ocp.state_lower[places], n)])
         upper = np.concatenate([np.tile(ocp.input_upper, n), np.tile(ocp.state_upper[places], n)])
         violation = max(np.max((lower - values) / unit, initial=0.0), np.max((values - upper) / unit, initial=0.0))
-        jacobian = np.vstack([np.eye(inputs.size), moved])
+        jacobian = np.vstack([np.eye(inputs.size), sensitivity])
         weight = np.tile(measures.inputs / measures.cost, n)[:, None]
         residuals = []
         for met in (_MET, _ROUGH):

@@ -26,7 +26,7 @@ import fpirhc as fp
 from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.base import Optimiser, judge
-from fpirhc.optimisers.nlp import _MultipleShooting
+from fpirhc.optimisers.multiple_shooting import MultipleShooting
 from fpirhc.optimisers.shooting import interleave, program, separate, shift_dynamics, shift_variables, sizes
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import native
@@ -77,11 +77,11 @@ def recorded(p: fp.Problem) -> Horizons:
     state, first, data = p.start_state, [], []
     before = np.zeros(ocp.input.size)
     for k in range(PLANS):
-        given = np.asarray(data_of(k * p.horizon.step, p.plant.approximate).full())
+        values = np.asarray(data_of(k * p.horizon.step, p.plant.approximate).full())
         s0 = ocp.start(state, before).full().ravel()
         first.append(s0)
-        data.append(given)
-        before = solve(s0, given)[0][:, 0]
+        data.append(values)
+        before = solve(s0, values)[0][:, 0]
         state = advance(state, before, p.plant.exact, np.zeros(len(p.plant.names))).full().ravel()
     return Horizons(ocp, first, data, tolerance)
 
@@ -107,7 +107,7 @@ def follow(optimiser: Optimiser, ocp: OptimalControl, function: ca.Function) -> 
     return solve
 
 
-def rival(optimiser: _MultipleShooting, ocp: OptimalControl, options: dict[str, object]) -> Callable:
+def rival(optimiser: MultipleShooting, ocp: OptimalControl, options: dict[str, object]) -> Callable:
     """The same around CasADi's solver alone, warm-started with its shifted variables and multipliers."""
     made = ca.nlpsol("fpirhc_rival", optimiser.plugin, program(ocp), {**optimiser.options(ocp), **options})
     solver = Evaluator(made)
@@ -129,7 +129,7 @@ def rival(optimiser: _MultipleShooting, ocp: OptimalControl, options: dict[str, 
             memory.update(w=None, lam_x=np.zeros(variables), lam_g=np.zeros(constraints))
         guess = np.zeros((ocp.input.size, n)) if memory["w"] is None else separated(memory["w"])[1].full()
         states = predict(s0, guess, data)[0]
-        given = {
+        arguments = {
             "x0": interleave(
                 states if np.isfinite(states.full()).all() else ca.repmat(ca.DM(s0), 1, n + 1), ca.DM(guess)
             ),
@@ -139,7 +139,7 @@ def rival(optimiser: _MultipleShooting, ocp: OptimalControl, options: dict[str, 
             "lam_x0": memory["lam_x"],
             "lam_g0": memory["lam_g"],
         }
-        for name, value in given.items():
+        for name, value in arguments.items():
             solver.arguments[place[name]][...] = np.asarray(ca.DM(value).full()).ravel()
         begin = time.perf_counter_ns()
         try:
@@ -148,10 +148,10 @@ def rival(optimiser: _MultipleShooting, ocp: OptimalControl, options: dict[str, 
             memory.update(w=None, lam_x=np.zeros(variables), lam_g=np.zeros(constraints))
             return np.asarray(guess, dtype=float), (time.perf_counter_ns() - begin) / 1e9, np.full(5, np.nan)
         taken = time.perf_counter_ns() - begin
-        found = {name: solver.results[result[name]].copy() for name in ("x", "lam_x", "lam_g")}
-        state["inputs"] = separated(found["x"])[1].full()
-        memory["w"], memory["lam_g"] = (v.full().ravel() for v in later(found["x"], found["lam_g"]))
-        memory["lam_x"] = later(found["lam_x"], found["lam_g"])[0].full().ravel()
+        solution = {name: solver.results[result[name]].copy() for name in ("x", "lam_x", "lam_g")}
+        state["inputs"] = separated(solution["x"])[1].full()
+        memory["w"], memory["lam_g"] = (v.full().ravel() for v in later(solution["x"], solution["lam_g"]))
+        memory["lam_x"] = later(solution["lam_x"], solution["lam_g"])[0].full().ravel()
         return state["inputs"], taken / 1e9, np.full(5, np.nan)
 
     return solve
@@ -164,9 +164,9 @@ def measured(horizons: Horizons, solve: Callable) -> tuple[np.ndarray, np.ndarra
     none = np.zeros((ocp.state.size, ocp.stages))
     seconds, residuals, iterations = [], [], []
     for s0, data in zip(horizons.first, horizons.data, strict=True):
-        inputs, taken, told = solve(s0, data)
+        inputs, taken, diagnostics = solve(s0, data)
         seconds.append(taken)
-        iterations.append(told[3])
+        iterations.append(diagnostics[3])
         residuals.append(float(verify(inputs, s0, data, ocp.input_lower, ocp.input_upper, none)[1]))
     return np.array(seconds), np.array(residuals), np.array(iterations)
 
@@ -196,7 +196,9 @@ def rows_of(name: str) -> list[tuple[str, ...]]:
         seconds, residuals, iterations = measured(horizons, build())
         middle = float(np.median(seconds[1:]))
         base = base or middle
-        told = f"{np.median(iterations):.0f} / {iterations.max():.0f}" if np.isfinite(iterations).all() else ""
+        iterations_text = (
+            f"{np.median(iterations):.0f} / {iterations.max():.0f}" if np.isfinite(iterations).all() else ""
+        )
         rows.append(
             (
                 title,
@@ -204,7 +206,7 @@ def rows_of(name: str) -> list[tuple[str, ...]]:
                 f"{1e6 * middle:.3g}",
                 f"{1e6 * np.quantile(seconds[1:], 0.99):.3g}",
                 f"{middle / base:.3g}",
-                told,
+                iterations_text,
                 f"{np.median(residuals) / horizons.tolerance * 1e-6:.1e}",
                 f"{(residuals > horizons.tolerance).sum()}",
             )

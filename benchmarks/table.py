@@ -17,8 +17,8 @@ def write_table(name: str, heads: Sequence[str], rows: Sequence[Sequence[str]], 
     """Print the table; with --write, replace the part of the page between the marks of this name."""
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     lines += ["| " + " | ".join(row) + " |" for row in rows]
-    found = versions()
-    lines += ["", f"{_processor()}; " + ", ".join(f"{k} {v}" for k, v in found.items()) + "."]
+    versions_by_name = versions()
+    lines += ["", f"{_processor()}; " + ", ".join(f"{k} {v}" for k, v in versions_by_name.items()) + "."]
     text = "\n".join(lines)
     print(text)
     if "--write" in sys.argv:

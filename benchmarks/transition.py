@@ -20,6 +20,9 @@ import numpy as np
 import optimisers
 
 import fpirhc as fp
+from fpirhc.horizon.hessian_models import GaussNewton
+from fpirhc.optimisers.plain import plain_driver
+from fpirhc.optimisers.plain_settings import PlainSettings
 from fpirhc.symbolic.native import find_compiler
 
 CALLS = 2000
@@ -36,7 +39,8 @@ def cycles(name: str, across: bool) -> tuple[float, float]:
     p = optimisers.problem_of(name)
     recorded = optimisers.recorded(p)
     optimiser = fp.FixedPoint(iterations=1, tolerance=recorded.tolerance)
-    source = optimiser._driver(recorded.ocp, iterations=1, stop_early=0).source()
+    settings = PlainSettings(optimiser.tolerance, optimiser.map, GaussNewton(), optimiser.damping, 1, converging=False)
+    source = plain_driver(recorded.ocp, settings).source()
     assert source.count(_CALL) == 1
     source = source.replace(_CALL, f"TIMED(count, {_CALL})")
     source = source.replace(', "no-ipa-ra"', "") if across else source
@@ -50,19 +54,19 @@ def cycles(name: str, across: bool) -> tuple[float, float]:
 
 def _measured(library: ctypes.CDLL, optimiser: fp.FixedPoint, recorded: optimisers.Horizons) -> tuple[float, float]:
     ocp, size = recorded.ocp, optimiser.memory(recorded.ocp).size
-    given = (recorded.first[0], recorded.data[0].T.copy(), ocp.input_lower, ocp.input_upper, np.zeros(size))
+    values = (recorded.first[0], recorded.data[0].T.copy(), ocp.input_lower, ocp.input_upper, np.zeros(size))
     results = (np.zeros(ocp.input.size * ocp.stages), np.zeros(5), np.zeros(size))
     pointer = ctypes.POINTER(ctypes.c_double)
     arguments, places = (
         (pointer * len(arrays))(*(np.ascontiguousarray(a, dtype=float).ctypes.data_as(pointer) for a in arrays))
-        for arrays in (given, results)
+        for arrays in (values, results)
     )
-    pair, told = (ctypes.c_double(), ctypes.c_double()), []
+    pair, times = (ctypes.c_double(), ctypes.c_double()), []
     for _ in range(CALLS):
         library.entry(arguments, places, None, None, 0)
         library.cycles(*(ctypes.byref(v) for v in pair))
-        told.append([v.value for v in pair])
-    first, second = np.median(told, axis=0)
+        times.append([v.value for v in pair])
+    first, second = np.median(times, axis=0)
     return float(first), float(second)
 
 

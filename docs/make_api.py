@@ -38,15 +38,15 @@ WITH_MEMBERS = {
 
 def by_section() -> dict[str, list[str]]:
     """Public names by section; a module that no section names is an error, so that no name is left out silently."""
-    found: dict[str, list[str]] = {title: [] for title in SECTIONS}
+    sections: dict[str, list[str]] = {title: [] for title in SECTIONS}
     homes = {module: title for title, modules in SECTIONS.items() for module in modules}
     text = re.sub(r"\(\s*([^)]*?),?\s*\)", lambda m: " ".join(m.group(1).split()), STUB.read_text(encoding="utf-8"))
     for module, names in re.findall(r"^from \.(\w+)[\w.]* import (.+)$", text, re.MULTILINE):
-        found[homes[module]] += [name.strip() for name in names.split(",") if name.strip()]
+        sections[homes[module]] += [name.strip() for name in names.split(",") if name.strip()]
     for family, kind in FAMILIES.items():
-        section = found[homes[kind.packages[0].split(".")[1]]]
+        section = sections[homes[kind.packages[0].split(".")[1]]]
         section += [c.__name__ for c in member_classes(family) if c.__name__ not in section]
-    return found
+    return sections
 
 
 def page() -> str:

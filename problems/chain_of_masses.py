@@ -49,10 +49,12 @@ def accelerations(free, end, p):
 def response_of(masses):
     def response(q, v, u, p):
         free = [ca.vertcat(*(q[f"{axis}{k}"] for axis in "xyz")) for k in range(1, masses - 1)]
-        moved, pull = accelerations(free, ca.vertcat(q.xe, q.ye, q.ze), p)
-        given = {f"{axis}{k}": moved[k - 1][i] for k in range(1, masses - 1) for i, axis in enumerate("xyz")}
+        free_accelerations, pull = accelerations(free, ca.vertcat(q.xe, q.ye, q.ze), p)
+        named = {
+            f"{axis}{k}": free_accelerations[k - 1][i] for k in range(1, masses - 1) for i, axis in enumerate("xyz")
+        }
         drift = p.droop * pull
-        return {**given, "xe": u.ux + drift[0], "ye": u.uy + drift[1], "ze": u.uz + drift[2]}
+        return {**named, "xe": u.ux + drift[0], "ye": u.uy + drift[1], "ze": u.uz + drift[2]}
 
     return response
 
@@ -85,10 +87,10 @@ def rest(plant):
     slope = ca.Function("slope", [free], [ca.jacobian(force, free)])
     fraction = np.arange(1, size // 3)[:, None] / (size // 3)
     guess = fraction * np.array(END) + 4 * fraction * (1 - fraction) * [0, 0, -0.3]
-    found = root(lambda w: value(w).full().ravel(), guess.ravel(), jac=lambda w: slope(w).full())
-    if not found.success:
-        raise RuntimeError(f"no rest position found: {found.message}")
-    return np.concatenate([found.x, END, np.zeros(size - 3)])
+    equilibrium = root(lambda w: value(w).full().ravel(), guess.ravel(), jac=lambda w: slope(w).full())
+    if not equilibrium.success:
+        raise RuntimeError(f"no rest position found: {equilibrium.message}")
+    return np.concatenate([equilibrium.x, END, np.zeros(size - 3)])
 
 
 def chain(masses, droop=0.2):

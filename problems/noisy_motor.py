@@ -36,11 +36,11 @@ PERIOD = 1e-2  # s
 
 
 def response(w, a, u, p):
-    bend = ca.tanh(w.speed / p.soft)
+    direction = ca.tanh(w.speed / p.soft)
     inertia = p.drag * p.mechanical
-    torque = inertia * a.speed + p.drag * w.speed + p.coulomb * bend
+    torque = inertia * a.speed + p.drag * w.speed + p.coulomb * direction
     lagged = (p.stall * u.voltage - torque) / p.electrical
-    return {"speed": (lagged - (p.drag + p.coulomb * (1 - bend**2) / p.soft) * a.speed) / inertia}
+    return {"speed": (lagged - (p.drag + p.coulomb * (1 - direction**2) / p.soft) * a.speed) / inertia}
 
 
 def finger(t):

@@ -80,13 +80,13 @@ def torques(q, v, a, p):
             push, couple = push + held, couple + ca.cross(arms[k] + ca.DM(GRIP), held)
         pushes.append(push)
         couples.append(couple)
-    force, moment, found = ca.SX.zeros(3), ca.SX.zeros(3), [None] * 6
+    force, moment, joint_torques = ca.SX.zeros(3), ca.SX.zeros(3), [None] * 6
     for k in reversed(range(6)):
         moment = moment + couples[k] + ca.cross(arms[k], force)
         force = force + pushes[k]
-        found[k] = ca.dot(moment, turns[k].T @ axis) + GEARS[k] ** 2 * ROTORS[k] * a[k]
+        joint_torques[k] = ca.dot(moment, turns[k].T @ axis) + GEARS[k] ** 2 * ROTORS[k] * a[k]
         moment, force = turns[k] @ moment, turns[k] @ force
-    return ca.vertcat(*found)
+    return ca.vertcat(*joint_torques)
 
 
 def swept(spin, twirl, arm):
@@ -103,8 +103,8 @@ def response(q, v, u, p):
     torque = torques(q.vector, v.vector, a, p)
     mass = ca.jacobian(torque, a)
     free = ca.substitute(torque, a, ca.SX.zeros(6)) + friction(v.vector, p)
-    found = ca.solve(ca.substitute(mass, a, ca.SX.zeros(6)), u.vector - free)
-    return {f"q{k + 1}": found[k] for k in range(6)}
+    accelerations = ca.solve(ca.substitute(mass, a, ca.SX.zeros(6)), u.vector - free)
+    return {f"q{k + 1}": accelerations[k] for k in range(6)}
 
 
 def inverse(q, v, r, p):
@@ -113,12 +113,12 @@ def inverse(q, v, r, p):
 
 
 def joint_parameters():
-    found = {}
+    parameters = {}
     for k in range(6):
         viscous, level = VISCOUS[k] * GEARS[k] ** 2, COULOMB[k] * abs(GEARS[k])
-        found[f"b{k + 1}"] = fp.Parameter(approximate=0.5 * viscous, exact=viscous, unit="N m s")
-        found[f"c{k + 1}"] = fp.Parameter(approximate=0.0, exact=level, unit="N m")
-    return found
+        parameters[f"b{k + 1}"] = fp.Parameter(approximate=0.5 * viscous, exact=viscous, unit="N m s")
+        parameters[f"c{k + 1}"] = fp.Parameter(approximate=0.0, exact=level, unit="N m")
+    return parameters
 
 
 plant = fp.Plant(

@@ -65,8 +65,8 @@ def forces(q, v, p):
 
 
 def response(q, v, u, p):
-    found = ca.solve(mass(q.vector, p), u.vector - forces(q.vector, v.vector, p))
-    return {"q1": found[0], "q2": found[1], "q3": found[2]}
+    accelerations = ca.solve(mass(q.vector, p), u.vector - forces(q.vector, v.vector, p))
+    return {"q1": accelerations[0], "q2": accelerations[1], "q3": accelerations[2]}
 
 
 def inverse(q, v, r, p):

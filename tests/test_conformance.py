@@ -172,8 +172,12 @@ def test_a_decay_that_is_not_the_promised_one_is_caught():
 # Optimisers
 
 
-OPTIMISERS = examples("optimisers")
 SETTLED = fp.FixedPoint(iterations=20, tolerance=FINE)
+SERVES_NO_STATE_LIMITS = fp.ReducedGradient(iterations=200, tolerance=FINE)
+OPTIMISERS = (
+    *examples("optimisers", SETTLED),
+    *(o for o in examples("optimisers", SERVES_NO_STATE_LIMITS) if o not in examples("optimisers")),
+)
 SINGLE = fp.FixedPoint(iterations=1, tolerance=FINE)
 
 

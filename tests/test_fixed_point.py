@@ -19,6 +19,7 @@ from fpirhc.horizon.problem import stage_data, transcribe
 from fpirhc.horizon.riccati import box_policy
 from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.base import judge
+from fpirhc.optimisers.plain_graph import call_symbols, first_anchor
 from fpirhc.optimisers.search import Search
 from fpirhc.symbolic.driver import substitute
 from fpirhc.symbolic.native import find_compiler, generate, native
@@ -192,13 +193,13 @@ def test_the_envelope_never_rises():
     ocp, data = pendulum_problem(SWING, fp.Limits(inputs={"torque": (-2.0, 2.0)}), fp.Horizon(stages=30, step=0.1))
     optimiser = fp.FixedPoint(iterations=1, tolerance=1e-9)
     search = Search(ocp, GaussNewton(), optimiser.map, 0.0)
-    given, memory = optimiser._arguments(ocp)
-    start = optimiser._begin(ocp, given, memory)
-    begin = ca.Function("begin", [*given, memory], list(start))
+    symbols, memory = call_symbols(ocp)
+    start = first_anchor(ocp, symbols, memory)
+    begin = ca.Function("begin", [*symbols, memory], list(start))
     anchor = [ca.MX.sym(f"a{k}", *v.shape) for k, v in enumerate(start)]
-    tried, plan = search.tried(type(start)(*anchor), given)
-    following = search.directed(tried, plan, given)
-    advance = ca.Function("advance", [*given, *anchor], [*following, plan.accepted])
+    tried, plan = search.tried(type(start)(*anchor), symbols)
+    next_anchor = search.directed(tried, plan, symbols)
+    advance = ca.Function("advance", [*symbols, *anchor], [*next_anchor, plan.accepted])
     arguments = np.array([0.1, 0.0]), data, np.array([-2.0]), np.array([2.0])
     state: list[ca.DM] = list(begin(*arguments, optimiser.memory(ocp).start()))
     costs = []

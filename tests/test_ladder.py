@@ -102,5 +102,5 @@ def test_a_run_counts_the_plans_of_the_second():
 
 @pytest.mark.parametrize("second", [fp.SequentialQuadratic(tolerance=1e-5)])
 def test_a_ladder_is_an_optimiser(second):
-    """All laws of optimisers."""
+    """All laws of optimisers with two different ones; the conformance tests try it around one."""
     check_optimiser(fp.Ladder(replace(FIXED, tolerance=1e-5), second), tolerance=1e-5, seed=0)

@@ -18,9 +18,11 @@ import fpirhc as fp
 from fpirhc.errors import NotSupported
 from fpirhc.horizon.problem import OptimalControl, transcribe
 from fpirhc.horizon.rollout import rollout
-from fpirhc.optimisers.base import is_finite, status_of
-from fpirhc.optimisers.nlp import Ipopt, Osqp, SequentialQuadratic, quadratic_solver
+from fpirhc.optimisers.base import status_of
+from fpirhc.optimisers.nlp import Ipopt, SequentialQuadratic
+from fpirhc.optimisers.quadratic_solvers import Osqp, quadratic_solver
 from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.functions import SMOOTHING, signed_power
 
 PLANT = fp.Plant(

@@ -19,7 +19,7 @@ from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.horizon.problem import stage_data, transcribe
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.base import judge
-from fpirhc.optimisers.nlp import quadratic_solver
+from fpirhc.optimisers.quadratic_solvers import quadratic_solver
 from fpirhc.symbolic.native import generate, native
 
 TASK: Any = fp.load_problem("two_mass")

@@ -68,12 +68,12 @@ try:
     rms(noisy, controllers["CTC+FPI"])
 except fp.FpirhcError as reason:
     print(reason)
-told = fp.ComputedTorque(
+leaky = fp.ComputedTorque(
     fp.Exponential(rate=3.0),
     fp.Increment(
         fp.RFPT(offset=1e6, sign=-1.0, gain=5e-8), cycles=noisy.response_delay
     ),
 )
 print(
-    f"CTC {rms(noisy, controllers['CTC']):.0f} mm, with FPI {rms(noisy, told):.0f} mm"
+    f"CTC {rms(noisy, controllers['CTC']):.0f} mm, with FPI {rms(noisy, leaky):.0f} mm"
 )

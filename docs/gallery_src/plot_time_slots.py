@@ -17,10 +17,10 @@ import fpirhc as fp
 
 task = fp.load_problem("crane_slots")
 controller = task.controllers["slots+FPI"]
-found = fp.floquet_radius(
+floquet = fp.floquet_radius(
     task.problem, controller.slots, controller.schedule, blend=controller.blend
 )
-print(f"Floquet radius {found.radius:.4f} per period of {found.period:g} s")
+print(f"Floquet radius {floquet.radius:.4f} per period of {floquet.period:g} s")
 
 # %%
 # The run. Grey: the slots of the cart.

@@ -12,10 +12,10 @@ import matplotlib.pyplot as plt
 import fpirhc as fp
 
 
-def results(name, chosen):
+def results(name, names):
     """Runs by controller; prints the rms error of ln(volume) from 60 days on."""
     task = fp.load_problem(name)
-    runs = {c: fp.simulate(task.problem, task.controllers[c], seed=0) for c in chosen}
+    runs = {c: fp.simulate(task.problem, task.controllers[c], seed=0) for c in names}
     for controller, run in runs.items():
         error = fp.measure(task.problem, run).rms_error["size"]
         print(f"{name:12s} {controller:16s} {error:.2g}")
@@ -48,4 +48,4 @@ for answer in fp.review(task.problem, gentle, mismatch=0.0, seed=0).controllers[
     "gentle"
 ]:
     if answer.verdict.value == "no":
-        print(answer.question, answer.found)
+        print(answer.question, answer.evidence)

@@ -11,10 +11,10 @@ import matplotlib.pyplot as plt
 import fpirhc as fp
 
 
-def results(name, chosen):
+def results(name, names):
     """Runs by controller; prints the rms error of the thrust from 20 s on."""
     task = fp.load_problem(name)
-    runs = {c: fp.simulate(task.problem, task.controllers[c], seed=0) for c in chosen}
+    runs = {c: fp.simulate(task.problem, task.controllers[c], seed=0) for c in names}
     for controller, run in runs.items():
         error = fp.measure(task.problem, run).rms_error["T"]
         print(f"{name:14s} {controller:16s} {error:.2g} N")

@@ -94,7 +94,7 @@ def both_parameter_sets_enter(trial: _Trial, generator: np.random.Generator) -> 
     size = len(plant.parameters)
     for which, values in trial.parameters.items():
         hold(values.shape == (size,), f"the {which} parameters have shape {values.shape}, expected ({size},)")
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     pattern = ca.DM(ca.jacobian_sparsity(plant.response_function(x, u, p), p), 1)
     entering = np.asarray(pattern.full()).sum(axis=0) > 0
     for k, name in enumerate(plant.parameters):
@@ -133,7 +133,7 @@ def derivative_is_the_chain(trial: _Trial, generator: np.random.Generator) -> No
 def slopes_are_true(trial: _Trial, generator: np.random.Generator) -> None:
     """The derivatives of the response agree with central differences, so that an optimiser can use them."""
     plant = trial.plant
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     z = ca.vertcat(x, u)
     slope = ca.Function("slope", [z, p], [ca.densify(ca.jacobian(plant.response_function(x, u, p), z))])
     split = plant.state.size

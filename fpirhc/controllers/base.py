@@ -21,11 +21,11 @@ from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.mirror import measured_state, mirror_blocks, with_measured_state
-from fpirhc.deformation.base import Deformation, is_finite
+from fpirhc.deformation.base import Deformation
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
-from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.task.problem import Problem
 
@@ -216,7 +216,7 @@ def _meaning(plant: Plant) -> ca.Function:
     For a response affine in the inputs this is request + B (command - unclipped command): exactly the request where nothing was
     clipped, without a second evaluation of the model.
     """
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     unclipped, r = ca.SX.sym("unclipped", u.numel()), ca.SX.sym("r", len(plant.controlled_names))
     response = plant.controlled_response_function(x, u, p)
     shifted = r + ca.mtimes(ca.jacobian(response, u), u - unclipped)

@@ -45,7 +45,7 @@ def plan_demand(problem: Problem) -> Demand:
             f"the scale of the deformation cannot be chosen: input '{free[0]}' has no finite limits, so the desired response "
             "may jump by any amount; give the deformation its scale (Sigmoid(scale=...)), or Limits(inputs=...)"
         )
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     gain = ca.Function("g", [x, u, p], [ca.jacobian(plant.controlled_response_function(x, u, p), u)])
     at_start = np.asarray(gain(problem.start_state, (lower + upper) / 2, plant.approximate).full())
     return Demand(float(np.linalg.norm(np.abs(at_start) @ (upper - lower))), sudden=True)

@@ -49,7 +49,7 @@ def with_measured_state(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
 def _instant_block(path: Path) -> Block:
     """Block (measured state, last command, parameters) -> the model's response at this instant."""
     plant = path.problem.plant
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     response = ca.Function("fpirhc_modelled", [x, u, p], [plant.controlled_response_function(x, u, p)])
 
     def step(s: Signals) -> dict[str, Expression]:

@@ -21,12 +21,11 @@ from fpirhc.controllers.mirror_path import MEASURED, Path
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals, expression, total
+from fpirhc.symbolic.expression import Signals, expression, is_finite, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
 
 BEFORE = "_deformation_before"
-_FINITE = 1e300
 
 
 def twin_block(path: Path) -> Block:
@@ -47,7 +46,7 @@ def twin_block(path: Path) -> Block:
 
     def step(s: Signals) -> dict[str, Expression]:
         end, mean, remembered = path.acted(s)
-        acting, answered, following = past.seen(s)
+        acting, answered, next_deformations = past.seen(s)
         waits = s.mirror_cycles < path.late + 0.5  # the samples still show the start
         at = ca.if_else(waits, s.mirror_state, advance(s.mirror_state, mean, s.parameters, -acting))
         sample = seen(at, end, s.parameters, -acting)
@@ -55,8 +54,8 @@ def twin_block(path: Path) -> Block:
         state, response, *memories = estimate.function(arrived, *(getattr(s, m.name) for m in own))
         away = getattr(s, MEASURED) - state
         # What is not finite must not be remembered.
-        move = ca.if_else(ca.mmin(ca.fabs(away) <= _FINITE), away, 0)
-        remembered |= {"mirror_state_next": at + moves.state @ move, **following}
+        move = ca.if_else(is_finite(away), away, 0)
+        remembered |= {"mirror_state_next": at + moves.state @ move, **next_deformations}
         if late:
             remembered["mirror_sample_next"] = sample + moves.sample @ move
         for signal, value, matrix in zip(own, memories, moves.memory, strict=True):
@@ -98,14 +97,14 @@ class _Deformations:
         forcing: list[Expression] = [expression(0.0)] * len(self._plant.names)
         for place, value in zip(self._plant.controlled_indices, ca.vertsplit(late[0]), strict=True):
             forcing[place] = value
-        kept = {"mirror_deformations_next": column[: size * self._length]}
-        return ca.vertcat(*forcing), ca.vertcat(*answered), kept
+        remembered = {"mirror_deformations_next": column[: size * self._length]}
+        return ca.vertcat(*forcing), ca.vertcat(*answered), remembered
 
 
 def _seen(problem: Problem, names: Sequence[str]) -> ca.Function:
     """Function (state, command that acted, parameters, forcing) -> what the sensors show without noise, rounded as they round."""
     plant = problem.plant
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
     values = dict(zip(plant.state.elements, ca.vertsplit(x), strict=True))
     answered = plant.controlled_response_function(x, u, p) + w[list(plant.controlled_indices)]
@@ -146,10 +145,10 @@ def _remembered(problem: Problem, names: Sequence[str], start: np.ndarray) -> li
 def _drift(plant: Plant, time: float) -> np.ndarray:
     """Matrix by which a state moves in that time while all highest derivatives are zero: Taylor's formula."""
     elements = plant.state.elements
-    found = np.zeros((len(elements), len(elements)))
+    drift = np.zeros((len(elements), len(elements)))
     for k, element in enumerate(elements):
         for j, other in enumerate(elements):
             power = len(other) - len(element)
             if other.rstrip("'") == element.rstrip("'") and power >= 0:
-                found[k, j] = time**power / math.factorial(power)
-    return found
+                drift[k, j] = time**power / math.factorial(power)
+    return drift

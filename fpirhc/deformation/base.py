@@ -20,9 +20,6 @@ from fpirhc.describe import replaced
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.symbolic.layout import Expression, Layout
 
-_FINITE = 1e300  # |v| <= 1e300 is false for NaN and infinity
-
-
 Wrapping = TypeVar("Wrapping")
 
 
@@ -241,11 +238,6 @@ def innermost(deformation: Deformation) -> Deformation:
 def smooth_norm(column: Expression, floor: float) -> Expression:
     """Return sqrt(|column|^2 + floor^2): the Euclidean norm, differentiable at zero and never zero."""
     return ca.sqrt(ca.sumsqr(column) + floor**2)
-
-
-def is_finite(column: Expression) -> Expression:
-    """Return whether every entry is a finite number, in a form that CasADi does not simplify away."""
-    return ca.mmin(ca.fabs(column) <= _FINITE)
 
 
 def require_numbers(owner: str, values: Mapping[str, float]) -> None:

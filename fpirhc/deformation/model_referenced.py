@@ -32,9 +32,8 @@ from fpirhc.deformation.leaky import check_pole, chosen_pole
 from fpirhc.deformation.queue import Cycles, Queue, check_cycles, check_uncertainty, every
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-
-_FINITE = 1e300
 
 
 @dataclass(frozen=True)
@@ -128,7 +127,7 @@ class ModelReferenced(Wrapper):
         if pole:
             deformation = pole * before + (1 - pole) * deformation
         # A deformation that is not a number must not be remembered.
-        remembered = ca.if_else(ca.mmin(ca.fabs(deformation) <= _FINITE), deformation, before)
+        remembered = ca.if_else(is_finite(deformation), deformation, before)
         return desired + deformation, {"own_deformation": queue.pushed(past, remembered), **next_memory}
 
     @property

@@ -364,12 +364,12 @@ def _view(
 def _advance(plant: Plant, horizon: Horizon) -> ca.Function:
     """Function (x, u, p) -> x after one stage by the undisturbed model."""
     step = horizon.discretisation.step(plant, horizon.step)
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     return ca.Function("fpirhc_advance", [x, u, p], [step(x, u, p, ca.SX.zeros(len(plant.names)))])
 
 
 def _linearise(plant: Plant, reference: Reference, horizon: Horizon, advance: ca.Function) -> Linearisation:
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     x_next = advance(x, u, p)
     jacobians = ca.Function("fpirhc_linear", [x, u, p], [ca.jacobian(x_next, x), ca.jacobian(x_next, u)])
     state, response = reference.function(plant)(0.0)

@@ -64,7 +64,7 @@ class ReferenceExpansion:
         columns = np.eye(stages * nu).reshape(-1, stages, nu)
         return np.array([self.hessian_times(column).ravel() for column in columns])
 
-    def least_bend(self) -> float:
+    def least_curvature(self) -> float:
         """Smallest eigenvalue of a stage's cost Hessian, relative to its largest."""
         blocks = np.block([[self.q, self.s.transpose(0, 2, 1)], [self.s, self.r]])
         values = np.linalg.eigvalsh(blocks)

@@ -21,7 +21,7 @@ import numpy as np
 
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, linear_stage, stage_symbols
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.symbolic.expression import kind
+from fpirhc.symbolic.expression import is_finite, kind
 
 _SCALAR_CODE = 1000  # multiplications of one stage up to which scalar code beats matrix calls
 PIVOT = 1e-13  # relative size of a pivot below which a matrix does not count as positive definite
@@ -32,7 +32,7 @@ class Expansion(NamedTuple):
 
     inputs: ca.MX  # (nu, N)
     states: ca.MX  # (ns, N + 1)
-    following: ca.MX  # F (ns, N)
+    next_states: ca.MX  # F (ns, N)
     a: ca.MX  # (ns, ns N)
     b: ca.MX  # (ns, nu N)
     by_state: ca.MX  # (ns, N)
@@ -59,8 +59,8 @@ def expand(ocp: OptimalControl) -> ca.Function:
     low, high = ca.SX.sym("low", nu), ca.SX.sym("high", nu)
     x = ca.if_else(rolled, at, node)
     used = ca.if_else(rolled, ca.fmin(ca.fmax(u + gain @ (at - node), low), high), u)
-    following, cost, a, b, by_state, by_input = linear_stage(ocp)(x, used, theta)
-    results = [following, x, used, cost, a, b, by_state, by_input]
+    next_state, cost, a, b, by_state, by_input = linear_stage(ocp)(x, used, theta)
+    results = [next_state, x, used, cost, a, b, by_state, by_input]
     stage = ca.Function("fpirhc_expand_stage", [at, node, u, gain, theta, low, high, rolled], results)
     inputs, states, gains = ca.MX.sym("U", nu, n), ca.MX.sym("X", ns, n + 1), ca.MX.sym("K", nu, ns * n)
     flag, s0, data = ca.MX.sym("rolled"), ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
@@ -68,15 +68,15 @@ def expand(ocp: OptimalControl) -> ca.Function:
     nodes = ca.horzcat(s0, states[:, 1:n]) if n > 1 else s0
     repeated = [ca.repmat(v, 1, n) for v in (lower, upper, flag)]
     made = stage.mapaccum("fpirhc_expand_stages", n)(s0, nodes, inputs, gains, data[:, :n], *repeated)
-    after, before, chosen, costs, *rest = made
+    after, before, used_inputs, costs, *rest = made
     last = ca.if_else(flag, after[:, n - 1], states[:, n])
-    final, tail, bend = hessian_end(ocp)(last, data[:, n])
-    parts = [chosen, ca.horzcat(before, last), after, *rest, tail, bend, ca.sum2(costs) + final]
+    final, tail, end_hessian = hessian_end(ocp)(last, data[:, n])
+    parts = [used_inputs, ca.horzcat(before, last), after, *rest, tail, end_hessian, ca.sum2(costs) + final]
     return ca.Function("fpirhc_expand", [inputs, states, gains, flag, s0, data, lower, upper], parts)
 
 
 def sweep(
-    ocp: OptimalControl, bend: HessianModel, places: tuple[int, ...], scales: tuple[np.ndarray, np.ndarray]
+    ocp: OptimalControl, hessian: HessianModel, places: tuple[int, ...], scales: tuple[np.ndarray, np.ndarray]
 ) -> ca.Function:
     """Function (expansion, W, w, costates (ns, N), mu, data) -> (v, K, dx (ns, N + 1), du, costates, ok).
 
@@ -88,22 +88,22 @@ def sweep(
     )
     weight, lean = (ca.MX.sym(name, nu + len(places), n) for name in ("W", "w"))
     costates, mu, data = ca.MX.sym("lambda", ns, n), ca.MX.sym("mu"), ca.MX.sym("data", ocp.data.size, n + 1)
-    chosen = ca.DM(ns, len(places))
+    selection = ca.DM(ns, len(places))
     for column, row in enumerate(places):
-        chosen[row, column] = 1
-    by_limit = [ca.mtimes(chosen, m[nu:, :]) for m in (weight, lean)]
-    gaps = p.following - p.states[:, 1:]
-    bent = hessian_stage(ocp, bend).map(n)(p.states[:, :n], p.inputs, data[:, :n], costates)
-    columns = [p.a, p.b, p.by_state, p.by_input, gaps, *bent, *by_limit, weight[:nu, :], lean[:nu, :]]
+        selection[row, column] = 1
+    by_limit = [ca.mtimes(selection, m[nu:, :]) for m in (weight, lean)]
+    gaps = p.next_states - p.states[:, 1:]
+    hessians = hessian_stage(ocp, hessian).map(n)(p.states[:, :n], p.inputs, data[:, :n], costates)
+    columns = [p.a, p.b, p.by_state, p.by_input, gaps, *hessians, *by_limit, weight[:nu, :], lean[:nu, :]]
     turned = [_turned(c, n) for c in [*columns, ca.repmat(mu, 1, n)]]
     back = _backward(ocp, scales).mapaccum("fpirhc_sweep_back", n, 2)(p.final, p.tail, *turned)
-    _, _, *found = back
-    v, k, values, slopes, ok = (_turned(c, n) for c in found)
+    _, _, *steps = back
+    v, k, values, slopes, ok = (_turned(c, n) for c in steps)
     ahead = _forward(ns, nu).mapaccum("fpirhc_sweep_ahead", n)(ca.MX.zeros(ns), p.a, p.b, gaps, v, k, values, slopes)
     after, du, after_costates = ahead
     dx = ca.horzcat(ca.MX.zeros(ns), after)
     numbers = ca.vertcat(ca.vec(du), ca.vec(dx), ca.vec(after_costates))
-    fine = ca.logic_and(ca.mmin(ok) > 0, ca.mmin(ca.fabs(numbers) <= 1e300))
+    fine = ca.logic_and(ca.mmin(ok) > 0, is_finite(numbers))
     arguments = [*p, weight, lean, costates, mu, data]
     return ca.Function("fpirhc_sweep", arguments, [v, k, dx, du, after_costates, fine])
 
@@ -122,9 +122,9 @@ def _backward(ocp: OptimalControl, scales: tuple[np.ndarray, np.ndarray]) -> ca.
     by_input, by_state = scales
     value, slope = y["P"] + ca.diag(y["Wx"] + y["mu"] * ca.DM(by_state)), y["p"] + y["wx"]
     pushed, ahead = slope + ca.mtimes(value, y["c"]), ca.mtimes(value, y["A"])
-    bent = y["R"] + ca.mtimes(y["B"].T, ca.mtimes(value, y["B"])) + ca.diag(y["Wu"] + y["mu"] * ca.DM(by_input))
+    q_uu = y["R"] + ca.mtimes(y["B"].T, ca.mtimes(value, y["B"])) + ca.diag(y["Wu"] + y["mu"] * ca.DM(by_input))
     cross, steep = y["S"] + ca.mtimes(y["B"].T, ahead), y["lu"] + y["wu"] + ca.mtimes(y["B"].T, pushed)
-    solution, ok = _definite(nu, 1 + ns)(bent, ca.horzcat(-steep, -cross))
+    solution, ok = _definite(nu, 1 + ns)(q_uu, ca.horzcat(-steep, -cross))
     v, k = solution[:, 0], solution[:, 1:]
     before = y["Q"] + ca.mtimes(y["A"].T, ahead) + ca.mtimes(cross.T, k)
     lean = y["ls"] + ca.mtimes(y["A"].T, pushed) + ca.mtimes(cross.T, v)
@@ -144,18 +144,18 @@ def _forward(ns: int, nu: int) -> ca.Function:
 
 def _definite(n: int, columns: int) -> ca.Function:
     """Function (M, right) -> (M^-1 right by L D L', 1 when every pivot is positive)."""
-    bend, right = ca.SX.sym("M", n, n), ca.SX.sym("r", n, columns)
+    matrix, right = ca.SX.sym("M", n, n), ca.SX.sym("r", n, columns)
     lower, pivots, ok, rows = ca.SX.eye(n), list[ca.SX](), ca.SX(1), list[ca.SX]()
     for j in range(n):
-        pivot = bend[j, j] - sum((lower[j, k] ** 2 * pivots[k] for k in range(j)), start=ca.SX(0))
-        ok = ca.logic_and(ok, pivot > PIVOT * ca.fabs(bend[j, j]))
+        pivot = matrix[j, j] - sum((lower[j, k] ** 2 * pivots[k] for k in range(j)), start=ca.SX(0))
+        ok = ca.logic_and(ok, pivot > PIVOT * ca.fabs(matrix[j, j]))
         pivots.append(pivot)
         for i in range(j + 1, n):
             known = sum((lower[i, k] * lower[j, k] * pivots[k] for k in range(j)), start=ca.SX(0))
-            lower[i, j] = (bend[i, j] - known) / pivot
+            lower[i, j] = (matrix[i, j] - known) / pivot
     for i in range(n):
         rows.append(right[i, :] - sum((lower[i, k] * rows[k] for k in range(i)), start=ca.SX.zeros(1, columns)))
     rows = [row / pivot for row, pivot in zip(rows, pivots, strict=True)]
     for i in reversed(range(n)):
         rows[i] = rows[i] - sum((lower[k, i] * rows[k] for k in range(i + 1, n)), start=ca.SX.zeros(1, columns))
-    return ca.Function("fpirhc_definite", [bend, right], ca.cse([ca.vertcat(*rows), ok]))
+    return ca.Function("fpirhc_definite", [matrix, right], ca.cse([ca.vertcat(*rows), ok]))

@@ -29,15 +29,17 @@ class Active:
 def active_limits(plan: Plan) -> Active:
     """Return the limits of states that have a multiplier at this plan."""
     ocp, multipliers = plan.problem, plan.state_multipliers
-    chosen = multipliers.ravel(order="F") != 0
-    if not chosen.any():
+    has_multiplier = multipliers.ravel(order="F") != 0
+    if not has_multiplier.any():
         return Active(np.zeros((0, plan.inputs.size)), np.zeros(0), 0.0)
-    _, _, moved = sensitivity_of(ocp)(plan.states[:, 0], plan.inputs, plan.data)
-    limits = np.where(multipliers > 0, ocp.state_upper[:, None], ocp.state_lower[:, None]).ravel(order="F")[chosen]
-    active = multipliers.ravel(order="F")[chosen]
-    beyond = np.sign(active) * (plan.states[:, 1:].ravel(order="F")[chosen] - limits)
+    _, _, sensitivity = sensitivity_of(ocp)(plan.states[:, 0], plan.inputs, plan.data)
+    limits = np.where(multipliers > 0, ocp.state_upper[:, None], ocp.state_lower[:, None]).ravel(order="F")[
+        has_multiplier
+    ]
+    active = multipliers.ravel(order="F")[has_multiplier]
+    beyond = np.sign(active) * (plan.states[:, 1:].ravel(order="F")[has_multiplier] - limits)
     products = np.abs(beyond * active)
-    return Active(np.asarray(moved.full())[chosen], beyond, float(products.max()))
+    return Active(np.asarray(sensitivity.full())[has_multiplier], beyond, float(products.max()))
 
 
 def directions(free: np.ndarray, active: Active) -> np.ndarray:

@@ -18,7 +18,7 @@ import casadi as ca
 
 from fpirhc.errors import InvalidValue
 from fpirhc.horizon.riccati import solve_free
-from fpirhc.optimisers.base import FINITE
+from fpirhc.symbolic.expression import is_finite
 
 _RIDGE = 1e-12  # of the normal equations with columns of length one
 _GROWTH = 2.0  # growth of |F| after which the memory is dropped
@@ -40,19 +40,19 @@ class Anderson:
 
 
 def iterated(
-    function: ca.Function, start: ca.MX, given: list[ca.MX], iterations: int, acceleration: Anderson | None
+    function: ca.Function, start: ca.MX, arguments: list[ca.MX], iterations: int, acceleration: Anderson | None
 ) -> ca.MX:
     """Return x after `iterations` of x <- function(x, *given), a column."""
     x = ca.vec(start)
     if acceleration is None:
         for _ in range(iterations):
-            x = function(x, *given)
+            x = function(x, *arguments)
         return x
     advance = _advance(function, acceleration.memory)
     size = start.numel()
     state = ca.vertcat(x, ca.MX.zeros(2 * size + 2 * size * acceleration.memory + 1))
     for _ in range(iterations):
-        state = advance(state, *given)
+        state = advance(state, *arguments)
     return state[:size]
 
 
@@ -60,11 +60,11 @@ def _advance(function: ca.Function, memory: int) -> ca.Function:
     """Function (state, *given) -> state, with state = (x, T before, F before, dF, dT, number of changes known)."""
     size = function.numel_in(0)
     state = ca.MX.sym("state", 3 * size + 2 * size * memory + 1)
-    given = [ca.MX.sym(function.name_in(k), *function.size_in(k)) for k in range(1, function.n_in())]
+    arguments = [ca.MX.sym(function.name_in(k), *function.size_in(k)) for k in range(1, function.n_in())]
     ends = [0, size, 2 * size, 3 * size, (3 + memory) * size, (3 + 2 * memory) * size, state.numel()]
     x, image_before, error_before, errors, images, known = ca.vertsplit(state, ends)
     errors, images = ca.reshape(errors, size, memory), ca.reshape(images, size, memory)
-    image = function(x, *given)
+    image = function(x, *arguments)
     error = image - x
     bad = ca.logic_not(ca.norm_2(error) <= _GROWTH * ca.norm_2(error_before))  # NaN is bad
     tripped = ca.logic_and(known >= 2, bad)
@@ -75,12 +75,12 @@ def _advance(function: ca.Function, memory: int) -> ca.Function:
     images = ca.if_else(ca.logic_or(first, tripped), 0, recorded_images)
     weights = _least_squares(memory)(ca.mtimes(errors.T, errors), ca.mtimes(errors.T, error))
     wanted = image - ca.mtimes(images, weights)
-    usable = ca.mmin(ca.fabs(wanted) <= FINITE)
-    following = ca.if_else(tripped, image_before, ca.if_else(ca.logic_and(usable, ca.logic_not(first)), wanted, image))
-    kept_image, kept_error = ca.if_else(tripped, image_before, image), ca.if_else(tripped, error_before, error)
+    usable = is_finite(wanted)
+    next_x = ca.if_else(tripped, image_before, ca.if_else(ca.logic_and(usable, ca.logic_not(first)), wanted, image))
+    last_image, last_error = ca.if_else(tripped, image_before, image), ca.if_else(tripped, error_before, error)
     count = ca.if_else(tripped, 0, known + 1)
-    result = ca.vertcat(following, kept_image, kept_error, ca.vec(errors), ca.vec(images), count)
-    return ca.Function("fpirhc_anderson", [state, *given], [result])
+    result = ca.vertcat(next_x, last_image, last_error, ca.vec(errors), ca.vec(images), count)
+    return ca.Function("fpirhc_anderson", [state, *arguments], [result])
 
 
 def _least_squares(memory: int) -> ca.Function:

@@ -23,10 +23,9 @@ from fpirhc.errors import InvalidValue
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient, rollout
 from fpirhc.status import Status
-from fpirhc.symbolic.expression import Matrix
+from fpirhc.symbolic.expression import FINITE, Matrix, is_finite
 from fpirhc.symbolic.layout import Layout
 
-FINITE = 1e300  # |v| <= FINITE is false for NaN and infinity
 FEASIBLE = 1e-4  # largest violation of a state bound that still counts as kept
 UNKNOWN_ITERATIONS = -1.0  # solver call-outs do not tell their iterations inside a graph
 
@@ -99,11 +98,6 @@ def clip(columns: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
     return ca.fmin(ca.fmax(columns, ca.repmat(lower, 1, stages)), ca.repmat(upper, 1, stages))
 
 
-def is_finite(value: Matrix) -> Matrix:
-    """1 when every entry is finite, 0 otherwise (NaN included, which fmax and fmin would hide)."""
-    return ca.mmin(ca.fabs(ca.vec(value)) <= FINITE)
-
-
 def largest(value: ca.MX) -> ca.MX:
     """Largest absolute entry."""
     return ca.norm_inf(ca.vec(value))
@@ -147,12 +141,12 @@ def _valid_multipliers(ocp: OptimalControl, states: ca.MX, multipliers: ca.MX) -
     """Keep what can be a multiplier: positive at the upper bound, negative at the lower one, zero elsewhere."""
     rows = []
     for k in range(ocp.state.size):
-        row, given = states[k, 1:], multipliers[k, :]
+        row, values = states[k, 1:], multipliers[k, :]
         at_upper = row >= ocp.state_upper[k] - FEASIBLE if ocp.state_upper[k] < FINITE else ca.MX.zeros(1, ocp.stages)
         at_lower = row <= ocp.state_lower[k] + FEASIBLE if ocp.state_lower[k] > -FINITE else ca.MX.zeros(1, ocp.stages)
-        kept = ca.if_else(at_upper, ca.fmax(given, 0), 0) + ca.if_else(at_lower, ca.fmin(given, 0), 0)
+        valid = ca.if_else(at_upper, ca.fmax(values, 0), 0) + ca.if_else(at_lower, ca.fmin(values, 0), 0)
         # fmax and fmin would hide NaN.
-        rows.append(kept + ca.if_else(ca.fabs(given) <= FINITE, 0, given))
+        rows.append(valid + ca.if_else(ca.fabs(values) <= FINITE, 0, values))
     return ca.vertcat(*rows)
 
 

@@ -22,8 +22,8 @@ import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.sweep import Expansion
-from fpirhc.optimisers.base import FINITE
 from fpirhc.optimisers.scales import Scales
+from fpirhc.symbolic.expression import FINITE
 
 ENOUGH = 0.99  # share of it from which a limit counts as given up
 STIFF = 1e8  # weight of an equality, in units of 1 / gamma
@@ -81,8 +81,8 @@ class Limited:
 
     def both(self, values: ca.MX) -> ca.MX:
         """Add up the lower and the upper side, (rows, N), where there is a limit."""
-        kept = ca.if_else(self.present, values, 0)
-        return kept[:, : self._n] + kept[:, self._n :]
+        present_values = ca.if_else(self.present, values, 0)
+        return present_values[:, : self._n] + present_values[:, self._n :]
 
     def pushes(self, z: ca.MX, counted: ca.MX | float) -> ca.MX:
         """Multipliers of states as they enter the gradient, (rows, N), where `counted`."""
@@ -104,8 +104,8 @@ class Limited:
         """Multipliers after a pure step."""
         d = self.distance(p)
         capped, active = self._chosen(d, z)
-        moved = z - STIFF / self.reach * (self.sign * self.entries(du, dx) + d)
-        return ca.if_else(capped, self.rho, ca.if_else(active, ca.fmin(moved, self.rho), 0))
+        next_z = z - STIFF / self.reach * (self.sign * self.entries(du, dx) + d)
+        return ca.if_else(capped, self.rho, ca.if_else(active, ca.fmin(next_z, self.rho), 0))
 
     def _chosen(self, d: ca.MX, z: ca.MX) -> tuple[ca.MX, ca.MX]:
         capped = ca.logic_and(z >= ENOUGH * self.rho, d < 0)

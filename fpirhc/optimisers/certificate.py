@@ -158,18 +158,18 @@ def _model(plan: Plan) -> np.ndarray:
     """M (N nu, N nu) at the plan, by propagating the linearised model."""
     ocp, data = plan.problem, plan.data
     n, nu = ocp.stages, ocp.input.size
-    linear, bent = linear_stage(ocp), hessian_stage(ocp, GaussNewton())
-    moved, total = np.zeros((ocp.state.size, n * nu)), np.zeros((n * nu, n * nu))
+    linear, hessians = linear_stage(ocp), hessian_stage(ocp, GaussNewton())
+    sensitivity, total = np.zeros((ocp.state.size, n * nu)), np.zeros((n * nu, n * nu))
     for i in range(n):
         s, u, theta = plan.states[:, i], plan.inputs[:, i], data[:, i]
         _, _, a, b, _, _ = (np.asarray(v.full()) for v in linear(s, u, theta))
-        q, cross, r = (np.asarray(v.full()) for v in bent(s, u, theta, np.zeros(ocp.state.size)))
+        q, cross, r = (np.asarray(v.full()) for v in hessians(s, u, theta, np.zeros(ocp.state.size)))
         own = slice(i * nu, (i + 1) * nu)
-        total += moved.T @ q @ moved
-        total[own] += cross @ moved
-        total[:, own] += (cross @ moved).T
+        total += sensitivity.T @ q @ sensitivity
+        total[own] += cross @ sensitivity
+        total[:, own] += (cross @ sensitivity).T
         total[own, own] += r
-        moved = a @ moved
-        moved[:, own] += b
+        sensitivity = a @ sensitivity
+        sensitivity[:, own] += b
     final = np.asarray(hessian_end(ocp)(plan.states[:, n], data[:, n])[2].full())
-    return np.asarray(total + moved.T @ final @ moved)
+    return np.asarray(total + sensitivity.T @ final @ sensitivity)

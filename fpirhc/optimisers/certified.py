@@ -14,9 +14,10 @@ import casadi as ca
 
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.sweep import Expansion
-from fpirhc.optimisers.base import FINITE, clip, is_finite
+from fpirhc.optimisers.base import clip
 from fpirhc.optimisers.bounds import ENOUGH, Interior, Limited
 from fpirhc.optimisers.scales import Scales
+from fpirhc.symbolic.expression import FINITE, is_finite
 
 
 class Certified(NamedTuple):
@@ -37,20 +38,20 @@ def certified(ocp: OptimalControl, limits: Limited, scales: Scales, p: Expansion
         ca.repmat(ca.DM(v), 1, n) for v in (scales.inputs, scales.inputs**2 / scales.cost, ocp.step * ocp.curvature)
     ]
     low, high = limits.inputs()
-    moved = ca.fabs(p.inputs - clip(p.inputs - units[1] * slope, low, high)) / units[0]
+    step = ca.fabs(p.inputs - clip(p.inputs - units[1] * slope, low, high)) / units[0]
     left = ca.norm_inf(ca.vec(p.inputs - clip(p.inputs - slope / units[2], low, high)))
     d = limits.distance(p)
     counted = ca.logic_and(limits.present, limits.of_states)
     given_up = z >= ENOUGH * limits.rho
-    kept = ca.fabs(ca.fmin(d, limits.reach * ca.fmin(ca.fmax(z, 0), limits.rho)))
-    error = ca.if_else(given_up, ca.fmax(d, 0), kept)
+    complementarity = ca.fabs(ca.fmin(d, limits.reach * ca.fmin(ca.fmax(z, 0), limits.rho)))
+    error = ca.if_else(given_up, ca.fmax(d, 0), complementarity)
     error = ca.if_else(counted, ca.fmax(error, limits.reach * ca.fmax(-z, 0)) / limits.unit, 0)
     beyond = ca.if_else(counted, ca.fmax(-d, 0), 0)
     broken = ca.if_else(given_up, 0, beyond)
-    worst = ca.fmax(ca.fmax(ca.mmax(moved), largest_gap(p, scales)), ca.mmax(error))
+    worst = ca.fmax(ca.fmax(ca.mmax(step), largest_gap(p, scales)), ca.mmax(error))
     finite = is_finite(ca.vec(slope))
-    told = [ca.if_else(finite, v, 10 * FINITE) for v in (left, worst)]
-    return Certified(slope, told[0], ca.mmax(beyond * limits.hard), ca.mmax(broken), told[1])
+    numbers = [ca.if_else(finite, v, 10 * FINITE) for v in (left, worst)]
+    return Certified(slope, numbers[0], ca.mmax(beyond * limits.hard), ca.mmax(broken), numbers[1])
 
 
 def certify(ocp: OptimalControl, limits: Limited, p: Expansion, z: ca.MX, counted: ca.MX | float = 1) -> ca.MX:
@@ -72,7 +73,7 @@ def adjoint(ocp: OptimalControl, limits: Limited, p: Expansion, push: ca.MX) -> 
 
 def largest_gap(p: Expansion, scales: Scales) -> ca.MX:
     """Return the largest |F(X, U) - X+| in units of the states."""
-    gaps = ca.fabs(p.following - p.states[:, 1:])
+    gaps = ca.fabs(p.next_states - p.states[:, 1:])
     return ca.mmax(gaps / ca.repmat(ca.DM(scales.states), 1, gaps.shape[1]))
 
 
@@ -87,7 +88,7 @@ def barrier_error(
     pairs = [(limits.present, y.t * z), (states, y.e * (limits.rho - z))]
     least = ca.fmin(*(ca.mmin(ca.if_else(c, v, 10 * FINITE)) for c, v in pairs))
     most = ca.fmax(*(ca.mmax(ca.if_else(c, v, 0)) for c, v in pairs))
-    nu, ns = p.inputs.shape[0], p.following.shape[0]
+    nu, ns = p.inputs.shape[0], p.next_states.shape[0]
     rest_u = p.by_input + push[:nu, :] + _stage_product(p.b, costates, nu, ns, n)
     before = ca.horzcat(p.by_state[:, 1:] + _stage_product(p.a, costates, ns, ns, n)[:, 1:], p.tail)
     rest_x = before - costates + limits.on_states(push)

@@ -1,7 +1,7 @@
 /* The iteration of FixedPoint as loops around generated stage functions.
 
    The same mathematics as the composed graph in fixed_point.py and search.py, which is the reference it is tested against:
-   names follow those files. What is generated stands before this text: the stage functions linear, bent, end and deformed, the
+   names follow those files. What is generated stands before this text: the stage functions linear, hessian, end and deformed, the
    sizes NS, NU, NT (entries of the data of a stage), N, WORK and INTEGERS (of the stage functions), the constants of the
    search, and ENTRY, the name of the function. Matrices are column-major, stages follow each other. Nothing is allocated:
    everything lies on the stack. */
@@ -88,14 +88,14 @@ INLINE int judged(Search* s, Plan* best, Plan* plan, int ok, In lower, In upper)
   casadi_real slack = ROUNDING * (1 + fabs(best->value)), reach, envelope = 0, descent = 0, rise = 0;
   if (ok && !untried) {
     if (bold) {
-      casadi_real kept[N * NU];
-      for (i = 0; i < N * NU; ++i) kept[i] = s->t[i];
+      casadi_real before[N * NU];
+      for (i = 0; i < N * NU; ++i) before[i] = s->t[i];
       envelope = plan->value + plain_step(s, plan, lower, upper, &reach) + reach;
       for (i = 0; i < N * NU; ++i) descent += best->g[i] * (plan->u[i] - best->u[i]);
       ok = envelope <= s->envelope - SHARE * (1 - SHARE) * s->reach + slack ||
            plan->value <= best->value + ARMIJO * fmin(descent, 0) + slack;
       ok = ok && envelope <= s->envelope + slack && plan->value <= best->value + slack;
-      if (!ok) for (i = 0; i < N * NU; ++i) s->t[i] = kept[i];
+      if (!ok) for (i = 0; i < N * NU; ++i) s->t[i] = before[i];
     } else {
       for (i = 0; i < N * NU; ++i) descent += best->g[i] * (s->t[i] - best->u[i]);
       ok = plan->value <= best->value + descent + SHARE * s->reach + slack;
@@ -118,15 +118,15 @@ INLINE int judged(Search* s, Plan* best, Plan* plan, int ok, In lower, In upper)
 }
 
 /* L D L' on the free rows; what is not free is a unit row. Pivots that are not positive are replaced. */
-INLINE void factorise(In bend, const int* free, Out lower, Out pivots) {
+INLINE void factorise(In matrix, const int* free, Out lower, Out pivots) {
   int i, j, k;
   for (j = 0; j < NU; ++j) {
-    casadi_real size = fabs(bend[j * NU + j]) + 1e-300, pivot = bend[j * NU + j];
+    casadi_real size = fabs(matrix[j * NU + j]) + 1e-300, pivot = matrix[j * NU + j];
     for (k = 0; k < j; ++k) pivot -= lower[k * NU + j] * lower[k * NU + j] * pivots[k];
     if (!free[j]) pivot = 1;
     pivots[j] = pivot > PIVOT * size ? pivot : size;
     for (i = j + 1; i < NU; ++i) {
-      casadi_real sum = bend[j * NU + i];
+      casadi_real sum = matrix[j * NU + i];
       for (k = 0; k < j; ++k) sum -= lower[k * NU + i] * lower[k * NU + j] * pivots[k];
       lower[j * NU + i] = free[i] && free[j] ? sum / pivots[j] : 0;
     }
@@ -145,7 +145,7 @@ INLINE void substitute(const int* free, In lower, In pivots, Out column) {
 }
 
 /* The stage's box QP; returns in v the best move, and in free, lower, pivots the factors of the feedback. */
-INLINE void box_policy(In slope, In bend, In low, In high, Out v, int* free, Out lower, Out pivots) {
+INLINE void box_policy(In slope, In matrix, In low, In high, Out v, int* free, Out lower, Out pivots) {
   int i, j, round, same, held[NU];
   casadi_real move[NU], grown[NU], lowest = 0;
   for (i = 0; i < NU; ++i) move[i] = v[i] = 0;
@@ -153,26 +153,26 @@ INLINE void box_policy(In slope, In bend, In low, In high, Out v, int* free, Out
     In at = round < ROUNDS ? move : v; /* the last round only finds what is free at the best move */
     for (i = 0; i < NU; ++i) {
       casadi_real rate = slope[i];
-      for (j = 0; j < NU; ++j) rate += bend[j * NU + i] * at[j];
+      for (j = 0; j < NU; ++j) rate += matrix[j * NU + i] * at[j];
       held[i] = (at[i] <= low[i] && rate > 0) || (at[i] >= high[i] && rate < 0);
       grown[i] = rate;
     }
     for (same = round > 0, i = 0; i < NU; ++i) same &= free[i] == !held[i];
     for (i = 0; i < NU; ++i) free[i] = !held[i];
-    if (!same) factorise(bend, free, lower, pivots);
+    if (!same) factorise(matrix, free, lower, pivots);
     if (round == ROUNDS) return;
     if (same) continue; /* the same system has the same solution */
     {
       casadi_real target[NU], value = 0;
       for (i = 0; i < NU; ++i) {
         target[i] = -slope[i];
-        for (j = 0; j < NU; ++j) target[i] -= free[j] ? 0 : bend[j * NU + i] * move[j];
+        for (j = 0; j < NU; ++j) target[i] -= free[j] ? 0 : matrix[j * NU + i] * move[j];
       }
       substitute(free, lower, pivots, target);
       for (i = 0; i < NU; ++i) move[i] = between(free[i] ? target[i] : move[i], low[i], high[i]);
       for (i = 0; i < NU; ++i) {
         casadi_real half = 0;
-        for (j = 0; j < NU; ++j) half += bend[j * NU + i] * move[j];
+        for (j = 0; j < NU; ++j) half += matrix[j * NU + i] * move[j];
         value += (slope[i] + 0.5 * half) * move[i];
       }
       if (value < lowest) {
@@ -193,22 +193,14 @@ INLINE int direct(Search* s, const Plan* plan, In data, In lower, In upper) {
   for (j = 0; j < NS; ++j) lean[j] = s->lambda[N * NS + j];
   for (i = N - 1; i >= 0; --i) {
     In a = s->a + i * NS * NS, b = s->b + i * NS * NU;
-    casadi_real q[NS * NS], cross[NU * NS], r[NU * NU], ahead[NS * NS], along[NS * NU], turned[NS * NS], flat[NU * NS];
+    casadi_real q[NS * NS], cross[NU * NS], r[NU * NU], turned[NS * NS], flat[NU * NS];
     casadi_real steep[NU], low[NU], high[NU], factor[NU * NU], pivots[NU], *v = wanted + i * NU, *k = s->k + i * NU * NS;
     casadi_real next[NS], pull[NU], gap[NU];
     int free[NU];
     arg[0] = plan->x + i * NS, arg[1] = plan->u + i * NU, arg[2] = data + i * NT, arg[3] = s->lambda + (i + 1) * NS;
     res[0] = q, res[1] = cross, res[2] = r;
-    if (bent(arg, res, s->iw, s->w, 0)) return 1;
-    for (j = 0; j < NS * NS; ++j) ahead[j] = 0;
-    for (j = 0; j < NS * NU; ++j) along[j] = 0;
-    multiply(ahead, p, a, NS, NS, NS);
-    multiply(along, p, b, NS, NS, NU);
-    transpose(turned, a, NS, NS);
-    transpose(flat, b, NS, NU);
-    multiply(q, turned, ahead, NS, NS, NS);
-    multiply(cross, flat, ahead, NU, NS, NS);
-    multiply(r, flat, along, NU, NS, NU);
+    if (hessian(arg, res, s->iw, s->w, 0)) return 1;
+    condense(q, cross, r, p, a, b, turned);
     for (l = 0; l < NU; ++l) {
       r[l * NU + l] += DAMPING / scale[l];
       steep[l] = s->lu[i * NU + l];

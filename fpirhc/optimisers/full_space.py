@@ -27,9 +27,9 @@ from fpirhc.horizon.auxiliary import auxiliary_gradient, auxiliary_hessian
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.anderson import Anderson, iterated
-from fpirhc.optimisers.base import Optimiser, is_finite, judge, require_settings, sane, shift, status_of
+from fpirhc.optimisers.base import Optimiser, judge, require_settings, sane, shift, status_of
 from fpirhc.status import Status
-from fpirhc.symbolic.expression import expression, graph
+from fpirhc.symbolic.expression import expression, graph, is_finite
 from fpirhc.symbolic.layout import Layout, Signal
 
 _SAFE = 0.95
@@ -89,35 +89,35 @@ class FullSpaceFixedPoint(Optimiser):
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         """Everything one stage later."""
         rows = {"plan_states": ocp.state.size, "plan_inputs": ocp.input.size, "plan_multipliers": ocp.state.size}
-        kept = self.memory(ocp).split(memory)
-        return self.memory(ocp).join({k: ca.vec(shift(ca.reshape(v, rows[k], ocp.stages))) for k, v in kept.items()})
+        parts = self.memory(ocp).split(memory)
+        return self.memory(ocp).join({k: ca.vec(shift(ca.reshape(v, rows[k], ocp.stages))) for k, v in parts.items()})
 
     def step(self, ocp: OptimalControl) -> ca.Function:
         """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
         nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
         s0, data = ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
         lower, upper, memory = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu), ca.MX.sym("memory", n * (2 * ns + nu))
-        kept = self.memory(ocp).split(ca.if_else(is_finite(memory), memory, 0))
-        fresh = ca.logic_not(ca.mmax(ca.fabs(kept["plan_states"])) > 0)
-        rolled = rollout(ocp)(s0, ca.reshape(kept["plan_inputs"], nu, n), data)[0]
+        remembered_parts = self.memory(ocp).split(ca.if_else(is_finite(memory), memory, 0))
+        fresh = ca.logic_not(ca.mmax(ca.fabs(remembered_parts["plan_states"])) > 0)
+        rolled = rollout(ocp)(s0, ca.reshape(remembered_parts["plan_inputs"], nu, n), data)[0]
         guess = ca.if_else(is_finite(rolled), rolled[:, 1:], ca.repmat(s0, 1, n))
-        states = ca.if_else(fresh, ca.vec(guess), kept["plan_states"])
-        start = ca.vertcat(states, kept["plan_inputs"], kept["plan_multipliers"])
+        states = ca.if_else(fresh, ca.vec(guess), remembered_parts["plan_states"])
+        start = ca.vertcat(states, remembered_parts["plan_inputs"], remembered_parts["plan_multipliers"])
         scale = ca.DM(_scaling(ocp, self.scaled)[0])
         last = scale * iterated(
             self._transformation(ocp), start / scale, [s0, data], self.iterations, self.acceleration
         )
-        found = ca.reshape(last[n * ns : n * (ns + nu)], nu, n)
-        cost, residual, _ = judge(ocp)(found, s0, data, lower, upper, ca.MX.zeros(ns, n))
+        plan = ca.reshape(last[n * ns : n * (ns + nu)], nu, n)
+        cost, residual, _ = judge(ocp)(plan, s0, data, lower, upper, ca.MX.zeros(ns, n))
         posed = sane(s0, data, lower, upper)
         finite = ca.logic_and(posed, is_finite(ca.vertcat(last, cost, residual)))
-        before = ca.reshape(kept["plan_inputs"], nu, n)
+        before = ca.reshape(remembered_parts["plan_inputs"], nu, n)
         status = status_of(finite, residual, 0, self.tolerance)
         empty = ca.mmax(lower - upper) > 0
-        told = ca.if_else(finite, ca.vertcat(cost, residual), ca.MX.zeros(2))
-        diagnostics = ca.vertcat(told, 0, self.iterations, ca.if_else(empty, int(Status.INFEASIBLE), status))
+        numbers = ca.if_else(finite, ca.vertcat(cost, residual), ca.MX.zeros(2))
+        diagnostics = ca.vertcat(numbers, 0, self.iterations, ca.if_else(empty, int(Status.INFEASIBLE), status))
         remembered = ca.if_else(finite, last, ca.if_else(posed, 0, memory))
-        results = [ca.if_else(finite, found, before), diagnostics, remembered]
+        results = [ca.if_else(finite, plan, before), diagnostics, remembered]
         return ca.Function("fpirhc_full_space", [s0, data, lower, upper, memory], results)
 
     def _transformation(self, ocp: OptimalControl) -> ca.Function:
@@ -131,10 +131,10 @@ class FullSpaceFixedPoint(Optimiser):
         shaped = ca.reshape(states, ns, n), ca.reshape(inputs, nu, n), ca.reshape(multipliers, ns, n)
         slope = scale * ca.vertcat(*(ca.vec(v) for v in auxiliary_gradient(ocp)(*shaped, s0, data)))
         response = ca.jtimes(slope, column, slope, True)
-        chosen = Affine(gain=-2 * _SAFE / largest**2) if self.map is None else self.map
+        map_in_use = Affine(gain=-2 * _SAFE / largest**2) if self.map is None else self.map
         request, error, none = (expression(v) for v in (column, response, ca.MX.zeros(column.numel())))
-        following, _ = chosen.step(request, error, none, {})
-        return ca.Function("fpirhc_transformed_auxiliary", [column, s0, data], [graph(following)])
+        next_column, _ = map_in_use.step(request, error, none, {})
+        return ca.Function("fpirhc_transformed_auxiliary", [column, s0, data], [graph(next_column)])
 
 
 def _scaling(ocp: OptimalControl, scaled: bool) -> tuple[np.ndarray, float]:

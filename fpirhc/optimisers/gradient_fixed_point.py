@@ -25,19 +25,9 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.reference_expansion import steepest_curvature
 from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.anderson import Anderson, iterated
-from fpirhc.optimisers.base import (
-    Optimiser,
-    clip,
-    is_finite,
-    judge,
-    remembered_plan,
-    require_settings,
-    sane,
-    shift,
-    status_of,
-)
+from fpirhc.optimisers.base import Optimiser, clip, judge, remembered_plan, require_settings, sane, shift, status_of
 from fpirhc.status import Status
-from fpirhc.symbolic.expression import expression, graph
+from fpirhc.symbolic.expression import expression, graph, is_finite
 from fpirhc.symbolic.layout import Layout, Signal
 
 _SAFE = 0.95  # share of the largest gain, for the map that is chosen automatically
@@ -73,9 +63,9 @@ class GradientFixedPoint(Optimiser):
         if ocp.bounds_states:
             raise NotSupported("GradientFixedPoint keeps input limits only; for state limits use FixedPoint()")
         largest = 2 / _steepest(ocp)
-        chosen = self._map(ocp)
-        require_own_requests("GradientFixedPoint", chosen)
-        gain = max(chosen.secant_gain(), chosen.effective_gain(), key=abs)
+        map_in_use = self._map(ocp)
+        require_own_requests("GradientFixedPoint", map_in_use)
+        gain = max(map_in_use.secant_gain(), map_in_use.effective_gain(), key=abs)
         if not 0 < gain < largest:
             raise NotContractive(
                 f"GradientFixedPoint: the map's gain {gain:.3g} is outside (0, {largest:.3g}), the interval in which the "
@@ -99,18 +89,20 @@ class GradientFixedPoint(Optimiser):
         lower, upper, memory = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu), ca.MX.sym("memory", nu * n)
         start = remembered_plan(memory, nu, lower, upper)
         last = iterated(self._transformation(ocp), start, [s0, data, lower, upper], self.iterations, self.acceleration)
-        found = clip(ca.reshape(last, nu, n), lower, upper)
-        cost, residual, _ = judge(ocp)(found, s0, data, lower, upper, ca.MX.zeros(ocp.state.size, n))
+        inputs = clip(ca.reshape(last, nu, n), lower, upper)
+        cost, residual, _ = judge(ocp)(inputs, s0, data, lower, upper, ca.MX.zeros(ocp.state.size, n))
         posed = sane(s0, data, lower, upper)
-        finite = ca.logic_and(posed, is_finite(ca.vertcat(ca.vec(found), cost, residual)))
-        plan = ca.if_else(finite, found, start)
+        finite = ca.logic_and(posed, is_finite(ca.vertcat(ca.vec(inputs), cost, residual)))
+        plan = ca.if_else(finite, inputs, start)
         empty = ca.mmax(lower - upper) > 0
         status = ca.if_else(empty, int(Status.INFEASIBLE), status_of(finite, residual, 0, self.tolerance))
-        told = ca.if_else(finite, ca.vertcat(cost, residual), ca.MX.zeros(2))
+        numbers = ca.if_else(finite, ca.vertcat(cost, residual), ca.MX.zeros(2))
         # A remembered plan under which a well-posed problem overflows is given up, so that the next call can succeed.
-        kept = ca.if_else(finite, ca.vec(plan), ca.if_else(posed, 0, memory))
-        diagnostics = ca.vertcat(told, 0, self.iterations, status)
-        return ca.Function("fpirhc_gradient_fixed_point", [s0, data, lower, upper, memory], [plan, diagnostics, kept])
+        next_memory = ca.if_else(finite, ca.vec(plan), ca.if_else(posed, 0, memory))
+        diagnostics = ca.vertcat(numbers, 0, self.iterations, status)
+        return ca.Function(
+            "fpirhc_gradient_fixed_point", [s0, data, lower, upper, memory], [plan, diagnostics, next_memory]
+        )
 
     def _map(self, ocp: OptimalControl) -> Deformation:
         return Affine(gain=-2 * _SAFE / _steepest(ocp)) if self.map is None else self.map
@@ -125,8 +117,8 @@ class GradientFixedPoint(Optimiser):
         slope = reduced_gradient(ocp)(s0, inputs, data, ca.MX.zeros(ocp.state.size, n))[1]
         response = ca.vec(ca.repmat(ca.DM(_scale(ocp)), 1, n) * slope)
         request, error, none = (expression(v) for v in (column, response, ca.MX.zeros(nu * n)))
-        following, _ = self._map(ocp).step(request, error, none, {})
-        clipped = ca.vec(clip(ca.reshape(graph(following), nu, n), lower, upper))
+        next_column, _ = self._map(ocp).step(request, error, none, {})
+        clipped = ca.vec(clip(ca.reshape(graph(next_column), nu, n), lower, upper))
         return ca.Function("fpirhc_transformed_plan", [column, s0, data, lower, upper], [clipped])
 
 

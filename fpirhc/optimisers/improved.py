@@ -30,12 +30,12 @@ def improved(
     status, count, iterations, violation, stuck = Status.NOT_CONVERGED, 0, 0.0, np.inf, 0
     inputs, diagnostics = np.zeros((ocp.input.size, ocp.stages)), np.zeros(5)
     while status in (Status.NOT_CONVERGED, Status.INFEASIBLE) and stuck < _PATIENCE and count < calls:
-        given = (state, data, *bounds, memory)
-        results = step(*given)
+        arguments = (state, data, *bounds, memory)
+        results = step(*arguments)
         if int(results[1][4]) != Status.OK:
             # Built only here: most horizons never need it.
             rescue = rescue or optimiser.rescue(ocp)
-            results = rescue(*given, *results) if rescue else results
+            results = rescue(*arguments, *results) if rescue else results
         inputs, diagnostics, memory = (np.asarray(v.full()) for v in results)
         diagnostics, memory = diagnostics.ravel(), memory.ravel()
         iterations += diagnostics[3]

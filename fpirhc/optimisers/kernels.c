@@ -46,6 +46,21 @@ INLINE void transpose(Out restrict to, In restrict from, int rows, int columns) 
     for (i = 0; i < rows; ++i) to[i * columns + j] = from[j * rows + i];
 }
 
+/* A stage's Hessian with the cost to go P behind it: Q += A'PA, S += B'PA, R += B'PB; turned = A' */
+INLINE void condense(Out q, Out cross, Out r, In p, In a, In b, Out turned) {
+  casadi_real ahead[NS * NS], along[NS * NU], flat[NU * NS];
+  int j;
+  for (j = 0; j < NS * NS; ++j) ahead[j] = 0;
+  for (j = 0; j < NS * NU; ++j) along[j] = 0;
+  multiply(ahead, p, a, NS, NS, NS);
+  multiply(along, p, b, NS, NS, NU);
+  transpose(turned, a, NS, NS);
+  transpose(flat, b, NS, NU);
+  multiply(q, turned, ahead, NS, NS, NS);
+  multiply(cross, flat, ahead, NU, NS, NS);
+  multiply(r, flat, along, NU, NS, NU);
+}
+
 INLINE int sane(In s0, In data, In lower, In upper) {
   int l, ok = all_finite(s0, NS) && all_finite(data, (N + 1) * NT);
   for (l = 0; l < NU; ++l) ok &= lower[l] <= upper[l] && lower[l] <= FINITE && upper[l] >= -FINITE;

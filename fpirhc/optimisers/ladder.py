@@ -14,8 +14,9 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.base import FINITE, Optimiser
+from fpirhc.optimisers.base import Optimiser
 from fpirhc.status import Status
+from fpirhc.symbolic.expression import FINITE
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 _PLAN, _ASKED = "plan_inputs", "plan_second_plans"
@@ -57,11 +58,11 @@ class Ladder(Optimiser):
 
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         """Both memories one stage later."""
-        kept = self.memory(ocp).split(memory)
-        one = self.first.shifted(ocp, self._part(ocp, self.first, "first", kept))
-        other = self.second.shifted(ocp, self._part(ocp, self.second, "second", kept))
+        parts = self.memory(ocp).split(memory)
+        one = self.first.shifted(ocp, self._part(ocp, self.first, "first", parts))
+        other = self.second.shifted(ocp, self._part(ocp, self.second, "second", parts))
         plan = self.first.memory(ocp).split(one)[_PLAN]
-        return self._joined(ocp, plan, one, other, kept[_ASKED])
+        return self._joined(ocp, plan, one, other, parts[_ASKED])
 
     def step(self, ocp: OptimalControl) -> ca.Function:
         """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
@@ -74,25 +75,25 @@ class Ladder(Optimiser):
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:
         """The memory with which the first begins; the second begins from its plan."""
         layout, one = self.memory(ocp), self.first.first_memory(ocp, state, data)
-        found = self.first.memory(ocp).unpack(one)
-        return layout.pack({(n if n == _PLAN else f"first_{n}"): value for n, value in found.items()})
+        parts = self.first.memory(ocp).unpack(one)
+        return layout.pack({(n if n == _PLAN else f"first_{n}"): value for n, value in parts.items()})
 
     def _laddered(self, ocp: OptimalControl, first: ca.Function, second: ca.Function) -> ca.Function:
         layout = self.memory(ocp)
         symbols = [ca.MX.sym(first.name_in(k), *first.size_in(k)) for k in range(4)]
         arguments = [*symbols, ca.MX.sym("memory", layout.size)]
-        kept = layout.split(arguments[4])
-        begun = first(*symbols, self._part(ocp, self.first, "first", kept))
+        parts = layout.split(arguments[4])
+        begun = first(*symbols, self._part(ocp, self.first, "first", parts))
         names, shapes = ("U", "told", "after"), [first.size_out(k) for k in range(3)]
         results = [ca.MX.sym(name, *shape) for name, shape in zip(names, shapes, strict=True)]
         work = ca.Function("fpirhc_second", [*arguments, *results], self._second(ocp, second, arguments, results))
-        before = self._part(ocp, self.second, "second", kept)
+        before = self._part(ocp, self.second, "second", parts)
         plan = ca.vec(results[0])
-        after = self._joined(ocp, plan, results[2], before, kept[_ASKED])
+        after = self._joined(ocp, plan, results[2], before, parts[_ASKED])
         rest = ca.Function("fpirhc_no_second", [*arguments, *results], [*results[:2], after])
         choice = ca.Function.if_else("fpirhc_second_if_needed", work, rest)
-        chosen = choice(begun[1][4] > int(Status.NOT_CONVERGED) + 0.5, *arguments, *begun)
-        inner = ca.Function("fpirhc_ladder_step", arguments, list(chosen))
+        better = choice(begun[1][4] > int(Status.NOT_CONVERGED) + 0.5, *arguments, *begun)
+        inner = ca.Function("fpirhc_ladder_step", arguments, list(better))
         # What is poisoned in the memory of the one that is not asked would stay for ever.
         usable = ca.if_else(ca.fabs(arguments[4]) <= FINITE, arguments[4], 0)
         return ca.Function("fpirhc_ladder", arguments, list(inner(*symbols, usable)))
@@ -101,27 +102,27 @@ class Ladder(Optimiser):
         self, ocp: OptimalControl, second: ca.Function, arguments: list[ca.MX], results: list[ca.MX]
     ) -> list[ca.MX]:
         """The better one of both answers."""
-        kept = self.memory(ocp).split(arguments[4])
-        inputs, told, after = second(*arguments[:4], self._part(ocp, self.second, "second", kept))
-        usable = told[4] < int(Status.INFEASIBLE) - 0.5
-        only = ca.logic_and(results[1][4] == int(Status.NON_FINITE), told[4] < int(Status.NON_FINITE) - 0.5)
+        parts = self.memory(ocp).split(arguments[4])
+        inputs, diagnostics, after = second(*arguments[:4], self._part(ocp, self.second, "second", parts))
+        usable = diagnostics[4] < int(Status.INFEASIBLE) - 0.5
+        only = ca.logic_and(results[1][4] == int(Status.NON_FINITE), diagnostics[4] < int(Status.NON_FINITE) - 0.5)
         better = ca.logic_or(usable, only)
         plan = ca.if_else(better, inputs, results[0])
         # The first has nothing to go on from but the inputs that will be used.
         forgotten = ca.if_else(better, ca.MX(self.first.memory(ocp).start()), results[2])
-        memory = self._joined(ocp, ca.vec(plan), forgotten, after, kept[_ASKED] + better)
-        return [plan, ca.if_else(better, told, results[1]), memory]
+        memory = self._joined(ocp, ca.vec(plan), forgotten, after, parts[_ASKED] + better)
+        return [plan, ca.if_else(better, diagnostics, results[1]), memory]
 
-    def _part(self, ocp: OptimalControl, optimiser: Optimiser, name: str, kept: Mapping[str, ca.MX]) -> ca.MX:
+    def _part(self, ocp: OptimalControl, optimiser: Optimiser, name: str, parts: Mapping[str, ca.MX]) -> ca.MX:
         layout = optimiser.memory(ocp)
-        return layout.join({n: kept[n if n == _PLAN else f"{name}_{n}"] for n in layout.names})
+        return layout.join({n: parts[n if n == _PLAN else f"{name}_{n}"] for n in layout.names})
 
-    def _joined(self, ocp: OptimalControl, plan: ca.MX, one: ca.MX, other: ca.MX, asked: ca.MX) -> ca.MX:
-        parts: dict[str, ca.MX] = {_PLAN: plan, _ASKED: asked}
+    def _joined(self, ocp: OptimalControl, plan: ca.MX, one: ca.MX, other: ca.MX, count: ca.MX) -> ca.MX:
+        joined: dict[str, ca.MX] = {_PLAN: plan, _ASKED: count}
         for name, optimiser, memory in (("first", self.first, one), ("second", self.second, other)):
             split = optimiser.memory(ocp).split(memory)
-            parts |= {f"{name}_{n}": value for n, value in split.items() if n != _PLAN}
-        return self.memory(ocp).join(parts)
+            joined |= {f"{name}_{n}": value for n, value in split.items() if n != _PLAN}
+        return self.memory(ocp).join(joined)
 
 
 def examples(inner: Optimiser) -> tuple[Optimiser, ...]:

@@ -13,11 +13,11 @@ typedef struct {
   Duals y, by;
   Direction move;
   Limits limits;
-  casadi_real next_z[2][COUNT], kept_u[N * NU], kept_x[(N + 1) * NS], kept_z[2][COUNT];
+  casadi_real next_z[2][COUNT], best_u[N * NU], best_x[(N + 1) * NS], best_z[2][COUNT];
   casadi_real weight[COUNT], lean[COUNT], costates[(N + 1) * NS], g[N * NU], filter[FILTER][2];
   casadi_real mu, floor, delta, error, alpha, alpha_dual, theta, phi, dphi;
   Certificate last;
-  int phase, place_of, fresh, again, slacks, misses, steps, halvings, raises, filtered, start, bent, stuck, rolled, ahead;
+  int phase, place_of, fresh, again, slacks, misses, steps, halvings, raises, filtered, start, use_exact, stuck, rolled, ahead;
   Scratch scratch;
 } Machine;
 
@@ -102,7 +102,7 @@ static void begin_cold(Machine* m, Point* p, In s0, In data, In lower, In upper,
   }
   for (j = 0; j < N * NU * NS; ++j) m->move.k[j] = 0;
   for (j = 0; j < (N + 1) * NS; ++j) m->costates[j] = 0;
-  m->phase = INTERIOR, m->slacks = COLD, m->fresh = 1, m->bent = 0;
+  m->phase = INTERIOR, m->slacks = COLD, m->fresh = 1, m->use_exact = 0;
   m->mu = COST, m->floor = MU_END * COST, m->delta = 0;
   m->filtered = m->raises = m->halvings = 0;
 }
@@ -114,9 +114,9 @@ static void restart(Machine* m, Point* p, In s0, In data, In lower, In upper) {
 
 static void keep(Machine* m, const Point* p) {
   int k;
-  for (k = 0; k < N * NU; ++k) m->kept_u[k] = p->u[k];
-  for (k = 0; k < (N + 1) * NS; ++k) m->kept_x[k] = p->x[k];
-  for (k = 0; k < COUNT; ++k) m->kept_z[0][k] = m->y.z[0][k], m->kept_z[1][k] = m->y.z[1][k];
+  for (k = 0; k < N * NU; ++k) m->best_u[k] = p->u[k];
+  for (k = 0; k < (N + 1) * NS; ++k) m->best_x[k] = p->x[k];
+  for (k = 0; k < COUNT; ++k) m->best_z[0][k] = m->y.z[0][k], m->best_z[1][k] = m->y.z[1][k];
 }
 
 /* Leave the pure phase: for an interior phase near its best plan, or back to the interior plan it came from. */
@@ -128,9 +128,9 @@ static void enter_interior(Machine* m, Point* p) {
     m->mu = REALTIME ? between(m->mu, MU_WARM * COST, MU_MOST * COST) : MU_WARM * COST, m->floor = MU_END * COST;
     if (m->misses == 0) return;
   }
-  for (k = 0; k < N * NU; ++k) p->u[k] = m->kept_u[k];
-  for (k = 0; k < (N + 1) * NS; ++k) p->x[k] = m->kept_x[k];
-  for (k = 0; k < COUNT; ++k) m->y.z[0][k] = m->kept_z[0][k], m->y.z[1][k] = m->kept_z[1][k];
+  for (k = 0; k < N * NU; ++k) p->u[k] = m->best_u[k];
+  for (k = 0; k < (N + 1) * NS; ++k) p->x[k] = m->best_x[k];
+  for (k = 0; k < COUNT; ++k) m->y.z[0][k] = m->best_z[0][k], m->y.z[1][k] = m->best_z[1][k];
   m->fresh = 1;
   if (m->place_of == BEGINS) return;
   m->floor *= 0.01, m->slacks = KEPT;
@@ -265,9 +265,9 @@ static void direct(Machine* m, Point* p, In data) {
     interior_terms(&m->limits, p, &m->y, m->mu, m->weight, m->lean);
     m->slacks = KEPT;
   }
-  ok = m->bent && swept(&m->move, p, m->weight, m->lean, m->costates, m->delta, 1, data, &m->scratch);
+  ok = m->use_exact && swept(&m->move, p, m->weight, m->lean, m->costates, m->delta, 1, data, &m->scratch);
   ok = ok || swept(&m->move, p, m->weight, m->lean, m->costates, m->delta, 0, data, &m->scratch);
-  m->bent = 1;
+  m->use_exact = 1;
   if (!ok) {
     m->delta = fmax(10 * m->delta, 1e-6);
     m->stuck |= m->delta > 1e8;
@@ -282,7 +282,7 @@ static void direct(Machine* m, Point* p, In data) {
 }
 
 static void begin(Machine* m, Point* p, In memory, In s0, In data, In lower, In upper) {
-  int k, known = all_finite(memory, MEMORY) && memory[MEMORY - 2] > 0, given = 0;
+  int k, known = all_finite(memory, MEMORY) && memory[MEMORY - 2] > 0, has_guess = 0;
   In z = memory + N * NU + 2 * N * NS + N * NU * NS;
   set_limits(&m->limits, lower, upper);
   m->stuck = m->again = m->rolled = m->filtered = m->raises = m->halvings = m->misses = m->steps = 0;
@@ -293,8 +293,8 @@ static void begin(Machine* m, Point* p, In memory, In s0, In data, In lower, In 
   for (k = 0; k < COUNT; ++k) m->next_z[0][k] = m->next_z[1][k] = 0; /* limits that are not there stay so */
   m->start = known ? -1 : 0;
   if (!known) {
-    for (k = 0; k < N * NU; ++k) given |= memory[k] != 0;
-    begin_cold(m, p, s0, data, lower, upper, given && all_finite(memory, N * NU) ? memory : 0);
+    for (k = 0; k < N * NU; ++k) has_guess |= memory[k] != 0;
+    begin_cold(m, p, s0, data, lower, upper, has_guess && all_finite(memory, N * NU) ? memory : 0);
     return;
   }
   for (k = 0; k < N * NU; ++k) p->u[k] = between(memory[k], lower[k % NU], upper[k % NU]);
@@ -302,7 +302,7 @@ static void begin(Machine* m, Point* p, In memory, In s0, In data, In lower, In 
   for (k = 0; k < N * NS; ++k) p->x[NS + k] = memory[N * NU + k], m->costates[NS + k] = memory[N * NU + N * NS + k];
   for (k = 0; k < N * NU * NS; ++k) m->move.k[k] = memory[N * NU + 2 * N * NS + k];
   m->mu = memory[MEMORY - 2] * COST, m->delta = memory[MEMORY - 1], m->floor = MU_END * COST;
-  m->phase = PURE, m->place_of = BEGINS, m->fresh = 1, m->slacks = WARM, m->bent = 1;
+  m->phase = PURE, m->place_of = BEGINS, m->fresh = 1, m->slacks = WARM, m->use_exact = 1;
 }
 
 static void remember(const Machine* m, const Point* p, Out memory) {

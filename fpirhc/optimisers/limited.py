@@ -21,7 +21,7 @@ from fpirhc.horizon.hessian_models import ExactHessian, GaussNewton, hessian_end
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.sweep import PIVOT
 from fpirhc.optimisers import limited_settings as numbers
-from fpirhc.optimisers.base import FEASIBLE, FINITE, shift
+from fpirhc.optimisers.base import FEASIBLE, shift
 from fpirhc.optimisers.bounds import BOUNDARY, ENOUGH, STIFF
 from fpirhc.optimisers.guess import guess
 from fpirhc.optimisers.limited_graph import limited_graph
@@ -31,6 +31,7 @@ from fpirhc.optimisers.scales import Scales, scales
 from fpirhc.optimisers.search import deformed_move
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, with_driver
+from fpirhc.symbolic.expression import FINITE
 
 _TEXTS = ("kernels", "limited_sweep", "limited_bounds", "limited")
 
@@ -43,16 +44,16 @@ def limited_step(ocp: OptimalControl, settings: LimitedSettings) -> ca.Function:
 def shifted_limited(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
     """The memory one stage later; the last stage, which is repeated, has no feedback."""
     layout, n, nu, ns = limited_memory(ocp), ocp.stages, ocp.input.size, ocp.state.size
-    kept = layout.split(memory)
+    parts = layout.split(memory)
     rows = layout["plan_multipliers"].size // (2 * n)
-    sides = ca.horzsplit(ca.reshape(kept["plan_multipliers"], rows, 2 * n), n)
-    moved: dict[str, ca.MX] = {
-        name: ca.vec(shift(ca.reshape(kept[name], size, n)))
+    sides = ca.horzsplit(ca.reshape(parts["plan_multipliers"], rows, 2 * n), n)
+    shifted_parts: dict[str, ca.MX] = {
+        name: ca.vec(shift(ca.reshape(parts[name], size, n)))
         for name, size in (("plan_inputs", nu), ("plan_states", ns), ("plan_costates", ns))
     }
-    moved["plan_gains"] = ca.vertcat(kept["plan_gains"][nu * ns :], ca.MX.zeros(nu * ns))
-    moved["plan_multipliers"] = ca.vec(ca.horzcat(*(shift(side) for side in sides)))
-    return layout.join({**kept, **moved})
+    shifted_parts["plan_gains"] = ca.vertcat(parts["plan_gains"][nu * ns :], ca.MX.zeros(nu * ns))
+    shifted_parts["plan_multipliers"] = ca.vec(ca.horzcat(*(shift(side) for side in sides)))
+    return layout.join({**parts, **shifted_parts})
 
 
 def _driver(ocp: OptimalControl, settings: LimitedSettings) -> Driver:

@@ -57,15 +57,15 @@ static int expand(Point* p, In k, int rolled, In s0, In data, In lower, In upper
 }
 
 /* L D L'; 0 when a pivot is not positive. */
-INLINE int factorised(In bend, Out lower, Out pivots) {
+INLINE int factorised(In matrix, Out lower, Out pivots) {
   int i, j, k, ok = 1;
   for (j = 0; j < NU; ++j) {
-    casadi_real pivot = bend[j * NU + j];
+    casadi_real pivot = matrix[j * NU + j];
     for (k = 0; k < j; ++k) pivot -= lower[k * NU + j] * lower[k * NU + j] * pivots[k];
-    ok &= pivot > PIVOT * fabs(bend[j * NU + j]);
+    ok &= pivot > PIVOT * fabs(matrix[j * NU + j]);
     pivots[j] = pivot;
     for (i = j + 1; i < NU; ++i) {
-      casadi_real sum = bend[j * NU + i];
+      casadi_real sum = matrix[j * NU + i];
       for (k = 0; k < j; ++k) sum -= lower[k * NU + i] * lower[k * NU + j] * pivots[k];
       lower[j * NU + i] = sum / pivots[j];
     }
@@ -82,8 +82,8 @@ INLINE void solved(In lower, In pivots, Out column) {
     for (k = i + 1; k < NU; ++k) column[i] -= lower[i * NU + k] * column[k];
 }
 
-/* Solve the quadratic model with these weights and gradients of the limits and with gaps; 0 when it does not bend upwards. */
-INLINE int sweep(Direction* d, const Point* p, In weight, In lean, In costates, casadi_real delta, int bent, In data, Scratch* s) {
+/* Solve the quadratic model with these weights and gradients of the limits and with gaps; 0 when it is not convex. */
+INLINE int sweep(Direction* d, const Point* p, In weight, In lean, In costates, casadi_real delta, int use_exact, In data, Scratch* s) {
   int i, j, l, m;
   In arg[8];
   Out res[8];
@@ -93,7 +93,7 @@ INLINE int sweep(Direction* d, const Point* p, In weight, In lean, In costates, 
   for (i = N; i-- > 0;) {
     In a = p->a + i * NS * NS, b = p->b + i * NS * NU;
     Out value = values + (i + 1) * NS * NS, slope = slopes + (i + 1) * NS, k = d->k + i * NU * NS, v = d->v + i * NU;
-    casadi_real q[NS * NS], cross[NU * NS], r[NU * NU], ahead[NS * NS], along[NS * NU], turned[NS * NS], flat[NU * NS];
+    casadi_real q[NS * NS], cross[NU * NS], r[NU * NU], turned[NS * NS], flat[NU * NS];
     casadi_real pushed[NS], factor[NU * NU], pivots[NU];
     for (m = 0; m < NB; ++m) {
       value[place[m] * NS + place[m]] += weight[i * ROWS + NU + m];
@@ -102,20 +102,12 @@ INLINE int sweep(Direction* d, const Point* p, In weight, In lean, In costates, 
     for (j = 0; j < NS; ++j) value[j * NS + j] += 0.01 * delta * COST / (spread[j] * spread[j]);
     arg[0] = p->x + i * NS, arg[1] = p->u + i * NU, arg[2] = data + i * NT, arg[3] = costates + (i + 1) * NS;
     res[0] = q, res[1] = cross, res[2] = r;
-    if (bent ? exact(arg, res, s->iw, s->w, 0) : plain(arg, res, s->iw, s->w, 0)) return 0;
+    if (use_exact ? exact(arg, res, s->iw, s->w, 0) : plain(arg, res, s->iw, s->w, 0)) return 0;
     for (j = 0; j < NS; ++j) {
       pushed[j] = slope[j];
       for (m = 0; m < NS; ++m) pushed[j] += value[m * NS + j] * (p->f[i * NS + m] - p->x[(i + 1) * NS + m]);
     }
-    for (j = 0; j < NS * NS; ++j) ahead[j] = 0;
-    for (j = 0; j < NS * NU; ++j) along[j] = 0;
-    multiply(ahead, value, a, NS, NS, NS);
-    multiply(along, value, b, NS, NS, NU);
-    transpose(turned, a, NS, NS);
-    transpose(flat, b, NS, NU);
-    multiply(q, turned, ahead, NS, NS, NS);
-    multiply(cross, flat, ahead, NU, NS, NS);
-    multiply(r, flat, along, NU, NS, NU);
+    condense(q, cross, r, value, a, b, turned);
     for (l = 0; l < NU; ++l) {
       r[l * NU + l] += weight[i * ROWS + l] + (DAMPING + delta) * curvature[l];
       v[l] = -p->lu[i * NU + l] - lean[i * ROWS + l];
@@ -161,13 +153,13 @@ INLINE int sweep(Direction* d, const Point* p, In weight, In lean, In costates, 
 
 /* One library runs on every machine of its architecture: wider registers are used where there are some. Without fused
    multiply-add both round alike. */
-#define SWEEP Direction *d, const Point *p, In weight, In lean, In costates, casadi_real delta, int bent, In data, Scratch *s
+#define SWEEP Direction *d, const Point *p, In weight, In lean, In costates, casadi_real delta, int use_exact, In data, Scratch *s
 #if defined(__GNUC__) && defined(__x86_64__)
-__attribute__((target("avx2"), noinline)) static int sweep_wide(SWEEP) { return sweep(d, p, weight, lean, costates, delta, bent, data, s); }
-__attribute__((noinline)) static int sweep_plain(SWEEP) { return sweep(d, p, weight, lean, costates, delta, bent, data, s); }
+__attribute__((target("avx2"), noinline)) static int sweep_wide(SWEEP) { return sweep(d, p, weight, lean, costates, delta, use_exact, data, s); }
+__attribute__((noinline)) static int sweep_plain(SWEEP) { return sweep(d, p, weight, lean, costates, delta, use_exact, data, s); }
 static int swept(SWEEP) {
-  return (__builtin_cpu_supports("avx2") ? sweep_wide : sweep_plain)(d, p, weight, lean, costates, delta, bent, data, s);
+  return (__builtin_cpu_supports("avx2") ? sweep_wide : sweep_plain)(d, p, weight, lean, costates, delta, use_exact, data, s);
 }
 #else
-static int swept(SWEEP) { return sweep(d, p, weight, lean, costates, delta, bent, data, s); }
+static int swept(SWEEP) { return sweep(d, p, weight, lean, costates, delta, use_exact, data, s); }
 #endif

@@ -41,10 +41,10 @@ def _fit(columns: np.ndarray, target: np.ndarray, upper: np.ndarray, lower: np.n
 
     signed = np.hstack([columns[:, upper], -columns[:, lower]])
     size = np.maximum(np.linalg.norm(signed, axis=0), 1e-300)
-    found, _ = nnls(signed / size, target)
+    weights, _ = nnls(signed / size, target)
     fitted = np.zeros(upper.size)
-    fitted[upper] += (found / size)[: upper.sum()]
-    fitted[lower] -= (found / size)[upper.sum() :]
+    fitted[upper] += (weights / size)[: upper.sum()]
+    fitted[lower] -= (weights / size)[upper.sum() :]
     return fitted
 
 
@@ -59,5 +59,5 @@ def sensitivity_of(ocp: OptimalControl) -> ca.Function:
     inputs = ca.MX.sym("U", ocp.input.size, ocp.stages)
     states, _, _ = rollout(ocp)(s0, inputs, data)
     slope = reduced_gradient(ocp)(s0, inputs, data, ca.MX.zeros(ocp.state.size, ocp.stages))[1]
-    moved = ca.jacobian(ca.vec(states[:, 1:]), ca.vec(inputs))
-    return ca.Function("fpirhc_sensitivity", [s0, inputs, data], [slope, states, ca.densify(moved)])
+    sensitivity = ca.jacobian(ca.vec(states[:, 1:]), ca.vec(inputs))
+    return ca.Function("fpirhc_sensitivity", [s0, inputs, data], [slope, states, ca.densify(sensitivity)])

@@ -66,7 +66,7 @@ class Plan:
 
     def violations(self) -> tuple[str, ...]:
         """The five worst violations of state bounds in words, the first state before all others; empty when there are none."""
-        ocp, found = self.problem, []
+        ocp, violations = self.problem, []
         for k, (name, unit) in enumerate(zip(ocp.state.elements, ocp.state.units, strict=True)):
             low, high = ocp.state_lower[k], ocp.state_upper[k]
             for stage, value in enumerate(self.states[k]):
@@ -74,8 +74,8 @@ class Plan:
                 means_something = stage > 0 or k < ocp.state.size - ocp.written
                 if by > FEASIBLE and means_something and ocp.hard[k]:
                     side = f"below {low:g}" if value < low else f"above {high:g}"
-                    found.append((stage > 0, -by, f"'{name}' is {value:.6g} {unit}, {side}, at stage {stage}"))
-        return tuple(text for _, _, text in sorted(found)[:_WORST])
+                    violations.append((stage > 0, -by, f"'{name}' is {value:.6g} {unit}, {side}, at stage {stage}"))
+        return tuple(text for _, _, text in sorted(violations)[:_WORST])
 
     def overflow(self) -> str:
         """Where the plan stops being finite: the state, input or cost term and its stage, in words; empty when nowhere."""
@@ -87,8 +87,8 @@ class Plan:
                 if bad.size:
                     return f"'{names[bad[0]]}' is {column[bad[0]]} at stage {stage}"
             if stage < ocp.stages:
-                given = self.states[:, stage], self.inputs[:, stage], self.data[:, stage]
-                terms = np.asarray(ocp.stage_cost(*given)[1].full()).ravel()
+                arguments = self.states[:, stage], self.inputs[:, stage], self.data[:, stage]
+                terms = np.asarray(ocp.stage_cost(*arguments)[1].full()).ravel()
                 bad = np.flatnonzero(~np.isfinite(terms))
                 if bad.size:
                     return f"cost term '{ocp.terms[bad[0]]}' is {terms[bad[0]]} at stage {stage}"
@@ -99,19 +99,19 @@ class Plan:
         """Cost of every soft limit and price of every priced one over the horizon by name, zero where it is kept."""
         _, _, terms = rollout(self.problem)(self.states[:, 0], self.inputs, self.data)
         values = zip(self.problem.terms, np.asarray(terms.full()).ravel(), strict=True)
-        found = {name.removeprefix("soft "): float(v) for name, v in values if name.startswith("soft ")}
+        prices = {name.removeprefix("soft "): float(v) for name, v in values if name.startswith("soft ")}
         ocp = self.problem
         for k in np.flatnonzero(~ocp.hard).tolist():
             row = self.states[k, 1:]
             beyond = np.maximum(row - ocp.state_upper[k], 0) + np.maximum(ocp.state_lower[k] - row, 0)
-            found[ocp.state.elements[k]] = float(ocp.state_price[k] * beyond.sum())
-        return found
+            prices[ocp.state.elements[k]] = float(ocp.state_price[k] * beyond.sum())
+        return prices
 
     def verify(self) -> tuple[float, float, float]:
         """Recompute (cost, stationarity, feasibility) from the problem's own functions."""
         ocp = self.problem
-        found = judge(ocp)(self.inputs, self.states[:, 0], self.data, *self.bounds, self.state_multipliers)
-        cost, stationarity, feasibility = (float(v) for v in found)
+        numbers = judge(ocp)(self.inputs, self.states[:, 0], self.data, *self.bounds, self.state_multipliers)
+        cost, stationarity, feasibility = (float(v) for v in numbers)
         return cost, stationarity, feasibility
 
 

@@ -21,18 +21,9 @@ import casadi as ca
 from fpirhc.errors import NotSupported
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient
-from fpirhc.optimisers.base import (
-    Optimiser,
-    clip,
-    is_finite,
-    judge,
-    remembered_plan,
-    require_settings,
-    sane,
-    shift,
-    status_of,
-)
+from fpirhc.optimisers.base import Optimiser, clip, judge, remembered_plan, require_settings, sane, shift, status_of
 from fpirhc.status import Status
+from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 _HISTORY = 5  # values that the non-monotone line search compares with
@@ -120,13 +111,15 @@ class ReducedGradient(Optimiser):
         iterations = ca.MX(self.iterations)
         empty = ca.mmax(lower - upper) > 0
         status = ca.if_else(empty, int(Status.INFEASIBLE), status_of(finite, residual, violation, self.tolerance))
-        told = _choose(finite, ca.vertcat(cost, residual, violation), ca.MX.zeros(3))
-        diagnostics = ca.vertcat(told, iterations, status)
+        numbers = _choose(finite, ca.vertcat(cost, residual, violation), ca.MX.zeros(3))
+        diagnostics = ca.vertcat(numbers, iterations, status)
         # A remembered plan under which a well-posed problem overflows is given up, so that the next call can succeed.
         lost = ca.logic_and(posed, ca.logic_not(ca.logic_or(finite, survives)))
-        following = ca.if_else(lost, clip(0 * plan, lower, upper), plan)
-        kept = ca.vertcat(ca.vec(following), ca.if_else(finite, length, 0))
-        return ca.Function("fpirhc_reduced_gradient", [s0, data, lower, upper, memory], [plan, diagnostics, kept])
+        next_inputs = ca.if_else(lost, clip(0 * plan, lower, upper), plan)
+        next_memory = ca.vertcat(ca.vec(next_inputs), ca.if_else(finite, length, 0))
+        return ca.Function(
+            "fpirhc_reduced_gradient", [s0, data, lower, upper, memory], [plan, diagnostics, next_memory]
+        )
 
     def _iteration(self, ocp: OptimalControl) -> ca.Function:
         """One iteration on the column (U, last values, step length, best U, best value, gradient at U)."""
@@ -139,19 +132,19 @@ class ReducedGradient(Optimiser):
         values, length = _part(ocp, state, 1), _part(ocp, state, 2)
         best, lowest = ca.reshape(_part(ocp, state, 3), nu, n), _part(ocp, state, 4)
         scale = _scale(ocp)
-        following = clip(inputs - length * scale * slope, lower, upper)
-        move = following - inputs
-        value, new_slope, _, _ = reduced_gradient(ocp)(s0, following, data, ca.MX.zeros(ocp.state.size, n))
+        next_inputs = clip(inputs - length * scale * slope, lower, upper)
+        move = next_inputs - inputs
+        value, new_slope, _, _ = reduced_gradient(ocp)(s0, next_inputs, data, ca.MX.zeros(ocp.state.size, n))
         # NaN compares false, so a rollout that overflows is rejected like one that does not decrease enough.
         enough = value <= ca.mmax(values) + _DECREASE * ca.dot(slope, move)
         accepted = ca.logic_and(enough, is_finite(ca.vertcat(value, ca.vec(new_slope))))
         spectral = _spectral_length(move, scale, new_slope - slope, length)
         better = ca.logic_and(accepted, value <= lowest)
         result = ca.vertcat(
-            ca.vec(_choose(accepted, following, inputs)),
+            ca.vec(_choose(accepted, next_inputs, inputs)),
             _choose(accepted, ca.vertcat(values[1:], value), values),
             _choose(accepted, spectral, _SHORTER * length),
-            ca.vec(_choose(better, following, best)),
+            ca.vec(_choose(better, next_inputs, best)),
             _choose(better, value, lowest),
             ca.vec(_choose(accepted, new_slope, slope)),
         )

@@ -32,30 +32,32 @@ def _better(
 ) -> list[ca.MX]:
     """The results of both, the better one of them, in the plain iteration's memory."""
     n, ns = ocp.stages, ocp.state.size
-    before, plan, kept = layout.split(arguments[4]), limited_memory(ocp), layout.split(first[2])
+    before, plan, plain_memory = layout.split(arguments[4]), limited_memory(ocp), layout.split(first[2])
     evaluated = first[1][4] < int(Status.INFEASIBLE)
     warm = ca.logic_and(before["plan_step"] > 0, evaluated)
     begin = {name: ca.MX.zeros(plan[name].size) for name in plan.names}
-    begin["plan_inputs"] = ca.if_else(warm, kept["plan_inputs"], before["plan_inputs"])
-    states = ca.vec(shift(ca.reshape(kept["plan_states"], ns, n)))
-    begin |= {"plan_states": ca.if_else(warm, states, 0), "plan_gains": ca.if_else(warm, kept["plan_gains"], 0)}
+    begin["plan_inputs"] = ca.if_else(warm, plain_memory["plan_inputs"], before["plan_inputs"])
+    states = ca.vec(shift(ca.reshape(plain_memory["plan_states"], ns, n)))
+    begin |= {"plan_states": ca.if_else(warm, states, 0), "plan_gains": ca.if_else(warm, plain_memory["plan_gains"], 0)}
     begin["plan_barrier"] = ca.if_else(warm, MU_WARM, 0)
     second = limited(*arguments[:4], plan.join(begin))
-    inputs, told, after = second
-    found = plan.split(after)
+    inputs, diagnostics, after = second
+    interior_memory = plan.split(after)
 
-    nodes = ca.reshape(found["plan_states"], ns, n)
+    nodes = ca.reshape(interior_memory["plan_states"], ns, n)
     earlier = ca.horzcat(arguments[0], nodes[:, : n - 1])
     memory: dict[str, ca.MX] = {
         "plan_inputs": ca.vec(inputs),
         "plan_states": ca.vec(earlier),
-        "plan_gains": found["plan_gains"],
+        "plan_gains": interior_memory["plan_gains"],
         "plan_gamma": ca.MX(0),
         "plan_step": ca.MX(1),
     }
-    usable = told[4] < int(Status.INFEASIBLE)
-    closer = ca.logic_or(told[4] == int(Status.OK), ca.logic_or(ca.logic_not(evaluated), told[1] < first[1][1]))
+    usable = diagnostics[4] < int(Status.INFEASIBLE)
+    closer = ca.logic_or(
+        diagnostics[4] == int(Status.OK), ca.logic_or(ca.logic_not(evaluated), diagnostics[1] < first[1][1])
+    )
     better = ca.logic_and(usable, closer)
     count = ca.vertcat(ca.MX.zeros(3), first[1][3], 0)
-    results = [inputs, told + count, layout.join(memory)]
+    results = [inputs, diagnostics + count, layout.join(memory)]
     return [ca.if_else(better, new, old) for new, old in zip(results, first, strict=True)]

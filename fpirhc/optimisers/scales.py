@@ -67,9 +67,9 @@ def _answered_curvature(ocp: OptimalControl) -> np.ndarray:
     along = ocp.along
     value = along.final
     for a, b, q, s, r in zip(*(v[::-1] for v in (along.a, along.b, along.q, along.s, along.r)), strict=True):
-        bend, cross = r + b.T @ value @ b, s + b.T @ value @ a
-        value = q + a.T @ value @ a - cross.T @ np.linalg.lstsq(bend, cross, rcond=None)[0]
-    diagonal = bend.diagonal()
+        q_uu, cross = r + b.T @ value @ b, s + b.T @ value @ a
+        value = q + a.T @ value @ a - cross.T @ np.linalg.lstsq(q_uu, cross, rcond=None)[0]
+    diagonal = q_uu.diagonal()
     usable = np.isfinite(diagonal) & (diagonal > 0)
     return np.where(usable, diagonal, ocp.step * ocp.curvature)
 

@@ -14,10 +14,10 @@ from fpirhc.optimisers.base import shift
 
 def program_values(ocp: OptimalControl) -> ca.Function:
     """Function (w, p) -> cost, constraints and their first derivatives in one column."""
-    given = program(ocp)
-    slopes = ca.gradient(given["f"], given["x"]), ca.jacobian(given["g"], given["x"])
-    column = ca.vertcat(given["f"], given["g"], ca.densify(slopes[0]), slopes[1].nz[:])
-    return ca.Function("fpirhc_program_values", [given["x"], given["p"]], [column])
+    nlp = program(ocp)
+    slopes = ca.gradient(nlp["f"], nlp["x"]), ca.jacobian(nlp["g"], nlp["x"])
+    column = ca.vertcat(nlp["f"], nlp["g"], ca.densify(slopes[0]), slopes[1].nz[:])
+    return ca.Function("fpirhc_program_values", [nlp["x"], nlp["p"]], [column])
 
 
 def sizes(ocp: OptimalControl) -> tuple[int, int]:
@@ -63,15 +63,15 @@ def program(ocp: OptimalControl) -> dict[str, ca.MX]:
     data = ca.reshape(flat, ocp.data.size, n + 1)
     costs, _ = ocp.stage_cost.map(n)(states[:, :n], inputs, data[:, :n])
     value = ca.sum2(costs) + ocp.terminal_cost(states[:, n], data[:, n])
-    following = ocp.dynamics.map(n)(states[:, :n], inputs, data[:, :n])
-    return {"x": w, "p": flat, "f": value, "g": ca.vec(states[:, 1:] - following)}
+    next_states = ocp.dynamics.map(n)(states[:, :n], inputs, data[:, :n])
+    return {"x": w, "p": flat, "f": value, "g": ca.vec(states[:, 1:] - next_states)}
 
 
 def gauss_newton_hessian(ocp: OptimalControl) -> ca.Function:
     """Function (x, p, lam_f, lam_g) -> Hessian of the cost alone, block by block (both triangles, as SQP wants it)."""
-    given = program(ocp)
-    hessian, _ = ca.hessian(given["f"], given["x"])
+    nlp = program(ocp)
+    hessian, _ = ca.hessian(nlp["f"], nlp["x"])
     weight, multipliers = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", sizes(ocp)[1])
-    inputs = [given["x"], given["p"], weight, multipliers]
+    inputs = [nlp["x"], nlp["p"], weight, multipliers]
     names = ["x", "p", "lam_f", "lam_g"]
     return ca.Function("nlp_hess_l", inputs, [weight * hessian], names, ["hess_gamma_x_x"])

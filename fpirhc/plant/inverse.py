@@ -22,7 +22,7 @@ INVERSE_TOLERANCE = 1e-8  # relative response error beyond which an input of New
 
 def inverse_by_user(plant: Plant, inverse: Callable[..., Mapping[str, Expression]]) -> ca.Function:
     """Function (state, response, parameters) -> input, made of the user's `inverse`."""
-    x, _, p = plant._symbols()
+    x, _, p = plant.symbols()
     r = ca.SX.sym("r", len(plant.controlled_names))
     commands = inverse(*plant._derivatives(x), Named(plant.controlled_names, r, "coordinate"), plant._parameters(p))
     column = ca.vertcat(*(ca.SX(commands[i]) for i in plant.inputs))
@@ -31,7 +31,7 @@ def inverse_by_user(plant: Plant, inverse: Callable[..., Mapping[str, Expression
 
 def inverse_of_affine(plant: Plant) -> ca.Function:
     """Function (state, response, parameters) -> input, for a response that is affine in the inputs."""
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     r = ca.SX.sym("r", len(plant.controlled_names))
     response = plant.controlled_response_function(x, u, p)
     gain = ca.jacobian(response, u)
@@ -42,7 +42,7 @@ def inverse_of_affine(plant: Plant) -> ca.Function:
 
 def inverse_by_newton(plant: Plant) -> ca.Function:
     """Function (state, response, parameters) -> input, found from zero inputs by Newton's method."""
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     r = ca.SX.sym("r", len(plant.controlled_names))
     error = ca.Function("fpirhc_inversion", [u, x, r, p], [plant.controlled_response_function(x, u, p) - r])
     finder = ca.rootfinder("fpirhc_newton", "fast_newton", error, {"error_on_fail": False})

@@ -156,6 +156,10 @@ class Plant:
         object.__setattr__(other, "parameters", parameters)
         return other
 
+    def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Return new symbols of the state, the input and the parameters, with the sizes of this plant."""
+        return (ca.SX.sym("x", self.state.size), ca.SX.sym("u", len(self.inputs)), ca.SX.sym("p", len(self.parameters)))
+
     def indices(self, derivative: int) -> tuple[int, ...]:
         """Places in the state vector of one derivative, for every coordinate whose order is higher."""
         elements = [c + "'" * derivative for c, r in zip(self.names, self.orders, strict=True) if r > derivative]
@@ -164,7 +168,7 @@ class Plant:
     @cached_property
     def response_function(self) -> ca.Function:
         """Function (state, input, parameters) -> highest derivative of every coordinate (n)."""
-        x, u, p = self._symbols()
+        x, u, p = self.symbols()
         responses = self.response(*self._derivatives(x), Named(self.input.elements, u, "input"), self._parameters(p))
         column = ca.vertcat(*(ca.SX(responses[c]) for c in self.names))
         return ca.Function("fpirhc_response", [x, u, p], [ca.densify(column)], ["x", "u", "p"], ["r"])
@@ -172,14 +176,14 @@ class Plant:
     @cached_property
     def controlled_response_function(self) -> ca.Function:
         """Function (state, input, parameters) -> highest derivative of the controlled coordinates."""
-        x, u, p = self._symbols()
+        x, u, p = self.symbols()
         responses = self.response_function(x, u, p)[list(self.controlled_indices)]
         return ca.Function("fpirhc_controlled_response", [x, u, p], [responses], ["x", "u", "p"], ["r"])
 
     @cached_property
     def forced_derivative_function(self) -> ca.Function:
         """Function (state, input, parameters, forcing) -> dx/dt; `forcing` (n) adds to the responses."""
-        x, u, p = self._symbols()
+        x, u, p = self.symbols()
         w = ca.SX.sym("w", len(self.names))
         responses = self.response_function(x, u, p) + w
         rates = []
@@ -194,14 +198,14 @@ class Plant:
     @cached_property
     def derivative_function(self) -> ca.Function:
         """Function (state, input, parameters) -> dx/dt, undisturbed."""
-        x, u, p = self._symbols()
+        x, u, p = self.symbols()
         rate = self.forced_derivative_function(x, u, p, ca.SX.zeros(len(self.names)))
         return ca.Function("fpirhc_free_derivative", [x, u, p], [rate], ["x", "u", "p"], ["xdot"])
 
     @cached_property
     def affine(self) -> bool:
         """Whether the controlled response is affine in the inputs, decided from the symbols."""
-        x, u, p = self._symbols()
+        x, u, p = self.symbols()
         return bool(ca.is_linear(self.controlled_response_function(x, u, p), u))
 
     @property
@@ -223,9 +227,6 @@ class Plant:
         if self.inverse is not None:
             return inverse_by_user(self, self.inverse)
         return inverse_of_affine(self) if self.affine else inverse_by_newton(self)
-
-    def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
-        return (ca.SX.sym("x", self.state.size), ca.SX.sym("u", len(self.inputs)), ca.SX.sym("p", len(self.parameters)))
 
     def _derivatives(self, x: Expression) -> list[Named]:
         views = []

@@ -50,7 +50,7 @@ def check_response(plant: Plant, mistakes: Mistakes) -> None:
             f"response({', '.join([*lower[: expected - 2], 'u', 'p'])})"
         )
         return
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     try:
         response = plant.response(*plant._derivatives(x), Named(plant.input.elements, u, "input"), plant._parameters(p))
     except FpirhcError as error:

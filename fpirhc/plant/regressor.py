@@ -94,14 +94,14 @@ class Regressor:
     @cached_property
     def covered(self) -> tuple[int, ...]:
         """Places of the plant's parameters on which theta depends."""
-        _, _, p = self.plant._symbols()
+        _, _, p = self.plant.symbols()
         pattern = ca.DM(ca.jacobian_sparsity(self.theta_function(p), p), 1).full()
         return tuple(int(k) for k in np.flatnonzero(pattern.any(axis=0)))
 
     @cached_property
     def function(self) -> ca.Function:
         """Function (state, response, plant's parameters) -> (Y (n x m), Q0 (n)); covered parameters are not read."""
-        x, r, p = self._symbols()
+        x, r, p = self.symbols()
         inverse, points = self.plant.inverse_function, self._points
         slope = ca.Function("fpirhc_slope", [x, r, p], [ca.jacobian(inverse(x, r, p), p)])
         slopes = [slope(x, r, self._placed(p, point))[:, list(self.covered)] for point in points]
@@ -113,7 +113,7 @@ class Regressor:
     @cached_property
     def force_function(self) -> ca.Function:
         """Function (state, response, theta, plant's parameters) -> Y theta + Q0."""
-        x, r, p = self._symbols()
+        x, r, p = self.symbols()
         theta = ca.SX.sym("theta", len(self.names))
         y, rest = self.function(x, r, p)
         return ca.Function("fpirhc_force", [x, r, theta, p], [ca.mtimes(y, theta) + rest])
@@ -121,7 +121,7 @@ class Regressor:
     @cached_property
     def mass_function(self) -> ca.Function:
         """Function (state, theta, plant's parameters) -> M (n x n)."""
-        x, r, p = self._symbols()
+        x, r, p = self.symbols()
         theta = ca.SX.sym("theta", len(self.names))
         mass = ca.jacobian(self.force_function(x, r, theta, p), r)
         mass = ca.substitute(mass, r, ca.SX.zeros(r.numel()))
@@ -130,7 +130,7 @@ class Regressor:
     @cached_property
     def coriolis_function(self) -> ca.Function:
         """Function (state, theta, plant's parameters) -> C (n x n) with M' - 2 C skew-symmetric."""
-        x, _, p = self._symbols()
+        x, _, p = self.symbols()
         theta = ca.SX.sym("theta", len(self.names))
         mass = self.mass_function(x, theta, p)
         q, v = x[list(self.plant.indices(0))], x[list(self.plant.indices(1))]
@@ -142,7 +142,7 @@ class Regressor:
     @cached_property
     def split_function(self) -> ca.Function:
         """Function (state, v, v', plant's parameters) -> (Y_s (n x m), Q0_s (n)), v a second velocity."""
-        x, v, p = self._symbols()
+        x, v, p = self.symbols()
         slope, theta = ca.SX.sym("slope", v.numel()), ca.SX.sym("theta", len(self.names))
         # M v' + C v + Q(q, q', 0) - C q' is affine in theta as Q is.
         force = self.force_function(x, slope, theta, p)
@@ -180,15 +180,16 @@ class Regressor:
         return points
 
     def _slopes(self, points: list[np.ndarray]) -> np.ndarray:
-        _, _, p = self.plant._symbols()
+        _, _, p = self.plant.symbols()
         slope = ca.Function("fpirhc_theta_slope", [p], [ca.jacobian(self.theta_function(p), p)])
         return np.hstack([slope(point).full()[:, list(self.covered)] for point in points])
 
     def _placed(self, p: Expression, point: np.ndarray) -> Expression:
         return ca.vertcat(*(point[k] if k in self.covered else p[k] for k in range(p.numel())))
 
-    def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
-        x, _, p = self.plant._symbols()
+    def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Return new symbols of the state, the response and the plant's parameters."""
+        x, _, p = self.plant.symbols()
         return x, ca.SX.sym("r", len(self.plant.names)), p
 
 
@@ -289,7 +290,7 @@ def _not_linear(regressor: Regressor, worst: float) -> str:
 
 def _nonlinear_pairs(plant: Plant) -> np.ndarray:
     """Pairs of parameters by which the inverse dynamics has a second derivative, shape (np, np), tested at random points."""
-    x, _, p = plant._symbols()
+    x, _, p = plant.symbols()
     r, count = ca.SX.sym("r", len(plant.names)), len(plant.parameters)
     force = plant.inverse_function(x, r, p)
     slope = ca.jacobian(force, p)

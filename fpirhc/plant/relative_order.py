@@ -62,7 +62,7 @@ def output_chain(plant: Plant, coordinate: str, input_name: str | None = None) -
         NotInvertible: the input reaches no derivative of the coordinate, or another input reaches an earlier one.
     """
     name = _input(plant, coordinate, input_name)
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
     rate = plant.forced_derivative_function(x, u, p, w)
     command = u[plant.input.elements.index(name)]

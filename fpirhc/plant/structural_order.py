@@ -17,7 +17,7 @@ def structural_order(plant: Plant, coordinate: str) -> int | None:
     Only the pattern of dependence counts, so an accidental cancellation has no effect. The search is a breadth-first walk from the
     coordinate through the states on which its derivatives depend.
     """
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     rate = plant.derivative_function(x, u, p)
     on_state = np.array(ca.DM(ca.jacobian_sparsity(rate, x), 1).full(), dtype=bool)
     on_input = np.array(ca.DM(ca.jacobian_sparsity(rate, u), 1).full(), dtype=bool).any(axis=1)

@@ -48,7 +48,7 @@ _CHANGE = "Control another coordinate, move the reference away from the singular
 def _gains(grid: ReviewGrid) -> np.ndarray:
     """B at every draw and point, shape (draws + 1, m, n, n); the last one is the model's."""
     plant = grid.problem.plant
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     slope = ca.densify(ca.jacobian(plant.controlled_response_function(x, u, p), u))
     function = ca.Function("fpirhc_input_gain", [x, u, p], [ca.vec(slope)])
     m, n = len(grid.times), len(plant.inputs)

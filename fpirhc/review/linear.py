@@ -115,7 +115,7 @@ def _read(f: np.ndarray, c: np.ndarray, among: np.ndarray) -> np.ndarray:
 
 def response_slopes(plant: Plant) -> ca.Function:
     """Return the Function (state, input, parameters) -> A (n, nx), B (n, nu) of the responses."""
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     response = plant.response_function(x, u, p)
     slopes = [ca.densify(ca.jacobian(response, v)) for v in (x, u)]
     return ca.Function("fpirhc_slopes", [x, u, p], slopes)

@@ -130,7 +130,7 @@ def _truth_block(problem: Problem, state: Signal) -> Block:
 
 def _own_response(plant: Plant) -> Response:
     """The response of the controlled coordinates."""
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
     response = plant.controlled_response_function(x, u, p) + w[list(plant.controlled_indices)]
     return Response(plant.response_signal("realised"), ca.Function("fpirhc_realised", [x, u, p, w], [response]))

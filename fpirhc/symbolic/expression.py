@@ -19,6 +19,8 @@ Expression: TypeAlias = ca.SX  # a CasADi SX, MX or DM
 Value: TypeAlias = ca.SX | ca.DM | float  # a result of a step: numbers become expressions
 Matrix = TypeVar("Matrix", ca.SX, ca.MX, ca.DM)  # for functions whose result is of the same kind as their argument
 
+FINITE = 1e300  # |v| <= FINITE is false for NaN and infinity, in a form that CasADi does not simplify away
+
 
 class Signals:
     """The signals that a step reads and remembers, by attribute: `s.desired` is a CasADi column."""
@@ -50,6 +52,11 @@ def column(parts: Sequence[Matrix]) -> Matrix:
     """Return the parts in one column; without parts an empty column of numbers, which mixes with every kind."""
     empty: object = ca.DM(0, 1)
     return ca.vertcat(*parts) if parts else cast(Matrix, empty)
+
+
+def is_finite(value: Matrix) -> Matrix:
+    """Return 1 where every entry is a finite number, else 0. fmax and fmin would hide NaN."""
+    return ca.mmin(ca.fabs(ca.vec(value)) <= FINITE)
 
 
 def total(terms: Iterable[Expression]) -> Expression:

@@ -169,7 +169,7 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
     plant = problem.plant
     if plant.controlled is None and len(plant.inputs) != len(plant.coordinates):
         return
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     response = plant.controlled_response_function(x, u, p)
     gain_of = ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response])
     state = ", ".join(f"{e} = {v:g}" for e, v in zip(plant.state.elements, problem.start_state, strict=True))

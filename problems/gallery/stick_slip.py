@@ -110,10 +110,10 @@ tuning = {
 
 def friction(run):
     """Friction of the bristles and the oil: sigma0 z + sigma1 z' + sigma2 x', with the plant's parameters, N."""
-    speed, bend = run["state.x'"], run["state.z"]
+    speed, bristle = run["state.x'"], run["state.z"]
     grip = COULOMB + (STATIC - COULOMB) * np.exp(-((speed / STRIBECK) ** 2))
     sigma1, sigma2 = (plant.parameters[name].exact for name in ("sigma1", "sigma2"))
-    return SIGMA0 * bend + sigma1 * (speed - SIGMA0 * np.abs(speed) * bend / grip) + sigma2 * speed
+    return SIGMA0 * bristle + sigma1 * (speed - SIGMA0 * np.abs(speed) * bristle / grip) + sigma2 * speed
 
 
 pictures = (

@@ -26,12 +26,12 @@ import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, invert_block
 from fpirhc.controllers.tracked import desired_blocks
-from fpirhc.deformation.base import Deformation, is_finite
+from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking

@@ -17,12 +17,11 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import clip, like
-from fpirhc.deformation.base import is_finite
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.learning.rules.base import Bounds, Evidence, Pair, Rule
 from fpirhc.plant.regressor import Combination, Regressor
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals, Value, pair
+from fpirhc.symbolic.expression import Signals, Value, is_finite, pair
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 
@@ -141,7 +140,7 @@ def fed(block: Block, name: str, source: Signal) -> Block:
 
 def equation_function(regressor: Regressor) -> ca.Function:
     """Return Function (state, response, last command, estimate, parameters) -> (M_hat^-1 Y, h)."""
-    x, r, p = regressor._symbols()
+    x, r, p = regressor.symbols()
     u, theta = ca.SX.sym("u", len(regressor.plant.inputs)), ca.SX.sym("theta", len(regressor.names))
     y, rest = regressor.function(x, r, p)
     both = ca.solve(regressor.mass_function(x, theta, p), ca.horzcat(y, u - rest - ca.mtimes(y, theta)))
@@ -178,7 +177,7 @@ def _states(problem: Problem) -> np.ndarray:
 
 def _mass_coefficients(regressor: Regressor, states: np.ndarray) -> np.ndarray:
     """M = A_0 + sum_j theta_j A_j at every state, shape (count, m + 1, n, n)."""
-    x, _, p = regressor._symbols()
+    x, _, p = regressor.symbols()
     theta = ca.SX.sym("theta", len(regressor.names))
     mass = ca.vec(regressor.mass_function(x, theta, p))
     zero = ca.substitute(mass, theta, ca.SX.zeros(theta.numel()))

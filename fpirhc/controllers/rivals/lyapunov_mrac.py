@@ -195,7 +195,7 @@ def _start_gains(plant: Plant) -> ca.Function:
 def _sign(problem: Problem) -> int:
     """Sign of the inputs' effect on the response by the model at the start; 0 where it is not definite."""
     plant = problem.plant
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     effect = ca.Function("fpirhc_effect", [x, u, p], [ca.jacobian(plant.controlled_response_function(x, u, p), u)])
     matrix = np.asarray(effect(problem.start_state, [0] * len(plant.inputs), plant.approximate).full())
     values = np.linalg.eigvalsh(matrix + matrix.T)

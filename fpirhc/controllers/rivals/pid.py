@@ -76,7 +76,7 @@ class PID(Controller):
             if name not in self.proportional:
                 mistakes.add(f"proportional: controlled coordinate '{name}' has no gain; add '{name}': ...")
         mistakes.raise_if_any()
-        x, u, p = plant._symbols()
+        x, u, p = plant.symbols()
         effect = ca.Function("fpirhc_effect", [x, u, p], [ca.jacobian(plant.controlled_response_function(x, u, p), u)])
         at_start = effect(problem.start_state, [0] * len(plant.inputs), plant.approximate)
         for k, (name, index) in enumerate(zip(names, plant.controlled_indices, strict=True)):

@@ -127,7 +127,7 @@ def _nominal_block(problem: Problem) -> Block:
 def _increment_block(problem: Problem) -> Block:
     """Block (change, last command, state) -> request: the model's response to the last command plus the change."""
     plant, period, warm_up_cycles = problem.plant, problem.period, problem.warm_up_cycles
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     measured = ca.SX.sym("f", len(plant.controlled_names))
     response = plant.controlled_response_function(x, u, p)
     highest = plant.response_function(x, u, p)

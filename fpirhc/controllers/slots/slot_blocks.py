@@ -20,10 +20,9 @@ import casadi as ca
 
 from fpirhc.controllers.base import clip, error_signal, like
 from fpirhc.controllers.slots.slot import Channel, First
-from fpirhc.deformation.base import is_finite
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals, Value, expression
+from fpirhc.symbolic.expression import Signals, Value, expression, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 

@@ -97,7 +97,7 @@ def _set_point(problem: Problem, parameters: np.ndarray) -> tuple[np.ndarray, np
     moving = [abs(v) for e, v in zip(plant.state.elements, state, strict=True) if "'" in e]
     if max([*moving, *np.abs(response)]) > _STILL:
         return f"the reference still moves at its end, t = {problem.duration:g} s"
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     rate = plant.derivative_function(x, u, p)
     function = ca.Function("fpirhc_rate", [x, u, p], [rate, ca.densify(ca.jacobian(rate, u))])
     free, gain = (np.asarray(v.full()) for v in function(state, np.zeros(u.numel()), parameters))
@@ -113,7 +113,7 @@ def _mode(
 ) -> Mode:
     plant, law = problem.plant, one.slot.tracking.feedback(one.chain.order)
     assert law is not None
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     rate, calm = plant.derivative_function(x, u, p), ca.SX.zeros(len(plant.names))
     acting_input = u[plant.input.elements.index(one.chain.input)]
     realised = one.chain.response(x, u, p, calm)

@@ -102,7 +102,7 @@ class Slotted(Controller):
     def response(self, problem: Problem) -> Response:
         """Return the response y^(r) of every slot's coordinate."""
         channels = self.channels(problem)
-        x, u, p = problem.plant._symbols()
+        x, u, p = problem.plant.symbols()
         w = ca.SX.sym("w", len(problem.plant.names))
         responses = ca.vertcat(*(c.chain.response(x, u, p, w) for c in channels))
         return Response(by_slot(channels, "realised"), ca.Function("fpirhc_slots_realised", [x, u, p, w], [responses]))

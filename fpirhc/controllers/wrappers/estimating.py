@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, compose_controller, embedded, like
-from fpirhc.deformation.base import Deformation, is_finite
+from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotSupported
 from fpirhc.learning.estimators.base import Estimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals, Value
+from fpirhc.symbolic.expression import Signals, Value, is_finite
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 

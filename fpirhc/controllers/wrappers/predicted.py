@@ -102,7 +102,7 @@ class ByModel(Predictor):
     def advance(self, plant: Plant, period: float) -> ca.Function:
         """Return one Runge-Kutta step of the model as a Function."""
         step = RungeKutta4().step(plant, period)
-        x, u, p = plant._symbols()
+        x, u, p = plant.symbols()
         w = ca.SX.sym("w", len(plant.names))
         return ca.Function("fpirhc_predict", [x, u, p, w], [step(x, u, p, w)])
 
@@ -130,7 +130,7 @@ class ByDesired(Predictor):
 
     def advance(self, plant: Plant, period: float) -> ca.Function:
         """Return Taylor's formula with the highest derivative held over the cycle, as a Function."""
-        x, _, p = plant._symbols()
+        x, _, p = plant.symbols()
         d, w = ca.SX.sym("d", len(plant.names)), ca.SX.sym("w", len(plant.names))
         elements, state_next = plant.state.elements, {}
         for k, name in enumerate(plant.names):
@@ -250,7 +250,7 @@ def _predict_block(
 
 def _residual(plant: Plant, time: float, period: float) -> ca.Function:
     """Function (residual, state, command that acted, realised, parameters) -> the low-passed residual one cycle later."""
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     old, f = ca.SX.sym("old", len(plant.names)), ca.SX.sym("f", len(plant.controlled_names))
     residual_now = ca.SX.zeros(len(plant.names))
     residual_now[list(plant.controlled_indices)] = f - plant.controlled_response_function(x, u, p)

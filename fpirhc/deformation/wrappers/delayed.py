@@ -26,6 +26,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import casadi as ca
 
@@ -37,6 +38,13 @@ from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 __all__ = ["MOST", "Increment", "Paired"]
+
+
+class _Past(NamedTuple):
+    """The queues of requests and of desired responses, newest first."""
+
+    requests: Expression
+    desired: Expression
 
 
 @dataclass(frozen=True)
@@ -91,7 +99,7 @@ class _Queued(Wrapper):
         past_requests = queue.pushed(memory["queue_requests"], request)
         past_desired = queue.pushed(memory["queue_desired"], desired_then)
         valid = memory["queue_filled"] >= queue.length - 1
-        next_request, next_memory = self._request(past_requests, past_desired, response, desired, inner)
+        next_request, next_memory = self._request(_Past(past_requests, past_desired), response, desired, inner)
         remembered = {name: ca.if_else(valid, value, inner[name]) for name, value in next_memory.items()}
         filled = ca.fmin(memory["queue_filled"] + 1, queue.length)
         queues = {
@@ -104,14 +112,9 @@ class _Queued(Wrapper):
 
     @abstractmethod
     def _request(
-        self,
-        past_requests: Expression,
-        past_desired: Expression,
-        response: Expression,
-        desired: Expression,
-        memory: Mapping[str, Expression],
+        self, past: _Past, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        """The next request, from the queues of requests and desired responses and from the response and desired response now."""
+        """The next request, from the queues and from the response and desired response of this cycle."""
 
 
 @dataclass(frozen=True)
@@ -148,15 +151,9 @@ class Paired(_Queued):
         return Queue(self.cycles, self.uncertainty)
 
     def _request(
-        self,
-        past_requests: Expression,
-        past_desired: Expression,
-        response: Expression,
-        desired: Expression,
-        memory: Mapping[str, Expression],
+        self, past: _Past, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
-        del past_desired
-        return self.map.step(self._queue.delayed(past_requests, desired.numel()), response, desired, memory)
+        return self.map.step(self._queue.delayed(past.requests, desired.numel()), response, desired, memory)
 
 
 @dataclass(frozen=True)
@@ -200,19 +197,14 @@ class Increment(_Queued):
         return Queue(self.cycles)
 
     def _request(
-        self,
-        past_requests: Expression,
-        past_desired: Expression,
-        response: Expression,
-        desired: Expression,
-        memory: Mapping[str, Expression],
+        self, past: _Past, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         size, pole = desired.numel(), self.leak
-        undeformed, request = self._queue.delayed(past_desired, size), self._queue.delayed(past_requests, size)
+        undeformed, request = self._queue.delayed(past.desired, size), self._queue.delayed(past.requests, size)
         next_request, next_memory = self.map.step(request, response, undeformed, memory)
         deformation = next_request - undeformed
         if pole:
-            deformation = pole * (past_requests[:size] - past_desired[:size]) + (1 - pole) * deformation
+            deformation = pole * (past.requests[:size] - past.desired[:size]) + (1 - pole) * deformation
         return desired + deformation, next_memory
 
 

@@ -22,10 +22,11 @@ from typing import ClassVar
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, is_finite, smooth_norm
+from fpirhc.deformation.base import Deformation, smooth_norm
 from fpirhc.deformation.wrappers.base import Wrapper, of_map, start_of_map
 from fpirhc.deformation.wrappers.forgetting import forget
 from fpirhc.errors import InvalidValue
+from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 EVENTS = {1: "oscillation at the step limit", 2: "growing oscillation", 3: "request too far from the desired response"}

@@ -150,7 +150,7 @@ class DisturbanceKalman(Estimator):
     def _matrices(self, problem: Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """A of state and disturbances over one period, the effect of response noise on the state, and C."""
         model = problem.plant
-        x, u, p = model._symbols()
+        x, u, p = model.symbols()
         w = ca.SX.sym("w", len(model.names))
         x_next = RungeKutta4().step(model, problem.period)(x, u, p, w)
         function = ca.Function("fpirhc_linear", [x, u, p, w], [ca.jacobian(x_next, x), ca.jacobian(x_next, w)])

@@ -80,7 +80,7 @@ def check_learner(owner: str, plant: Plant, parameters: Mapping[str, Uncertain],
 
 def residual_function(plant: Plant, parameters: Mapping[str, Uncertain], noise: Sequence[float]) -> ca.Function:
     """Return Function (z, state, input, response, model's parameters) -> (e, H) of one pair."""
-    x, u, p = plant._symbols()
+    x, u, p = plant.symbols()
     z, f = ca.SX.sym("z", len(parameters)), ca.SX.sym("f", len(plant.controlled_names))
     believed = ca.SX(p)
     for k, name in enumerate(parameters):

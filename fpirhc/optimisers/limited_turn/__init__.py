@@ -1,0 +1,1 @@
+"""One turn of the iteration with limits, as expressions: one file for each of its parts."""

@@ -1,0 +1,96 @@
+"""One turn of the iteration with limits: expand a plan, judge it, and find the next one by a sweep.
+
+A phase of pure steps accepts a plan that halves the scaled error E of the first-order conditions. It is patient for a few steps,
+because a change of the active limits raises E at first. A phase of interior steps accepts a plan by a filter of (infeasibility
+theta, barrier function phi) after Fletcher and Leyffer as in IPOPT. A Levenberg-Marquardt term replaces its restoration, because
+limits of states give way anyway. Where mu is low enough pure steps end the phase; where they do not contract, an interior phase
+goes on.
+
+References: R. Fletcher, S. Leyffer, Math. Program. 91, 2002; A. Waechter, L. T. Biegler, Math. Program. 106, 2006.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from fpirhc.horizon.sweep import Expansion, expand
+from fpirhc.optimisers.certified import Certified
+from fpirhc.optimisers.limited_settings import NEAR, ROLLED, SEVERAL
+from fpirhc.optimisers.limited_turn.call import Call
+from fpirhc.optimisers.limited_turn.direction import Direction
+from fpirhc.optimisers.limited_turn.interior import judge_interior
+from fpirhc.optimisers.limited_turn.phases import enter_interior, enter_pure, restart
+from fpirhc.optimisers.limited_turn.pure import judge_pure
+from fpirhc.optimisers.limited_turn.state import BEGINS, COLD, PURE, State, as_point, choose, fixed, point
+from fpirhc.optimisers.search import deformed_move
+from fpirhc.symbolic.expression import is_finite
+
+
+class Turn:
+    """Builds the expressions of a turn.
+
+    Args:
+        call: the problem and its arguments.
+    """
+
+    def __init__(self, call: Call) -> None:
+        ocp = call.ocp
+        self._call, self._direction, self._expand = call, Direction(call), expand(ocp)
+        self._deformed = deformed_move(call.settings.map, ocp.input.size * ocp.stages)
+
+    def turned(self, s: State) -> State:
+        """Return the whole state after one turn."""
+        final = s["count"] >= self._call.settings.iterations
+        p, rolled, usable = self._next(s, final)
+        s = {**s, **self._judged(s, p, rolled, usable)}
+        ends = ca.logic_or(ca.logic_or(final, s["stuck"]), self._limits_met(s))
+        s = {**s, "ends": ends, "count": s["count"] + ca.logic_not(ends)}
+        needed = ca.logic_and(s["fresh"] == 0, ca.logic_or(s["accepted"], s["again"]))
+        return self._direction.directed(s, ca.logic_and(needed, ca.logic_not(ends)))
+
+    def _limits_met(self, s: State) -> ca.MX:
+        last = Certified(s["error"] * 0, s["last_left"], s["last_violation"], s["last_broken"], s["last_error"])
+        return ca.logic_and(ca.logic_and(s["fresh"] == 0, s["phase"] == PURE), self._call.is_done(last))
+
+    def _next(self, s: State, final: ca.MX) -> tuple[Expansion, ca.MX, ca.MX]:
+        """The next plan, expanded; whether it is rolled out, and whether it is finite."""
+        call, old, fresh = self._call, point(s), s["fresh"] > 0
+        pure = ca.logic_and(ca.logic_not(fresh), s["phase"] == PURE)
+        share = ca.if_else(ca.logic_or(fresh, pure), 0, s["alpha"])
+        deformed = ca.reshape(self._deformed(ca.vec(s["v"])), old.inputs.shape)
+        inputs = old.inputs + ca.if_else(share > 0, share * s["du"], 0) + ca.if_else(pure, deformed, 0)
+        states = old.states + ca.if_else(share > 0, share * s["dx"], 0)
+        starts = ca.logic_and(ca.logic_and(s["fresh"] == 1, s["slacks"] == COLD), s["start"] == ROLLED)
+        last = ca.logic_and(final, int(call.settings.realtime))
+        rolled = ca.if_else(fresh, starts, ca.logic_or(pure, last))
+        arguments = (call.s0, call.data, call.lower, call.upper)
+        p = Expansion(*self._expand(inputs, states, s["gains"], rolled, *arguments))
+        return p, rolled, is_usable(p)
+
+    def _judged(self, s: State, p: Expansion, rolled: ca.MX, usable: ca.MX) -> State:
+        fresh, pure = s["fresh"] > 0, s["phase"] == PURE
+        guessed = self._judge_fresh(s, p, rolled, usable)
+        stepped = judge_pure(self._call, s, p, usable), judge_interior(self._call, s, p, usable)
+        judged = choose(s, fresh, guessed, choose(s, pure, *stepped))
+        return {**judged, "rolled": ca.if_else(judged["accepted"], rolled, s["rolled"])}
+
+    def _judge_fresh(self, s: State, p: Expansion, rolled: ca.MX, usable: ca.MX) -> State:
+        """A plan that was not made by a sweep: first guesses, remembered plans, and the last one again."""
+        call, new = self._call, {**s, **as_point(p), **fixed(fresh=0)}
+        far = ca.mmax(ca.fabs(p.states) - 100 * ca.horzcat(call.spread[:, 0], call.spread)) > 0
+        fit = ca.logic_and(usable, ca.logic_not(ca.logic_and(rolled, far)))
+        pure = enter_pure(call, new, BEGINS)
+        if call.settings.realtime and call.settings.iterations < SEVERAL:
+            pure = choose(pure, pure["error"] > NEAR, enter_interior(call, pure), pure)
+        begun = choose(new, new["phase"] == PURE, pure, new)
+        first = choose(s, fit, begun, {**restart(call, new), **fixed(accepted=1)})
+        again = choose(s, usable, new, {**s, **fixed(fresh=0)})
+        retried = s["fresh"] == 2
+        judged = choose(s, retried, again, first)
+        return {**judged, "accepted": ca.if_else(retried, usable, 1)}
+
+
+def is_usable(p: Expansion) -> ca.MX:
+    """Whether the numbers of an expansion that a sweep reads are finite."""
+    numbers = [p.value, p.next_states, p.by_state, p.by_input, p.tail, p.a, p.b]
+    return is_finite(ca.vertcat(*(ca.vec(v) for v in numbers)))

@@ -1,0 +1,114 @@
+"""The plain iteration as one composed graph: the reference for tests of the loops in C, and what runs without a compiler."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.optimisers.anchor import SHORTEST, UNTRIED, Anchor, Arguments
+from fpirhc.optimisers.base import clip, sane, stationarity, status_of
+from fpirhc.optimisers.plain_settings import MOST_PLAIN, PlainSettings, plain_memory
+from fpirhc.optimisers.search import Search, first_gamma
+from fpirhc.status import Status
+from fpirhc.symbolic.expression import is_finite
+
+
+def plain_graph(ocp: OptimalControl, settings: PlainSettings, name: str) -> ca.Function:
+    """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
+    arguments, memory = call_symbols(ocp)
+    search, anchor = _search(ocp, settings), first_anchor(ocp, arguments, memory)
+    if settings.converging:
+        anchor, count = _converged(ocp, settings, search, arguments, anchor)
+        return ca.Function(name, [*arguments, memory], _results(ocp, settings, arguments, memory, anchor, count - 1))
+    for _ in range(settings.iterations):
+        anchor, plan = search.tried(anchor, arguments)
+        anchor = search.directed(anchor, plan, arguments)
+    anchor, _ = search.tried(anchor, arguments)
+    results = _results(ocp, settings, arguments, memory, anchor, settings.iterations)
+    return ca.Function(name, [*arguments, memory], results)
+
+
+def call_symbols(ocp: OptimalControl) -> tuple[Arguments, ca.MX]:
+    """Return symbols of the arguments and of the memory of one call."""
+    nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
+    s0, data = ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
+    lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
+    return Arguments(s0, data, lower, upper), ca.MX.sym("memory", plain_memory(ocp).size)
+
+
+def first_anchor(ocp: OptimalControl, arguments: Arguments, memory: ca.MX) -> Anchor:
+    """Return the remembered plan, not evaluated yet; a memory that is not finite is forgotten."""
+    nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
+    remembered = plain_memory(ocp).split(ca.if_else(is_finite(memory), memory, 0))
+    inputs = clip(ca.reshape(remembered["plan_inputs"], nu, n), arguments.lower, arguments.upper)
+    none = ca.MX.zeros(nu, n)
+    first = first_gamma(ocp)
+    resume = ca.if_else(remembered["plan_step"] > 0, ca.fmin(remembered["plan_step"], 1), 1)
+    # After a rejected T a longer gamma would be rejected again, in every call of one iteration.
+    longer = ca.if_else(resume < SHORTEST, 1, 2) * remembered["plan_gamma"]
+    gamma = ca.if_else(remembered["plan_gamma"] > 0, ca.fmin(longer, first), first)
+    return Anchor(
+        inputs=inputs,
+        states=ca.reshape(remembered["plan_states"], ns, n),
+        move=none,
+        gains=ca.reshape(remembered["plan_gains"], nu, ns * n),
+        plain=clip(none, arguments.lower, arguments.upper),
+        slope=none,
+        value=ca.MX(10 * UNTRIED),
+        envelope=ca.MX(10 * UNTRIED),
+        step=ca.MX(1),
+        gamma=gamma,
+        resume=resume,
+    )
+
+
+def _search(ocp: OptimalControl, settings: PlainSettings) -> Search:
+    return Search(ocp, settings.hessian, settings.map, settings.damping)
+
+
+def _converged(
+    ocp: OptimalControl, settings: PlainSettings, search: Search, arguments: Arguments, anchor: Anchor
+) -> tuple[Anchor, ca.MX]:
+    """The anchor after the last iteration that is needed, and how many plans were tried."""
+    count, plain = ca.MX(0), ca.MX(0)
+    symbols = Anchor(*(ca.MX.sym(name, *v.shape) for name, v in zip(Anchor._fields, anchor, strict=True)))
+    tried, plan = search.tried(symbols, arguments)
+    work = ca.Function("fpirhc_iteration", [*arguments, *symbols], list(search.directed(tried, plan, arguments)))
+    rest = ca.Function("fpirhc_rest", [*arguments, *symbols], list(symbols))
+    choice = ca.Function.if_else("fpirhc_iteration_if_needed", work, rest)
+    for _ in range(settings.iterations + 1):
+        residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper)
+        needed = ca.logic_not(ca.logic_and(anchor.value < UNTRIED, residual <= settings.tolerance))
+        needed = ca.logic_and(needed, plain < MOST_PLAIN)
+        plain += ca.logic_and(needed, anchor.step < SHORTEST)
+        anchor, count = Anchor(*choice(needed, *arguments, *anchor)), count + needed
+    return anchor, count
+
+
+def _results(
+    ocp: OptimalControl,
+    settings: PlainSettings,
+    arguments: Arguments,
+    memory: ca.MX,
+    anchor: Anchor,
+    iterations: ca.MX | int,
+) -> list[ca.MX]:
+    """Plan, diagnostics and memory at the end of a call."""
+    posed, evaluated = sane(*arguments), anchor.value < UNTRIED
+    finite = ca.logic_and(posed, evaluated)
+    residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper)
+    empty = ca.mmax(arguments.lower - arguments.upper) > 0
+    status = ca.if_else(empty, int(Status.INFEASIBLE), status_of(finite, residual, 0, settings.tolerance))
+    numbers = ca.if_else(finite, ca.vertcat(anchor.value, residual), ca.MX.zeros(2))
+    solved = plain_memory(ocp).join(
+        {
+            "plan_inputs": ca.vec(anchor.inputs),
+            "plan_states": ca.vec(anchor.states),
+            "plan_gains": ca.vec(anchor.gains),
+            "plan_gamma": anchor.gamma,
+            "plan_step": anchor.step,
+        }
+    )
+    # A remembered plan under which a well-posed problem overflows is given up, so that the next call can succeed.
+    next_memory = ca.if_else(finite, solved, ca.if_else(posed, ca.MX.zeros(solved.shape), memory))
+    return [anchor.inputs, ca.vertcat(numbers, 0, iterations, status), next_memory]

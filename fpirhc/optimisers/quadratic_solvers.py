@@ -1,0 +1,92 @@
+"""Solvers of the quadratic programs of `SequentialQuadratic`, and the types of CasADi's options."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import casadi as ca
+
+from fpirhc.errors import InvalidValue, NotSupported, nearest
+
+Setting: TypeAlias = "bool | int | float | str | Sequence[bool] | ca.Function | Mapping[str, Setting]"
+Options: TypeAlias = Mapping[str, Setting]
+
+
+@dataclass(frozen=True)
+class QuadraticSolver(ABC):
+    """Contract: a solver of the quadratic programs inside `SequentialQuadratic`."""
+
+    @property
+    @abstractmethod
+    def plugin(self) -> str:
+        """CasADi's name of the solver."""
+
+    @abstractmethod
+    def options(self) -> Options:
+        """CasADi's options of the solver."""
+
+
+@dataclass(frozen=True)
+class Qrqp(QuadraticSolver):
+    """CasADi's own active-set solver on a sparse QR factorisation.
+
+    Args:
+        iterations: most iterations of one program.
+    """
+
+    iterations: int = 200
+
+    @property
+    def plugin(self) -> str:
+        """CasADi's name of the solver."""
+        return "qrqp"
+
+    def options(self) -> Options:
+        """Quiet, with an iteration limit."""
+        quiet = {"print_iter": False, "print_header": False, "print_info": False, "print_lincomb": False}
+        return {**quiet, "max_iter": self.iterations, "error_on_fail": False}
+
+
+@dataclass(frozen=True)
+class Osqp(QuadraticSolver):
+    """OSQP, an operator-splitting method.
+
+    Args:
+        accuracy: of both residuals.
+    """
+
+    accuracy: float = 1e-8
+
+    @property
+    def plugin(self) -> str:
+        """CasADi's name of the solver."""
+        return "osqp"
+
+    def options(self) -> Options:
+        """Quiet, with the accuracy for both residuals and without polishing."""
+        inner = {"verbose": False, "eps_abs": self.accuracy, "eps_rel": self.accuracy, "max_iter": 20000}
+        return {"osqp": inner, "error_on_fail": False}
+
+
+def quadratic_solver(name: str) -> QuadraticSolver:
+    """Return the named quadratic solver, for names that come from a command line.
+
+    Raises:
+        NotSupported: CasADi has the solver, but it returns wrong answers here; the message names the reason.
+        InvalidValue: an unknown name.
+    """
+    if name in _REFUSED:
+        raise NotSupported(f"quadratic solver '{name}' is refused: {_REFUSED[name]}. Use qrqp or osqp")
+    known: dict[str, QuadraticSolver] = {"qrqp": Qrqp(), "osqp": Osqp()}
+    if name not in known:
+        raise InvalidValue(f"quadratic solver '{name}' is unknown.{nearest(name, known)}")
+    return known[name]
+
+
+_REFUSED = {
+    "fatrop": "CasADi's conic interface to it has returned infeasible points marked as solved",
+    "hpipm": "it needs finite bounds on everything",
+}
