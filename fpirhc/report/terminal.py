@@ -108,8 +108,8 @@ def _plan_row(solved: Solved) -> list[str | Text]:
     bounds = [f"{known.factor:.3f}", f"{known.input_error:.1e}", f"{known.suboptimality:.1e}"] if known else ["-"] * 3
     return [
         literal(solved.name),
-        f"{plan.cost:.7g}",
-        f"{plan.stationarity:.0e}",
+        "-" if plan.cost is None else f"{plan.cost:.7g}",
+        "-" if plan.stationarity is None else f"{plan.stationarity:.0e}",
         f"{plan.iterations:.0f}" if plan.iterations >= 0 else "-",
         *bounds,
         plan.status.name.lower().replace("_", " "),

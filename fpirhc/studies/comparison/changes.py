@@ -3,8 +3,8 @@
 An error counts relative to a scale of its coordinate. The scale is the range of the reference, the start included; for a set-point
 held from the start it is 1 / sqrt(w) with the cost's weight w, else the width of the limits, else 1 in the coordinate's unit.
 
-A coordinate that the cost of a planning controller does not weigh is not judged, because nobody asked the plan for it. Neither is one
-whose relative errors stay below 1 % of the largest relative error, or below 1e-9, which is rounding.
+A coordinate that the cost of a planning controller does not weigh is not judged, because nobody asked the plan for it. Neither is
+one whose relative errors stay below 1 % of the largest relative error, or below 1e-9, which is rounding.
 """
 
 from __future__ import annotations
@@ -58,9 +58,7 @@ class Change:
         """Better below 0.9, worse above 1.1."""
         if not self.size >= ROUNDING:
             return Outcome.NO_DIFFERENCE
-        return (
-            Outcome.BETTER if self.ratio < HELPS else Outcome.WORSE if self.ratio > HURTS else Outcome.NO_DIFFERENCE
-        )
+        return Outcome.BETTER if self.ratio < HELPS else Outcome.WORSE if self.ratio > HURTS else Outcome.NO_DIFFERENCE
 
 
 def times(factor: float) -> str:

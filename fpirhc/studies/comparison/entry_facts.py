@@ -1,4 +1,4 @@
-"""Facts about a controller on a problem that the verdict needs: what its cost weighs, its rate, and why its exact model is no bound."""
+"""Facts for the verdict about a controller on a problem: what its cost weighs, its rate, why its exact model is no bound."""
 
 from __future__ import annotations
 
@@ -61,9 +61,7 @@ def no_bound_because(
     return tuple(reasons)
 
 
-def _plans_of(
-    problem: Problem, controller: Controller, metrics: Metrics, optimality: Optimality | None
-) -> list[str]:
+def _plans_of(problem: Problem, controller: Controller, metrics: Metrics, optimality: Optimality | None) -> list[str]:
     """Reasons that lie in the plans."""
     if controller.planner is None or problem.horizon is None:
         return []

@@ -1,13 +1,13 @@
 """The null test: with the approximate model as plant there is nothing to adapt, so adaptation must not make the error larger.
 
-It catches what adaptation takes for an error of the model without being one: a response that drifts within a long cycle, a delay that
-is not paired, the noise of a sensor. Disturbances are left out, because they are an error of the model.
+It catches what adaptation takes for an error of the model without being one: a response that drifts within a long cycle, a delay
+that is not paired, the noise of a sensor. Disturbances are left out, because they are an error of the model.
 
-The plain form passes on the changes of the desired response a little late, so some error of its own is usual. It is harmful where it is
-larger than the error that the wrong model causes without adaptation, which adaptation is there to remove.
+The plain form passes on the changes of the desired response a little late, so some error of its own is usual. It is harmful where
+it is larger than the error that the wrong model causes without adaptation, which adaptation is there to remove.
 
-The loops of the comparison run once more with other exact parameters, so nothing is composed or compiled again. A run is the original
-one, cut to `CYCLES` cycles after `measure_from`; a test costs two such runs.
+The loops of the comparison run once more with other exact parameters, so nothing is composed or compiled again. A run is the
+original one, cut to `CYCLES` cycles after `measure_from`; a test costs two such runs.
 """
 
 from __future__ import annotations
@@ -155,6 +155,6 @@ def _sentence(
             f"({costs})."
         )
     return (
-        f"{head}failed, {adaptive} is worse than {plain} although there is nothing to adapt ({numbers}). It takes something else for an "
-        "error of the model: the drift of the response within a long cycle, an unpaired delay, or noise."
+        f"{head}failed, {adaptive} is worse than {plain} although there is nothing to adapt ({numbers}). It takes something else "
+        "for an error of the model: the drift of the response within a long cycle, an unpaired delay, or noise."
     )

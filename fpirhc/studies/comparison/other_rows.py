@@ -35,9 +35,7 @@ def relative_error(entry: Entry, scales: Mapping[str, float], weighed: frozenset
     return math.sqrt(math.fsum(s * s for s in shares) / len(shares))
 
 
-def _far_better(
-    entries: Sequence[Entry], pair: tuple[Entry, Entry] | None, scales: Mapping[str, float]
-) -> list[str]:
+def _far_better(entries: Sequence[Entry], pair: tuple[Entry, Entry] | None, scales: Mapping[str, float]) -> list[str]:
     if pair is None:
         return []
     weighed = pair[1].weighed
@@ -92,5 +90,6 @@ def _rates(entries: Sequence[Entry]) -> list[str]:
     stride = planners[0].plan_every
     return [
         f"Rates: {', '.join(every_cycle)} corrects in every cycle, {', '.join(every_plan)} only at every plan, that is every "
-        f"{stride} cycles. A part of their difference is an effect of the rate; a period as long as a stage gives both the same rate."
+        f"{stride} cycles. A part of their difference is an effect of the rate; a period as long as a stage gives both the same "
+        "rate."
     ]

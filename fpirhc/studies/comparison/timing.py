@@ -15,6 +15,7 @@ from fpirhc.task.problem import Problem, cycles_per_stage
 REPLAYED = 2000  # cycles of the run that are stepped again, one by one
 ROUNDS = 40  # in which two controllers are timed in turn
 _FEWEST = 10  # rounds from which a median has an interval
+_PLACEMENT = 0.03  # of a time: where code and data happen to lie changes it by this much
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Price:
     Args:
         beside: name of the other controller.
         difference: median over the rounds in which both were timed, one directly after the other.
-        noise: half width of the 95 % interval of this median, from the order statistics of the rounds; a smaller difference is none.
+        noise: half width of the 95 % interval of this median, at least 3 % of the time itself; a smaller difference is none.
     """
 
     beside: str
@@ -56,8 +57,8 @@ def measure_price(
 ) -> Price | None:
     """Replay two runs in turn, and return how much longer a cycle of the adaptive controller takes.
 
-    Other work on the machine slows both alike, because they take turns; what is left of it is the noise. The result is None for runs
-    of fewer than ten plans.
+    Other work on the machine slows both alike, because they take turns, now one first and now the other; what is left is the noise.
+    The result is None for runs of fewer than ten plans.
     """
     cycles = min(plain[1].cycles, adaptive[1].cycles, REPLAYED)
     stride = cycles_per_stage(problem.horizon, problem.period) if problem.horizon else 1
@@ -66,12 +67,27 @@ def measure_price(
     if rounds < _FEWEST:
         return None
     replays = [_Replay(Stepper(problem, c, compiled=compiled), run) for c, run in (plain, adaptive)]
-    times = np.array([[replay.micro(block) for replay in replays] for _ in range(rounds)])
+    times = np.empty((rounds, 2))
+    for number in range(rounds):
+        for k in (0, 1) if number % 2 else (1, 0):
+            times[number, k] = replays[k].micro(block)
+    return price_of(plain[1].controller, times)
+
+
+def price_of(beside: str, times: np.ndarray) -> Price:
+    """Return the price that these times of both controllers show.
+
+    The interval of the median is that of the sign test, between the order statistics n/2 - sqrt(n) and n/2 + sqrt(n); single
+    rounds that were interrupted do not widen it.
+
+    Args:
+        beside: name of the first controller.
+        times: of a cycle, microseconds, shape (rounds, 2).
+    """
     differences = np.sort(times[:, 1] - times[:, 0])
-    outer = max(int(rounds / 2 - np.sqrt(rounds)), 0)  # the sign test's interval: n/2 -+ 1.96 sqrt(n)/2
-    return Price(
-        plain[1].controller, float(np.median(differences)), float(differences[-1 - outer] - differences[outer]) / 2
-    )
+    outer = max(int(differences.size / 2 - np.sqrt(differences.size)), 0)
+    half = float(differences[-1 - outer] - differences[outer]) / 2
+    return Price(beside, float(np.median(differences)), max(half, _PLACEMENT * float(np.median(times[:, 0]))))
 
 
 class _Replay:

@@ -56,7 +56,9 @@ def judge(plain: Entry, adaptive: Entry, scales: Mapping[str, float]) -> Finding
         text = f"{adaptive.name} does not finish: {adaptive.run.stop}{also}.{_causes(plain, adaptive)}"
         return Finding(text, Outcome.NOT_COMPARABLE if also else Outcome.WORSE, pair)
     if plain.run.stop is not None:
-        return Finding(f"{adaptive.name} finishes where {plain.name} does not ({plain.run.stop}).", Outcome.BETTER, pair)
+        return Finding(
+            f"{adaptive.name} finishes where {plain.name} does not ({plain.run.stop}).", Outcome.BETTER, pair
+        )
     changes = _changes(plain, adaptive, scales)
     lost = [c.name for c in changes.values() if not math.isfinite(c.before + c.after)]
     if lost or not changes:
