@@ -24,9 +24,9 @@ _WORST = 5  # violations told
 class Plan:
     """A solved horizon.
 
-    inputs (nu, N), states (ns, N + 1). cost, stationarity, feasibility as defined in `fpirhc.optimisers.base`, None where the status
-    is NON_FINITE: what was tried has no such numbers. iterations as far as the optimiser tells (-1: it does not); calls of its step;
-    status. problem, data (ntheta, N + 1), bounds of the inputs:
+    inputs (nu, N), states (ns, N + 1). cost, stationarity, feasibility as defined in `fpirhc.optimisers.base`; None where the
+    status is NON_FINITE, because what was tried has no such numbers. iterations as far as the optimiser tells (-1: it does not);
+    calls of its step; status. problem, data (ntheta, N + 1), bounds of the inputs:
     what was solved.
     """
 
@@ -72,6 +72,8 @@ class Plan:
         for k, (name, unit) in enumerate(zip(ocp.state.elements, ocp.state.units, strict=True)):
             low, high = ocp.state_lower[k], ocp.state_upper[k]
             for stage, value in enumerate(self.states[k]):
+                if not np.isfinite(value):
+                    continue  # `overflow` names it
                 by = max(low - value, value - high)
                 means_something = stage > 0 or k < ocp.state.size - ocp.written
                 if by > FEASIBLE and means_something and ocp.hard[k]:
