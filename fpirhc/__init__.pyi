@@ -63,6 +63,7 @@ from .plant.integrators import Cvodes, Euler, RungeKutta4
 from .plant.plant import Parameter, Plant, structural_order
 from .plant.regressor import Combination, Regressor, linear_parameters
 from .plant.relative_order import OutputChain, output_chain
+from .plant.spread import LogNormal, Normal, Spread, Uniform
 from .problem_files.problem_file import load_problem
 from .problem_files.settings import with_settings
 from .problem_files.tuning_spans import LogSpan, Span
@@ -158,6 +159,7 @@ __all__ = [
     "LQRTerminal",
     "Ladder",
     "Limits",
+    "LogNormal",
     "LogSpan",
     "LowPassDifference",
     "LyapunovMRAC",
@@ -169,6 +171,7 @@ __all__ = [
     "ModelReferenced",
     "MovingHorizon",
     "Noise",
+    "Normal",
     "Osqp",
     "OutputChain",
     "OverTime",
@@ -213,6 +216,7 @@ __all__ = [
     "SlotineLi",
     "Slotted",
     "Span",
+    "Spread",
     "StateVariableFilter",
     "Status",
     "Step",
@@ -224,6 +228,7 @@ __all__ = [
     "Tuned",
     "Tuning",
     "Uncertain",
+    "Uniform",
     "VelocityDifference",
     "accept",
     "assess_gain",

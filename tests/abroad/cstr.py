@@ -7,7 +7,8 @@
 Model and figures: do-mpc, examples/CSTR (LGPL-3; Klatt and Engell 1998). Concentrations in mol/l, temperatures in C, time in
 hours; F is the inflow per volume, 1/h, Q the heat flow, kJ/h. The set-point 0.6 mol/l, the weights of the inputs' changes,
 the limits, the period of 0.005 h and the 20 stages are those of the example. `problem` has the exact model; `wrong` has
-alpha = 0.95, beta = 1.1 as its model. The jacket has a pole at K_w A_R / (m_k c_pk) = 86.7 1/h: 0.43 of it passes in a cycle.
+alpha = 0.95, beta = 1.1 as its model; the spreads are do-mpc's scenarios alpha in {0.95, 1, 1.05}, beta in {0.9, 1, 1.1}.
+The jacket has a pole at K_w A_R / (m_k c_pk) = 86.7 1/h: 0.43 of it passes in a cycle.
 """
 
 import casadi as ca
@@ -47,8 +48,8 @@ def reactor(alpha, beta, controlled=("C_b", "T_K")):
         order=1,
         response=response,
         parameters={
-            "alpha": fp.Parameter(approximate=alpha, exact=1.0, unit="1", bounds=(0.8, 1.2)),
-            "beta": fp.Parameter(approximate=beta, exact=1.0, unit="1", bounds=(0.5, 1.5)),
+            "alpha": fp.Parameter(approximate=alpha, exact=1.0, unit="1", spread=fp.Uniform(absolute=0.05)),
+            "beta": fp.Parameter(approximate=beta, exact=1.0, unit="1", spread=fp.Uniform(absolute=0.1)),
         },
     )
 
