@@ -64,6 +64,7 @@ from .plant.integrators import Cvodes, Euler, RungeKutta4
 from .plant.plant import Parameter, Plant, structural_order
 from .plant.regressor import Combination, Regressor, linear_parameters
 from .plant.relative_order import OutputChain, output_chain
+from .plant.spread import LogNormal, Normal, Spread, Uniform
 from .problem_files.problem_file import load_problem
 from .problem_files.settings import with_settings
 from .problem_files.tuning_spans import LogSpan, Span
@@ -160,6 +161,7 @@ __all__ = [
     "LQRTerminal",
     "Ladder",
     "Limits",
+    "LogNormal",
     "LogSpan",
     "LowPassDifference",
     "LyapunovMRAC",
@@ -171,6 +173,7 @@ __all__ = [
     "ModelReferenced",
     "MovingHorizon",
     "Noise",
+    "Normal",
     "Osqp",
     "OutputChain",
     "OverTime",
@@ -215,6 +218,7 @@ __all__ = [
     "SlotineLi",
     "Slotted",
     "Span",
+    "Spread",
     "StateVariableFilter",
     "Status",
     "Step",
@@ -226,6 +230,7 @@ __all__ = [
     "Tuned",
     "Tuning",
     "Uncertain",
+    "Uniform",
     "VelocityDifference",
     "accept",
     "assess_gain",

@@ -43,3 +43,9 @@ def chain(order: int) -> fp.Plant:
         4: lambda q, v, a, j, u, p: {"y": u.u / p.m},
     }
     return fp.Plant({"y": "m"}, {"u": "N"}, {"m": fp.Parameter(1.0, 1.0, "kg")}, responses[order], order=order)
+
+
+def known(number: float | None) -> float:
+    """A number of a plan that is finite."""
+    assert number is not None
+    return number

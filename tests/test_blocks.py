@@ -7,7 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from plants import pendulum
+from plants import known, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import InvalidValue
@@ -54,7 +54,7 @@ def test_inputs_are_held_over_blocks_at_the_best_values(limits):
     best = minimize(cost, np.zeros(5), method="SLSQP", constraints=rows, options={"ftol": 1e-13, "maxiter": 300})
     assert plan.cost == pytest.approx(best.fun, rel=1e-6)
     without = fp.solve(free, fp.FixedPoint(iterations=1, tolerance=1e-7), np.array([0.4, 0.0]), free_data)
-    assert plan.cost > without.cost
+    assert known(plan.cost) > known(without.cost)
 
 
 def test_blocks_must_add_up():
@@ -83,6 +83,6 @@ def test_terminal_weight_with_rates_is_what_is_left_to_pay():
     values = []
     for before in (-1.0, 0.0, 1.0):
         plan = fp.solve(long, fp.FixedPoint(iterations=1, tolerance=1e-8), np.array([0.7, -0.4, before]), data)
-        values.append(plan.cost)
+        values.append(known(plan.cost))
     fit = np.polyfit([-1.0, 0.0, 1.0], values, 2)
     assert weighed == pytest.approx(np.polyval(fit, -fit[1] / (2 * fit[0])), rel=1e-4)

@@ -11,6 +11,7 @@ from foreign import FOREIGN, first_states
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from judging import Judge
+from plants import known
 
 import fpirhc as fp
 from fpirhc.horizon.problem import stage_data, transcribe
@@ -196,9 +197,9 @@ def test_horizons_with_limits_of_inputs_only_are_rescued(start):
     plan = fp.solve(ocp, optimiser, first, data)
     other = fp.solve(ocp, fp.Ipopt(accuracy=1e-9), first, data, calls=2)
     assert int(plain[1][4]) != fp.Status.OK
-    assert float(plain[1][0]) > 100 * plan.cost
+    assert float(plain[1][0]) > 100 * known(plan.cost)
     assert plan.status == fp.Status.OK
-    assert plan.cost <= other.cost * (1 + 3e-5)
+    assert known(plan.cost) <= known(other.cost) * (1 + 3e-5)
     assert Judge(ocp)(plan.inputs, first, np.asarray(data.full())).residual <= 1e-6
 
 

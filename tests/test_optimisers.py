@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import chain, pendulum
+from plants import chain, known, pendulum
 
 import fpirhc as fp
 from fpirhc.controllers.contract import resolved
@@ -67,7 +67,7 @@ def test_state_limits_are_kept(optimiser):
     assert plan.states[0].min() == pytest.approx(2.195, abs=1e-4) or plan.states[0].max() == pytest.approx(
         2.3, abs=1e-4
     )
-    assert plan.feasibility < 1e-4
+    assert known(plan.feasibility) < 1e-4
 
 
 def test_state_limits_are_refused_by_the_reduced_gradient():
@@ -413,7 +413,7 @@ def test_a_first_state_outside_its_limits_is_infeasible():
     ocp, data, _ = two_mass(RIDING["upper"])
     plan = fp.solve(ocp, fp.Ipopt(), np.array([2.6, 5.6, 0.2, -0.1]), data)
     assert plan.status == fp.Status.INFEASIBLE
-    assert plan.feasibility > 1e-2
+    assert known(plan.feasibility) > 1e-2
     assert plan.verify()[2] == pytest.approx(plan.feasibility)
 
 

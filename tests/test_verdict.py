@@ -14,8 +14,9 @@ import fpirhc as fp
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.metrics import Metrics, known_metrics
 from fpirhc.studies.comparison.compare import Entry, compare
-from fpirhc.studies.comparison.timing import CycleTime
-from fpirhc.studies.comparison.verdict import verdict
+from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.studies.comparison.timing import CycleTime, Price, measure_price, price_of
+from fpirhc.studies.comparison.verdict import findings
 
 TRACK = fp.Exponential(rate=6.0)
 
@@ -79,6 +80,7 @@ def test_controller_that_cannot_serve_is_skipped_with_its_reason():
     found = compare(Task("case", Path("case.py"), "", "", problem, controllers), seed=0, compiled=False)
     assert "needs Problem(horizon=...)" in found.skipped["RHC"]
     assert found.verdict[-1].startswith("Not run: RHC")
+    assert found.outcome is Outcome.NOT_COMPARABLE
 
 
 def test_unknown_entry_offers_the_nearest():
@@ -99,20 +101,46 @@ def pair():
 def entry(source: Entry, micro: float = 5.0, **rms_error: float) -> Entry:
     """The entry with these errors, and with this median time of a cycle."""
     metrics = Metrics({"rms_error": rms_error}, {}, {m.name: m for m in known_metrics()})
-    return replace(source, metrics=metrics, cycle=CycleTime(micro, micro, micro, micro, micro))
+    return replace(source, metrics=metrics, cycle=CycleTime(micro, micro, micro, micro, micro), price=None)
 
 
-def said(pair, before, after, times=(5.0, 7.5)) -> str:
-    plain, adaptive = (entry(e, t, y=v) for e, t, v in zip(pair, times, (before, after), strict=True))
-    return verdict([plain, adaptive], {}, None)[0]
+def said(pair, before, after, price=None) -> str:
+    plain, adaptive = (entry(e, y=v) for e, v in zip(pair, (before, after), strict=True))
+    return findings([plain, replace(adaptive, price=price)], {}, None)[0].text
 
 
 def test_numbers_of_the_verdict(pair):
-    """From 0.5 m to 0.1 m is five times less, and 7.5 instead of 5 microseconds are 2.5 more."""
-    assert said(pair, 0.5, 0.1) == (
-        "adaptive lowers the rms error of y from 0.5 to 0.1 m (5 times less for y) at 2.5 more microseconds per cycle."
+    """From 0.5 m to 0.1 m is five times less; 2.5 microseconds more than the pair, and no claim where they are within the noise."""
+    assert said(pair, 0.5, 0.1, Price("plain", 2.5, 0.1)) == (
+        "adaptive lowers the rms error of y from 0.5 to 0.1 m (5 times less) at 2.5 more microseconds per cycle."
     )
-    assert said(pair, 0.5, 0.1, times=(5.0, 4.0)).endswith("(5 times less for y) at no more time per cycle.")
+    assert said(pair, 0.5, 0.1, Price("plain", -1.0, 0.1)).endswith(" at 1 fewer microseconds per cycle.")
+    noisy = said(pair, 0.5, 0.1, Price("plain", -1.0, 1.5))
+    assert noisy.endswith("; the time per cycle differs by less than can be measured here (1.5 microseconds).")
+
+
+def test_noise_of_the_machine_is_no_price():
+    """40 rounds of 10 us with interruptions of milliseconds: 2.5 us more is a difference, 0.1 us more is none."""
+    random = np.random.default_rng(3)
+    times = 10 + random.normal(0, 0.5, (40, 2)) + np.where(random.random((40, 2)) < 0.1, 4000.0, 0.0)
+    same, more, little = (price_of("plain", times + np.array([0.0, extra])) for extra in (0.0, 2.5, 0.1))
+    assert abs(same.difference) <= same.noise < 1
+    assert more.difference - more.noise < 2.5 < more.difference + more.noise
+    assert more.difference > more.noise
+    assert abs(little.difference) <= little.noise
+
+
+def test_two_loops_are_timed_in_turn():
+    """A price names the controller beside which it was measured; a run that is too short has none."""
+    problem = fp.Problem(linear(1.6, 1.0), fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}), {"y": 0.0}, 1e-3, 0.1)
+    one = fp.ComputedTorque(TRACK)
+    run = fp.simulate(problem, one, seed=0, compiled=False)
+    price = measure_price(problem, (one, run), (one, run), compiled=False)
+    assert price is not None
+    assert price.beside == "ComputedTorque"
+    assert price.noise > 0
+    short = replace(run, log=run.log[:9])
+    assert measure_price(problem, (one, short), (one, short), compiled=False) is None
 
 
 @pytest.mark.parametrize(
@@ -129,14 +157,16 @@ def test_a_tenth_more_or_less_is_a_difference(pair, after, words):
     assert said(pair, 1.0, after).startswith(f"adaptive {words}")
 
 
-def test_one_coordinate_that_is_no_better_spoils_the_verdict(pair):
-    """Ten times less in one coordinate and the same in the other is no clear difference."""
+def test_a_coordinate_that_stays_is_named(pair):
+    """Ten times less in one coordinate and the same in the other: better, and what stays is said."""
     plain, adaptive = entry(pair[0], y=1.0, z=1.0), entry(pair[1], y=0.1, z=1.0)
     plain, adaptive = (replace(e, run=_with_second_error(e.run)) for e in (plain, adaptive))
+    [only] = findings([plain, adaptive], {}, None)
     assert (
-        "makes no clear difference: the rms error of y from 1 to 0.1 m, z from 1 to 1 m"
-        in (verdict([plain, adaptive], {}, None)[0])
+        only.text
+        == "adaptive lowers the rms error of y from 1 to 0.1 m (10 times less); that of z from 1 to 1 m stays."
     )
+    assert only.outcome is Outcome.BETTER
 
 
 def _with_second_error(run):
@@ -160,4 +190,4 @@ def test_how_much_to_raise_the_scale_is_a_quarter_more_than_is_needed():
 def test_without_a_pair_the_smallest_error_is_named(pair):
     """By the worst coordinate of each."""
     alone = [replace(entry(e, y=v), pair=None) for e, v in zip(pair, (0.25, 0.75), strict=True)]
-    assert verdict(alone, {}, None)[0].startswith("plain has the smallest rms error (0.25)")
+    assert findings(alone, {}, None)[0].text.startswith("plain has the smallest rms error (0.25)")

@@ -12,8 +12,9 @@ from hand_made_runs import CYCLES, SOLVE
 from fpirhc.simulation.metrics import Metrics, known_metrics
 from fpirhc.simulation.run import Run
 from fpirhc.studies.comparison.compare import Entry
-from fpirhc.studies.comparison.timing import CycleTime
-from fpirhc.studies.comparison.verdict import verdict
+from fpirhc.studies.comparison.outcome import Finding, Outcome
+from fpirhc.studies.comparison.timing import CycleTime, Price
+from fpirhc.studies.comparison.verdict import findings
 from fpirhc.symbolic.layout import Layout, Signal
 
 STOP = "signal 'x' is not finite"
@@ -24,7 +25,7 @@ EFFORT = (
 
 
 def entry(name: str, pair: str | None = None, *, micro: float | None = 5.0, errors=None, **changes: Any) -> Entry:
-    """An entry with these errors of y [m] and z [rad]; `changes` are stop, desired (rows), settings, planning, factor."""
+    """An entry with these errors of y [m] and z [rad]; `changes` are stop, desired (rows), settings, planning, factor, facts."""
     signals = [Signal("error", ("y", "z"), ("m", "rad")), Signal("desired", ("y", "z"), ("m/s2", "rad/s2"))]
     values = [np.zeros((CYCLES, 2)), np.broadcast_to(changes.get("desired", 0.0), (CYCLES, 2))]
     if changes.get("planning"):
@@ -37,11 +38,15 @@ def entry(name: str, pair: str | None = None, *, micro: float | None = 5.0, erro
     report = SimpleNamespace(predicted=factor, report=SimpleNamespace(text="Lower the gain."))
     cycle = None if micro is None else CycleTime(micro, micro, micro, micro, micro)
     contraction = cast(Any, None if factor is None else report)
-    return Entry(name, made, metrics, cycle, pair is not None, pair, contraction)
+    return Entry(name, made, metrics, cycle, pair is not None, pair, contraction, **changes.get("facts", {}))
 
 
 def said(*entries: Entry, skipped=None, headline=None) -> tuple[str, ...]:
-    return verdict(entries, skipped or {}, headline)
+    return tuple(finding.text for finding in findings(entries, skipped or {}, headline))
+
+
+def first(*entries: Entry, scales=None) -> Finding:
+    return findings(entries, {}, None, scales)[0]
 
 
 def no_difference(**adaptive: Any) -> str:
@@ -60,71 +65,132 @@ def test_who_finishes():
     """The adaptive run ended, the plain one, or both: the adaptive one is told first."""
     assert said(entry("RHC"), entry("FPI", "RHC", stop=STOP)) == (f"FPI does not finish: {STOP}.",)
     assert said(entry("RHC", stop=STOP), entry("FPI", "RHC")) == (f"FPI finishes where RHC does not ({STOP}).",)
-    assert said(entry("RHC", stop="b"), entry("FPI", "RHC", stop="a")) == ("FPI does not finish: a.",)
+    assert said(entry("RHC", stop="b"), entry("FPI", "RHC", stop="a")) == ("FPI does not finish: a, nor does RHC (b).",)
+    outcomes = [
+        first(entry("RHC", stop=a), entry("FPI", "RHC", stop=b)).outcome
+        for a, b in ((None, "b"), ("a", None), ("a", "b"))
+    ]
+    assert outcomes == [Outcome.WORSE, Outcome.BETTER, Outcome.NOT_COMPARABLE]
 
 
 def test_several_coordinates():
-    """Each has its numbers and unit; the factor is that of the coordinate with the largest error before."""
-    plain, adaptive = entry("RHC", errors={"y": 1.0, "z": 2.0}), entry("FPI", "RHC", errors={"y": 0.5, "z": 0.2})
+    """Each has its numbers, unit and factor, the worst first; better and worse together are mixed."""
+    plain, adaptive = entry("RHC", errors={"y": 1.0, "z": 2.0}), entry("FPI", "RHC", errors={"y": 0.2, "z": 1.0})
     assert said(plain, adaptive) == (
-        "FPI lowers the rms error of y from 1 to 0.5 m, z from 2 to 0.2 rad (10 times less for z) at no more time per cycle.",
+        "FPI lowers the rms error of z from 2 to 1 rad (2 times less), y from 1 to 0.2 m (5 times less).",
     )
     worse = entry("FPI", "RHC", errors={"y": 1.5, "z": 4.0})
     assert said(plain, worse) == (
-        "FPI does not help: it raises the rms error of y from 1 to 1.5 m, z from 2 to 4 rad.",
+        "FPI does not help: it raises the rms error of z from 2 to 4 rad (2 times more), y from 1 to 1.5 m (1.5 times more).",
     )
     mixed = entry("FPI", "RHC", errors={"y": 0.1, "z": 4.0})
-    assert said(plain, mixed)[0].startswith("FPI makes no clear difference: the rms error of y from 1 to 0.1 m, z from")
+    assert said(plain, mixed) == (
+        "FPI has mixed results: it raises the rms error of z from 2 to 4 rad (2 times more) and lowers that of y from 1 to 0.1 m "
+        "(10 times less).",
+    )
+    assert [first(plain, e).outcome for e in (adaptive, worse, mixed)] == [Outcome.BETTER, Outcome.WORSE, Outcome.MIXED]
+    assert first(plain, mixed).ratios == {"z": 2.0, "y": 0.1}
 
 
-def test_an_error_that_was_zero_has_no_ratio():
-    """Nothing can be said of a share of zero; a tiny error has one."""
+def test_errors_count_relative_to_their_scale():
+    """A rise from 1 to 2 m in a range of 1000 m does not count beside half of another range; in a range of 1 m it does."""
+    plain, adaptive = entry("RHC", errors={"y": 1.0, "z": 0.5}), entry("FPI", "RHC", errors={"y": 2.0, "z": 0.3})
+    assert first(plain, adaptive, scales={"y": 1000.0, "z": 1.0}).text == (
+        "FPI lowers the rms error of z from 0.5 to 0.3 rad (1.67 times less). Too small beside them to count: y from 1 to 2 m."
+    )
+    assert first(plain, adaptive, scales={"y": 1.0, "z": 1.0}).outcome is Outcome.MIXED
+
+
+def test_only_what_the_cost_weighs_is_judged():
+    """The weighed y is 245 000 times worse, the unweighed z nine times better: that does not help."""
+    plain = entry("RHC", errors={"y": 1.79e-6, "z": 9.0})
+    adaptive = entry("FPI", "RHC", errors={"y": 0.438, "z": 1.0}, facts={"weighed": frozenset({"y"})})
+    assert first(plain, adaptive) == Finding(
+        "FPI does not help: it raises the rms error of y from 1.79e-06 to 0.438 m (245 000 times more). The cost does not weigh, "
+        "so the verdict leaves out: z from 9 to 1 rad.",
+        Outcome.WORSE,
+        ("RHC", "FPI"),
+        {"y": 0.438 / 1.79e-6},
+    )
+
+
+def test_an_error_that_was_zero():
+    """From zero to something is worse, and has no factor; two errors of rounding are no difference; a tiny error has a ratio."""
     zero, some = entry("RHC", errors={"y": 0.0}), entry("FPI", "RHC", errors={"y": 0.1})
-    assert said(zero, some) == ("FPI makes no clear difference: the rms error of y from 0 to 0.1 m.",)
+    assert said(zero, some) == ("FPI does not help: it raises the rms error of y from 0 to 0.1 m.",)
+    rounding = entry("RHC", errors={"y": 1e-16}), entry("FPI", "RHC", errors={"y": 1e-15})
+    assert first(*rounding).outcome is Outcome.NO_DIFFERENCE
+    assert first(zero, entry("FPI", "RHC", errors={"y": 0.0})).outcome is Outcome.NO_DIFFERENCE
     tiny = entry("RHC", errors={"y": 1e-3}), entry("FPI", "RHC", errors={"y": 1e-4})
-    assert "(10 times less for y)" in said(*tiny)[0]
+    assert "(10 times less)" in said(*tiny)[0]
+
+
+def test_an_error_that_is_no_number_is_not_compared():
+    """NaN is neither better nor worse."""
+    lost = first(entry("RHC"), entry("FPI", "RHC", errors={"y": float("nan")}))
+    assert lost.outcome is Outcome.NOT_COMPARABLE
+    assert lost.text == "FPI and RHC cannot be compared: the error of y is no number."
 
 
 @pytest.mark.parametrize(
-    ("times", "price"),
+    ("price", "words"),
     [
-        ((5.0, 7.5), " at 2.5 more microseconds per cycle."),
-        ((5.0, 5.4), " at 0.4 more microseconds per cycle."),
-        ((5.0, 5.0), " at no more time per cycle."),
-        ((5.0, None), "."),
-        ((None, 5.0), "."),
+        (Price("RHC", 2.5, 0.1), " at 2.5 more microseconds per cycle."),
+        (Price("RHC", -0.4, 0.1), " at 0.4 fewer microseconds per cycle."),
+        (Price("RHC", 0.4, 0.5), "; the time per cycle differs by less than can be measured here (0.5 microseconds)."),
+        (Price("another", 2.5, 0.1), "."),
+        (None, "."),
     ],
 )
-def test_price(times, price):
-    """The difference of the median times; nothing where one was not measured."""
-    plain, adaptive = entry("RHC", micro=times[0]), entry("FPI", "RHC", micro=times[1], errors={"y": 0.5})
-    assert said(plain, adaptive) == (f"FPI lowers the rms error of y from 1 to 0.5 m (2 times less for y){price}",)
+def test_price(price, words):
+    """Only a difference beyond the noise has a sign; nothing where both were not timed in turn."""
+    plain, adaptive = entry("RHC"), entry("FPI", "RHC", errors={"y": 0.5}, facts={"price": price})
+    assert said(plain, adaptive) == (f"FPI lowers the rms error of y from 1 to 0.5 m (2 times less){words}",)
 
 
-def test_order_of_the_sentences():
-    """The headline pair, then receding horizons, then the others as they come; each once."""
-    pairs = [
-        *(entry("CTC"), entry("CTC+FPI", "CTC")),
-        *(entry("PID"), entry("PID+FPI", "PID")),
-        *(entry("RHC", planning=True), entry("RHC+FPI", "RHC", planning=True)),
-        entry("lost", "nobody"),
-    ]
-    names = [s.split()[0] for s in said(*pairs, headline=("PID", "PID+FPI"))]
-    assert names == ["PID+FPI", "RHC+FPI", "CTC+FPI"]
-    assert [s.split()[0] for s in said(*pairs)] == ["RHC+FPI", "CTC+FPI", "PID+FPI"]
-    assert [s.split()[0] for s in said(*pairs, headline=("CTC", "PID+FPI"))] == ["RHC+FPI", "CTC+FPI", "PID+FPI"]
+# The other rows
 
 
-def test_no_pair():
-    """The smallest worst error, of those that finished; and what is said where none did or none ran."""
-    alone = [entry("A", errors={"y": 0.1, "z": 0.5}), entry("B", errors={"y": 0.4, "z": 0.4})]
-    assert said(*alone, entry("C", stop=STOP, errors={"y": 0.0})) == (
-        "B has the smallest rms error (0.4); no controller is here both with and without adaptation, so adaptation itself is "
-        "not judged.",
+def test_a_far_better_row_is_named():
+    """From a factor of two on, counted from the better of the pair; a row with the exact model is no rival."""
+    pair = entry("RHC"), entry("FPI", "RHC", errors={"y": 2.0})
+    assert said(*pair, entry("learner", errors={"y": 1 / 32001}))[1] == (
+        "learner is far better than this pair: its relative error is 3.12e-05 (RHC 1 and FPI 2), 32 000 times smaller than that of "
+        "RHC."
     )
-    assert said(entry("A", stop="a"), entry("B", stop="b")) == ("No controller finished its run: A: a; B: b.",)
-    assert said() == ("No controller finished, so nothing can be compared.",)
-    assert said(skipped={"A": "no horizon", "B": "no limits"})[1:] == ("Not run: A (no horizon); B (no limits).",)
+    assert len(said(*pair, entry("learner", errors={"y": 0.51}))) == 1
+    assert len(said(*pair, entry("exact", errors={"y": 1e-6}, facts={"exact": True}))) == 1
+    assert said(*(entry(e.name, e.pair, stop="x") for e in pair), entry("learner"))[1] == (
+        "learner finishes its run, with a relative error of 1."
+    )
+
+
+def test_an_exact_model_that_is_worse_is_no_bound():
+    """It is said with the reasons; an exact model that is as good or better is a bound, and nothing is said."""
+    pair = entry("RHC"), entry("FPI", "RHC", errors={"y": 0.01})
+    exact = {"exact": True, "no_bound": ("it plans every 10 cycles", "its model does not hold the wind")}
+    assert said(*pair, entry("exact", errors={"y": 0.1}, facts=exact))[1] == (
+        "exact is no bound here: its relative error is 0.1, that of FPI 0.01. Why: it plans every 10 cycles; its model does not "
+        "hold the wind."
+    )
+    assert len(said(*pair, entry("exact", errors={"y": 0.0105}, facts=exact))) == 1
+
+
+def test_unequal_rates_are_stated():
+    """Where adaptation acts in every cycle and a learner at every plan; with a plan in every cycle there is nothing to say."""
+    for every, count in ((10, 2), (1, 1)):
+        facts = {"plan_every": every}
+        rows = (
+            entry("RHC", facts=facts),
+            entry("FPI", "RHC", facts=facts),
+            entry("RLS", facts={**facts, "learns": True}),
+        )
+        texts = said(*rows)
+        assert len(texts) == count
+        if count == 2:
+            assert texts[1].startswith(
+                "Rates: FPI corrects in every cycle, RLS only at every plan, that is every 10 cycles."
+            )
 
 
 # Why
@@ -169,4 +235,4 @@ def test_a_cost_of_absolute_effort_is_a_cause():
     [ended] = said(entry("RHC"), entry("FPI", "RHC", stop=STOP, factor=2.0))
     assert ended.endswith(f"{STOP}. Its iteration is no contraction (predicted factor 2): Lower the gain.")
     [worse] = said(entry("RHC"), entry("FPI", "RHC", errors={"y": 2.0}, factor=2.0))
-    assert worse.endswith("2 m. Its iteration is no contraction (predicted factor 2): Lower the gain.")
+    assert worse.endswith("2 m (2 times more). Its iteration is no contraction (predicted factor 2): Lower the gain.")

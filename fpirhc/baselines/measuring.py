@@ -132,7 +132,7 @@ def first_plan(task: Task, problem: Problem, controller: Controller) -> dict[str
     except FpirhcError as error:
         return {"plan.status": f"{REFUSED} ({type(error).__name__})"}
     return {
-        "plan.cost": solved.plan.cost,
+        "plan.cost": math.nan if solved.plan.cost is None else solved.plan.cost,
         "plan.stages": solved.plan.inputs.shape[1],
         "plan.iterations": int(solved.plan.iterations),
         "plan.status": solved.plan.status.name,

@@ -28,7 +28,8 @@ EXAMPLES = (
 )
 NOTES = """
 Scenario k of a seed is the same for every controller, whatever the number of scenarios and processes. Every exact parameter
-is multiplied by a factor of its own, log-uniform between 1 - PERCENT/100 and 1 + PERCENT/100. Finished scenarios are kept in
+is multiplied by a factor of its own, log-uniform between 1 - PERCENT/100 and 1 + PERCENT/100; a parameter with a spread in the
+problem file is drawn from PERCENT/100 of it, 100 for all of it. Finished scenarios are kept in
 scenarios.jsonl in the output folder; after an interruption or a crash the same command continues from them. A folder that
 holds results of another problem, seed, mismatch or version is refused (exit code 3).
 """

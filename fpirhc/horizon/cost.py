@@ -76,6 +76,11 @@ class Cost(ABC):
         return False
 
     @property
+    def tracked(self) -> Mapping[str, float] | None:
+        """Weights of the squared errors of states along the horizon or at its end, by name; None where unknown."""
+        return None
+
+    @property
     @abstractmethod
     def uses_rate(self) -> bool:
         """Whether a term needs the input of the stage before, which then becomes part of the stage's state."""
@@ -129,6 +134,13 @@ class Quadratic(Cost):
     def weighs_effort(self) -> bool:
         """Whether `effort` has weights."""
         return bool(self.effort)
+
+    @property
+    def tracked(self) -> Mapping[str, float]:
+        """The weights of `states`; those of `terminal` for states that only the end of the horizon weighs."""
+        at_end = self.terminal if isinstance(self.terminal, Mapping) else {}
+        weights = {**at_end, **{n: w for n, w in self.states.items() if w > 0}}
+        return {n: w for n, w in weights.items() if w > 0}
 
     @property
     def uses_rate(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,16 +24,17 @@ _WORST = 5  # violations told
 class Plan:
     """A solved horizon.
 
-    inputs (nu, N), states (ns, N + 1). cost, stationarity, feasibility as defined in `fpirhc.optimisers.base`; iterations as far as
-    the optimiser tells (-1: it does not); calls of its step; status. problem, data (ntheta, N + 1), bounds of the inputs:
+    inputs (nu, N), states (ns, N + 1). cost, stationarity, feasibility as defined in `fpirhc.optimisers.base`; None where the
+    status is NON_FINITE, because what was tried has no such numbers. iterations as far as the optimiser tells (-1: it does not);
+    calls of its step; status. problem, data (ntheta, N + 1), bounds of the inputs:
     what was solved.
     """
 
     inputs: np.ndarray
     states: np.ndarray
-    cost: float
-    stationarity: float
-    feasibility: float
+    cost: float | None
+    stationarity: float | None
+    feasibility: float | None
     iterations: float
     calls: int
     status: Status
@@ -52,9 +54,9 @@ class Plan:
         """What sums up the plan, by name."""
         steps = f"{self.iterations:g}" if self.iterations >= 0 else "unknown"
         return [
-            ("cost", f"{self.cost:.7g}"),
-            ("stationarity", number(self.stationarity)),
-            ("feasibility", number(self.feasibility)),
+            ("cost", _shown(self.cost, lambda v: f"{v:.7g}")),
+            ("stationarity", _shown(self.stationarity, number)),
+            ("feasibility", _shown(self.feasibility, number)),
             ("stages", f"{self.problem.stages} of {self.problem.step:g} s"),
             ("iterations", f"{steps} in {self.calls} calls"),
         ]
@@ -70,6 +72,8 @@ class Plan:
         for k, (name, unit) in enumerate(zip(ocp.state.elements, ocp.state.units, strict=True)):
             low, high = ocp.state_lower[k], ocp.state_upper[k]
             for stage, value in enumerate(self.states[k]):
+                if not np.isfinite(value):
+                    continue  # `overflow` names it
                 by = max(low - value, value - high)
                 means_something = stage > 0 or k < ocp.state.size - ocp.written
                 if by > FEASIBLE and means_something and ocp.hard[k]:
@@ -140,16 +144,22 @@ def solve(
     memory[layout.slice("plan_inputs")] = inputs.ravel(order="F")
     inputs, diagnostics, _, count = improved(optimiser, ocp, state, data, memory, calls=calls)
     states = np.asarray(rollout(ocp)(state, inputs, data)[0].full())
+    status = Status(int(diagnostics[4]))
+    known = status != Status.NON_FINITE
     return Plan(
         inputs,
         states,
-        float(diagnostics[0]),
-        float(diagnostics[1]),
-        float(diagnostics[2]),
+        float(diagnostics[0]) if known else None,
+        float(diagnostics[1]) if known else None,
+        float(diagnostics[2]) if known else None,
         float(diagnostics[3]) if diagnostics[3] >= 0 else -1.0,
         count,
-        Status(int(diagnostics[4])),
+        status,
         ocp,
         np.asarray(ca.DM(data).full()),
         (ocp.input_lower, ocp.input_upper),
     )
+
+
+def _shown(value: float | None, text: Callable[[float], str]) -> str:
+    return "none" if value is None else text(value)

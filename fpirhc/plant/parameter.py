@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from fpirhc.errors import Mistakes
+from fpirhc.plant.spread import Spread
 
 
 @dataclass(frozen=True)
@@ -18,12 +19,15 @@ class Parameter:
         exact: value in the simulated plant.
         unit: of both values.
         bounds: least and largest physically possible value, in the same unit.
+        spread: distribution of the exact value in scenarios, and its range in reviews; None: a percentage of the exact value. A run
+            does not depend on it.
     """
 
     approximate: float
     exact: float
     unit: str
     bounds: tuple[float, float] = (-math.inf, math.inf)
+    spread: Spread | None = field(default=None, metadata={"setting": False})
 
 
 def check_parameters(parameters: Mapping[str, Parameter], mistakes: Mistakes) -> None:
@@ -38,7 +42,7 @@ def check_parameters(parameters: Mapping[str, Parameter], mistakes: Mistakes) ->
             if not isinstance(value, int | float) or not math.isfinite(value):
                 mistakes.add(f"parameter '{name}': {which} must be a finite number, got {value!r}")
                 numbers = False
-        mistake = _bounds_mistake(parameter) if numbers else ""
+        mistake = (_bounds_mistake(parameter) or _spread_mistake(parameter)) if numbers else ""
         if mistake:
             mistakes.add(f"parameter '{name}': {mistake}")
         if not isinstance(parameter.unit, str) or not parameter.unit:
@@ -54,3 +58,13 @@ def _bounds_mistake(parameter: Parameter) -> str:
         return f"bounds must be (lowest, highest), got {parameter.bounds!r}"
     outside = [w for w in ("approximate", "exact") if not low <= getattr(parameter, w) <= high]
     return f"{outside[0]} is outside its bounds {parameter.bounds!r}" if outside else ""
+
+
+def _spread_mistake(parameter: Parameter) -> str:
+    spread = parameter.spread
+    if spread is None:
+        return ""
+    if not isinstance(spread, Spread):
+        return f"spread must be Uniform(...), Normal(...) or LogNormal(...), got {spread!r}"
+    mistake = spread.mistake(float(parameter.exact))
+    return f"spread: it {mistake}" if mistake else ""

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from fpirhc.simulation.metrics import Metrics
     from fpirhc.studies.comparison.compare import Comparison, Entry
+    from fpirhc.studies.comparison.null_test import NullTest
+    from fpirhc.studies.comparison.outcome import Finding
 
 
 def to_json(comparison: Comparison) -> str:
@@ -18,10 +20,35 @@ def to_json(comparison: Comparison) -> str:
         "seed": comparison.seed,
         "versions": dict(comparison.versions),
         "verdict": list(comparison.verdict),
+        "outcome": str(comparison.outcome),
+        "findings": [_finding(f) for f in comparison.findings],
+        "null_test": None if comparison.null is None else _null_test(comparison.null),
         "controllers": {e.name: _entry(e) for e in comparison.entries},
         "skipped": dict(comparison.skipped),
     }
     return json.dumps(_finite(facts), indent=2)
+
+
+def _finding(finding: Finding) -> dict[str, Any]:
+    return {
+        "text": finding.text,
+        "outcome": None if finding.outcome is None else str(finding.outcome),
+        "pair": None if finding.pair is None else list(finding.pair),
+        "ratios": dict(finding.ratios),
+    }
+
+
+def _null_test(null: NullTest) -> dict[str, Any]:
+    return {
+        "passed": null.passed,
+        "harmful": null.harmful,
+        "outcome": str(null.outcome),
+        "pair": list(null.pair),
+        "rms_error": {"before": dict(null.before), "after": dict(null.after)},
+        "cycles": null.cycles,
+        "elapsed_s": null.elapsed,
+        "text": null.text,
+    }
 
 
 def _entry(entry: Entry) -> dict[str, Any]:
@@ -41,6 +68,9 @@ def _entry(entry: Entry) -> dict[str, Any]:
         "optimality": None
         if entry.optimality is None
         else {"median": entry.optimality.median, "worst": entry.optimality.worst, "plans": entry.optimality.plans},
+        "price_us": None
+        if entry.price is None
+        else {"beside": entry.price.beside, "difference": entry.price.difference, "noise": entry.price.noise},
         "notes": list(entry.notes),
         "stop": entry.run.stop,
         "compiled": entry.run.compiled,

@@ -123,7 +123,7 @@ def lyapunov_figure(comparison: Comparison) -> Figure | None:
         color, values = PALETTE[k % len(PALETTE)], np.maximum(view.function, 1e-20)
         times = entry.run.period * np.arange(values.size)
         axis.semilogy(thinned(times), thinned(values), color=color, lw=1, label=literal(entry.name))
-        axis.axhline(max(0.5 * view.bound**2, 1e-20), color=color, lw=0.8, ls="--")
+        axis.axhline(max(0.5 * view.ultimate**2, 1e-20), color=color, lw=0.8, ls="--")
     axis.set_xlabel("time [s]")
     axis.set_ylabel("V")
     axis.grid(visible=True, alpha=0.25)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fpirhc.report.figures import contraction_figure, lyapunov_figure, pair_figures
+from fpirhc.report.outcomes import css_class, sentences
 from fpirhc.report.page import asset as _asset
 from fpirhc.report.page import page, write_page
 from fpirhc.report.page import picture as _picture
@@ -66,10 +67,10 @@ def render(comparison: Comparison) -> str:
 
 
 def _verdict(comparison: Comparison) -> str:
-    first, *others = comparison.verdict
-    rest = "".join(f"<li>{_text(s)}</li>" for s in others)
+    (first, outcome), *others = sentences(comparison)
+    rest = "".join(f"<li class='{css_class(one)}'>{_text(s)}</li>" for s, one in others)
     about = f"<p class='about'>{_text(comparison.description)}</p>" if comparison.description else ""
-    return f"<section id='verdict'><p class='headline'>{_text(first)}</p><ul>{rest}</ul>{about}</section>"
+    return f"<section id='verdict'><p class='headline {css_class(outcome)}'>{_text(first)}</p><ul>{rest}</ul>{about}</section>"
 
 
 def _number(value: float | None, digits: int = 3) -> str:
@@ -183,7 +184,7 @@ def headline_pair(comparison: Comparison) -> tuple[Entry, Entry] | None:
     by_name = {e.name: e for e in comparison.entries}
     pairs = [(by_name[e.pair], e) for e in comparison.entries if e.pair in by_name]
     usable = [p for p in pairs if p[0].run.cycles > 1 and p[1].run.cycles > 1]
-    named = [p for p in usable if comparison.verdict[0].startswith(p[1].name + " ")]
+    named = [p for p in usable if comparison.findings[0].pair == (p[0].name, p[1].name)]
     candidates = named or usable
     return candidates[0] if candidates else None
 

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 from rich.text import Text
 
+from fpirhc.report.outcomes import sentences, terminal_style
 from fpirhc.simulation.metrics.columns import Column, columns
 from fpirhc.simulation.simulate import SWITCHED_OFF
 from fpirhc.status import Status
@@ -54,8 +55,8 @@ def show(comparison: Comparison, report: Path) -> None:
     """Print the verdict, the table and the path of the report."""
     console = Console()
     say(console, comparison.title, style="bold")
-    for sentence in comparison.verdict:
-        say(console, f"- {sentence}")
+    for sentence, outcome in sentences(comparison):
+        say(console, f"- {sentence}", style=terminal_style(outcome))
     console.print(_table(comparison))
     if sum(e.optimality is not None for e in comparison.entries) > 1:
         console.print(_plans(comparison))
@@ -107,8 +108,8 @@ def _plan_row(solved: Solved) -> list[str | Text]:
     bounds = [f"{known.factor:.3f}", f"{known.input_error:.1e}", f"{known.suboptimality:.1e}"] if known else ["-"] * 3
     return [
         literal(solved.name),
-        f"{plan.cost:.7g}",
-        f"{plan.stationarity:.0e}",
+        "-" if plan.cost is None else f"{plan.cost:.7g}",
+        "-" if plan.stationarity is None else f"{plan.stationarity:.0e}",
         f"{plan.iterations:.0f}" if plan.iterations >= 0 else "-",
         *bounds,
         plan.status.name.lower().replace("_", " "),

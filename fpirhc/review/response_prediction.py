@@ -10,7 +10,8 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.identity import Identity
-from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.errors import NotSupported
+from fpirhc.plant.mismatch import check_mismatch
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
 from fpirhc.review.prediction import NominalRun, ResponseErrors, nominal_run, response_errors
@@ -105,8 +106,8 @@ def predict_response(
         InvalidValue: a mismatch outside [0, 100).
         FpirhcError: every error that the controller raises about the problem.
     """
-    if mismatch is not None and not 0 <= mismatch < 100:
-        raise InvalidValue(f"predict_response(mismatch={mismatch!r}): expected percent of at least 0 and below 100")
+    if mismatch is not None:
+        check_mismatch(problem.plant, mismatch)
     if resolved(problem, controller).deformation.effective_gain() == 0:
         raise NotSupported(f"{type(controller).__name__} has no deformation whose effect could be predicted")
     nominal = nominal_run(problem, controller, compiled=compiled)

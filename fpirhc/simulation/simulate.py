@@ -134,8 +134,20 @@ def simulate(
         progress: called with (cycles done, cycles in all).
     """
     ready = simulator(problem, controller, compiled=compiled, flags=flags)
-    run = ready.run(seed=seed, name=name or type(ready.controller).__name__, progress=progress)
-    judged = judgements(problem, ready.controller, run.layout, run.log)
+    return judged_run(ready, seed=seed, name=name, progress=progress)
+
+
+def judged_run(ready: Simulator, *, seed: int, name: str = "", progress: Progress | None = None) -> Run:
+    """Run a loop that is ready and return every signal, also those that judge the run; see `simulate`.
+
+    Args:
+        ready: from `simulator`.
+        seed: of the noise of disturbances and sensors.
+        name: of the controller in the results; '': the name of its class.
+        progress: called with (cycles done, cycles in all).
+    """
+    run = ready.run(seed=seed, name=name, progress=progress)
+    judged = judgements(ready.problem, ready.controller, run.layout, run.log)
     log = np.hstack([run.log, *(values for _, values in judged)])
     log.setflags(write=False)
     return replace(run, layout=run.layout + Layout(tuple(signal for signal, _ in judged)), log=log)

@@ -58,13 +58,13 @@ plant = fp.Plant(
     controlled=("V",),
     response=response,
     parameters={
-        "C": fp.Parameter(approximate=1.2, exact=1.0, unit="uF/cm^2"),
-        "gNa": fp.Parameter(approximate=0.0, exact=120.0, unit="mS/cm^2"),
-        "gK": fp.Parameter(approximate=0.0, exact=36.0, unit="mS/cm^2"),
-        "gL": fp.Parameter(approximate=0.5, exact=0.3, unit="mS/cm^2"),
-        "ENa": fp.Parameter(approximate=50.0, exact=50.0, unit="mV"),
-        "EK": fp.Parameter(approximate=-77.0, exact=-77.0, unit="mV"),
-        "EL": fp.Parameter(approximate=-60.0, exact=-54.387, unit="mV"),
+        "C": fp.Parameter(approximate=1.2, exact=1.0, unit="uF/cm^2", spread=fp.Uniform(relative=0.1)),
+        "gNa": fp.Parameter(approximate=0.0, exact=120.0, unit="mS/cm^2", spread=fp.LogNormal(factor=1.2)),
+        "gK": fp.Parameter(approximate=0.0, exact=36.0, unit="mS/cm^2", spread=fp.LogNormal(factor=1.2)),
+        "gL": fp.Parameter(approximate=0.5, exact=0.3, unit="mS/cm^2", spread=fp.LogNormal(factor=1.2)),
+        "ENa": fp.Parameter(approximate=50.0, exact=50.0, unit="mV", spread=fp.Normal(absolute=2.0)),
+        "EK": fp.Parameter(approximate=-77.0, exact=-77.0, unit="mV", spread=fp.Normal(absolute=2.0)),
+        "EL": fp.Parameter(approximate=-60.0, exact=-54.387, unit="mV", spread=fp.Normal(absolute=2.0)),
     },
 )
 

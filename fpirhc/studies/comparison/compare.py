@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -22,10 +22,15 @@ from fpirhc.simulation.metrics.columns import columns
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import simulate
+from fpirhc.simulation.simulate import Simulator, judged_run, simulator
+from fpirhc.studies.comparison.changes import scales
+from fpirhc.studies.comparison.entry_facts import has_exact_model, no_bound_because, plan_every, weighed
+from fpirhc.studies.comparison.null_test import NullTest, null_test
 from fpirhc.studies.comparison.optimality import Optimality, measure_optimality
-from fpirhc.studies.comparison.timing import CycleTime, measure_cycle
-from fpirhc.studies.comparison.verdict import verdict
+from fpirhc.studies.comparison.other_rows import beaten_by
+from fpirhc.studies.comparison.outcome import Finding, Outcome
+from fpirhc.studies.comparison.timing import CycleTime, Price, measure_cycle, measure_price
+from fpirhc.studies.comparison.verdict import findings
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
 
@@ -65,6 +70,12 @@ class Entry:
         notes: sentences for the report.
         lyapunov: Lyapunov function along the run, if one is known.
         prediction: prediction of the response, for the adaptive controller of the headline.
+        weighed: judged coordinates that its cost weighs; None: all.
+        exact: whether its model is exact where the others' is not, so that it should be a bound.
+        learns: whether its model or its gains change during a run.
+        plan_every: cycles from plan to plan; 1 for a controller that does not plan.
+        price: its time per cycle beside that of its pair.
+        no_bound: why it is no bound, for an exact model that an adapted controller beats.
     """
 
     name: str
@@ -78,6 +89,12 @@ class Entry:
     notes: tuple[str, ...] = ()
     lyapunov: LyapunovView | None = None
     prediction: Prediction | None = None
+    weighed: frozenset[str] | None = None
+    exact: bool = False
+    learns: bool = False
+    plan_every: int = 1
+    price: Price | None = None
+    no_bound: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,12 +109,13 @@ class Comparison:
         measure_from: time from which errors count, s.
         entries: the controllers that ran, in order.
         skipped: reasons why controllers were skipped, by name.
-        verdict: the verdict in sentences.
+        findings: the verdict, sentence by sentence with outcomes; the headline pair is first.
         command: the command line.
         versions: versions of fpirhc and of what its numbers depend on.
         settings: settings of the problem.
         elapsed: wall time of the comparison, s.
         pictures: pictures of the problem for the report.
+        null: what adaptation does where there is nothing to adapt, for the first pair; None without one.
     """
 
     problem: str
@@ -107,12 +125,23 @@ class Comparison:
     measure_from: float
     entries: tuple[Entry, ...]
     skipped: Mapping[str, str]
-    verdict: tuple[str, ...]
+    findings: tuple[Finding, ...]
     command: str
     versions: Mapping[str, str]
     settings: Mapping[str, Any]
     elapsed: float
     pictures: tuple[Picture, ...] = ()
+    null: NullTest | None = None
+
+    @property
+    def verdict(self) -> tuple[str, ...]:
+        """The verdict in sentences."""
+        return tuple(finding.text for finding in self.findings)
+
+    @property
+    def outcome(self) -> Outcome:
+        """What the first sentence states."""
+        return self.findings[0].outcome or Outcome.NOT_COMPARABLE
 
     def __repr__(self) -> str:
         counts = f"{len(self.entries)} controllers" + (f", {len(self.skipped)} skipped" if self.skipped else "")
@@ -183,7 +212,11 @@ def compare(
     begin = time.perf_counter()
     selected = select(task, controllers)
     check_gains(task, selected)
-    entries, skipped = _entries(task, selected, seed, compiled, progress)
+    loops: dict[str, Simulator] = {}
+    ran, skipped = _entries(task, selected, seed, compiled, progress, loops)
+    sizes = scales(task.problem)
+    entries = [_beside(task.problem, one, ran, loops, sizes, compiled) for one in ran]
+    judged = findings(entries, skipped, task.headline, sizes)
     return Comparison(
         problem=task.name,
         title=task.title,
@@ -192,12 +225,13 @@ def compare(
         measure_from=task.problem.measure_from,
         entries=tuple(entries),
         skipped=skipped,
-        verdict=verdict(entries, skipped, task.headline),
+        findings=judged,
         command=command,
         versions=versions(),
         settings=describe(task.problem),
         elapsed=time.perf_counter() - begin,
         pictures=task.pictures,
+        null=_null(task.problem, judged[0], entries, loops, sizes, seed),
     )
 
 
@@ -223,14 +257,19 @@ def versions() -> dict[str, str]:
 
 
 def _entries(
-    task: Task, controllers: Mapping[str, Controller], seed: int, compiled: bool, progress: Progress | None
+    task: Task,
+    controllers: Mapping[str, Controller],
+    seed: int,
+    compiled: bool,
+    progress: Progress | None,
+    loops: dict[str, Simulator],
 ) -> tuple[list[Entry], dict[str, str]]:
-    """Entries of the controllers that ran, and reasons why the others were skipped."""
+    """Entries of the controllers that ran, and reasons why the others were skipped; the loops that ran are added to `loops`."""
     entries: list[Entry] = []
     skipped: dict[str, str] = {}
     for name, controller in controllers.items():
         try:
-            entries.append(_entry(task, controllers, name, controller, seed, compiled, progress))
+            entries.append(_entry(task, controllers, name, controller, seed, compiled, progress, loops))
         except FpirhcError as error:
             skipped[name] = str(error)
         except KeyboardInterrupt:
@@ -248,6 +287,7 @@ def _entry(
     seed: int,
     compiled: bool,
     progress: Progress | None,
+    loops: dict[str, Simulator],
 ) -> Entry:
     problem = task.problem
     ready = resolved(problem, controller)
@@ -257,7 +297,8 @@ def _entry(
             progress(name, done, total)
 
     report(0, problem.cycles)
-    run = simulate(problem, ready, seed=seed, name=name, compiled=compiled, progress=report)
+    loops[name] = simulator(problem, ready, compiled=compiled)
+    run = judged_run(loops[name], seed=seed, name=name, progress=report)
     adaptive = ready.deformation.adapts
     view = lyapunov_view(problem, ready, run)
     metrics = measure(problem, run, task.metrics)
@@ -273,7 +314,47 @@ def _entry(
         notes=(*_notes(controller, ready), *ready.notes(problem), *([view.text] if view else [])),
         lyapunov=view,
         prediction=_predicted(problem, controller, compiled) if adaptive and name in (task.headline or ()) else None,
+        weighed=weighed(problem, ready),
+        exact=has_exact_model(problem, ready),
+        learns=ready.learns,
+        plan_every=plan_every(problem, ready),
     )
+
+
+def _beside(
+    problem: Problem,
+    entry: Entry,
+    entries: Sequence[Entry],
+    loops: Mapping[str, Simulator],
+    sizes: Mapping[str, float],
+    compiled: bool,
+) -> Entry:
+    """The entry with what only shows beside the others: its price, and why its exact model is no bound."""
+    controller, by_name = loops[entry.name].controller, {e.name: e for e in entries}
+    if entry.exact and beaten_by(entry, entries, sizes):
+        return replace(entry, no_bound=no_bound_because(problem, controller, entry.metrics, entry.optimality))
+    plain = by_name.get(entry.pair or "")
+    if plain is None:
+        return entry
+    both = (loops[plain.name].controller, plain.run), (controller, entry.run)
+    return replace(entry, price=measure_price(problem, *both, compiled=compiled))
+
+
+def _null(
+    problem: Problem,
+    first: Finding,
+    entries: Sequence[Entry],
+    loops: Mapping[str, Simulator],
+    sizes: Mapping[str, float],
+    seed: int,
+) -> NullTest | None:
+    """The null test of the pair of the first sentence."""
+    if first.pair is None:
+        return None
+    both = loops[first.pair[0]], loops[first.pair[1]]
+    plain, adaptive = (next(e for e in entries if e.name == name) for name in first.pair)
+    cured = plain.metrics.rms_error
+    return null_test(problem, both, first.pair, sizes, adaptive.weighed, cured=cured, seed=seed)
 
 
 def _predicted(problem: Problem, controller: Controller, compiled: bool) -> Prediction | None:

@@ -13,6 +13,9 @@ from fpirhc.simulation.stepper import Stepper
 from fpirhc.task.problem import Problem, cycles_per_stage
 
 REPLAYED = 2000  # cycles of the run that are stepped again, one by one
+ROUNDS = 40  # in which two controllers are timed in turn
+_FEWEST = 10  # rounds from which a median has an interval
+_PLACEMENT = 0.03  # of a time: where code and data happen to lie changes it by this much
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,76 @@ class CycleTime:
     maximum: float
     first: float
     planning: float
+
+
+@dataclass(frozen=True)
+class Price:
+    """The time per cycle of one controller beyond that of another, microseconds.
+
+    Args:
+        beside: name of the other controller.
+        difference: median over the rounds in which both were timed, one directly after the other.
+        noise: half width of the 95 % interval of this median, at least 3 % of the time itself; a smaller difference is none.
+    """
+
+    beside: str
+    difference: float
+    noise: float
+
+
+def measure_price(
+    problem: Problem, plain: tuple[Controller, Run], adaptive: tuple[Controller, Run], *, compiled: bool = True
+) -> Price | None:
+    """Replay two runs in turn, and return how much longer a cycle of the adaptive controller takes.
+
+    Other work on the machine slows both alike, because they take turns, now one first and now the other; what is left is the noise.
+    The result is None for runs of fewer than ten plans.
+    """
+    cycles = min(plain[1].cycles, adaptive[1].cycles, REPLAYED)
+    stride = cycles_per_stage(problem.horizon, problem.period) if problem.horizon else 1
+    block = max(cycles // ROUNDS // stride, 1) * stride  # whole periods of the plan
+    rounds = cycles // block
+    if rounds < _FEWEST:
+        return None
+    replays = [_Replay(Stepper(problem, c, compiled=compiled), run) for c, run in (plain, adaptive)]
+    times = np.empty((rounds, 2))
+    for number in range(rounds):
+        for k in (0, 1) if number % 2 else (1, 0):
+            times[number, k] = replays[k].micro(block)
+    return price_of(plain[1].controller, times)
+
+
+def price_of(beside: str, times: np.ndarray) -> Price:
+    """Return the price that these times of both controllers show.
+
+    The interval of the median is that of the sign test, between the order statistics n/2 - sqrt(n) and n/2 + sqrt(n); single
+    rounds that were interrupted do not widen it.
+
+    Args:
+        beside: name of the first controller.
+        times: of a cycle, microseconds, shape (rounds, 2).
+    """
+    differences = np.sort(times[:, 1] - times[:, 0])
+    outer = max(int(differences.size / 2 - np.sqrt(differences.size)), 0)
+    half = float(differences[-1 - outer] - differences[outer]) / 2
+    return Price(beside, float(np.median(differences)), max(half, _PLACEMENT * float(np.median(times[:, 0]))))
+
+
+class _Replay:
+    """A controller on the measurements of its run, block by block."""
+
+    def __init__(self, stepper: Stepper, run: Run) -> None:
+        self._step, self._memory, self._at = stepper.step, stepper.start(), 0
+        self._signals = run.time, run["state"], run["realised"]
+
+    def micro(self, block: int) -> float:
+        """The mean time of a cycle over the next block; the median would hide cycles that plan."""
+        times, states, realised = (signal[self._at : self._at + block] for signal in self._signals)
+        begin = time.perf_counter_ns()
+        for k in range(block):
+            _, self._memory = self._step(times[k], states[k], realised[k], self._memory)
+        self._at += block
+        return (time.perf_counter_ns() - begin) / 1e3 / block
 
 
 def measure_cycle(problem: Problem, controller: Controller, run: Run, *, compiled: bool = True) -> CycleTime | None:

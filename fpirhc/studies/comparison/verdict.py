@@ -1,85 +1,178 @@
 """The verdict: the effect of adaptation in sentences, with the reasons where there is none.
 
-Every claim is computed from the entries. Known reasons are the response Jacobian's eigenvalues, a step
-limit below the slew of the desired response, and a cost that weighs absolute effort.
+Every claim is computed from the entries, and every sentence about a pair carries its outcome. Known reasons are the response
+Jacobian's eigenvalues, a step limit below the slew of the desired response, and a cost that weighs absolute effort.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fpirhc.studies.comparison.changes import Change, major, outcome_of, times
+from fpirhc.studies.comparison.other_rows import remarks
+from fpirhc.studies.comparison.outcome import Finding, Outcome
+
 if TYPE_CHECKING:
     from fpirhc.studies.comparison.compare import Entry
 
-HELPS = 0.9  # an rms error below this share of the pair's counts as lower
-HURTS = 1.1
 MANY_CYCLES = 3  # of a run from which the slew of its desired response is judged
 
 
-def verdict(entries: Sequence[Entry], skipped: Mapping[str, str], headline: tuple[str, str] | None) -> tuple[str, ...]:
-    """Return the verdict's sentences, the headline pair first."""
+def findings(
+    entries: Sequence[Entry],
+    skipped: Mapping[str, str],
+    headline: tuple[str, str] | None,
+    scales: Mapping[str, float] | None = None,
+) -> tuple[Finding, ...]:
+    """Return the verdict's sentences: the headline pair first, the other pairs, what other rows show, what was not run.
+
+    Args:
+        entries: the controllers that ran.
+        skipped: reasons why others did not.
+        headline: names without and with adaptation of the pair that comes first.
+        scales: by which errors are judged, by coordinate; 1 where not named.
+    """
     by_name = {e.name: e for e in entries}
     pairs = [(by_name[e.pair], e) for e in entries if e.pair in by_name]
     first = [p for p in pairs if headline and (p[0].name, p[1].name) == headline]
     receding = [p for p in pairs if "solve" in p[1].run.layout]
     ordered = list(dict.fromkeys([*first, *receding, *pairs]))
-    sentences = [_sentence(plain, adaptive) for plain, adaptive in ordered]
-    if not sentences:
-        sentences = _no_pair(entries)
+    judged = [judge(plain, adaptive, scales or {}) for plain, adaptive in ordered] or [_no_pair(entries)]
+    judged += remarks(entries, ordered[0] if ordered else None, scales or {})
     if skipped:
-        sentences.append("Not run: " + "; ".join(f"{name} ({why})" for name, why in skipped.items()) + ".")
-    return tuple(sentences)
+        judged.append(Finding("Not run: " + "; ".join(f"{name} ({why})" for name, why in skipped.items()) + "."))
+    return tuple(judged)
 
 
-def _no_pair(entries: Sequence[Entry]) -> list[str]:
+def judge(plain: Entry, adaptive: Entry, scales: Mapping[str, float]) -> Finding:
+    """Return what adaptation does to one pair."""
+    pair = (plain.name, adaptive.name)
+    if adaptive.run.stop is not None:
+        also = f", nor does {plain.name} ({plain.run.stop})" if plain.run.stop is not None else ""
+        text = f"{adaptive.name} does not finish: {adaptive.run.stop}{also}.{_causes(plain, adaptive)}"
+        return Finding(text, Outcome.NOT_COMPARABLE if also else Outcome.WORSE, pair)
+    if plain.run.stop is not None:
+        return Finding(
+            f"{adaptive.name} finishes where {plain.name} does not ({plain.run.stop}).", Outcome.BETTER, pair
+        )
+    changes = _changes(plain, adaptive, scales)
+    lost = [c.name for c in changes.values() if not math.isfinite(c.before + c.after)]
+    if lost or not changes:
+        text = f"{adaptive.name} and {plain.name} cannot be compared: the error of {', '.join(lost) or 'nothing'} is no number."
+        return Finding(text, Outcome.NOT_COMPARABLE, pair)
+    asked = {n: c for n, c in changes.items() if adaptive.weighed is None or n in adaptive.weighed} or changes
+    counted = major(asked)
+    outcome = outcome_of(counted)
+    beside = _minor(adaptive, [c for n, c in asked.items() if n not in counted])
+    beside += _not_weighed(adaptive, [c for n, c in changes.items() if n not in asked])
+    text = _SENTENCES[outcome](plain, adaptive, list(counted.values())) + beside
+    if outcome is not Outcome.BETTER:
+        text += _causes(plain, adaptive)
+    return Finding(text, outcome, pair, {n: c.ratio for n, c in counted.items()})
+
+
+def _changes(plain: Entry, adaptive: Entry, scales: Mapping[str, float]) -> dict[str, Change]:
+    before, after = plain.metrics.rms_error, adaptive.metrics.rms_error
+    return {c: Change(c, before[c], after[c], scales.get(c, 1.0)) for c in before}
+
+
+def _better(plain: Entry, adaptive: Entry, changes: list[Change]) -> str:
+    stays = [c for c in changes if c.outcome is Outcome.NO_DIFFERENCE]
+    lower = _listed(adaptive, [c for c in changes if c not in stays])
+    rest = f"; that of {_listed(adaptive, stays, factors=False)} stays" if stays else ""
+    return f"{adaptive.name} lowers the rms error of {lower}{rest}{_price(plain, adaptive)}."
+
+
+def _worse(_: Entry, adaptive: Entry, changes: list[Change]) -> str:
+    stays = [c for c in changes if c.outcome is Outcome.NO_DIFFERENCE]
+    higher = _listed(adaptive, [c for c in changes if c not in stays])
+    rest = f"; that of {_listed(adaptive, stays, factors=False)} stays" if stays else ""
+    return f"{adaptive.name} does not help: it raises the rms error of {higher}{rest}."
+
+
+def _mixed(_: Entry, adaptive: Entry, changes: list[Change]) -> str:
+    higher, lower, stays = (
+        [c for c in changes if c.outcome is one] for one in (Outcome.WORSE, Outcome.BETTER, Outcome.NO_DIFFERENCE)
+    )
+    rest = f"; that of {_listed(adaptive, stays, factors=False)} stays" if stays else ""
+    return (
+        f"{adaptive.name} has mixed results: it raises the rms error of {_listed(adaptive, higher)} and lowers that of "
+        f"{_listed(adaptive, lower)}{rest}."
+    )
+
+
+def _no_difference(_: Entry, adaptive: Entry, changes: list[Change]) -> str:
+    return f"{adaptive.name} makes no clear difference: the rms error of {_listed(adaptive, changes, factors=False)}."
+
+
+_SENTENCES = {
+    Outcome.BETTER: _better,
+    Outcome.WORSE: _worse,
+    Outcome.MIXED: _mixed,
+    Outcome.NO_DIFFERENCE: _no_difference,
+}
+
+
+def _listed(entry: Entry, changes: Sequence[Change], *, factors: bool = True) -> str:
+    return ", ".join(
+        f"{c.name} from {c.before:.3g} to {c.after:.3g} {entry.run.unit(f'error.{c.name}')}"
+        + (_factor(c) if factors else "")
+        for c in changes
+    )
+
+
+def _factor(change: Change) -> str:
+    if not 0 < change.ratio < math.inf:
+        return ""
+    more = change.ratio > 1
+    return f" ({times(change.ratio if more else 1 / change.ratio)} {'more' if more else 'less'})"
+
+
+def _minor(entry: Entry, changes: Sequence[Change]) -> str:
+    if not changes:
+        return ""
+    return f" Too small beside them to count: {_listed(entry, changes, factors=False)}."
+
+
+def _not_weighed(entry: Entry, changes: Sequence[Change]) -> str:
+    if not changes:
+        return ""
+    return f" The cost does not weigh, so the verdict leaves out: {_listed(entry, changes, factors=False)}."
+
+
+def _no_pair(entries: Sequence[Entry]) -> Finding:
+    return Finding(_without_a_pair(entries), Outcome.NOT_COMPARABLE)
+
+
+def _without_a_pair(entries: Sequence[Entry]) -> str:
     if not entries:
-        return ["No controller finished, so nothing can be compared."]
+        return "No controller finished, so nothing can be compared."
     finished = [e for e in entries if e.run.stop is None]
     if not finished:
-        return ["No controller finished its run: " + "; ".join(f"{e.name}: {e.run.stop}" for e in entries) + "."]
+        return "No controller finished its run: " + "; ".join(f"{e.name}: {e.run.stop}" for e in entries) + "."
     best = min(finished, key=_worst_rms)
-    return [
+    return (
         f"{best.name} has the smallest rms error ({_worst_rms(best):.3g}); no controller is here both with and without "
         "adaptation, so adaptation itself is not judged."
-    ]
+    )
 
 
 def _worst_rms(entry: Entry) -> float:
     return max(entry.metrics.rms_error.values())
 
 
-def _sentence(plain: Entry, adaptive: Entry) -> str:
-    if adaptive.run.stop is not None:
-        return f"{adaptive.name} does not finish: {adaptive.run.stop}.{_causes(plain, adaptive)}"
-    if plain.run.stop is not None:
-        return f"{adaptive.name} finishes where {plain.name} does not ({plain.run.stop})."
-    before, after = plain.metrics.rms_error, adaptive.metrics.rms_error
-    ratios = {c: after[c] / before[c] if before[c] > 0 else float("nan") for c in before}
-    worst = max(ratios.values())
-    main = max(before, key=lambda c: before[c])
-    numbers = ", ".join(f"{c} from {before[c]:.3g} to {after[c]:.3g} {_unit(adaptive, c)}" for c in before)
-    if worst < HELPS:
-        factor = f"{1 / ratios[main]:.3g} times less for {main}"
-        return f"{adaptive.name} lowers the rms error of {numbers} ({factor}){_price(plain, adaptive)}."
-    if min(ratios.values()) > HURTS:
-        return f"{adaptive.name} does not help: it raises the rms error of {numbers}.{_causes(plain, adaptive)}"
-    return f"{adaptive.name} makes no clear difference: the rms error of {numbers}.{_causes(plain, adaptive)}"
-
-
-def _unit(entry: Entry, coordinate: str) -> str:
-    return entry.run.unit(f"error.{coordinate}")
-
-
 def _price(plain: Entry, adaptive: Entry) -> str:
-    if plain.cycle is None or adaptive.cycle is None:
+    """The difference of both times, from cycles that were timed in turn; nothing where they were not."""
+    price = adaptive.price
+    if price is None or plain.cycle is None or price.beside != plain.name:
         return ""
-    more = adaptive.cycle.median - plain.cycle.median
-    if more <= 0:
-        return " at no more time per cycle"
-    return f" at {more:.2g} more microseconds per cycle"
+    if abs(price.difference) <= price.noise:
+        return f"; the time per cycle differs by less than can be measured here ({price.noise:.2g} microseconds)"
+    return f" at {abs(price.difference):.2g} {'more' if price.difference > 0 else 'fewer'} microseconds per cycle"
 
 
 def _causes(plain: Entry, adaptive: Entry) -> str:

@@ -2,17 +2,17 @@
 
 Scenario k of a seed is always the same: its numbers come from a stream of its own, `SeedSequence(seed, spawn_key=(use, k))`,
 whatever the number of scenarios, of processes and of controllers, and in whatever order they run. Every exact parameter
-is drawn from its range (see `fpirhc.plant.mismatch`): it is multiplied by a factor of its own, the logarithm of which is uniform
-between log(1 - P/100) and log(1 + P/100).
+is drawn from its range (see `fpirhc.plant.mismatch`): by its own spread, or without one multiplied by a factor of its own, the
+logarithm of which is uniform between log(1 - P/100) and log(1 + P/100).
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fpirhc.plant.mismatch import drawn
 from fpirhc.plant.plant import Plant
 from fpirhc.task.problem import Problem
 
@@ -45,9 +45,9 @@ def draw(plant: Plant, *, seed: int, use: int, number: int, percent: float) -> S
         percent: range of the exact parameters, percent.
     """
     parameters, noise = np.random.SeedSequence(seed, spawn_key=(use, number)).spawn(2)
-    low, high = math.log1p(-percent / 100), math.log1p(percent / 100)
-    factors = np.exp(np.random.default_rng(parameters).uniform(low, high, plant.exact.size))
-    exact = plant.exact * (factors if percent else 1.0)
+    shares = np.random.default_rng(parameters).random(plant.exact.size)
+    values = [drawn(p, percent, float(s)) for p, s in zip(plant.parameters.values(), shares, strict=True)]
+    exact = np.array(values, dtype=float)
     return Scenario(int(noise.generate_state(1)[0]), exact, mismatch_of(plant.approximate, exact))
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from fpirhc.simulation.metrics.base import Function, Metric
 from fpirhc.simulation.run import Run
+from fpirhc.status import Status
 from fpirhc.task.problem import Problem
 
 
@@ -17,10 +18,14 @@ def iterations(value: float) -> str:
 
 
 def _over(column: str, summary: Callable[[np.ndarray], np.floating]) -> Function:
-    """Function of a metric that sums up one column of 'solve'."""
+    """Function of a metric that sums up one column of 'solve'; a plan that is not finite has an entry there, but no such number."""
 
     def function(problem: Problem, run: Run) -> float | None:  # noqa: ARG001 -- every metric is given the problem
-        return float(summary(run[f"solve.{column}"])) if "solve" in run.layout and run.cycles else None
+        if "solve" not in run.layout or not run.cycles:
+            return None
+        counts = column == "iterations" or run["solve.status"] < Status.NON_FINITE
+        values = run[f"solve.{column}"][np.broadcast_to(counts, run.cycles)]
+        return float(summary(values)) if values.size else None
 
     return function
 

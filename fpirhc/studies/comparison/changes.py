@@ -1,0 +1,108 @@
+"""Changes of errors between two controllers: which coordinates count, and what their changes amount to.
+
+An error counts relative to a scale of its coordinate. The scale is the range of the reference, the start included; for a set-point
+held from the start it is 1 / sqrt(w) with the cost's weight w, else the width of the limits, else 1 in the coordinate's unit.
+
+A coordinate that the cost of a planning controller does not weigh is not judged, because nobody asked the plan for it. Neither is
+one whose relative errors stay below 1 % of the largest relative error, or below 1e-9, which is rounding.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.task.problem import Problem
+
+HELPS = 0.9  # an rms error below this share of the pair's counts as lower
+HURTS = 1.1
+MINOR = 0.01  # of the largest relative error
+ROUNDING = 1e-9  # relative errors
+_SAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Change:
+    """The errors of one coordinate, in its unit.
+
+    Args:
+        name: of the coordinate.
+        before: rms error without adaptation.
+        after: rms error with adaptation.
+        scale: that the errors are judged by.
+    """
+
+    name: str
+    before: float
+    after: float
+    scale: float = 1.0
+
+    @property
+    def ratio(self) -> float:
+        """After over before; infinite from zero to something, NaN where both are zero."""
+        if self.before > 0:
+            return self.after / self.before
+        return math.inf if self.after > 0 else math.nan
+
+    @property
+    def size(self) -> float:
+        """The larger of both errors over the scale."""
+        return max(self.before, self.after) / self.scale
+
+    @property
+    def outcome(self) -> Outcome:
+        """Better below 0.9, worse above 1.1."""
+        if not self.size >= ROUNDING:
+            return Outcome.NO_DIFFERENCE
+        return Outcome.BETTER if self.ratio < HELPS else Outcome.WORSE if self.ratio > HURTS else Outcome.NO_DIFFERENCE
+
+
+def times(factor: float) -> str:
+    """Return a factor in three digits, and never as a power of ten below a million: 245 000 times."""
+    if not 1e3 <= factor < 1e7:
+        return f"{factor:.3g} times"
+    return f"{float(f'{factor:.3g}'):,.0f} times".replace(",", " ")
+
+
+def outcome_of(changes: Mapping[str, Change]) -> Outcome:
+    """Mixed where one coordinate is better and another worse; else what any of them is."""
+    outcomes = {c.outcome for c in changes.values()}
+    if {Outcome.BETTER, Outcome.WORSE} <= outcomes:
+        return Outcome.MIXED
+    return next((one for one in (Outcome.BETTER, Outcome.WORSE) if one in outcomes), Outcome.NO_DIFFERENCE)
+
+
+def major(changes: Mapping[str, Change]) -> dict[str, Change]:
+    """The changes that count beside the others, worst ratio first."""
+    before, after = (max(getattr(c, w) / c.scale for c in changes.values()) for w in ("before", "after"))
+    least = MINOR * min(before, after)
+    counted = [c for c in changes.values() if c.size >= least]
+    return {c.name: c for c in sorted(counted, key=lambda c: -c.ratio if c.ratio == c.ratio else 0.0)}
+
+
+def scales(problem: Problem) -> dict[str, float]:
+    """Return the scale of every judged coordinate."""
+    plant = problem.plant
+    function = problem.reference.function(plant)
+    times = np.linspace(0.0, problem.duration, _SAMPLES)
+    states = np.asarray(function.map(_SAMPLES)(times[None, :])[0].full())
+    asked = np.column_stack([problem.start_state, states])
+    chosen = {}
+    for name in problem.judged_names:
+        row = asked[plant.state.elements.index(name)]
+        moves = np.ptp(row) > ROUNDING * max(1.0, float(np.abs(row).max()))
+        chosen[name] = float(np.ptp(row)) if moves else _tolerance(problem, name)
+    return chosen
+
+
+def _tolerance(problem: Problem, name: str) -> float:
+    """The scale of a coordinate that is held where it starts."""
+    weights = problem.cost.tracked if problem.cost is not None else None
+    if weights and weights.get(name, 0.0) > 0:
+        return float(weights[name] ** -0.5)
+    low, high = problem.limits.states.get(name, (-math.inf, math.inf))
+    return high - low if math.isfinite(high - low) else 1.0

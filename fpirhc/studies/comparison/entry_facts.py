@@ -1,0 +1,86 @@
+"""Facts for the verdict about a controller on a problem: what its cost weighs, its rate, why its exact model is no bound."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller
+from fpirhc.errors import FpirhcError
+from fpirhc.review.answer import Verdict
+from fpirhc.review.discretisation import discretisation_follows
+from fpirhc.review.grid import review_grid
+from fpirhc.simulation.metrics import Metrics
+from fpirhc.status import Status
+from fpirhc.studies.comparison.optimality import Optimality
+from fpirhc.task.problem import Problem, cycles_per_stage
+
+_MUCH = 1e-2  # relative cost above the optimum
+
+
+def weighed(problem: Problem, controller: Controller) -> frozenset[str] | None:
+    """Return the judged coordinates whose errors, or whose derivatives' errors, the plan's cost weighs.
+
+    None stands for all of them: the controller does not plan, the cost does not say, or it weighs no judged coordinate.
+    """
+    planner = controller.planner
+    cost = (planner.cost or problem.cost) if planner else None
+    weights = None if cost is None else cost.tracked
+    if weights is None:
+        return None
+    names = {state.rstrip("'") for state in weights}
+    return frozenset(n for n in problem.judged_names if n in names) or None
+
+
+def plan_every(problem: Problem, controller: Controller) -> int:
+    """Return the number of cycles from plan to plan; 1 for a controller that does not plan."""
+    if controller.planner is None or problem.horizon is None:
+        return 1
+    return cycles_per_stage(problem.horizon, problem.period)
+
+
+def has_exact_model(problem: Problem, controller: Controller) -> bool:
+    """Whether it is the bound of a controller with a wrong model: exact parameters, nothing adapted, nothing learned."""
+    plant, parameters = problem.plant, controller.parameters(problem.plant)
+    wrong = not np.array_equal(plant.approximate, plant.exact)
+    fixed = not controller.deformation.adapts and not controller.learns
+    return bool(wrong and fixed and np.array_equal(parameters, plant.exact))
+
+
+def no_bound_because(
+    problem: Problem, controller: Controller, metrics: Metrics, optimality: Optimality | None
+) -> tuple[str, ...]:
+    """Return why a controller with the exact model need not have the smallest error."""
+    reasons = []
+    if problem.disturbances:
+        reasons.append(f"its model does not hold the disturbance of {', '.join(problem.disturbances)}")
+    if any(problem.dead_time.inputs.values()) or problem.dead_time.measurement:
+        reasons.append("dead time stands between its model and the plant")
+    reasons += _plans_of(problem, controller, metrics, optimality)
+    if not reasons and controller.planner is not None:
+        reasons.append("its cost weighs more than the error, so the best plan has not the smallest error")
+    return tuple(reasons)
+
+
+def _plans_of(problem: Problem, controller: Controller, metrics: Metrics, optimality: Optimality | None) -> list[str]:
+    """Reasons that lie in the plans."""
+    if controller.planner is None or problem.horizon is None:
+        return []
+    reasons, every = [], plan_every(problem, controller)
+    if every > 1:
+        reasons.append(f"it plans every {every} cycles, while a deformation acts in each of them")
+    missed = 1 - metrics.statuses.get(Status.OK.name, 0) / max(sum(metrics.statuses.values()), 1)
+    if missed > 0:
+        reasons.append(f"its optimiser did not converge in {100 * missed:.3g} % of the cycles")
+    if optimality is not None and optimality.median > _MUCH:
+        reasons.append(f"the cost of its plans is {100 * optimality.median:.2g} % above the converged optimum")
+    return reasons + _discretisation(problem, controller)
+
+
+def _discretisation(problem: Problem, controller: Controller) -> list[str]:
+    try:
+        answer = discretisation_follows(review_grid(controller.inner_problem(problem), 0.0, 0))
+    except FpirhcError:
+        return []
+    if answer is None or answer.verdict == Verdict.YES:
+        return []
+    return [f"the discretisation of its horizon does not follow the plant ({answer.found})"]

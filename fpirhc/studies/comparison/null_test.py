@@ -1,0 +1,160 @@
+"""The null test: with the approximate model as plant there is nothing to adapt, so adaptation must not make the error larger.
+
+It catches what adaptation takes for an error of the model without being one: a response that drifts within a long cycle, a delay
+that is not paired, the noise of a sensor. Disturbances are left out, because they are an error of the model.
+
+The plain form passes on the changes of the desired response a little late, so some error of its own is usual. It is harmful where
+it is larger than the error that the wrong model causes without adaptation, which adaptation is there to remove.
+
+The loops of the comparison run once more with other exact parameters, so nothing is composed or compiled again. A run is the
+original one, cut to `CYCLES` cycles after `measure_from`; a test costs two such runs.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from fpirhc.simulation.metrics.window import by_name
+from fpirhc.simulation.simulate import Simulator
+from fpirhc.studies.comparison.changes import ROUNDING, Change, major, outcome_of
+from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.task.disturbance import Step
+from fpirhc.task.problem import Problem
+
+CYCLES = 2000  # measured cycles of a run at most
+_LARGER = (Outcome.WORSE, Outcome.MIXED)
+
+
+@dataclass(frozen=True)
+class NullTest:
+    """The result of a null test.
+
+    Args:
+        pair: names of the controllers without and with adaptation.
+        before: rms error without adaptation, by judged coordinate; NaN for a run that ended early.
+        after: rms error with adaptation.
+        outcome: what adaptation does where there is nothing to adapt.
+        harmful: whether it then makes an error that is larger than that of the wrong model without adaptation.
+        text: the result in a sentence.
+        cycles: of one run.
+        elapsed: wall time of both runs, s.
+    """
+
+    pair: tuple[str, str]
+    before: Mapping[str, float]
+    after: Mapping[str, float]
+    outcome: Outcome
+    harmful: bool
+    text: str
+    cycles: int
+    elapsed: float = field(default=0.0, compare=False)
+
+    @property
+    def passed(self) -> bool:
+        """Whether adaptation is not worse where there is nothing to adapt."""
+        return self.outcome in (Outcome.BETTER, Outcome.NO_DIFFERENCE)
+
+
+def null_test(
+    problem: Problem,
+    loops: tuple[Simulator, Simulator],
+    names: tuple[str, str],
+    scales: Mapping[str, float],
+    weighed: frozenset[str] | None = None,
+    *,
+    cured: Mapping[str, float],
+    seed: int,
+) -> NullTest:
+    """Return what adaptation does on the approximate model as plant.
+
+    Args:
+        problem: of the comparison.
+        loops: without and with adaptation.
+        names: of both controllers.
+        scales: by which errors are judged, by coordinate.
+        weighed: coordinates that are judged; None: all.
+        cured: rms error on the plant itself without adaptation, by judged coordinate.
+        seed: of the sensors' noise.
+    """
+    begin = time.perf_counter()
+    null = _null_problem(problem)
+    before, after = (_errors(loop, null, seed) for loop in loops)
+    changes = {n: Change(n, before[n], after[n], scales.get(n, 1.0)) for n in before if weighed is None or n in weighed}
+    outcome = _outcome(changes)
+    harmful = _harmful(outcome, changes, cured)
+    text = _sentence(names, outcome, changes, null, cured if not harmful and outcome in _LARGER else None)
+    return NullTest(names, before, after, outcome, harmful, text, null.cycles, time.perf_counter() - begin)
+
+
+def _null_problem(problem: Problem) -> Problem:
+    longest = problem.measure_from + CYCLES * problem.period
+    return replace(
+        problem,
+        plant=problem.plant.with_exact(problem.plant.approximate),
+        duration=min(problem.duration, longest),
+        disturbances={name: Step(at=0.0, size=0.0) for name in problem.disturbances},
+    )
+
+
+def _errors(loop: Simulator, null: Problem, seed: int) -> dict[str, float]:
+    """Rms error of the plant's own state over the measured cycles."""
+    run = loop.run(seed=seed, variant=null)
+    states = run["plant_state"] if "plant_state" in run.layout else run["state"]
+    names = null.judged_names
+    measured = run.time >= null.measure_from - 0.5 * null.period
+    if run.stop is not None or not measured.any():
+        return dict.fromkeys(names, math.nan)
+    places = [null.plant.state.elements.index(name) for name in names]
+    nominal = null.reference.function(null.plant).map(int(measured.sum()))(run.time[measured][None, :])[0]
+    errors = np.asarray(nominal.full()).T[:, places] - states[measured][:, places]
+    return by_name(names, np.sqrt(np.mean(errors**2, axis=0)))
+
+
+def _outcome(changes: Mapping[str, Change]) -> Outcome:
+    lost = [c for c in changes.values() if math.isnan(c.after)]
+    if any(math.isnan(c.before) for c in changes.values()) or not changes:
+        return Outcome.NOT_COMPARABLE
+    return Outcome.WORSE if lost else outcome_of(major(changes))
+
+
+def _harmful(outcome: Outcome, changes: Mapping[str, Change], cured: Mapping[str, float]) -> bool:
+    if outcome not in _LARGER:
+        return False
+    worse = [c for c in major(changes).values() if c.outcome is Outcome.WORSE] or changes.values()
+    return any(not c.after <= cured[c.name] for c in worse)
+
+
+def _sentence(
+    names: tuple[str, str],
+    outcome: Outcome,
+    changes: Mapping[str, Change],
+    null: Problem,
+    cured: Mapping[str, float] | None,
+) -> str:
+    plain, adaptive = names
+    head = "Null test (the approximate model as plant"
+    head += ", no disturbance): " if null.disturbances else "): "
+    if outcome is Outcome.NOT_COMPARABLE:
+        return f"{head}{plain} does not finish there, so nothing is shown."
+    if any(math.isnan(c.after) for c in changes.values()):
+        return f"{head}failed, {adaptive} does not finish where {plain} does, with nothing to adapt."
+    shown = sorted(changes.values(), key=lambda c: -c.ratio if c.ratio == c.ratio else 0.0)
+    numbers = ", ".join(f"{c.name} {c.before:.3g} -> {c.after:.3g} {null.plant.coordinates[c.name]}" for c in shown)
+    if outcome in (Outcome.BETTER, Outcome.NO_DIFFERENCE):
+        tiny = all(c.size < ROUNDING for c in changes.values())
+        return f"{head}passed, {adaptive} is not worse than {plain} ({'rounding only' if tiny else numbers})."
+    if cured is not None:
+        costs = ", ".join(f"{n} {cured[n]:.3g} {null.plant.coordinates[n]}" for n in changes)
+        return (
+            f"{head}{adaptive} makes a small error of its own ({numbers}); it is smaller than that of {plain} with the wrong model "
+            f"({costs})."
+        )
+    return (
+        f"{head}failed, {adaptive} is worse than {plain} although there is nothing to adapt ({numbers}). It takes something else "
+        "for an error of the model: the drift of the response within a long cycle, an unpaired delay, or noise."
+    )

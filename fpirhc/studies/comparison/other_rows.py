@@ -1,0 +1,95 @@
+"""What the other rows of a table say about the headline pair: far better rows, an exact model that is no bound, unequal rates.
+
+Rows are compared by their relative error, the rms over the coordinates that the adaptive controller's cost weighs of rms error over
+scale (see `changes`). Two rows with the same rate and the same information are at parity within a factor of two.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from fpirhc.studies.comparison.changes import HELPS, ROUNDING, times
+from fpirhc.studies.comparison.outcome import Finding
+
+if TYPE_CHECKING:
+    from fpirhc.studies.comparison.compare import Entry
+
+FAR = 2.0  # times a smaller error, from which another row is far better
+
+
+def remarks(entries: Sequence[Entry], pair: tuple[Entry, Entry] | None, scales: Mapping[str, float]) -> list[Finding]:
+    """Return the remarks about the first pair; none without a pair that finished."""
+    texts = [*_far_better(entries, pair, scales), *_no_bound(entries, scales), *_rates(entries)]
+    return [Finding(text) for text in texts]
+
+
+def relative_error(entry: Entry, scales: Mapping[str, float], weighed: frozenset[str] | None) -> float:
+    """The relative error of an entry; infinite for a run that ended early."""
+    errors = entry.metrics.rms_error
+    names = [n for n in errors if weighed is None or n in weighed] or list(errors)
+    shares = [errors[n] / scales.get(n, 1.0) for n in names]
+    if entry.run.stop is not None or not shares or not all(map(math.isfinite, shares)):
+        return math.inf
+    return math.sqrt(math.fsum(s * s for s in shares) / len(shares))
+
+
+def _far_better(entries: Sequence[Entry], pair: tuple[Entry, Entry] | None, scales: Mapping[str, float]) -> list[str]:
+    if pair is None:
+        return []
+    weighed = pair[1].weighed
+    error = {e.name: relative_error(e, scales, weighed) for e in entries}
+    ahead = min(pair, key=lambda e: error[e.name])
+    others = [e for e in entries if e not in pair and not e.exact]
+    best = min(others, key=lambda e: error[e.name], default=None)
+    if best is None or not math.isfinite(error[best.name]) or error[ahead.name] < ROUNDING:
+        return []
+    if math.isinf(error[ahead.name]):
+        return [f"{best.name} finishes its run, with a relative error of {error[best.name]:.3g}."]
+    ratio = error[ahead.name] / max(error[best.name], ROUNDING)
+    if ratio < FAR:
+        return []
+    both = " and ".join(f"{e.name} {error[e.name]:.3g}" for e in pair)
+    return [
+        f"{best.name} is far better than this pair: its relative error is {error[best.name]:.3g} ({both}), {times(ratio)} "
+        f"smaller than that of {ahead.name}."
+    ]
+
+
+def beaten_by(exact: Entry, entries: Sequence[Entry], scales: Mapping[str, float]) -> str | None:
+    """The adapted row that is clearly better than this row with the exact model; None where there is none."""
+    errors = {e.name: relative_error(e, scales, exact.weighed) for e in entries if e.adaptive or e.learns}
+    bound = relative_error(exact, scales, exact.weighed)
+    name = min(errors, key=lambda n: errors[n], default=None)
+    return name if name is not None and bound > ROUNDING and errors[name] < HELPS * bound else None
+
+
+def _no_bound(entries: Sequence[Entry], scales: Mapping[str, float]) -> list[str]:
+    """A sentence for every exact model that is worse than an adapted row."""
+    by_name, sentences = {e.name: e for e in entries}, []
+    for exact in (e for e in entries if e.exact):
+        name = beaten_by(exact, entries, scales)
+        if name is None:
+            continue
+        bound, less = (relative_error(e, scales, exact.weighed) for e in (exact, by_name[name]))
+        why = "; ".join(exact.no_bound) or "not known"
+        sentences.append(
+            f"{exact.name} is no bound here: its relative error is {bound:.3g}, that of {name} {less:.3g}. Why: {why}."
+        )
+    return sentences
+
+
+def _rates(entries: Sequence[Entry]) -> list[str]:
+    """Adaptation acts in every cycle; what is learned for a plan acts when a plan is made."""
+    planners = [e for e in entries if e.plan_every > 1]
+    every_cycle = [e.name for e in planners if e.adaptive and not e.learns]
+    every_plan = [e.name for e in planners if e.learns and not e.adaptive]
+    if not every_cycle or not every_plan:
+        return []
+    stride = planners[0].plan_every
+    return [
+        f"Rates: {', '.join(every_cycle)} corrects in every cycle, {', '.join(every_plan)} only at every plan, that is every "
+        f"{stride} cycles. A part of their difference is an effect of the rate; a period as long as a stage gives both the same "
+        "rate."
+    ]

@@ -1,0 +1,34 @@
+"""Outcomes of a comparison, and findings: sentences with the outcome that they state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+
+class Outcome(StrEnum):
+    """The effect of adaptation on one pair of controllers; words and colours of every output follow from it."""
+
+    BETTER = "better"
+    WORSE = "worse"
+    MIXED = "mixed"
+    NO_DIFFERENCE = "no difference"
+    NOT_COMPARABLE = "not comparable"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sentence of a verdict.
+
+    Args:
+        text: the sentence.
+        outcome: of the pair that it is about; None for a remark.
+        pair: names of the controllers without and with adaptation, where it is about a pair.
+        ratios: rms error with adaptation over that without, by judged coordinate, largest first; NaN where both are zero.
+    """
+
+    text: str
+    outcome: Outcome | None = None
+    pair: tuple[str, str] | None = None
+    ratios: Mapping[str, float] = field(default_factory=dict)

@@ -1,0 +1,116 @@
+"""A spread says for its parameter what a mismatch of 100 % means; studies draw from it, and reviews cover it."""
+
+from __future__ import annotations
+
+import math
+
+import abroad
+import numpy as np
+import pytest
+from scipy import stats
+
+import fpirhc as fp
+from fpirhc.errors import InvalidProblem, InvalidValue
+from fpirhc.plant.mismatch import exact_ranges
+from fpirhc.plant.spread import EXAMPLES, TAILS
+from fpirhc.review.grid import parameter_box
+from fpirhc.studies.scenarios.draws import COMPARING, draw
+
+
+def plant(**parameters: fp.Parameter) -> fp.Plant:
+    """A mass on a line that ignores its further parameters."""
+    return fp.Plant(
+        {"y": "m"}, {"u": "N"}, {"b": fp.Parameter(1.0, 1.0, "1/kg"), **parameters}, lambda q, v, u, p: {"y": p.b * u.u}
+    )
+
+
+def parameter(exact: float, spread: fp.Spread, **changes) -> fp.Parameter:
+    return fp.Parameter(approximate=exact, exact=exact, unit="1", spread=spread, **changes)
+
+
+@pytest.mark.parametrize("spread", EXAMPLES, ids=repr)
+@pytest.mark.parametrize("exact", [3.0, -2.0])
+def test_laws_of_spreads(spread, exact):
+    """Quantiles rise, are finite at both ends, have the exact value as median, and stand still at share zero."""
+    shares = np.linspace(0.0, 1.0, 21)
+    values = np.array([spread.quantile(exact, 0.7, s) for s in shares])
+    assert np.isfinite(values).all()
+    assert (np.diff(values) > 0).all()
+    assert values[10] == pytest.approx(exact)
+    assert (values[0], values[-1]) == spread.interval(exact, 0.7)
+    assert [spread.quantile(exact, 0.0, s) for s in (0.0, 0.3, 1.0)] == [exact] * 3
+
+
+def test_distributions_are_those_of_scipy():
+    """Quantiles of the uniform, and of the normal and log-normal cut off at two standard deviations."""
+    shares = np.linspace(0.02, 0.98, 15)
+    cut = stats.truncnorm(-TAILS, TAILS)
+    for spread, known in (
+        (fp.Uniform(absolute=0.4), stats.uniform(2.6, 0.8).ppf(shares)),
+        (fp.Normal(relative=0.1), 3.0 + 0.3 * cut.ppf(shares)),
+        (fp.LogNormal(factor=1.3), 3.0 * np.exp(math.log(1.3) * cut.ppf(shares))),
+    ):
+        assert [spread.quantile(3.0, 1.0, s) for s in shares] == pytest.approx(known)
+
+
+def test_the_option_scales_spreads_and_keeps_its_meaning_elsewhere():
+    """50 %: half of an absolute width of 4, the square root of a factor at two deviations, and 50 % of what has no spread."""
+    parameters = {"a": parameter(300.0, fp.Uniform(absolute=4.0)), "k": parameter(-5.0, fp.LogNormal(factor=1.2))}
+    ranges = exact_ranges(plant(**parameters), 50.0)
+    assert ranges["a"] == (298.0, 302.0)
+    assert ranges["k"] == pytest.approx((-5.0 * 1.2, -5.0 / 1.2))
+    assert ranges["b"] == (0.5, 1.5)
+
+
+def test_a_review_covers_what_scenarios_draw():
+    """Draws fill the box of the review and never leave it; the stream of one parameter does not depend on another's spread."""
+    task = abroad.load("cstr", "wrong")
+    box = parameter_box(task.problem, 100.0)
+    assert box["alpha"] == pytest.approx((0.95, 1.05))
+    assert box["beta"] == pytest.approx((0.9, 1.1))
+    both = plant(a=parameter(2.0, fp.Normal(absolute=0.1)))
+    rows = np.array([draw(both, seed=1, use=COMPARING, number=k, percent=40.0).exact for k in range(400)])
+    low, high = np.array(list(exact_ranges(both, 40.0).values())).T
+    assert ((rows >= low) & (rows <= high)).all()
+    assert np.ptp(rows, axis=0) == pytest.approx(high - low, rel=0.05)
+    other = plant(a=parameter(2.0, fp.Uniform(relative=0.5)))
+    again = np.array([draw(other, seed=1, use=COMPARING, number=k, percent=40.0).exact for k in range(20)])
+    np.testing.assert_array_equal(again[:, 0], rows[:20, 0])
+
+
+def test_the_whole_spread_needs_spreads_everywhere():
+    """100 % and more have no meaning for a parameter that could change its sign; with spreads everywhere they have."""
+    some = plant(a=parameter(2.0, fp.Uniform(absolute=0.1)))
+    with pytest.raises(InvalidValue, match="below 100"):
+        exact_ranges(some, 100.0)
+    every = fp.Plant(
+        {"y": "m"}, {"u": "N"}, {"b": parameter(1.0, fp.Uniform(absolute=0.1))}, lambda q, v, u, p: {"y": p.b * u.u}
+    )
+    assert exact_ranges(every, 150.0)["b"] == pytest.approx((0.85, 1.15))
+    with pytest.raises(InvalidValue, match="at least 0"):
+        exact_ranges(every, -1.0)
+
+
+def test_a_range_beyond_the_bounds_is_refused_with_the_largest_inside():
+    """0.5 -+ 0.3 leaves (0.35, 1): half of the spread stays inside."""
+    tight = plant(c=parameter(0.5, fp.Uniform(absolute=0.3), bounds=(0.35, 1.0)))
+    with pytest.raises(InvalidProblem, match=r"parameter 'c'.*at most 50 % stay inside"):
+        exact_ranges(tight, 60.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: fp.Uniform(), "absolute=.* or relative="),
+        (lambda: fp.Normal(absolute=1.0, relative=0.1), "one positive number"),
+        (lambda: fp.Uniform(absolute=-1.0), "one positive number"),
+        (lambda: fp.LogNormal(factor=0.9), "a number above 1"),
+        (lambda: plant(z=parameter(0.0, fp.Uniform(relative=0.3))), "parameter 'z': spread: it has the value 0"),
+        (lambda: plant(z=parameter(0.0, fp.LogNormal(factor=2.0))), "use Uniform or Normal with absolute"),
+        (lambda: plant(z=fp.Parameter(1.0, 1.0, "1", spread=0.3)), "spread must be Uniform"),  # type: ignore[arg-type]
+    ],
+)
+def test_wrong_spreads_are_refused(make, message):
+    """Where they are written, with what to write instead."""
+    with pytest.raises(fp.FpirhcError, match=message):
+        make()

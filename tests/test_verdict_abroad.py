@@ -1,0 +1,133 @@
+"""The verdict on plants that are not shipped, by value: what a user reads there is what happened."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import abroad
+import pytest
+
+import fpirhc as fp
+from fpirhc.report.as_json import to_json
+from fpirhc.report.html import render
+from fpirhc.report.outcomes import css_class, terminal_style
+from fpirhc.studies.comparison.compare import Comparison, compare
+from fpirhc.studies.comparison.outcome import Outcome
+
+
+def compared(name: str, *controllers: str, variant: str = "problem", **changes) -> Comparison:
+    """The comparison of some of the file's controllers; the problem may be changed, such as its duration."""
+    task = abroad.load(name, variant)
+    if changes:
+        task = replace(task, problem=replace(task.problem, **changes))
+    return compare(task, seed=0, controllers=controllers or None)
+
+
+@pytest.fixture(scope="module")
+def cstr() -> Comparison:
+    return compared("cstr", "RHC", "RHC+FPI")
+
+
+def test_reactor_whose_only_weighted_output_is_lost(cstr):
+    """C_b, the only weighted output, goes from 7e-6 to 0.44 mol/l: that is worse, though the unweighed jacket's error is smaller."""
+    first = cstr.findings[0]
+    assert cstr["RHC"].metrics.rms_error["C_b"] < 1e-5
+    assert cstr["RHC+FPI"].metrics.rms_error["C_b"] == pytest.approx(0.44, rel=0.1)
+    assert cstr["RHC+FPI"].metrics.rms_error["T_K"] < cstr["RHC"].metrics.rms_error["T_K"]
+    assert first.outcome is Outcome.WORSE
+    assert set(first.ratios) == {"C_b"}
+    assert first.ratios["C_b"] > 1e4
+    assert "RHC+FPI does not help: it raises the rms error of C_b from" in first.text
+    assert "The cost does not weigh, so the verdict leaves out: T_K" in first.text
+
+
+def test_reactor_fails_the_null_test(cstr):
+    """Its model is exact, so the null test is the run itself; at a tenth of the period the error of FPI's own is 14 times smaller."""
+    assert cstr.null is not None
+    assert cstr.null.harmful
+    assert not cstr.null.passed
+    assert cstr.null.after["C_b"] == pytest.approx(cstr["RHC+FPI"].metrics.rms_error["C_b"], rel=1e-6)
+    assert "failed, RHC+FPI is worse than RHC although there is nothing to adapt (C_b" in cstr.null.text
+
+
+def test_what_does_not_help_is_never_green(cstr):
+    """One outcome decides the words, the terminal's colour, the page's class and the JSON."""
+    assert terminal_style(cstr.outcome) == "bold red"
+    page = render(cstr)
+    assert "class='headline outcome-worse'>RHC+FPI does not help" in page
+    assert "outcome-better" not in page.partition("<section id='verdict'>")[2].partition("</section>")[0]
+    facts = to_json(cstr)
+    assert '"outcome": "worse"' in facts
+    assert '"harmful": true' in facts
+    green = [outcome for outcome in Outcome if "green" in terminal_style(outcome)]
+    assert green == [Outcome.BETTER]
+    assert len({css_class(outcome) for outcome in Outcome}) == len(Outcome)
+
+
+def test_tanks_get_better_in_both_levels_worst_first():
+    """h1 four times better, h2 forty times; the page's first number is the smaller gain. Own errors are small beside the model's."""
+    tanks = compared("quadruple_tank", "RHC", "RHC+FPI", "RHC exact model")
+    first = tanks.findings[0]
+    assert first.outcome is Outcome.BETTER
+    assert list(first.ratios) == ["h1", "h2"]
+    assert 1 / first.ratios["h1"] == pytest.approx(3.6, rel=0.2)
+    assert 1 / first.ratios["h2"] == pytest.approx(37, rel=0.3)
+    assert first.text.index("h1 from") < first.text.index("h2 from")
+    assert not any("no bound" in text for text in tanks.verdict)
+    assert tanks.null is not None
+    assert not tanks.null.harmful
+    assert "makes a small error of its own" in tanks.null.text
+
+
+def test_servo_does_not_change():
+    """The mismatch is where the controlled response does not feel it: 5 % is no clear difference, and it is not called a gain."""
+    servo = compared("flexible_servo", "RHC", "RHC+FPI", "RHC exact model")
+    assert servo.outcome is Outcome.NO_DIFFERENCE
+    assert servo.findings[0].text.startswith("RHC+FPI makes no clear difference: the rms error of load from 0.0066")
+    assert terminal_style(servo.outcome) == ""
+    assert servo["RHC exact model"].metrics.rms_error["load"] < 1e-4
+
+
+def test_infusion_is_better():
+    """Marsh's kinetics in a Schnider patient: RHC 0.28 mg/l, RHC+FPI 0.001 mg/l; a plan every second cycle is said to be one."""
+    infusion = compared("drug_infusion", "RHC", "RHC+FPI", "RHC offset-free", duration=60.0)
+    assert infusion.outcome is Outcome.BETTER
+    assert infusion.findings[0].ratios["C1"] < 0.02
+    assert any(
+        text.startswith("Rates: RHC+FPI corrects in every cycle, RHC offset-free only") for text in infusion.verdict
+    )
+
+
+def test_own_map_in_the_wrong_form_is_worse_and_the_right_form_is_named():
+    """Paired, the plan's own feedback diverges through the dead time; as an increment the same map halves the error, and is named."""
+    cart = compared("own_map", "RHC", "RHC+FPI", "RHC+FPI, increment")
+    outcomes = {f.pair[1]: f.outcome for f in cart.findings if f.pair}
+    assert outcomes == {"RHC+FPI": Outcome.WORSE, "RHC+FPI, increment": Outcome.BETTER}
+    assert any(text.startswith("RHC+FPI, increment is far better than this pair") for text in cart.verdict)
+    assert cart.null is not None
+    assert cart.null.harmful
+
+
+def test_an_exact_model_that_is_beaten_is_no_bound():
+    """The tumour's exact model does not know the step of the dose and plans once in 20 cycles: adaptation has a smaller error."""
+    task = fp.load_problem("tumour")
+    found = compare(task, seed=0, controllers=["RHC", "RHC+FPI", "RHC exact model"])
+    [text] = [t for t in found.verdict if "no bound" in t]
+    assert text.startswith("RHC exact model is no bound here: its relative error is")
+    assert "its model does not hold the disturbance of dose; it plans every 20 cycles" in text
+
+
+def test_at_the_same_rate_and_with_the_same_information_it_is_parity():
+    """Van der Pol-Duffing: at ten corrections per plan RHC+FPI has less than half the error of offset-free control; at one it has 0.9.
+
+    Both correct the response that the model expected by the one that was measured, so that only the rate differs.
+    """
+    task = fp.load_problem("van_der_pol_duffing")
+    names, error = ("RHC+FPI", "RHC offset-free"), {}
+    for period in (2e-3, 2e-2):
+        problem = replace(task.problem, period=period)
+        runs = [fp.simulate(problem, task.controllers[name], seed=0) for name in names]
+        error[period] = [fp.measure(problem, run).rms_error["q"] for run in runs]
+    fast, slow = (adaptive / learner for adaptive, learner in error.values())
+    assert fast < 0.5
+    assert 0.5 < slow < 2
