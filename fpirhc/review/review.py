@@ -22,6 +22,7 @@ from fpirhc.review.loops import Loops, loops_along
 from fpirhc.review.maps import largest_product
 from fpirhc.review.margins import margins_enough
 from fpirhc.review.neighbourhood import spectrum_near
+from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.orders import relative_orders
 from fpirhc.review.pays import pays
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, known_questions
@@ -57,7 +58,9 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
     reach = horizon_long_enough(grid)
     more = (question.ask(grid) for question in known_questions(ProblemQuestion))
     general += [answer for answer in (reach, discretisation_follows(grid), *more) if answer is not None]
-    return Review(tuple(general), {name: _of(grid, one, general) for name, one in controllers.items()}, mismatch)
+    runs = NominalRuns(problem)
+    answers = {name: _of(grid, one, general, runs) for name, one in controllers.items()}
+    return Review(tuple(general), answers, mismatch)
 
 
 def predict(problem: Problem, controller: Controller) -> Answer:
@@ -72,11 +75,11 @@ def predict(problem: Problem, controller: Controller) -> Answer:
     ready = resolved(problem, controller)
     general = [well_posed(own), inverse_exists(own), commands_inside(own)]
     loops = loops_along(own, ready)
-    case = Case(own, ready, loops)
+    case = Case(own, ready, loops, NominalRuns(problem))
     return converges(own, ready, loops, _doubts([*general, *_speed_and_range(own, ready, loops), *_doubtful(case)]))
 
 
-def _of(grid: ReviewGrid, controller: Controller, general: list[Answer]) -> tuple[Answer, ...]:
+def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: NominalRuns) -> tuple[Answer, ...]:
     try:
         ready = resolved(grid.problem, controller)
         ready.check(grid.problem)
@@ -87,7 +90,7 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer]) -> tupl
         return (schedule,)
     loops = loops_along(grid, ready)
     outer = [rates_inside(grid, ready, loops), zero_dynamics(zero_dynamics_rate(grid), is_planned(ready), loops)]
-    case = Case(grid, ready, loops)
+    case = Case(grid, ready, loops, runs)
     inner = [] if not ready.deformation.adapts else _of_map(case, general)
     return (*inner, *outer, margins_enough(grid.problem, loops), *_more(case))
 
