@@ -220,8 +220,8 @@ def test_a_wrapper_of_a_wrapper_is_reviewed_as_what_it_is_made_of(controller, se
     """Two wrappers of a user's own change no answer."""
     problem = mass(**settings)
     plain, wrapped = answers(problem, controller), answers(problem, twice(controller))
-    assert {q: (a.verdict, a.found.replace("Named", type(controller).__name__)) for q, a in wrapped.items()} == {
-        q: (a.verdict, a.found) for q, a in plain.items()
+    assert {q: (a.verdict, a.evidence.replace("Named", type(controller).__name__)) for q, a in wrapped.items()} == {
+        q: (a.verdict, a.evidence) for q, a in plain.items()
     }
 
 
@@ -229,10 +229,10 @@ def test_an_estimating_controller_is_reviewed_with_the_model_that_it_begins_with
     """It has its horizon; its margins are those of the wrapped controller, and no verdict is final where the model changes."""
     problem = mass(**LOOKING_AHEAD)
     plain, learning = (answers(problem, c) for c in (PLAN, fp.Estimating(PLAN, FILTER)))
-    assert not any("needs Problem(horizon" in a.found for a in learning.values())
+    assert not any("needs Problem(horizon" in a.evidence for a in learning.values())
     margins = about(learning, "margin")
     assert margins.numbers == about(plain, "margin").numbers
-    assert "before the controller has learned" in margins.found
+    assert "before the controller has learned" in margins.evidence
     adaptive = fp.Estimating(replace(PLAN, deformation=fp.Affine(-0.5)), FILTER)
     verdict = about(answers(problem, adaptive), "Does the deformation converge")
     assert (verdict.verdict, verdict.change[:10]) == ("unknown", "Estimating")

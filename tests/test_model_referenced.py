@@ -359,5 +359,5 @@ def test_review_says_which_form():
     assert right_form(TWO_MASS.problem, fp.ModelReferenced(affine(0.5))).verdict == "yes"
     advice = right_form(TWO_MASS.problem, affine(0.5))
     assert advice.verdict == "unknown"
-    assert "it is plain; measurements speak for model-referenced" in advice.found
+    assert "it is plain; measurements speak for model-referenced" in advice.evidence
     assert advice.change.startswith("Try ModelReferenced")

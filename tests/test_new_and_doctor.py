@@ -137,7 +137,7 @@ def test_doctor_finds_this_installation_in_order(capsys, tmp_path, monkeypatch):
     assert found["outcome"] in ("ok", "warn")
     checks = {c["name"]: c for c in found["checks"]}
     assert list(checks) == [check.__name__.replace("_", "-") for check in machine.CHECKS]
-    assert str(tmp_path / "cache") in checks["cache"]["found"]
+    assert str(tmp_path / "cache") in checks["cache"]["evidence"]
 
 
 def test_a_missing_compiler_is_a_warning(monkeypatch):
@@ -231,7 +231,7 @@ def test_a_check_that_raises_has_failed_and_the_rest_goes_on(capsys, monkeypatch
     findings = ask([broken_library, machine.python_threads])
     assert findings[0].outcome == Outcome.FAIL
     assert findings[0].name == "broken-library"
-    assert findings[0].found == "OSError: libfoo.so: cannot open"
+    assert findings[0].evidence == "OSError: libfoo.so: cannot open"
     assert findings[1].outcome == Outcome.OK
     monkeypatch.setattr("fpirhc.doctor.examine.examine", lambda: Diagnosis({"fpirhc": "0"}, findings))
     assert main(["doctor"]) == 7

@@ -286,7 +286,7 @@ def test_every_shipped_problem_can_be_reviewed(name, capsys):
     found = json.loads(capsys.readouterr().out)
     assert set(found["controllers"]) == set(few)
     every = [*found["answers"], *(a for group in found["controllers"].values() for a in group)]
-    assert all(a["found"] and a["question"].endswith("?") for a in every)
+    assert all(a["evidence"] and a["question"].endswith("?") for a in every)
     assert all(a["change"] for a in every if a["verdict"] == "no")
     assert code == int(any(a["verdict"] == "no" for a in every))
 

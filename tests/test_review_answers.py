@@ -84,14 +84,14 @@ def test_convergence_is_a_hundredfold_change_over_the_run(grid, logarithms, verd
     radii = np.exp(logarithms)
     one = convergence(grid, loops(*radii))
     assert one.verdict == verdict
-    assert one.found.startswith(f"the slowest mode of the linear loop changes by {max(radii):.6g} per cycle")
+    assert one.evidence.startswith(f"the slowest mode of the linear loop changes by {max(radii):.6g} per cycle")
     assert one.numbers == {"radius": max(radii), "smallest_radius": min(radii)}
     assert bool(one.change) == (verdict != "yes")
 
 
 def test_the_range_along_the_reference_is_told(grid):
     """What is unknown has its smallest and its largest factor."""
-    assert convergence(grid, loops(0.5, 1.25)).found.endswith("per cycle (between 0.5 and 1.25 along the reference)")
+    assert convergence(grid, loops(0.5, 1.25)).evidence.endswith("per cycle (between 0.5 and 1.25 along the reference)")
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_a_loop_that_changes_on_line_is_unknown(grid):
     ):
         assert (one.verdict, one.change) == ("unknown", f"{name} on line; the factor is that of the first cycle.")
     none = convergence(grid, Loops((), (), None, reason="the inverse does not exist"))
-    assert (none.verdict, none.found) == ("unknown", "no linear loop: the inverse does not exist")
+    assert (none.verdict, none.evidence) == ("unknown", "no linear loop: the inverse does not exist")
 
 
 def test_doubts_and_steep_maps_speak_against_convergence(grid):
@@ -119,11 +119,11 @@ def test_doubts_and_steep_maps_speak_against_convergence(grid):
     assert convergence(grid, loops(0.5), fp.Affine(-5.33)).verdict == "yes"
     steep = convergence(grid, loops(0.5), fp.Affine(-5.36), ["the map is too slow"])
     assert steep.verdict == "unknown"
-    assert steep.found.endswith(
+    assert steep.evidence.endswith(
         "near the reference its steepest secant times an eigenvalue reaches 2.01, and the limit is 2; the map is too slow"
     )
     wrong = convergence(grid, loops(0.5), fp.Affine(0.5))
-    assert wrong.found.endswith("but near the reference the response Jacobian changes its sign")
+    assert wrong.evidence.endswith("but near the reference the response Jacobian changes its sign")
 
 
 @pytest.mark.parametrize(
@@ -139,9 +139,9 @@ def test_share_of_the_box_that_converges(drawn, verdict, text):
     """Of the draws; without draws of the loops along the reference."""
     one = box_converges(loops(0.25, drawn=tuple(map(loop, drawn))))
     radii = drawn or (0.25,)
-    assert (one.verdict, one.found, bool(one.change)) == (verdict, text, verdict == "unknown")
+    assert (one.verdict, one.evidence, bool(one.change)) == (verdict, text, verdict == "unknown")
     assert one.numbers == {"share": pytest.approx(np.mean(np.array(radii) < 1)), "radius": max(radii)}
-    assert box_converges(Loops((), (), None, reason="none")).found == "no linear loop: none"
+    assert box_converges(Loops((), (), None, reason="none")).evidence == "no linear loop: none"
 
 
 # The gain
@@ -156,7 +156,7 @@ def test_numbers_of_the_gain():
     """J from 1 to 1.5: A = -A_c / 2 below 2 / 1.5, best 1 / 1.25; under a dead time that halves the limit half of it all."""
     one = admissible(-0.5, [1.0], [1.0, 1.5])
     assert (one.verdict, one.change) == ("yes", "")
-    assert one.found == (
+    assert one.evidence == (
         "gain = -0.5; admissible 0 to -2.67 for errors of any size, to -2.67 for small ones; recommended -1.6"
     )
     assert one.numbers == pytest.approx(
@@ -211,7 +211,7 @@ def test_a_map_is_fast_enough_at_twice_the_speed(ratio, verdict):
     """The request is 4.667 sin 3t: 14 per second."""
     one = slew(mass(), ratio * 14.0 * PERIOD)
     assert one.verdict == verdict
-    assert one.found == f"the request changes by up to 14 per second, the map by {ratio * 14:.3g}"
+    assert one.evidence == f"the request changes by up to 14 per second, the map by {ratio * 14:.3g}"
     assert one.numbers == {"needed": pytest.approx(14.0, rel=1e-3), "limit": pytest.approx(ratio * 14.0), "jump": 0.0}
     change = f"Raise the map's scale at least {2 / ratio:.2g} times, or leave it out to have it chosen."
     assert one.change == ("" if verdict == "yes" else change)
@@ -220,7 +220,7 @@ def test_a_map_is_fast_enough_at_twice_the_speed(ratio, verdict):
 def test_a_map_without_bound_is_fast_enough(grid):
     """The affine map takes a step of any size."""
     one = slew_enough(grid, fp.Affine(-0.5), grid.problem.plant.approximate, None)
-    assert (one.verdict, one.found) == (
+    assert (one.verdict, one.evidence) == (
         "yes",
         "the request changes by up to 14 per second; the map's step has no bound",
     )
@@ -233,7 +233,7 @@ def test_disturbances_ask_for_speed_as_well():
     assert one.numbers["needed"] == pytest.approx(14.0 + 10.0, rel=1e-3)
     two = slew(mass(disturbances={"u": fp.Step(at=1.0, size=-3.0)}), 0.7)
     assert two.numbers["jump"] == pytest.approx(1.5)
-    assert two.found.endswith("; a jump of a disturbance takes the map 3 cycles")
+    assert two.evidence.endswith("; a jump of a disturbance takes the map 3 cycles")
     both = {"u": fp.Step(at=1.0, size=3.0), "q": fp.Step(at=1.0, size=2.0)}
     assert slew(mass(disturbances=both), 0.7).numbers["jump"] == pytest.approx(2.0)
 
@@ -243,10 +243,10 @@ def test_a_start_off_the_reference_asks_for_speed():
     plan = LinearLoop(np.diag([0.5, 0.5]), np.eye(2), np.array([[6.0, 0.0]]), np.array([0, 1]), PERIOD)
     one = slew(mass(start={"q": 1.0, "q'": 1.5}), 1.0, plan)
     assert one.numbers["needed"] == pytest.approx(20.0)
-    assert one.found.startswith("the request changes by up to 20 per second after the start, the map")
+    assert one.evidence.startswith("the request changes by up to 20 per second after the start, the map")
     near = slew(mass(start={"q": 0.5, "q'": 1.5}), 1.0, plan)
     assert near.numbers["needed"] == pytest.approx(14.0, rel=1e-3)
-    assert "after the start" not in near.found
+    assert "after the start" not in near.evidence
 
 
 def cubed(**settings: Any) -> fp.Problem:
@@ -275,7 +275,7 @@ def test_at_rest_nothing_is_asked_for():
     still = fp.Trajectory(lambda t: {"q": 0 * t})
     one = slew(replace(mass(start={"q": 0.0}), reference=still), 1.0)
     assert one.verdict == "yes"
-    assert one.found == "the request changes by up to 0 per second, the map by 10"
+    assert one.evidence == "the request changes by up to 0 per second, the map by 10"
 
 
 # The commands
@@ -309,7 +309,7 @@ def test_share_of_the_limits(rows, limits, verdict, own, widest):
     one = commands(rows, limits)
     assert one.verdict == verdict
     assert one.numbers == pytest.approx({"share_of_limits": own, "share_over_box": widest})
-    assert one.found.endswith(f"; {100 * own:.3g} % of the limits, {100 * widest:.3g} % over the box")
+    assert one.evidence.endswith(f"; {100 * own:.3g} % of the limits, {100 * widest:.3g} % over the box")
     change = f"Slow the reference down, or widen the limits {widest:.2g} times."
     assert one.change == ("" if verdict == "yes" else change)
 
@@ -317,8 +317,8 @@ def test_share_of_the_limits(rows, limits, verdict, own, widest):
 def test_range_of_the_commands():
     """That of the plant's own parameters, at the points where there is a command."""
     assert (
-        commands([[-1.25, 2.5, math.nan], [-9.0, 9.0, 9.0]], None).found
+        commands([[-1.25, 2.5, math.nan], [-9.0, 9.0, 9.0]], None).evidence
         == "needed: u -1.25 to 2.5; no input has limits"
     )
     none = commands([[math.nan, math.nan]], (-4.0, 8.0))
-    assert (none.verdict, none.found) == ("unknown", "no finite command is known")
+    assert (none.verdict, none.evidence) == ("unknown", "no finite command is known")

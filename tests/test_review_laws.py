@@ -88,7 +88,7 @@ def test_benefit_is_not_known_under_dead_time():
     late = moving(dead_time=fp.DeadTime(inputs={"u": PERIOD}))
     found = answer(late, fp.Paired(fp.Affine(gain=-0.5), cycles=1), "lower the response error")
     assert found.verdict == "unknown"
-    assert "dead time" in found.found
+    assert "dead time" in found.evidence
     assert answer(late, fp.Paired(fp.Affine(gain=-0.5), cycles=1), "two-cycles") is None
     assert answer(late, fp.Paired(fp.Affine(gain=-0.5), cycles=1), "small lag") is None
 

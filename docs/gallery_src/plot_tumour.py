@@ -48,4 +48,4 @@ for answer in fp.review(task.problem, gentle, mismatch=0.0, seed=0).controllers[
     "gentle"
 ]:
     if answer.verdict.value == "no":
-        print(answer.question, answer.found)
+        print(answer.question, answer.evidence)

@@ -72,7 +72,7 @@ large = fp.ComputedTorque(tracking, fp.Sigmoid(gain=-4.0, scale=5.0))
     for a in fp.review(problem, {"large": large}, mismatch=0.0, seed=0).answers
     if "gain admissible" in a.question
 ]
-print(answer.verdict, "-", answer.found)
+print(answer.verdict, "-", answer.evidence)
 
 # %%
 # 3. The map cannot keep up

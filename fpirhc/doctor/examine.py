@@ -31,7 +31,7 @@ class Diagnosis:
         """Return one line per finding, with the remedy under each that is not OK."""
         lines = [", ".join(f"{name} {number}" for name, number in self.versions.items())]
         for finding in self.findings:
-            lines.append(f"{finding.outcome.name.lower():4s}  {finding.name}: {finding.found}")
+            lines.append(f"{finding.outcome.name.lower():4s}  {finding.name}: {finding.evidence}")
             if finding.remedy:
                 lines.append(f"      to do: {finding.remedy}")
         counts = [sum(f.outcome == outcome for f in self.findings) for outcome in Outcome]
@@ -40,7 +40,7 @@ class Diagnosis:
     def json(self) -> str:
         """Return one JSON object."""
         checks = [
-            {"name": f.name, "outcome": f.outcome.name.lower(), "found": f.found, "remedy": f.remedy}
+            {"name": f.name, "outcome": f.outcome.name.lower(), "evidence": f.evidence, "remedy": f.remedy}
             for f in self.findings
         ]
         return json.dumps({"outcome": self.outcome.name.lower(), "versions": self.versions, "checks": checks}, indent=2)

@@ -22,13 +22,13 @@ class Finding:
     Args:
         name: name of the check.
         outcome: its outcome.
-        found: the facts in a sentence.
+        evidence: the facts in a sentence.
         remedy: what to do; empty: nothing.
     """
 
     name: str
     outcome: Outcome
-    found: str
+    evidence: str
     remedy: str = ""
 
 

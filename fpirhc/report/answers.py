@@ -42,7 +42,7 @@ def review_to_json(name: str, review: Review) -> str:
 def _show(console: Console, answers: Iterable[Answer]) -> None:
     for one in answers:
         console.print(Text(f"  {one.verdict:7s} ", _COLOURS[one.verdict]) + Text(one.question), highlight=False)
-        console.print(Text(f"          {one.found}"), highlight=False, soft_wrap=True)
+        console.print(Text(f"          {one.evidence}"), highlight=False, soft_wrap=True)
         if one.change:
             console.print(Text(f"          -> {one.change}"), highlight=False, soft_wrap=True)
 
@@ -56,7 +56,7 @@ def _facts(answer: Answer) -> dict[str, Any]:
     return {
         "question": answer.question,
         "verdict": str(answer.verdict),
-        "found": answer.found,
+        "evidence": answer.evidence,
         "change": answer.change,
         "numbers": {name: v if math.isfinite(v) else None for name, v in answer.numbers.items()},
     }

@@ -22,14 +22,14 @@ class Answer:
     Args:
         question: in the words of a reader.
         verdict: yes, no, unknown.
-        found: the facts in a sentence, with the deciding number and its unit.
+        evidence: the facts in a sentence, with the deciding number and its unit.
         change: what to change; empty after a yes.
         numbers: the same facts by name.
     """
 
     question: str
     verdict: Verdict
-    found: str
+    evidence: str
     change: str = ""
     numbers: Mapping[str, float] = field(default_factory=dict)
 
