@@ -28,6 +28,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.errors import NotSupported
 from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Parameter, Plant
+from fpirhc.review.plan_feedback import PlanGain
 from fpirhc.sensing import Sensing
 from fpirhc.simulation.loop import close_loop
 from fpirhc.symbolic.layout import Expression, Named
@@ -129,25 +130,25 @@ def controlled_gain(
 
 
 def linear_parameters(
-    slopes: ca.Function, state: np.ndarray, command: np.ndarray, parameters: np.ndarray, feedback: np.ndarray
+    slopes: ca.Function, state: np.ndarray, command: np.ndarray, parameters: np.ndarray, feedback: PlanGain
 ) -> np.ndarray:
-    """Return the parameters of `linear_plant`: A and B of the responses at a point, and a plan's feedback (nu, nx)."""
+    """Return the parameters of `linear_plant`: A and B of the responses at a point, and a plan's gains."""
     a, b = (np.asarray(m.full()) for m in slopes(state, command, parameters))
-    return np.concatenate([a.ravel(), b.ravel(), feedback.ravel()])
+    return np.concatenate([a.ravel(), b.ravel(), feedback.entries])
 
 
 def linear_plant(plant: Plant, sign: float) -> Plant:
     """Return a plant of the same coordinates and inputs whose parameters are the entries of A and B.
 
-    The first n nx entries are A, the next B, the last K of a plan's feedback, which the plant itself does not use. Its own values
+    The first n nx entries are A, the next B, the last [K, L] of a plan's feedback, which the plant itself does not use. Its own values
     are A = 0, and B = 1 on the controlled coordinates, times `sign` on the exact side.
     """
     n, nx, nu = len(plant.names), plant.state.size, len(plant.inputs)
     gain = np.zeros((n, nu))
     gain[list(plant.controlled_indices), range(nu)] = 1.0
     names = [f"a{k}" for k in range(n * nx)] + [f"b{k}" for k in range(n * nu)]
-    names += [f"f{k}" for k in range(nu * nx)]
-    values = np.concatenate([np.zeros(n * nx), gain.ravel(), np.zeros(nu * nx)])
+    names += [f"f{k}" for k in range(nu * (nx + nu))]
+    values = np.concatenate([np.zeros(n * nx), gain.ravel(), np.zeros(nu * (nx + nu))])
     parameters = {name: Parameter(v, sign * v, "1") for name, v in zip(names, values, strict=True)}
 
     def response(*arguments: Named) -> Mapping[str, Expression]:

@@ -12,7 +12,7 @@ from fpirhc.controllers.contract import Planner, without_deformation
 from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.linear import LinearLoop, controlled_gain, linear_parameters, loop_matrices, response_slopes
-from fpirhc.review.plan_feedback import plan_gains
+from fpirhc.review.plan_feedback import PlanGain, no_gain, plan_gains
 from fpirhc.review.stand_in import linear_stand_in
 from fpirhc.task.problem import Problem
 
@@ -60,7 +60,7 @@ def loops_along(grid: ReviewGrid, controller: Controller) -> Loops:
 def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
     problem, plant = grid.problem, grid.problem.plant
     believed = controller.parameters(plant)
-    stand_in, plan = linear_stand_in(controller)
+    stand_in, plan = linear_stand_in(problem, controller)
     matrices = loop_matrices(problem, stand_in)
     usable = [k for k in range(len(grid.times)) if np.isfinite(grid.commands[0, k]).all()]
     if not usable:
@@ -91,7 +91,7 @@ def loops_at(grid: ReviewGrid, controller: Controller, places: Sequence[int]) ->
     """
     problem, plant = grid.problem, grid.problem.plant
     believed = controller.parameters(plant)
-    stand_in, plan = linear_stand_in(controller)
+    stand_in, plan = linear_stand_in(problem, controller)
     feedbacks = _gains(problem, plan, [float(grid.times[k]) for k in places], believed)
     matrices, slopes = loop_matrices(problem, stand_in), response_slopes(plant)
     loops = []
@@ -113,7 +113,7 @@ def ideal_loops(grid: ReviewGrid, controller: Controller, count: int) -> list[tu
     """
     problem, plant = grid.problem, grid.problem.plant
     believed = controller.parameters(plant)
-    stand_in, plan = linear_stand_in(controller)
+    stand_in, plan = linear_stand_in(problem, controller)
     needed = grid.needed(believed)
     usable = [k for k in range(len(grid.times)) if np.isfinite(needed[k]).all()]
     if not usable:
@@ -144,9 +144,9 @@ def _thinned(places: list[int], most: int) -> list[int]:
     return [places[int(k)] for k in np.unique(np.linspace(0, len(places) - 1, count).astype(int))]
 
 
-def _gains(problem: Problem, plan: Planner | None, times: list[float], believed: np.ndarray) -> list[np.ndarray]:
+def _gains(problem: Problem, plan: Planner | None, times: list[float], believed: np.ndarray) -> list[PlanGain]:
     if plan is None:
-        return [np.zeros((len(problem.plant.inputs), problem.plant.state.size))] * len(times)
+        return [no_gain(problem.plant)] * len(times)
     cost = plan.cost or problem.cost
     assert problem.horizon is not None
     assert cost is not None

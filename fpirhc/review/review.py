@@ -30,9 +30,10 @@ from fpirhc.review.schedule import schedule_stable
 from fpirhc.review.signs import one_sign
 from fpirhc.review.slew import slew_enough
 from fpirhc.review.speed import bears_lag, fast_enough
+from fpirhc.review.stand_in import is_planned
 from fpirhc.review.two_cycles import free_of_two_cycles
 from fpirhc.review.well_posed import well_posed
-from fpirhc.review.zero_dynamics import is_planned, zero_dynamics, zero_dynamics_rate
+from fpirhc.review.zero_dynamics import zero_dynamics, zero_dynamics_rate
 from fpirhc.task.problem import Problem
 
 

@@ -9,14 +9,11 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller
-from fpirhc.errors import FpirhcError
 from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict, decided
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.linear import response_slopes
 from fpirhc.review.loops import Loops
-from fpirhc.review.stand_in import linear_stand_in
 from fpirhc.review.state_matrix import state_matrices
 
 QUESTION = "Are the zero dynamics stable?"
@@ -69,11 +66,3 @@ def zero_dynamics(rate: float | None, planned: bool, loops: Loops) -> Answer:
         "" if rate < 0 else "Let a plan carry those states in its cost, use time slots, or control another coordinate."
     )
     return Answer(QUESTION, decided(rate < 0), text, change, numbers)
-
-
-def is_planned(controller: Controller) -> bool:
-    """Whether the controller plans over a horizon that it restarts from the measured state."""
-    try:
-        return linear_stand_in(controller)[1] is not None
-    except FpirhcError:
-        return True
