@@ -140,8 +140,8 @@ def linear_parameters(
 def linear_plant(plant: Plant, sign: float) -> Plant:
     """Return a plant of the same coordinates and inputs whose parameters are the entries of A and B.
 
-    The first n nx entries are A, the next B, the last [K, L] of a plan's feedback, which the plant itself does not use. Its own values
-    are A = 0, and B = 1 on the controlled coordinates, times `sign` on the exact side.
+    The first n nx entries are A, the next B, the last [K, L] of a plan's feedback, which the plant itself does not use.
+    Its own values are A = 0, and B = 1 on the controlled coordinates, times `sign` on the exact side.
     """
     n, nx, nu = len(plant.names), plant.state.size, len(plant.inputs)
     gain = np.zeros((n, nu))

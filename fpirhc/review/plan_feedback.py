@@ -10,8 +10,8 @@ reference they bind nowhere. An end that must be met, C x_N = 0, enters exactly,
 
     q^Des = A^ x + B^ (K x + L u_before)      in deviations from the reference,
 
-as if the plan were renewed in every cycle. The input before is then the command of one stage ago, so that the inputs change per stage
-as the plan wants them to.
+as if the plan were renewed in every cycle. The input before is then the command of one stage ago: the plan limits the change of the
+inputs per stage and not per cycle.
 """
 
 from __future__ import annotations
