@@ -84,7 +84,7 @@ def nominal_run(problem: Problem, controller: Controller, *, compiled: bool = Tr
     ready = resolved(problem, controller)
     ready.check(problem)
     believed = ready.parameters(problem.plant)
-    model = replace(problem, plant=_exactly(problem.plant, believed), disturbances={}, sensing=Sensing())
+    model = replace(problem, plant=exactly(problem.plant, believed), disturbances={}, sensing=Sensing())
     run = simulate(model, without_deformation(ready), seed=0, compiled=compiled)
     if run.stop is not None or run.cycles < 2:
         raise NotSupported(f"no prediction: the model's own run ended early: {run.stop}")
@@ -157,8 +157,8 @@ def _judge_block(plant: Plant) -> Block:
     return Block("judge_response", Layout(reads), Layout(writes), step, opaque=plant.inverse_opaque)
 
 
-def _exactly(plant: Plant, values: np.ndarray) -> Plant:
-    """The plant with these exact parameters."""
+def exactly(plant: Plant, values: np.ndarray) -> Plant:
+    """Return the plant with these exact parameters."""
     named = {n: replace(p, exact=float(v)) for (n, p), v in zip(plant.parameters.items(), values, strict=True)}
     return replace(plant, parameters=named)
 

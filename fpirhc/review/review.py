@@ -24,6 +24,7 @@ from fpirhc.review.margins import margins_enough
 from fpirhc.review.neighbourhood import spectrum_near
 from fpirhc.review.orders import relative_orders
 from fpirhc.review.pays import pays
+from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, known_questions
 from fpirhc.review.rates import rates_inside
 from fpirhc.review.reach import range_enough
 from fpirhc.review.schedule import schedule_stable
@@ -55,7 +56,8 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
     grid = review_grid(problem, mismatch, seed)
     general = [well_posed(grid), relative_orders(grid), inverse_exists(grid), commands_inside(grid)]
     reach = horizon_long_enough(grid)
-    general += [answer for answer in (reach, discretisation_follows(grid)) if answer is not None]
+    more = (question.ask(grid) for question in known_questions(ProblemQuestion))
+    general += [answer for answer in (reach, discretisation_follows(grid), *more) if answer is not None]
     return Review(tuple(general), {name: _of(grid, one, general) for name, one in controllers.items()}, mismatch)
 
 
@@ -71,7 +73,8 @@ def predict(problem: Problem, controller: Controller) -> Answer:
     ready = resolved(problem, controller)
     general = [well_posed(own), inverse_exists(own), commands_inside(own)]
     loops = loops_along(own, ready)
-    return converges(own, ready, loops, _doubts([*general, *_speed_and_range(own, ready, loops)]))
+    case = Case(own, ready, loops)
+    return converges(own, ready, loops, _doubts([*general, *_speed_and_range(own, ready, loops), *_doubtful(case)]))
 
 
 def _of(grid: ReviewGrid, controller: Controller, general: list[Answer]) -> tuple[Answer, ...]:
@@ -85,19 +88,33 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer]) -> tupl
         return (schedule,)
     loops = loops_along(grid, ready)
     outer = [rates_inside(grid, ready, loops), zero_dynamics(zero_dynamics_rate(grid), is_planned(ready), loops)]
-    inner = [] if not ready.deformation.adapts else _of_map(grid, ready, loops, general)
-    return (*inner, *outer, margins_enough(grid.problem, loops))
+    case = Case(grid, ready, loops)
+    inner = [] if not ready.deformation.adapts else _of_map(case, general)
+    return (*inner, *outer, margins_enough(grid.problem, loops), *_more(case))
 
 
-def _of_map(grid: ReviewGrid, controller: Controller, loops: Loops, general: list[Answer]) -> list[Answer]:
+def _more(case: Case) -> list[Answer]:
+    """Answers to the questions that are found by discovery."""
+    asked = (q for q in known_questions(ControllerQuestion) if case.controller.deformation.adapts or not q.adaptive)
+    answers = (question.ask(case) for question in asked if not question.doubts)
+    return [answer for answer in answers if answer is not None]
+
+
+def _doubtful(case: Case) -> list[Answer]:
+    """Answers whose no speaks against convergence."""
+    answers = (q.ask(case) for q in known_questions(ControllerQuestion) if q.doubts)
+    return [answer for answer in answers if answer is not None]
+
+
+def _of_map(case: Case, general: list[Answer]) -> list[Answer]:
+    grid, controller, loops, believed = case.grid, case.controller, case.loops, case.believed
     deformation = controller.deformation
-    believed = controller.parameters(grid.problem.plant)
     try:
         own, boxed = (spectrum_near(grid, believed, draws, near=False) for draws in (grid.draws[:1], grid.draws))
     except InvalidValue as error:
         return [Answer("Do the eigenvalues of the response Jacobian have one sign?", Verdict.UNKNOWN, str(error))]
     limit = largest_product(grid.problem, deformation)
-    suited = _speed_and_range(grid, controller, loops)
+    suited = [*_speed_and_range(grid, controller, loops), *_doubtful(case)]
     verdict = converges(grid, controller, loops, _doubts([*general, *suited]))
     gains = [one_sign(own, boxed), gain_admissible(deformation, own, boxed, limit)]
     law = [
@@ -107,7 +124,7 @@ def _of_map(grid: ReviewGrid, controller: Controller, loops: Loops, general: lis
     ]
     known = [a for a in (*law, chatter_small(grid, controller)) if a is not None]
     form = right_form(grid.problem, deformation)
-    return [verdict, box_converges(loops), *gains, *suited, *known, form, pays(grid, controller)]
+    return [verdict, box_converges(loops), *gains, *suited, *known, form, pays(case)]
 
 
 def _speed_and_range(grid: ReviewGrid, controller: Controller, loops: Loops) -> list[Answer]:

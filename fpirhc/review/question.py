@@ -1,0 +1,109 @@
+"""The contract of a question about a problem or a controller: a file of the folder `questions` adds one.
+
+A file defines `QUESTION`, a `ProblemQuestion` or a `ControllerQuestion`. Another package does so with an entry point of the
+group `fpirhc.questions`.
+"""
+
+from __future__ import annotations
+
+import pkgutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import TypeVar
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller
+from fpirhc.errors import FpirhcError
+from fpirhc.review import questions
+from fpirhc.review.answer import Answer
+from fpirhc.review.grid import ReviewGrid
+from fpirhc.review.loops import Loops
+from fpirhc.review.prediction import NominalRun, nominal_run
+from fpirhc.task.problem import Problem
+
+GROUP = "fpirhc.questions"  # of entry points
+CYCLES = 2000  # of runs of the model that a question may need
+
+Kind = TypeVar("Kind", "ProblemQuestion", "ControllerQuestion")
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What is known when a question about a controller is asked; what takes time is computed once, when it is first read.
+
+    Args:
+        grid: points of the reference and draws of the parameters.
+        controller: the controller, with its automatic settings chosen.
+        loops: its linear loops.
+    """
+
+    grid: ReviewGrid
+    controller: Controller
+    loops: Loops
+
+    @property
+    def problem(self) -> Problem:
+        """The problem."""
+        return self.grid.problem
+
+    @cached_property
+    def believed(self) -> np.ndarray:
+        """Parameters of the model, shape (np,)."""
+        return self.controller.parameters(self.problem.plant)
+
+    @cached_property
+    def shortened(self) -> Problem:
+        """The problem with at most `CYCLES` cycles."""
+        duration = min(self.problem.duration, CYCLES * self.problem.period)
+        return replace(self.problem, duration=duration, measure_from=min(self.problem.measure_from, 0.5 * duration))
+
+    @cached_property
+    def nominal(self) -> NominalRun | str:
+        """The model's own run over the shortened duration, or the reason why there is none."""
+        try:
+            return nominal_run(self.shortened, self.controller, compiled=False)
+        except FpirhcError as error:
+            return str(error)
+
+
+@dataclass(frozen=True, eq=False)
+class ProblemQuestion:
+    """A question about a problem.
+
+    Args:
+        ask: the answer from the points of the reference; None where the question has no meaning for the problem.
+        order: place among the questions; the built-in ones come first.
+    """
+
+    ask: Callable[[ReviewGrid], Answer | None]
+    order: int = 100
+
+
+@dataclass(frozen=True, eq=False)
+class ControllerQuestion:
+    """A question about a controller on a problem.
+
+    Args:
+        ask: the answer; None where the question has no meaning for the controller.
+        order: place among the questions; the built-in ones come first.
+        adaptive: whether it is asked about controllers with a deformation alone.
+        doubts: whether a no makes it unknown that the deformation converges.
+    """
+
+    ask: Callable[[Case], Answer | None]
+    order: int = 100
+    adaptive: bool = True
+    doubts: bool = False
+
+
+@cache
+def known_questions(kind: type[Kind]) -> tuple[Kind, ...]:
+    """Return the questions of one kind in their order, those of installed packages included."""
+    modules = (import_module(f"{questions.__name__}.{m.name}") for m in pkgutil.iter_modules(questions.__path__))
+    known = [module.QUESTION for module in modules if hasattr(module, "QUESTION")]
+    known += [point.load() for point in entry_points(group=GROUP)]
+    return tuple(sorted((q for q in known if type(q) is kind), key=lambda q: q.order))

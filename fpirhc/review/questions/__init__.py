@@ -1,0 +1,1 @@
+"""Questions of a review, one per file, found by discovery."""
