@@ -1,0 +1,26 @@
+"""Problem files as a user would write them, on plants that are not shipped; `fpirhc compare` takes each of them.
+
+cstr             do-mpc's reactor, exact model; variant `wrong`
+quadruple_tank   Johansson's four tanks, minimum phase; variant `nonminimum`
+flexible_servo   a load on a flexible shaft, whose mismatch the controlled motor does not feel
+drug_infusion    propofol with compartments that have no reference, the wrong kinetics as model
+own_map          a user's own deformation and a dead time; controller `unpaired`
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import replace
+from pathlib import Path
+
+import fpirhc as fp
+from fpirhc.problem_files.problem_file import Task
+
+FOLDER = Path(__file__).parent
+NAMES = tuple(sorted(path.stem for path in FOLDER.glob("*.py") if not path.stem.startswith("_")))
+
+
+def load(name: str, variant: str = "problem") -> Task:
+    """The task of one file, with another of the file's problems if `variant` names it."""
+    task = fp.load_problem(str(FOLDER / f"{name}.py"))
+    return replace(task, problem=getattr(importlib.import_module(f"{__name__}.{name}"), variant))
