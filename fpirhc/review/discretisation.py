@@ -30,7 +30,8 @@ def discretisation_follows(grid: ReviewGrid) -> Answer | None:
     exact = np.exp(rates * h)
     apart = float(max(np.abs(poles - one).min() for one in exact))
     fastest = float(np.abs(rates).max())
-    text = f"stage of {h:g} s, fastest mode {fastest:.3g} 1/s; poles of the stage are off by {apart:.2g} at most"
+    text = f"stage of {h:g} {problem.time_unit}, fastest mode {fastest:.3g} {problem.rate_unit}"
+    text += f"; poles of the stage are off by {apart:.2g} at most"
     numbers = {"apart": apart, "fastest_mode": fastest, "largest_pole": float(np.abs(poles).max())}
     if np.abs(poles).max() > 1 + _CLOSE and np.abs(exact).max() <= 1:
         text += f"; the plant's modes decay, but the discretisation grows by {np.abs(poles).max():.3g} per stage"

@@ -24,20 +24,23 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
     problem, plant = grid.problem, grid.problem.plant
     if problem.horizon is None or problem.cost is None:
         return None
-    reach = problem.horizon.stages * problem.horizon.step
+    reach, unit = problem.horizon.stages * problem.horizon.step, problem.time_unit
     try:
         [first] = plan_gains(problem, problem.horizon, problem.cost, [0.0], plant.approximate)
         [second] = plan_gains(problem, longer(problem.horizon), problem.cost, [0.0], plant.approximate)
     except (FpirhcError, np.linalg.LinAlgError) as error:
-        return Answer(QUESTION, Verdict.UNKNOWN, f"{reach:g} s; the plan's feedback is not known: {error}")
+        return Answer(QUESTION, Verdict.UNKNOWN, f"{reach:g} {unit}; the plan's feedback is not known: {error}")
     size = float(np.linalg.norm(second.entries))
     change = float(np.linalg.norm(first.entries - second.entries)) / max(size, 1e-300)
     grows = _growth(grid, first)
     slowest = _slowest(grid)
-    text = f"{reach:g} s; twice as long changes the plan's feedback by {100 * change:.3g} %; slowest time constant {slowest:.3g} s"
+    text = (
+        f"{reach:g} {unit}; twice as long changes the plan's feedback by {100 * change:.3g} %; slowest time constant "
+    )
+    text += f"{slowest:.3g} {unit}" if math.isfinite(slowest) else "infinite"
     numbers = {"reach": reach, "change": change, "slowest_time_constant": slowest, "growth": grows}
     if grows > 0:
-        text += f"; the model under the plan's feedback diverges at {grows:.3g} 1/s"
+        text += f"; the model under the plan's feedback diverges at {grows:.3g} {problem.rate_unit}"
         return Answer(QUESTION, Verdict.NO, text, "Lengthen the horizon, or weigh its end (LQRTerminal).", numbers)
     if change > _SAME:
         return Answer(

@@ -19,6 +19,7 @@ import scipy.linalg
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import Loops
+from fpirhc.review.neutral import NEUTRAL
 from fpirhc.task.problem import Problem
 
 QUESTION = "Has the linear loop enough margin?"
@@ -43,21 +44,29 @@ def margins_enough(problem: Problem, loops: Loops) -> Answer:
     radius = float(loops.radii.max())
     numbers = {"radius": radius, "gain_margin": gain, "phase_margin": phase, "delay_margin": delay}
     text = (
-        f"largest |pole| {radius:.6g}; gain may change {gain:.3g} times, phase by {phase:.3g} deg, delay by {delay:.3g} s "
-        f"({delay / problem.period:.3g} cycles)"
+        f"largest |pole| {radius:.6g}; gain may change {gain:.3g} times, phase by {phase:.3g} deg, "
+        f"delay by {delay:.3g} {problem.time_unit} ({delay / problem.period:.3g} cycles)"
     )
     if loops.learns:
         text += ", before the controller has learned anything"
+    if any(one.hidden.any() for one in loops.loops):
+        text += "; neutral modes that no judged coordinate shows are left out"
     if radius >= 1:
-        everywhere = float(loops.radii.min()) >= 1
-        text += (
-            f"; a pole is outside the unit circle {'all along' if everywhere else 'at some points of'} the reference"
-        )
-        verdict = Verdict.NO if everywhere and not loops.learns else Verdict.UNKNOWN
-        return Answer(QUESTION, verdict, text, "See the convergence and the rates.", numbers)
+        return _outside(loops, text, numbers)
     good = gain >= LEAST_GAIN and phase >= LEAST_PHASE
     change = "" if good else "Lower the map's gain or the rate."
     return Answer(QUESTION, Verdict.YES if good else Verdict.UNKNOWN, text, change, numbers)
+
+
+def _outside(loops: Loops, text: str, numbers: dict[str, float]) -> Answer:
+    """The answer where the largest |pole| is at least 1."""
+    smallest = float(loops.radii.min())
+    where = "all along" if smallest >= 1 else "at some points of"
+    text += f"; a pole is {'on' if smallest < 1 + NEUTRAL else 'outside'} the unit circle {where} the reference"
+    verdict = Verdict.NO if smallest >= 1 + NEUTRAL and not loops.learns else Verdict.UNKNOWN
+    return Answer(
+        QUESTION, verdict, text, "See the rates, the zero dynamics, and the convergence of a deformation.", numbers
+    )
 
 
 def margins(loop: LinearLoop, place: int) -> tuple[float, float, float]:

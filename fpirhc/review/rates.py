@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from fpirhc.controllers.base import Controller
-from fpirhc.review.answer import Answer, Verdict, decided
+from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Loops
 from fpirhc.review.maps import dead_cycles
+from fpirhc.review.neutral import NEUTRAL
 
 QUESTION = "Are rate x period and rate x dead time small enough?"
 
@@ -24,8 +25,11 @@ def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answ
     radius = loops.ideal.radius
     numbers["ideal_radius"] = radius
     text += f"; with the right model the slowest mode changes by {radius:.6g} per cycle"
+    if radius < 1:
+        return Answer(QUESTION, Verdict.YES, text, "", numbers)
     change = "Lower the rate, shorten the period, or predict over the dead time (Predicted)."
-    return Answer(QUESTION, decided(radius < 1), text, "" if radius < 1 else change, numbers)
+    verdict = Verdict.UNKNOWN if radius < 1 + NEUTRAL else Verdict.NO
+    return Answer(QUESTION, verdict, text, change, numbers)
 
 
 def _rate(controller: Controller) -> float | None:

@@ -87,7 +87,10 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer]) -> tupl
     if schedule is not None:
         return (schedule,)
     loops = loops_along(grid, ready)
-    outer = [rates_inside(grid, ready, loops), zero_dynamics(zero_dynamics_rate(grid), is_planned(ready), loops)]
+    outer = [
+        rates_inside(grid, ready, loops),
+        zero_dynamics(grid.problem, zero_dynamics_rate(grid), is_planned(ready), loops),
+    ]
     case = Case(grid, ready, loops)
     inner = [] if not ready.deformation.adapts else _of_map(case, general)
     return (*inner, *outer, margins_enough(grid.problem, loops), *_more(case))

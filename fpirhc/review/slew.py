@@ -37,7 +37,7 @@ def slew_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray
     steady = sum(d.slew * _effect(grid, name) for name, d in problem.disturbances.items())
     needed, step = speed + steady, deformation.largest_step()
     numbers = {"needed": needed, "limit": step / problem.period, "jump": sudden}
-    text = f"the request changes by up to {needed:.3g} per second"
+    text = f"the request changes by up to {needed:.3g} per {problem.time_unit}"
     if after_start == speed > 0:
         text += " after the start"
     if not math.isfinite(step):

@@ -17,14 +17,19 @@ def well_posed(grid: ReviewGrid) -> Answer:
     if not whole.all():
         when = grid.times[int(np.argmin(whole))]
         change = "Give a reference with as many finite derivatives as the plant's order."
-        return Answer(QUESTION, Verdict.NO, f"the reference or a derivative is not finite at t = {when:g} s", change)
+        return Answer(
+            QUESTION,
+            Verdict.NO,
+            f"the reference or a derivative is not finite at t = {when:g} {grid.problem.time_unit}",
+            change,
+        )
     finite = np.isfinite(grid.commands).all(axis=2)
     own = finite[0] & np.isfinite(grid.needed(plant.approximate)).all(axis=1)
     share = float(finite.mean())
     numbers = {"finite_share": share}
     if not own.all():
         when = grid.times[int(np.argmin(own))]
-        text = f"plant or model has no finite command for the reference at t = {when:g} s"
+        text = f"plant or model has no finite command for the reference at t = {when:g} {grid.problem.time_unit}"
         return Answer(
             QUESTION, Verdict.NO, text, "Keep the reference away from states where the response is singular.", numbers
         )

@@ -67,6 +67,7 @@ def task(plant, period=PERIOD):
         horizon=fp.Horizon(stages=20, step=PERIOD),
         cost=fp.Quadratic(states={"C_b": 1.0}, rate={"F": 0.1, "Q": 1e-3}),
         measure_from=1.0,  # h
+        time_unit="h",
     )
 
 

@@ -71,6 +71,7 @@ problem = fp.Problem(
     horizon=fp.Horizon(stages=30, step=1 / 3),  # min
     cost=fp.Quadratic(states={"C1": 10.0}, rate={"u": 1e-4}),
     measure_from=20.0,  # min
+    time_unit="min",
 )
 
 optimiser = fp.FixedPoint(iterations=2, tolerance=1e-1)  # mg/min
