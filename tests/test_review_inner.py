@@ -1,4 +1,4 @@
-"""What a review states about states that move by themselves: their rate and its sign, neutral ones, and where they are linearised."""
+"""What a review states about states that move by themselves: rate and sign, neutral ones, where they are linearised."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any
 
 import casadi as ca
-import numpy as np
 import pytest
 
 import fpirhc as fp

@@ -1,7 +1,7 @@
 """Neutral modes that nobody judges: an integral that nothing reads, or inputs that may drift without an effect.
 
 A mode with |pole| = 1 neither decays nor grows. Where the judged coordinates do not show it, C V = 0 for its eigenvector V, it
-is no fault of the loop: the amount of a drug that has left the body, or the heat of a jacket whose only weight is that of its change.
+is no fault of the loop: the amount of a drug that has left the body, or the heat of a jacket whose change alone is weighed.
 """
 
 from __future__ import annotations

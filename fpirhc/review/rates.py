@@ -28,8 +28,10 @@ def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answ
     if radius < 1:
         return Answer(QUESTION, Verdict.YES, text, "", numbers)
     change = "Lower the rate, shorten the period, or predict over the dead time (Predicted)."
-    verdict = Verdict.UNKNOWN if radius < 1 + NEUTRAL else Verdict.NO
-    return Answer(QUESTION, verdict, text, change, numbers)
+    if radius < 1 + NEUTRAL:
+        change = "A mode neither grows nor decays: weigh the state or the input in which it is."
+        return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
+    return Answer(QUESTION, Verdict.NO, text, change, numbers)
 
 
 def _rate(controller: Controller) -> float | None:
