@@ -26,8 +26,8 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
         return None
     reach, unit = problem.horizon.stages * problem.horizon.step, problem.time_unit
     try:
-        [first] = plan_gains(problem, problem.horizon, problem.cost, [0.0], plant.approximate)
-        [second] = plan_gains(problem, longer(problem.horizon), problem.cost, [0.0], plant.approximate)
+        [first] = plan_gains(problem, problem.horizon, problem.cost, [0.0], plant.approximate, grid.states_at)
+        [second] = plan_gains(problem, longer(problem.horizon), problem.cost, [0.0], plant.approximate, grid.states_at)
     except (FpirhcError, np.linalg.LinAlgError) as error:
         return Answer(QUESTION, Verdict.UNKNOWN, f"{reach:g} {unit}; the plan's feedback is not known: {error}")
     size = float(np.linalg.norm(second.entries))

@@ -62,7 +62,8 @@ def _outside(loops: Loops, text: str, numbers: dict[str, float]) -> Answer:
     """The answer where the largest |pole| is at least 1."""
     smallest = float(loops.radii.min())
     where = "all along" if smallest >= 1 else "at some points of"
-    text += f"; a pole is {'on' if smallest < 1 + NEUTRAL else 'outside'} the unit circle {where} the reference"
+    on_circle = float(loops.radii.max()) < 1 + NEUTRAL
+    text += f"; a pole is {'on' if on_circle else 'outside'} the unit circle {where} the reference"
     verdict = Verdict.NO if smallest >= 1 + NEUTRAL and not loops.learns else Verdict.UNKNOWN
     return Answer(
         QUESTION, verdict, text, "See the rates, the zero dynamics, and the convergence of a deformation.", numbers

@@ -16,7 +16,7 @@ inputs per stage and not per cycle.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -112,7 +112,12 @@ class PlanFeedback(Tracking):
 
 
 def plan_gains(
-    problem: Problem, horizon: Horizon, cost: Cost, times: Sequence[float], believed: np.ndarray
+    problem: Problem,
+    horizon: Horizon,
+    cost: Cost,
+    times: Sequence[float],
+    believed: np.ndarray,
+    states_at: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> list[PlanGain]:
     """Return the gains of the plans that start on the reference at these times.
 
@@ -122,6 +127,7 @@ def plan_gains(
         cost: of the plans.
         times: at which the plans start.
         believed: parameters of the model, shape (np,).
+        states_at: times (m,) -> states (m, nx) at which the model is linearised; None: those of the reference.
     """
     plant = problem.plant
     ends = [plant.state.elements.index(name) for name in horizon.terminal]
@@ -134,8 +140,9 @@ def plan_gains(
     gains = []
     for time in times:
         data = np.asarray(data_of(time, believed).full())
-        states = data[ocp.data.slice("reference")]
         clock = time + horizon.step * np.arange(horizon.stages)
+        nodes = np.append(clock, clock[-1] + horizon.step)
+        states = data[ocp.data.slice("reference")] if states_at is None else states_at(nodes).T
         wanted = np.asarray(function.map(horizon.stages)(clock[None, :])[1].full())[controlled]
         repeated = np.repeat(believed[:, None], horizon.stages, axis=1)
         inputs = np.asarray(plant.inverse_function.map(horizon.stages)(states[:, :-1], wanted, repeated).full())

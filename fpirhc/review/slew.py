@@ -56,7 +56,8 @@ def _speed(grid: ReviewGrid, believed: np.ndarray) -> float:
     """Largest |d r*/dt|, by differences between points much closer than those of the review."""
     problem, plant = grid.problem, grid.problem.plant
     times = np.linspace(0.0, problem.duration, _POINTS)
-    states, responses = (np.asarray(v.full()) for v in problem.reference.function(plant).map(_POINTS)(times[None, :]))
+    states = grid.states_at(times).T
+    responses = np.asarray(problem.reference.function(plant).map(_POINTS)(times[None, :])[1].full())
     exact, model = (np.repeat(p[:, None], _POINTS, axis=1) for p in (plant.exact, believed))
     commands = plant.inverse_function.map(_POINTS)(states, responses[list(plant.controlled_indices)], exact)
     requests = np.asarray(plant.controlled_response_function.map(_POINTS)(states, commands, model).full())

@@ -39,5 +39,17 @@ def well_posed(grid: ReviewGrid) -> Answer:
             QUESTION, Verdict.UNKNOWN, text, "Narrow the box of the parameters, or move the reference.", numbers
         )
     return Answer(
-        QUESTION, Verdict.YES, f"finite at {len(grid.times)} points with {len(grid.draws)} parameter draws", "", numbers
+        QUESTION,
+        Verdict.YES,
+        f"finite at {len(grid.times)} points with {len(grid.draws)} parameter draws{_simulated(grid)}",
+        "",
+        numbers,
     )
+
+
+def _simulated(grid: ReviewGrid) -> str:
+    """Half a sentence about the inner states, empty without any."""
+    names = [grid.problem.plant.state.elements[k] for k in grid.inner]
+    if not names:
+        return ""
+    return f"; {', '.join(names)} ha{'s' if len(names) == 1 else 've'} no task and {'is' if len(names) == 1 else 'are'} simulated"

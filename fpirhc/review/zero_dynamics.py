@@ -56,7 +56,7 @@ def zero_dynamics(problem: Problem, rate: float | None, planned: bool, loops: Lo
         return Answer(QUESTION, Verdict.YES, "there are none: every coordinate is controlled")
     numbers, text = {"rate": rate}, _text(problem, rate)
     neutral = abs(rate) * problem.duration <= _STILL
-    if (planned or neutral) and loops.loops:
+    if ((planned and rate > 0) or neutral) and loops.loops:
         radius = float(loops.radii.max())
         numbers["radius"] = radius
         text += f"; the linear loop changes by {radius:.6g} per cycle"
