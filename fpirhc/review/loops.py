@@ -9,7 +9,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import Planner, without_deformation
-from fpirhc.errors import FpirhcError, NotSupported
+from fpirhc.errors import FpirhcError, InvalidName, NotSupported
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.linear import LinearLoop, controlled_gain, linear_parameters, loop_matrices, response_slopes
 from fpirhc.review.plan_feedback import PlanGain, no_gain, plan_gains
@@ -50,8 +50,12 @@ def loops_along(grid: ReviewGrid, controller: Controller) -> Loops:
     """Return the controller's linear loops along the reference, or the reason why there are none."""
     try:
         return replace(_loops(grid, controller), learns=controller.learns)
+    except InvalidName as error:
+        # The names of the plant's parameters mean nothing on a linearised plant, whose parameters are matrices.
+        learned = f"{type(controller).__name__} learns parameters by name, which a linearised plant does not have"
+        return Loops((), (), None, reason=learned if controller.learns else str(error), learns=controller.learns)
     except FpirhcError as error:
-        return Loops((), (), None, reason=str(error))
+        return Loops((), (), None, reason=str(error), learns=controller.learns)
     except np.linalg.LinAlgError as error:
         return Loops((), (), None, reason=f"the linear loop has no eigenvalues: {error}")
 

@@ -30,8 +30,14 @@ _FREQUENCIES = 300
 _LOWEST = 1e-5  # of the Nyquist frequency
 
 
-def margins_enough(problem: Problem, loops: Loops) -> Answer:
-    """Return the smallest margins of all inputs at the first point of the reference and where the largest |pole| is."""
+def margins_enough(problem: Problem, loops: Loops, *, adapts: bool) -> Answer:
+    """Return the smallest margins of all inputs at the first point of the reference and where the largest |pole| is.
+
+    Args:
+        problem: the problem.
+        loops: linear loops of the controller.
+        adapts: whether the controller has a deformation.
+    """
     if not loops.loops:
         return Answer(QUESTION, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
     if len(loops.loops[0].dynamics) > _LARGEST:
@@ -54,7 +60,9 @@ def margins_enough(problem: Problem, loops: Loops) -> Answer:
     if radius >= 1:
         return _outside(loops, text, numbers)
     good = gain >= LEAST_GAIN and phase >= LEAST_PHASE
-    change = "" if good else "Lower the map's gain or the rate."
+    change = (
+        "" if good else "Lower the map's gain or the rate." if adapts else "Lower the rate, or weigh the inputs more."
+    )
     return Answer(QUESTION, Verdict.YES if good else Verdict.UNKNOWN, text, change, numbers)
 
 

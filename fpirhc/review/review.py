@@ -93,7 +93,7 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer]) -> tupl
     ]
     case = Case(grid, ready, loops)
     inner = [] if not ready.deformation.adapts else _of_map(case, general)
-    return (*inner, *outer, margins_enough(grid.problem, loops), *_more(case))
+    return (*inner, *outer, margins_enough(grid.problem, loops, adapts=ready.deformation.adapts), *_more(case))
 
 
 def _more(case: Case) -> list[Answer]:
