@@ -55,3 +55,52 @@ def test_poles_of_a_stage(method, verdict, pole):
 def test_a_problem_without_a_horizon_is_not_asked():
     """There is nothing to discretise."""
     assert discretisation_follows(review_grid(replace(PROBLEM, horizon=None, cost=None), 0.0, 0)) is None
+
+
+STIFF = fp.RungeKutta4()
+
+
+def answers(problem: fp.Problem, controller: fp.Controller) -> dict[str, fp.Answer]:
+    """All answers by question."""
+    return {a.question: a for a in fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).answers}
+
+
+def test_the_named_number_of_sub_steps_is_enough_and_half_of_it_is_not():
+    """Lambda h = -4: the advice is tried, in the horizon and in the plant."""
+    stiff = replace(PROBLEM, integrator=STIFF, horizon=replace(HORIZON, discretisation=STIFF))
+    every = answers(stiff, fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3)))
+    for words, field in (("of the horizon follow the plant", "discretisation"), ("follow the simulated", "integrator")):
+        [one] = [a for q, a in every.items() if words in q]
+        assert one.verdict == Verdict.NO
+        count = int(one.change.partition(f"{field}=RungeKutta4(substeps=")[2].partition(")")[0])
+        for tried, verdict in ((count, {Verdict.YES}), (count // 2, {Verdict.NO, Verdict.UNKNOWN})):
+            method = fp.RungeKutta4(tried)
+            horizon = replace(HORIZON, discretisation=method)
+            mended = answers(
+                replace(PROBLEM, integrator=method, horizon=horizon), fp.ComputedTorque(fp.Exponential(1.0))
+            )
+            [again] = [a for q, a in mended.items() if words in q]
+            assert again.verdict in verdict
+
+
+def test_a_stiff_discretisation_is_not_the_fault_of_the_rate():
+    """The loop of a stable plant that its own discretisation makes unstable: sub-steps, and no lower rate."""
+    stiff = replace(PROBLEM, integrator=fp.RungeKutta4(8), horizon=replace(HORIZON, discretisation=STIFF))
+    adaptive = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), fp.Sigmoid(gain=-0.5, scale=10.0))
+    every = answers(stiff, adaptive)
+    for words, verdicts in (("rate x period", {Verdict.NO}), ("deformation converge", {Verdict.NO, Verdict.UNKNOWN})):
+        [one] = [a for q, a in every.items() if words in q]
+        assert one.verdict in verdicts
+        assert "substeps" in one.change
+        assert "ower" not in one.change
+
+
+def test_a_controller_with_the_exact_model_has_a_discretisation_of_its_own():
+    """The model is slow and the plant is fast: the exact model's plan is asked about by itself."""
+    slow = replace(PLANT, parameters={"rate": fp.Parameter(4.0, 40.0, "1/s")})
+    problem = replace(PROBLEM, plant=slow, integrator=fp.RungeKutta4(8))
+    plain = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3))
+    words = "controller's own model"
+    assert not [q for q in answers(problem, plain) if words in q]
+    [one] = [a for q, a in answers(problem, fp.ExactModel(plain)).items() if words in q]
+    assert (one.verdict, one.numbers["fastest_mode"]) == (Verdict.NO, pytest.approx(40.0))

@@ -157,7 +157,8 @@ def test_feedback_of_a_plan_is_that_of_the_riccati_equation():
     m, k = problem.plant.approximate
     whole = scipy.linalg.expm(np.array([[0, 1, 0], [-k / m, 0, 1 / m], [0, 0, 0]]) * 1e-2)
     stationary, *_ = control.dlqr(whole[:2, :2], whole[:2, 2:], np.diag([1e3, 1.0]), np.array([[1e-2]]))
-    assert found == pytest.approx(-stationary, rel=1e-3)
+    assert found.state == pytest.approx(-stationary, rel=1e-3)
+    assert not found.before.any()
 
 
 def test_a_good_problem_is_ready():

@@ -14,9 +14,11 @@ def commands_inside(grid: ReviewGrid) -> Answer:
     """Return the largest share of its limits that the reference needs of an input."""
     plant = grid.problem.plant
     lower, upper = grid.problem.limits.input_bounds(plant)
-    ranges = [f"{i} {low:.3g} to {high:.3g}" for i, low, high in zip(plant.inputs, *_range(grid), strict=True)]
+    # Inner states begin at the problem's start, and not where the reference would have led them before.
+    commands = grid.commands[:, 1:] if grid.inner else grid.commands
+    ranges = [f"{i} {low:.3g} to {high:.3g}" for i, low, high in zip(plant.inputs, *_range(commands[0]), strict=True)]
     text = "needed: " + ", ".join(ranges)
-    used = _used(grid.commands, lower, upper)
+    used = _used(commands, lower, upper)
     if not np.isfinite(used).any():
         return Answer(QUESTION, Verdict.UNKNOWN, "no finite command is known", "See whether the problem is well posed.")
     own, widest = float(np.nanmax(used[0])), float(np.nanmax(used))
@@ -30,10 +32,10 @@ def commands_inside(grid: ReviewGrid) -> Answer:
     return Answer(QUESTION, Verdict.UNKNOWN if widest > 1 else Verdict.YES, text, change if widest > 1 else "", numbers)
 
 
-def _range(grid: ReviewGrid) -> tuple[np.ndarray, np.ndarray]:
-    own = grid.commands[0][np.isfinite(grid.commands[0]).all(axis=1)]
+def _range(commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    own = commands[np.isfinite(commands).all(axis=1)]
     if not len(own):
-        nothing = np.full(len(grid.problem.plant.inputs), np.nan)
+        nothing = np.full(commands.shape[1], np.nan)
         return nothing, nothing
     return own.min(axis=0), own.max(axis=0)
 

@@ -25,6 +25,8 @@ from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Loops
 from fpirhc.review.maps import largest_product
 from fpirhc.review.neighbourhood import eigenvalues_near
+from fpirhc.review.stages import stiff_advice
+from fpirhc.review.stand_in import is_planned
 
 QUESTION = "Does the deformation converge?"
 _SURE = math.log(100)
@@ -55,10 +57,12 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
         change = f"{what} on line; the factor is that of the first cycle."
         return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
     if growth.min() > _SURE:
-        return Answer(QUESTION, Verdict.NO, f"{text}: it grows all along the reference", _mend(loops), numbers)
+        return Answer(
+            QUESTION, Verdict.NO, f"{text}: it grows all along the reference", _mend(grid, controller, loops), numbers
+        )
     if growth.max() > -_SURE:
         where = f"between {loops.radii.min():.6g} and {worst:.6g} along the reference"
-        return Answer(QUESTION, Verdict.UNKNOWN, f"{text} ({where})", _mend(loops), numbers)
+        return Answer(QUESTION, Verdict.UNKNOWN, f"{text} ({where})", _mend(grid, controller, loops), numbers)
     against = [*_steep(grid, controller), *doubts]
     if against:
         return Answer(
@@ -82,11 +86,11 @@ def box_converges(loops: Loops) -> Answer:
     return Answer(question, Verdict.UNKNOWN, text, "Lower the gain, or narrow the box of the parameters.", numbers)
 
 
-def _mend(loops: Loops) -> str:
+def _mend(grid: ReviewGrid, controller: Controller, loops: Loops) -> str:
     if loops.ideal is not None and loops.ideal.radius >= 1:
-        return (
-            "The outer loop does not converge even with the right model: lower its rate, or predict over the dead time."
-        )
+        stiff = stiff_advice(grid, controller.parameters(grid.problem.plant), planned=is_planned(controller))
+        outer = "The outer loop does not converge even with the right model"
+        return f"{outer}. {stiff}" if stiff else f"{outer}: lower its rate, or predict over the dead time."
     return "Change the gain to the recommended one; under dead time pair the deformation."
 
 

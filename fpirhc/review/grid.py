@@ -1,7 +1,13 @@
 """The points of a review: points of the reference, and draws of the exact parameters from their box.
 
-The box of a parameter spans the range of its exact value (see `fpirhc.plant.mismatch`) and its approximate value. At every point
-the symbols give the input u* that the reference needs and the request r* for which the model computes this input:
+The exact parameters are drawn from the range of a mismatch (see `fpirhc.plant.mismatch`) and from all points between this range and
+the approximate parameters,
+
+    p = (1 - s) p_range + s p_approximate,        0 <= s <= 1,
+
+with one s for all parameters: those of a plant belong together, as bristles and the friction that they carry do, and nobody
+believes in a plant with one of each kind. At every point the symbols give the input u* that the reference needs and the request r*
+for which the model computes this input:
 
     u* = inverse(x^N, r^N; exact),        r* = response(x^N, u*; approximate),
 
@@ -17,10 +23,13 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.plant.mismatch import exact_ranges
+from fpirhc.review.inner import inner_motion, inner_places
 from fpirhc.task.problem import Problem
 
 _POINTS = 41
 _DRAWS = 64
+_INNER_DRAWS = 16  # where each has inner states that are simulated
+_FINE = 2001  # times of the plant's own inner states
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +38,11 @@ class ReviewGrid:
 
     Args:
         problem: the problem.
-        times: times of the points, s, shape (m,).
-        states: states of the reference, shape (m, nx).
+        times: times of the points, shape (m,).
+        states: states of the reference, shape (m, nx); inner ones are simulated with the exact parameters, see `inner`.
         responses: responses of the controlled coordinates that the reference needs, shape (m, n).
         draws: exact parameters, shape (draws, np); the first row is the plant's own.
+        inner: places of the simulated states.
     """
 
     problem: Problem
@@ -40,12 +50,42 @@ class ReviewGrid:
     states: np.ndarray
     responses: np.ndarray
     draws: np.ndarray
+    inner: tuple[int, ...] = ()
+
+    @cached_property
+    def drawn_states(self) -> np.ndarray:
+        """States of the reference with the inner states that each draw has, shape (draws, m, nx)."""
+        states = np.tile(self.states, (len(self.draws), 1, 1))
+        if self.inner:
+            for rows, motion in zip(
+                states[1:], inner_motion(self.problem, self.inner, self.draws[1:], self.times), strict=True
+            ):
+                rows[:, list(self.inner)] = np.nan if motion is None else motion
+        return states
+
+    def states_at(self, times: np.ndarray) -> np.ndarray:
+        """Return states of the reference with the plant's own inner states, shape (k, nx)."""
+        plant = self.problem.plant
+        states = np.asarray(self.problem.reference.function(plant).map(len(times))(times[None, :])[0].full()).T
+        if self.inner:
+            grid, motion = self._fine
+            for place, column in zip(self.inner, motion.T, strict=True):
+                states[:, place] = np.interp(times, grid, column)
+        return states
+
+    @cached_property
+    def _fine(self) -> tuple[np.ndarray, np.ndarray]:
+        """Times, and the inner states with the exact parameters."""
+        times = np.linspace(0.0, self.problem.duration, _FINE)
+        [motion] = inner_motion(self.problem, self.inner, self.draws[:1], times)
+        assert motion is not None
+        return times, motion
 
     @cached_property
     def commands(self) -> np.ndarray:
         """Inputs that the reference needs, per draw and point, shape (draws, m, nu); NaN where there is no inverse."""
         m, k = len(self.times), len(self.draws)
-        states, responses = (np.tile(rows, (k, 1)) for rows in (self.states, self.responses))
+        states, responses = self.drawn_states.reshape(k * m, -1), np.tile(self.responses, (k, 1))
         commands = each(self.problem.plant.inverse_function, states, responses, np.repeat(self.draws, m, axis=0))
         return commands.reshape(k, m, -1)
 
@@ -78,15 +118,21 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
     times = np.linspace(0.0, problem.duration, _POINTS)
     nominal = function.map(_POINTS)(times[None, :])
     states, responses = (np.asarray(v.full()).T for v in nominal)
-    box = parameter_box(problem, mismatch)
-    lower, upper = (np.array([box[name][k] for name in plant.parameters]) for k in (0, 1))
-    draws = _draws(lower, upper, np.random.default_rng(seed))
+    ranges = exact_ranges(plant, mismatch)
+    lower, upper = (np.array([ranges[name][k] for name in plant.parameters]) for k in (0, 1))
+    inner = inner_places(problem)
+    draws = _draws(lower, upper, plant.approximate, np.random.default_rng(seed), _INNER_DRAWS if inner else _DRAWS)
     rows = np.vstack([plant.exact[None, :], draws])
-    return ReviewGrid(problem, times, states, responses[:, list(plant.controlled_indices)], rows)
+    own = inner_motion(problem, inner, rows[:1], times)[0] if inner else None
+    if own is None:
+        inner = ()
+    else:
+        states[:, list(inner)] = own
+    return ReviewGrid(problem, times, states, responses[:, list(plant.controlled_indices)], rows, inner)
 
 
 def parameter_box(problem: Problem, mismatch: float) -> dict[str, tuple[float, float]]:
-    """Return the interval of every parameter of the plant: the range of the exact value, extended to the approximate one.
+    """Return the interval of every parameter of the plant over all draws: the range of the mismatch and the approximate value.
 
     Raises:
         InvalidValue, InvalidProblem: see `exact_ranges`.
@@ -98,19 +144,25 @@ def parameter_box(problem: Problem, mismatch: float) -> dict[str, tuple[float, f
     }
 
 
-def _draws(lower: np.ndarray, upper: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """All corners of the box where they are few, else random corners; and as many random points inside."""
+def _draws(
+    lower: np.ndarray, upper: np.ndarray, approximate: np.ndarray, random: np.random.Generator, most: int
+) -> np.ndarray:
+    """Corners of the range, all of them where they are few; the approximate parameters; and points inside and between."""
     free = np.flatnonzero(upper > lower)
-    if not free.size:
-        return np.zeros((0, lower.size))
-    if 2**free.size <= _DRAWS:
-        corners = np.array(np.meshgrid(*[[0.0, 1.0]] * free.size)).reshape(free.size, -1).T
-    else:
-        corners = random.integers(0, 2, size=(_DRAWS, free.size)).astype(float)
-    shares = np.vstack([corners, random.uniform(size=(len(corners), free.size))])
-    rows = np.repeat(lower[None, :], len(shares), axis=0)
-    rows[:, free] += shares * (upper - lower)[free]
-    return rows
+    corners = np.zeros((0, lower.size))
+    if free.size:
+        if 2**free.size <= most:
+            signs = np.array(np.meshgrid(*[[0.0, 1.0]] * free.size)).reshape(free.size, -1).T
+        else:
+            signs = random.integers(0, 2, size=(most, free.size)).astype(float)
+        corners = np.repeat(lower[None, :], len(signs), axis=0)
+        corners[:, free] += signs * (upper - lower)[free]
+    if not free.size and np.array_equal(lower, approximate):
+        return corners
+    inside = lower + random.uniform(size=(most // 2, lower.size)) * (upper - lower)
+    # Without a mismatch the range is a point, and the draws are evenly spaced on the way to the approximate parameters.
+    shares = (random.uniform(size=most // 2) if free.size else np.arange(1, most // 2 + 1) / (most // 2 + 1))[:, None]
+    return np.vstack([corners, approximate[None, :], (1 - shares) * inside + shares * approximate])
 
 
 def each(function: ca.Function, *arguments: np.ndarray) -> np.ndarray:

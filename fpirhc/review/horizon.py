@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+import scipy.linalg
 
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.linear import response_slopes
-from fpirhc.review.plan_feedback import longer, plan_gains
+from fpirhc.review.plan_feedback import PlanGain, longer, plan_gains
 from fpirhc.review.state_matrix import state_matrices
 
 QUESTION = "Is the horizon long enough?"
 _SAME = 0.1  # relative change of the plan's feedback
+_STILL = 1e-6  # of a growth per stage: a mode that neither decays nor grows
 
 
 def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
@@ -20,19 +24,23 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
     problem, plant = grid.problem, grid.problem.plant
     if problem.horizon is None or problem.cost is None:
         return None
-    reach = problem.horizon.stages * problem.horizon.step
+    reach, unit = problem.horizon.stages * problem.horizon.step, problem.time_unit
     try:
-        [first] = plan_gains(problem, problem.horizon, problem.cost, [0.0], plant.approximate)
-        [second] = plan_gains(problem, longer(problem.horizon), problem.cost, [0.0], plant.approximate)
+        [first] = plan_gains(problem, problem.horizon, problem.cost, [0.0], plant.approximate, grid.states_at)
+        [second] = plan_gains(problem, longer(problem.horizon), problem.cost, [0.0], plant.approximate, grid.states_at)
     except (FpirhcError, np.linalg.LinAlgError) as error:
-        return Answer(QUESTION, Verdict.UNKNOWN, f"{reach:g} s; the plan's feedback is not known: {error}")
-    change = float(np.linalg.norm(first - second)) / max(float(np.linalg.norm(second)), 1e-300)
-    grows = _fastest(grid, first)
+        return Answer(QUESTION, Verdict.UNKNOWN, f"{reach:g} {unit}; the plan's feedback is not known: {error}")
+    size = float(np.linalg.norm(second.entries))
+    change = float(np.linalg.norm(first.entries - second.entries)) / max(size, 1e-300)
+    grows = _growth(grid, first)
     slowest = _slowest(grid)
-    text = f"{reach:g} s; twice as long changes the plan's feedback by {100 * change:.3g} %; slowest time constant {slowest:.3g} s"
+    text = (
+        f"{reach:g} {unit}; twice as long changes the plan's feedback by {100 * change:.3g} %; slowest time constant "
+    )
+    text += f"{slowest:.3g} {unit}" if math.isfinite(slowest) else "infinite"
     numbers = {"reach": reach, "change": change, "slowest_time_constant": slowest, "growth": grows}
     if grows > 0:
-        text += f"; the model under the plan's feedback diverges at {grows:.3g} 1/s"
+        text += f"; the model under the plan's feedback diverges at {grows:.3g} {problem.rate_unit}"
         return Answer(QUESTION, Verdict.NO, text, "Lengthen the horizon, or weigh its end (LQRTerminal).", numbers)
     if change > _SAME:
         return Answer(
@@ -42,22 +50,30 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
 
 
 def _slowest(grid: ReviewGrid) -> float:
-    """Longest time constant of the model alone, s; infinite where a mode neither decays nor grows."""
-    plant = grid.problem.plant
-    without_feedback = _generator(grid, np.zeros((len(plant.inputs), plant.state.size)))
-    rates = np.abs(np.linalg.eigvals(without_feedback).real)
+    """Longest time constant of the model alone; infinite where a mode neither decays nor grows."""
+    rates = np.abs(np.linalg.eigvals(_model(grid)[0]).real)
     return float(1 / rates.min()) if rates.min() > 1e-9 else float("inf")
 
 
-def _fastest(grid: ReviewGrid, gain: np.ndarray) -> float:
-    """Largest real part of the model's poles under the feedback, 1/s."""
-    return float(np.linalg.eigvals(_generator(grid, gain)).real.max())
+def _growth(grid: ReviewGrid, gain: PlanGain) -> float:
+    """Growth rate of the model's fastest mode, per unit of time, where every stage begins with a new plan.
+
+    It is ln(rho) / step with the spectral radius rho of the state and the held input over one stage, and 0 where rho is 1.
+    """
+    assert grid.problem.horizon is not None
+    step = grid.problem.horizon.step
+    a, b = _model(grid)
+    nx, nu = b.shape
+    held = scipy.linalg.expm(step * np.block([[a, b], [np.zeros((nu, nx + nu))]]))[:nx]
+    feedback = np.hstack([gain.state, gain.before])
+    stage = np.vstack([held[:, :nx] @ np.eye(nx, nx + nu) + held[:, nx:] @ feedback, feedback])
+    radius = float(np.abs(np.linalg.eigvals(stage)).max())
+    return 0.0 if abs(radius - 1) < _STILL else math.log(radius) / step
 
 
-def _generator(grid: ReviewGrid, gain: np.ndarray) -> np.ndarray:
-    """A + B K of the model's state at the start of the reference."""
+def _model(grid: ReviewGrid) -> tuple[np.ndarray, np.ndarray]:
+    """A and B of the model's state at the start of the reference."""
     plant = grid.problem.plant
     needed = grid.needed(plant.approximate)[0]
     slopes = response_slopes(plant)(grid.states[0], needed, plant.approximate)
-    a, b = state_matrices(plant, *(np.asarray(m.full()) for m in slopes))
-    return a + b @ gain
+    return state_matrices(plant, *(np.asarray(m.full()) for m in slopes))

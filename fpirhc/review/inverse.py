@@ -53,6 +53,7 @@ def _gains(grid: ReviewGrid) -> np.ndarray:
     function = ca.Function("fpirhc_input_gain", [x, u, p], [ca.vec(slope)])
     m, n = len(grid.times), len(plant.inputs)
     sets = np.vstack([grid.draws, plant.approximate])
+    states = np.concatenate([grid.drawn_states, grid.states[None]]).reshape(-1, plant.state.size)
     commands = np.concatenate([grid.commands, grid.needed(plant.approximate)[None]]).reshape(-1, n)
-    columns = each(function, np.tile(grid.states, (len(sets), 1)), commands, np.repeat(sets, m, axis=0))
+    columns = each(function, states, commands, np.repeat(sets, m, axis=0))
     return columns.reshape(len(sets), m, n, n).transpose(0, 1, 3, 2)

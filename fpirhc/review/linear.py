@@ -28,6 +28,8 @@ from fpirhc.controllers.base import Controller
 from fpirhc.errors import NotSupported
 from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Parameter, Plant
+from fpirhc.review.neutral import hidden_modes
+from fpirhc.review.plan_feedback import PlanGain
 from fpirhc.sensing import Sensing
 from fpirhc.simulation.loop import close_loop
 from fpirhc.symbolic.layout import Expression, Named
@@ -48,7 +50,8 @@ class LinearLoop:
         entry: G.
         arriving: C.
         state: places of the plant's state in z.
-        period: of the control cycle, s.
+        period: of the control cycle.
+        judged: places of the judged coordinates in z; None: every mode counts.
     """
 
     dynamics: np.ndarray
@@ -56,6 +59,7 @@ class LinearLoop:
     arriving: np.ndarray
     state: np.ndarray
     period: float
+    judged: np.ndarray | None = None
 
     @cached_property
     def poles(self) -> np.ndarray:
@@ -64,8 +68,16 @@ class LinearLoop:
 
     @property
     def radius(self) -> float:
-        """The factor by which the slowest or fastest growing mode changes per cycle."""
-        return float(np.abs(self.poles).max())
+        """The factor by which the slowest or fastest growing mode changes per cycle.
+
+        Neutral modes that no judged coordinate shows are left out.
+        """
+        return float(np.abs(self.poles[~self.hidden]).max(initial=0.0))
+
+    @cached_property
+    def hidden(self) -> np.ndarray:
+        """Which poles belong to neutral modes that no judged coordinate shows, such as an integral that nothing reads."""
+        return hidden_modes(self.dynamics, self.poles, self.judged)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +90,8 @@ class LoopMatrices:
         exact: places of the plant's linearisation in the memory.
         believed: places of the model's linearisation in the memory.
         state: places of the plant's state in the memory.
-        period: of the control cycle, s.
+        period: of the control cycle.
+        judged: numbers of the judged coordinates among the plant's states.
     """
 
     function: ca.Function
@@ -87,6 +100,7 @@ class LoopMatrices:
     believed: slice
     state: slice
     period: float
+    judged: tuple[int, ...]
 
     def at(self, exact: np.ndarray, believed: np.ndarray) -> LinearLoop:
         """Return the loop of a plant and a model, both as `linear_parameters` returns them."""
@@ -99,7 +113,8 @@ class LoopMatrices:
         used = _read(f, c, moving)
         used[self.state] = True
         state = np.cumsum(used)[self.state] - 1
-        return LinearLoop(f[np.ix_(used, used)], g[used], c[:, used], state, self.period)
+        shown = state[list(self.judged)]
+        return LinearLoop(f[np.ix_(used, used)], g[used], c[:, used], state, self.period, shown)
 
 
 def _read(f: np.ndarray, c: np.ndarray, among: np.ndarray) -> np.ndarray:
@@ -129,25 +144,25 @@ def controlled_gain(
 
 
 def linear_parameters(
-    slopes: ca.Function, state: np.ndarray, command: np.ndarray, parameters: np.ndarray, feedback: np.ndarray
+    slopes: ca.Function, state: np.ndarray, command: np.ndarray, parameters: np.ndarray, feedback: PlanGain
 ) -> np.ndarray:
-    """Return the parameters of `linear_plant`: A and B of the responses at a point, and a plan's feedback (nu, nx)."""
+    """Return the parameters of `linear_plant`: A and B of the responses at a point, and a plan's gains."""
     a, b = (np.asarray(m.full()) for m in slopes(state, command, parameters))
-    return np.concatenate([a.ravel(), b.ravel(), feedback.ravel()])
+    return np.concatenate([a.ravel(), b.ravel(), feedback.entries])
 
 
 def linear_plant(plant: Plant, sign: float) -> Plant:
     """Return a plant of the same coordinates and inputs whose parameters are the entries of A and B.
 
-    The first n nx entries are A, the next B, the last K of a plan's feedback, which the plant itself does not use. Its own values
-    are A = 0, and B = 1 on the controlled coordinates, times `sign` on the exact side.
+    The first n nx entries are A, the next B, the last [K, L] of a plan's feedback, which the plant itself does not use.
+    Its own values are A = 0, and B = 1 on the controlled coordinates, times `sign` on the exact side.
     """
     n, nx, nu = len(plant.names), plant.state.size, len(plant.inputs)
     gain = np.zeros((n, nu))
     gain[list(plant.controlled_indices), range(nu)] = 1.0
     names = [f"a{k}" for k in range(n * nx)] + [f"b{k}" for k in range(n * nu)]
-    names += [f"f{k}" for k in range(nu * nx)]
-    values = np.concatenate([np.zeros(n * nx), gain.ravel(), np.zeros(nu * nx)])
+    names += [f"f{k}" for k in range(nu * (nx + nu))]
+    values = np.concatenate([np.zeros(n * nx), gain.ravel(), np.zeros(nu * (nx + nu))])
     parameters = {name: Parameter(v, sign * v, "1") for name, v in zip(names, values, strict=True)}
 
     def response(*arguments: Named) -> Mapping[str, Expression]:
@@ -185,7 +200,9 @@ def loop_matrices(problem: Problem, controller: Controller) -> LoopMatrices:
     results = [ca.jacobian(next_memory, z), ca.jacobian(next_memory, w), ca.jacobian(trace[arriving], z)]
     function = ca.Function("fpirhc_loop_matrices", [z, w], [ca.densify(r) for r in results])
     exact, believed, state = (loop.memory.slice(name) for name in ("_exact", "parameters", "_state_before"))
-    return LoopMatrices(function, _at_rest(loop.function, loop.memory.start()), exact, believed, state, problem.period)
+    rest = _at_rest(loop.function, loop.memory.start())
+    judged = tuple(problem.plant.state.elements.index(c) for c in problem.judged_names)
+    return LoopMatrices(function, rest, exact, believed, state, problem.period, judged)
 
 
 def _linear_problem(problem: Problem, controller: Controller) -> Problem:

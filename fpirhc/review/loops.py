@@ -9,12 +9,11 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import Planner, without_deformation
-from fpirhc.errors import FpirhcError, NotSupported
+from fpirhc.errors import FpirhcError, InvalidName, NotSupported
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.linear import LinearLoop, controlled_gain, linear_parameters, loop_matrices, response_slopes
-from fpirhc.review.plan_feedback import plan_gains
+from fpirhc.review.plan_feedback import PlanGain, no_gain, plan_gains
 from fpirhc.review.stand_in import linear_stand_in
-from fpirhc.task.problem import Problem
 
 _WORK = 2e7  # entries^3 of all loops together: large ones are evaluated at fewer points
 _FEWEST = 3
@@ -51,8 +50,12 @@ def loops_along(grid: ReviewGrid, controller: Controller) -> Loops:
     """Return the controller's linear loops along the reference, or the reason why there are none."""
     try:
         return replace(_loops(grid, controller), learns=controller.learns)
+    except InvalidName as error:
+        # The names of the plant's parameters mean nothing on a linearised plant, whose parameters are matrices.
+        learned = f"{type(controller).__name__} learns parameters by name, which a linearised plant does not have"
+        return Loops((), (), None, reason=learned if controller.learns else str(error), learns=controller.learns)
     except FpirhcError as error:
-        return Loops((), (), None, reason=str(error))
+        return Loops((), (), None, reason=str(error), learns=controller.learns)
     except np.linalg.LinAlgError as error:
         return Loops((), (), None, reason=f"the linear loop has no eigenvalues: {error}")
 
@@ -60,18 +63,18 @@ def loops_along(grid: ReviewGrid, controller: Controller) -> Loops:
 def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
     problem, plant = grid.problem, grid.problem.plant
     believed = controller.parameters(plant)
-    stand_in, plan = linear_stand_in(controller)
+    stand_in, plan = linear_stand_in(problem, controller)
     matrices = loop_matrices(problem, stand_in)
     usable = [k for k in range(len(grid.times)) if np.isfinite(grid.commands[0, k]).all()]
     if not usable:
         raise NotSupported("the inverse does not exist along the reference")
     places = _thinned(usable, int(_WORK / max(len(matrices.rest), 1) ** 3))
-    gains = dict(zip(places, _gains(problem, plan, [float(grid.times[k]) for k in places], believed), strict=True))
+    gains = dict(zip(places, _gains(grid, plan, [float(grid.times[k]) for k in places], believed), strict=True))
 
     slopes = response_slopes(plant)
 
     def at(place: int, draw: int) -> LinearLoop:
-        here = (grid.states[place], grid.commands[draw, place])
+        here = (grid.drawn_states[draw, place], grid.commands[draw, place])
         own, model = (linear_parameters(slopes, *here, p, gains[place]) for p in (grid.draws[draw], believed))
         return matrices.at(own, model)
 
@@ -91,8 +94,8 @@ def loops_at(grid: ReviewGrid, controller: Controller, places: Sequence[int]) ->
     """
     problem, plant = grid.problem, grid.problem.plant
     believed = controller.parameters(plant)
-    stand_in, plan = linear_stand_in(controller)
-    feedbacks = _gains(problem, plan, [float(grid.times[k]) for k in places], believed)
+    stand_in, plan = linear_stand_in(problem, controller)
+    feedbacks = _gains(grid, plan, [float(grid.times[k]) for k in places], believed)
     matrices, slopes = loop_matrices(problem, stand_in), response_slopes(plant)
     loops = []
     for k, feedback in zip(places, feedbacks, strict=True):
@@ -113,13 +116,13 @@ def ideal_loops(grid: ReviewGrid, controller: Controller, count: int) -> list[tu
     """
     problem, plant = grid.problem, grid.problem.plant
     believed = controller.parameters(plant)
-    stand_in, plan = linear_stand_in(controller)
+    stand_in, plan = linear_stand_in(problem, controller)
     needed = grid.needed(believed)
     usable = [k for k in range(len(grid.times)) if np.isfinite(needed[k]).all()]
     if not usable:
         raise NotSupported("the model's inverse does not exist along the reference")
     places = _thinned(usable, count)
-    feedbacks = _gains(problem, plan, [float(grid.times[k]) for k in places], believed)
+    feedbacks = _gains(grid, plan, [float(grid.times[k]) for k in places], believed)
     matrices = loop_matrices(problem, without_deformation(stand_in))
     slopes = response_slopes(plant)
     loops = []
@@ -144,10 +147,11 @@ def _thinned(places: list[int], most: int) -> list[int]:
     return [places[int(k)] for k in np.unique(np.linspace(0, len(places) - 1, count).astype(int))]
 
 
-def _gains(problem: Problem, plan: Planner | None, times: list[float], believed: np.ndarray) -> list[np.ndarray]:
+def _gains(grid: ReviewGrid, plan: Planner | None, times: list[float], believed: np.ndarray) -> list[PlanGain]:
+    problem = grid.problem
     if plan is None:
-        return [np.zeros((len(problem.plant.inputs), problem.plant.state.size))] * len(times)
+        return [no_gain(problem.plant)] * len(times)
     cost = plan.cost or problem.cost
     assert problem.horizon is not None
     assert cost is not None
-    return plan_gains(problem, problem.horizon, cost, times, believed)
+    return plan_gains(problem, problem.horizon, cost, times, believed, grid.states_at)

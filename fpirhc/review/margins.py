@@ -19,6 +19,7 @@ import scipy.linalg
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import Loops
+from fpirhc.review.neutral import NEUTRAL
 from fpirhc.task.problem import Problem
 
 QUESTION = "Has the linear loop enough margin?"
@@ -29,8 +30,14 @@ _FREQUENCIES = 300
 _LOWEST = 1e-5  # of the Nyquist frequency
 
 
-def margins_enough(problem: Problem, loops: Loops) -> Answer:
-    """Return the smallest margins of all inputs at the first point of the reference and where the largest |pole| is."""
+def margins_enough(problem: Problem, loops: Loops, *, adapts: bool) -> Answer:
+    """Return the smallest margins of all inputs at the first point of the reference and where the largest |pole| is.
+
+    Args:
+        problem: the problem.
+        loops: linear loops of the controller.
+        adapts: whether the controller has a deformation.
+    """
     if not loops.loops:
         return Answer(QUESTION, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
     if len(loops.loops[0].dynamics) > _LARGEST:
@@ -43,21 +50,32 @@ def margins_enough(problem: Problem, loops: Loops) -> Answer:
     radius = float(loops.radii.max())
     numbers = {"radius": radius, "gain_margin": gain, "phase_margin": phase, "delay_margin": delay}
     text = (
-        f"largest |pole| {radius:.6g}; gain may change {gain:.3g} times, phase by {phase:.3g} deg, delay by {delay:.3g} s "
-        f"({delay / problem.period:.3g} cycles)"
+        f"largest |pole| {radius:.6g}; gain may change {gain:.3g} times, phase by {phase:.3g} deg, "
+        f"delay by {delay:.3g} {problem.time_unit} ({delay / problem.period:.3g} cycles)"
     )
     if loops.learns:
         text += ", before the controller has learned anything"
+    if any(one.hidden.any() for one in loops.loops):
+        text += "; neutral modes that no judged coordinate shows are left out"
     if radius >= 1:
-        everywhere = float(loops.radii.min()) >= 1
-        text += (
-            f"; a pole is outside the unit circle {'all along' if everywhere else 'at some points of'} the reference"
-        )
-        verdict = Verdict.NO if everywhere and not loops.learns else Verdict.UNKNOWN
-        return Answer(QUESTION, verdict, text, "See the convergence and the rates.", numbers)
+        return _outside(loops, text, numbers)
     good = gain >= LEAST_GAIN and phase >= LEAST_PHASE
-    change = "" if good else "Lower the map's gain or the rate."
+    change = (
+        "" if good else "Lower the map's gain or the rate." if adapts else "Lower the rate, or weigh the inputs more."
+    )
     return Answer(QUESTION, Verdict.YES if good else Verdict.UNKNOWN, text, change, numbers)
+
+
+def _outside(loops: Loops, text: str, numbers: dict[str, float]) -> Answer:
+    """The answer where the largest |pole| is at least 1."""
+    smallest = float(loops.radii.min())
+    where = "all along" if smallest >= 1 else "at some points of"
+    on_circle = float(loops.radii.max()) < 1 + NEUTRAL
+    text += f"; a pole is {'on' if on_circle else 'outside'} the unit circle {where} the reference"
+    verdict = Verdict.NO if smallest >= 1 + NEUTRAL and not loops.learns else Verdict.UNKNOWN
+    return Answer(
+        QUESTION, verdict, text, "See the rates, the zero dynamics, and the convergence of a deformation.", numbers
+    )
 
 
 def margins(loop: LinearLoop, place: int) -> tuple[float, float, float]:

@@ -24,17 +24,17 @@ def eigenvalues_near(grid: ReviewGrid, believed: np.ndarray, draws: np.ndarray, 
     Args:
         grid: points of the reference.
         believed: parameters of the model, shape (np,).
-        draws: draws of the exact parameters, shape (draws, np); as many are used as the number of samples allows.
+        draws: the first draws of the grid, shape (draws, np); as many are used as the number of samples allows.
         near: whether to sample near the reference too, and not only on it at r*.
     """
     states, requests = _near(grid, believed) if near else (grid.states, grid.requests(believed))
     count = max(1, min(len(draws), _SAMPLES // len(states)))
-    rows = draws[np.unique(np.linspace(0, len(draws) - 1, count).astype(int))]
+    places = np.unique(np.linspace(0, len(draws) - 1, count).astype(int))
+    rows = draws[places]
     m, n = requests.shape
+    points = np.tile(states, (len(rows), 1)) if near else grid.drawn_states[places].reshape(len(rows) * m, -1)
     known = (np.repeat(rows, m, axis=0), np.tile(believed, (m * len(rows), 1)))
-    jacobians = each(
-        stacked_jacobian(grid.problem.plant), np.tile(states, (len(rows), 1)), np.tile(requests, (len(rows), 1)), *known
-    )
+    jacobians = each(stacked_jacobian(grid.problem.plant), points, np.tile(requests, (len(rows), 1)), *known)
     finite = jacobians[np.isfinite(jacobians).all(axis=1)]
     # The transposed Jacobian has the same eigenvalues.
     return np.linalg.eigvals(finite.reshape(-1, n, n)).reshape(-1, n)

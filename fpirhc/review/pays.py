@@ -49,4 +49,5 @@ def rms(nominal: NominalRun, errors: ResponseErrors) -> float:
 
 def nominal_size(nominal: NominalRun) -> float:
     """Return the rms of the desired response over all coordinates."""
-    return float(np.sqrt(np.mean(np.sum(nominal.desired**2, axis=1))))
+    largest = float(np.abs(nominal.desired).max())  # a diverging model's own run would overflow when it is squared
+    return largest * float(np.sqrt(np.mean(np.sum((nominal.desired / max(largest, 1e-300)) ** 2, axis=1))))

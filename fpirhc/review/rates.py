@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from fpirhc.controllers.base import Controller
-from fpirhc.review.answer import Answer, Verdict, decided
+from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Loops
 from fpirhc.review.maps import dead_cycles
+from fpirhc.review.neutral import NEUTRAL
+from fpirhc.review.stages import stiff_advice
+from fpirhc.review.stand_in import is_planned
 
 QUESTION = "Are rate x period and rate x dead time small enough?"
 
@@ -24,8 +27,15 @@ def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answ
     radius = loops.ideal.radius
     numbers["ideal_radius"] = radius
     text += f"; with the right model the slowest mode changes by {radius:.6g} per cycle"
-    change = "Lower the rate, shorten the period, or predict over the dead time (Predicted)."
-    return Answer(QUESTION, decided(radius < 1), text, "" if radius < 1 else change, numbers)
+    if radius < 1:
+        return Answer(QUESTION, Verdict.YES, text, "", numbers)
+    change = stiff_advice(grid, controller.parameters(grid.problem.plant), planned=is_planned(controller)) or (
+        "Lower the rate, shorten the period, or predict over the dead time (Predicted)."
+    )
+    if radius < 1 + NEUTRAL:
+        change = "A mode neither grows nor decays: weigh the state or the input in which it is."
+        return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
+    return Answer(QUESTION, Verdict.NO, text, change, numbers)
 
 
 def _rate(controller: Controller) -> float | None:

@@ -32,9 +32,10 @@ from fpirhc.review.schedule import schedule_stable
 from fpirhc.review.signs import one_sign
 from fpirhc.review.slew import slew_enough
 from fpirhc.review.speed import bears_lag, fast_enough
+from fpirhc.review.stand_in import is_planned
 from fpirhc.review.two_cycles import free_of_two_cycles
 from fpirhc.review.well_posed import well_posed
-from fpirhc.review.zero_dynamics import is_planned, zero_dynamics, zero_dynamics_rate
+from fpirhc.review.zero_dynamics import zero_dynamics, zero_dynamics_rate
 from fpirhc.task.problem import Problem
 
 
@@ -89,10 +90,13 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: N
     if schedule is not None:
         return (schedule,)
     loops = loops_along(grid, ready)
-    outer = [rates_inside(grid, ready, loops), zero_dynamics(zero_dynamics_rate(grid), is_planned(ready), loops)]
+    outer = [
+        rates_inside(grid, ready, loops),
+        zero_dynamics(grid.problem, zero_dynamics_rate(grid), is_planned(ready), loops),
+    ]
     case = Case(grid, ready, loops, runs)
     inner = [] if not ready.deformation.adapts else _of_map(case, general)
-    return (*inner, *outer, margins_enough(grid.problem, loops), *_more(case))
+    return (*inner, *outer, margins_enough(grid.problem, loops, adapts=ready.deformation.adapts), *_more(case))
 
 
 def _more(case: Case) -> list[Answer]:

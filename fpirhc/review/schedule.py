@@ -23,7 +23,10 @@ def schedule_stable(problem: Problem, controller: Controller) -> Answer | None:
         return None
     if floquet.radius is None:
         return Answer(QUESTION, Verdict.UNKNOWN, f"no Floquet radius: {floquet.reason}", "Use a periodic schedule.")
-    text = f"near the set-point errors change by {floquet.radius:.3g} per period of {floquet.period:g} s, with ideal deformations"
+    text = (
+        f"near the set-point errors change by {floquet.radius:.3g} per period of {floquet.period:g} {problem.time_unit}"
+    )
+    text += ", with ideal deformations"
     change = "" if floquet.radius < 1 else "Change the slots' durations or rates; see floquet_radius."
     return Answer(
         QUESTION,

@@ -37,7 +37,7 @@ def slew_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray
     steady = sum(d.slew * _effect(grid, name) for name, d in problem.disturbances.items())
     needed, step = speed + steady, deformation.largest_step()
     numbers = {"needed": needed, "limit": step / problem.period, "jump": sudden}
-    text = f"the request changes by up to {needed:.3g} per second"
+    text = f"the request changes by up to {needed:.3g} per {problem.time_unit}"
     if after_start == speed > 0:
         text += " after the start"
     if not math.isfinite(step):
@@ -56,7 +56,8 @@ def _speed(grid: ReviewGrid, believed: np.ndarray) -> float:
     """Largest |d r*/dt|, by differences between points much closer than those of the review."""
     problem, plant = grid.problem, grid.problem.plant
     times = np.linspace(0.0, problem.duration, _POINTS)
-    states, responses = (np.asarray(v.full()) for v in problem.reference.function(plant).map(_POINTS)(times[None, :]))
+    states = grid.states_at(times).T
+    responses = np.asarray(problem.reference.function(plant).map(_POINTS)(times[None, :])[1].full())
     exact, model = (np.repeat(p[:, None], _POINTS, axis=1) for p in (plant.exact, believed))
     commands = plant.inverse_function.map(_POINTS)(states, responses[list(plant.controlled_indices)], exact)
     requests = np.asarray(plant.controlled_response_function.map(_POINTS)(states, commands, model).full())

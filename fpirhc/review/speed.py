@@ -22,7 +22,8 @@ def fast_enough(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answ
     rate, poles = law
     product = _products(controller, own)[0]
     ratio = product / least_product(poles, rate, grid.problem.period)
-    text = f"gain x eigenvalue is at least {product:.3g}, {ratio:.3g} times what {poles} poles at {rate:g} 1/s need"
+    text = f"gain x eigenvalue is at least {product:.3g}, {ratio:.3g} times what {poles} poles"
+    text += f" at {rate:g} {grid.problem.rate_unit} need"
     numbers = {"product": product, "ratio": ratio}
     change = "Raise the gain, lower the rate or the period, or use the form that passes the desired response at once (Increment)."
     if ratio >= _SPARE:
@@ -35,15 +36,15 @@ def bears_lag(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer
 
     None for laws without known poles, and where the response is late already.
     """
-    law, period = _law(grid, controller), grid.problem.period
+    law, period, unit = _law(grid, controller), grid.problem.period, grid.problem.time_unit
     if law is None or grid.problem.response_delay > 0:
         return None
     (rate, poles), product = law, _products(controller, own)[1]
     longest = bearable_lag(product, period, rate, poles, damping=_DAMPING)
     limit = 1 / (poles * rate)
     text = (
-        f"up to {longest:.3g} s ({longest / period:.3g} cycles) of an actuator or a sensor with damping {_DAMPING:g}; beyond "
-        f"{limit:.3g} s a fast iteration is unstable at any gain"
+        f"up to {longest:.3g} {unit} ({longest / period:.3g} cycles) of an actuator or a sensor with damping {_DAMPING:g}; beyond "
+        f"{limit:.3g} {unit} a fast iteration is unstable at any gain"
     )
     numbers = {"lag": longest, "limit": limit}
     if longest >= _CYCLES * period:

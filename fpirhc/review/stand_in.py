@@ -15,7 +15,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotSupported
 from fpirhc.review.plan_feedback import PlanFeedback
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.task.problem import Problem
+from fpirhc.task.problem import Problem, cycles_per_stage
 from fpirhc.tracking.base import Tracking
 
 
@@ -36,20 +36,39 @@ class StandIn(Controller):
         return tracked_blocks(problem, self.tracking, self.deformation)
 
 
-def linear_stand_in(controller: Controller) -> tuple[Controller, Planner | None]:
+def linear_stand_in(problem: Problem, controller: Controller) -> tuple[Controller, Planner | None]:
     """Return the stand-in of a controller on a linear plant, and the plan whose feedback it needs.
+
+    Args:
+        problem: the problem, with the horizon and the cost of the plan.
+        controller: the controller.
 
     Raises:
         NotSupported: a plan that is restarted and tracked.
     """
     if controller.inner is not None:
-        inner, planner = linear_stand_in(controller.inner)
+        inner, planner = linear_stand_in(problem, controller.inner)
         return controller.linear_around(inner), planner
     planner = controller.planner
     if planner is None:
         return controller, None
     if planner.restarts and planner.tracking is None:
-        return StandIn(PlanFeedback(), controller.deformation), planner
+        return StandIn(PlanFeedback(_cycles_before(problem, planner)), controller.deformation), planner
     if planner.tracking is not None and not planner.restarts:
         return StandIn(planner.tracking, controller.deformation), None
     raise NotSupported("a plan that is restarted and tracked is not constant near the reference")
+
+
+def is_planned(controller: Controller) -> bool:
+    """Whether the controller plans over a horizon that it restarts from the measured state."""
+    while controller.inner is not None:
+        controller = controller.inner
+    return controller.planner is not None and controller.planner.restarts
+
+
+def _cycles_before(problem: Problem, planner: Planner) -> int:
+    """Control cycles of one stage where the plan weighs the change of its inputs, else 0."""
+    cost = planner.cost or problem.cost
+    if problem.horizon is None or cost is None or not cost.uses_rate:
+        return 0
+    return cycles_per_stage(problem.horizon, problem.period)

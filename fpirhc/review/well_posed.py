@@ -17,14 +17,19 @@ def well_posed(grid: ReviewGrid) -> Answer:
     if not whole.all():
         when = grid.times[int(np.argmin(whole))]
         change = "Give a reference with as many finite derivatives as the plant's order."
-        return Answer(QUESTION, Verdict.NO, f"the reference or a derivative is not finite at t = {when:g} s", change)
+        return Answer(
+            QUESTION,
+            Verdict.NO,
+            f"the reference or a derivative is not finite at t = {when:g} {grid.problem.time_unit}",
+            change,
+        )
     finite = np.isfinite(grid.commands).all(axis=2)
     own = finite[0] & np.isfinite(grid.needed(plant.approximate)).all(axis=1)
     share = float(finite.mean())
     numbers = {"finite_share": share}
     if not own.all():
         when = grid.times[int(np.argmin(own))]
-        text = f"plant or model has no finite command for the reference at t = {when:g} s"
+        text = f"plant or model has no finite command for the reference at t = {when:g} {grid.problem.time_unit}"
         return Answer(
             QUESTION, Verdict.NO, text, "Keep the reference away from states where the response is singular.", numbers
         )
@@ -34,5 +39,17 @@ def well_posed(grid: ReviewGrid) -> Answer:
             QUESTION, Verdict.UNKNOWN, text, "Narrow the box of the parameters, or move the reference.", numbers
         )
     return Answer(
-        QUESTION, Verdict.YES, f"finite at {len(grid.times)} points with {len(grid.draws)} parameter draws", "", numbers
+        QUESTION,
+        Verdict.YES,
+        f"finite at {len(grid.times)} points with {len(grid.draws)} parameter draws{_simulated(grid)}",
+        "",
+        numbers,
     )
+
+
+def _simulated(grid: ReviewGrid) -> str:
+    """Half a sentence about the inner states, empty without any."""
+    names = [grid.problem.plant.state.elements[k] for k in grid.inner]
+    if not names:
+        return ""
+    return f"; {', '.join(names)} ha{'s' if len(names) == 1 else 've'} no task and {'is' if len(names) == 1 else 'are'} simulated"

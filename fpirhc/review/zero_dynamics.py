@@ -9,22 +9,21 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller
-from fpirhc.errors import FpirhcError
 from fpirhc.plant.plant import Plant
-from fpirhc.review.answer import Answer, Verdict, decided
+from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.linear import response_slopes
 from fpirhc.review.loops import Loops
-from fpirhc.review.stand_in import linear_stand_in
+from fpirhc.review.neutral import NEUTRAL
 from fpirhc.review.state_matrix import state_matrices
+from fpirhc.task.problem import Problem
 
 QUESTION = "Are the zero dynamics stable?"
-_STILL = 1e-6  # 1/s
+_STILL = 1e-4  # growth over the run, as a share, below which a mode is neutral
 
 
 def zero_dynamics_rate(grid: ReviewGrid) -> float | None:
-    """Return the largest real part of the zero dynamics along the reference, 1/s; None where there are none."""
+    """Return the largest real part of the zero dynamics along the reference, per unit of time; None where there are none."""
     plant = grid.problem.plant
     inside = [k for k, e in enumerate(plant.state.elements) if e.rstrip("'") not in plant.controlled_names]
     if not inside:
@@ -44,36 +43,44 @@ def _rate(plant: Plant, slopes: tuple[ca.DM, ca.DM], inside: list[int]) -> float
     return float(np.linalg.eigvals(internal).real.max())
 
 
-def zero_dynamics(rate: float | None, planned: bool, loops: Loops) -> Answer:
-    """Return whether the zero dynamics are stable.
+def zero_dynamics(problem: Problem, rate: float | None, planned: bool, loops: Loops) -> Answer:
+    """Return whether the zero dynamics are stable, with their rate and its sign.
 
     Args:
-        rate: largest real part of the zero dynamics, 1/s; None where there are none.
+        problem: the problem.
+        rate: largest real part of the zero dynamics, per unit of time; None where there are none.
         planned: whether the controller is a plan; with these states in its cost it may hold unstable ones.
         loops: linear loops of the controller.
     """
     if rate is None:
         return Answer(QUESTION, Verdict.YES, "there are none: every coordinate is controlled")
-    numbers = {"rate": rate}
-    text = f"their fastest growth is {rate:.3g} 1/s"
-    if planned and loops.loops:
+    numbers, text = {"rate": rate}, _text(problem, rate)
+    neutral = abs(rate) * problem.duration <= _STILL
+    if ((planned and rate > 0) or neutral) and loops.loops:
         radius = float(loops.radii.max())
-        text += f"; with the plan's feedback the linear loop changes by {radius:.6g} per cycle"
-        change = "" if radius < 1 else "Weigh the other states in the cost, or lengthen the horizon."
-        verdict = Verdict.UNKNOWN if loops.learns and radius >= 1 else decided(radius < 1)
-        return Answer(QUESTION, verdict, text, change, numbers)
-    if not np.isfinite(rate) or planned or abs(rate) <= _STILL:
-        change = "Undamped or not known: run it and look at the coordinates that are not controlled."
-        return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
-    change = (
-        "" if rate < 0 else "Let a plan carry those states in its cost, use time slots, or control another coordinate."
-    )
-    return Answer(QUESTION, decided(rate < 0), text, change, numbers)
+        numbers["radius"] = radius
+        text += f"; the linear loop changes by {radius:.6g} per cycle"
+        if radius < 1:
+            return Answer(QUESTION, Verdict.YES, text, "", numbers)
+        verdict = Verdict.UNKNOWN if loops.learns or neutral or radius < 1 + NEUTRAL else Verdict.NO
+        return Answer(QUESTION, verdict, text, "Weigh the other states in the cost, or lengthen the horizon.", numbers)
+    if rate < 0 and not neutral:
+        return Answer(QUESTION, Verdict.YES, text, "", numbers)
+    if rate > 0 and not neutral and not planned:
+        change = "Let a plan carry those states in its cost, use time slots, or control another coordinate."
+        return Answer(QUESTION, Verdict.NO, text, change, numbers)
+    change = "Run it and look at the coordinates that are not controlled."
+    if planned and rate > 0 and not neutral:
+        change = f"A plan holds them only if its cost weighs those states. {change}"
+    return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
 
 
-def is_planned(controller: Controller) -> bool:
-    """Whether the controller plans over a horizon that it restarts from the measured state."""
-    try:
-        return linear_stand_in(controller)[1] is not None
-    except FpirhcError:
-        return True
+def _text(problem: Problem, rate: float) -> str:
+    unit = problem.rate_unit
+    if not np.isfinite(rate):
+        return "their rate is not known: the reference has no finite command"
+    if abs(rate) * problem.duration <= _STILL:
+        return "they neither grow nor decay"
+    if rate > 0:
+        return f"unstable: while the reference is followed they grow at up to {rate:.3g} {unit}"
+    return f"stable: while the reference is followed they decay at {-rate:.3g} {unit} or faster"

@@ -42,6 +42,7 @@ class Problem:
         measure_from: time from which metrics count, s; the transient before it is left out.
         judged: coordinates whose errors are logged and measured; None: the controlled ones.
         name: of the problem in results; the problem of a file has the name of the file.
+        time_unit: unit of every time in the problem (period, duration, steps, rates); texts use it, no calculation does.
 
     Raises:
         InvalidProblem: all mistakes together.
@@ -62,6 +63,7 @@ class Problem:
     measure_from: float = 0.0
     judged: Sequence[str] | None = None
     name: str = field(default="", kw_only=True, metadata={"setting": False})
+    time_unit: str = field(default="s", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("problem")
@@ -89,6 +91,11 @@ class Problem:
     def cycles(self) -> int:
         """Number of control cycles in a run."""
         return round(self.duration / self.period)
+
+    @property
+    def rate_unit(self) -> str:
+        """Unit of a rate: 1/s, or one per unit of time."""
+        return f"1/{self.time_unit}"
 
     @cached_property
     def judged_names(self) -> tuple[str, ...]:

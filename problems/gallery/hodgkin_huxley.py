@@ -79,6 +79,7 @@ problem = fp.Problem(
     horizon=fp.Horizon(stages=50, step=0.1),  # ms
     cost=fp.Quadratic(states={"V": 1.0}, deviation={"I": 1e-5}),
     measure_from=10.0,  # ms
+    time_unit="ms",
 )
 
 tracking = fp.Exponential(rate=1.0)  # 1/ms

@@ -61,6 +61,7 @@ problem = fp.Problem(
     horizon=fp.Horizon(stages=14, step=1.0),  # day
     cost=fp.Quadratic(states={"size": 1.0, "size'": 10.0}, deviation={"dose": 1e-5}),
     measure_from=60.0,  # days
+    time_unit="day",
 )
 
 tracking = fp.Exponential(rate=0.15)  # 1/day

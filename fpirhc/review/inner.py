@@ -1,0 +1,96 @@
+"""Inner states: coordinates that have no task. They are neither controlled nor judged, and no cost weighs them.
+
+What a reference gives for them is an invention. A review linearises on the motion that they have while the other states are on the
+reference, with the inputs that this needs,
+
+    z' = f(x^N, z, inverse(x^N, z, r^N; p); p),        z(0) = the problem's start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import FpirhcError
+from fpirhc.horizon.problem import transcribe
+from fpirhc.symbolic.expression import kind
+from fpirhc.task.limits import Limits
+from fpirhc.task.problem import Problem
+
+_TOLERANCE = 1e-7
+_STEPS = 100_000
+_SHORTEST = 2000  # steps of a run at least
+
+
+def inner_places(problem: Problem) -> tuple[int, ...]:
+    """Return the places of the inner states among the states of the plant."""
+    plant = problem.plant
+    with_task = {*plant.controlled_names, *problem.judged_names}
+    weighed = _weighed(problem)
+    with_task |= {plant.state.elements[k].rstrip("'") for k in weighed}
+    return tuple(k for k, e in enumerate(plant.state.elements) if e.rstrip("'") not in with_task)
+
+
+def inner_motion(
+    problem: Problem, places: Sequence[int], draws: np.ndarray, times: np.ndarray
+) -> list[np.ndarray | None]:
+    """Return the motion of the inner states for every draw of the exact parameters.
+
+    Args:
+        problem: the problem.
+        places: of the inner states, from `inner_places`.
+        draws: parameters, shape (draws, np).
+        times: increasing times from 0 on, shape (m,).
+
+    Returns:
+        For every draw the states, shape (m, len(places)); None where they do not stay finite.
+    """
+    steps = _integrator(problem, list(places), times)
+    start = problem.start_state[list(places)]
+    return [_motion(steps, start, row) for row in draws]
+
+
+def _motion(steps: ca.Function, start: np.ndarray, parameters: np.ndarray) -> np.ndarray | None:
+    try:
+        rows = np.asarray(steps(x0=start, p=parameters)["xf"].full()).T
+    except RuntimeError:  # CVODES gives up where the motion leaves every bound
+        return None
+    return np.vstack([start, rows]) if np.isfinite(rows).all() else None
+
+
+def _integrator(problem: Problem, places: list[int], times: np.ndarray) -> ca.Function:
+    plant = problem.plant
+    matrix = kind(problem.reference.opaque or plant.inverse_opaque)
+    t, p, inner = matrix.sym("t"), matrix.sym("p", plant.parameter.size), matrix.sym("z", len(places))
+    nominal, response = problem.reference.function(plant)(t)
+    rows = [nominal[k] for k in range(plant.state.size)]
+    for place, entry in zip(places, range(len(places)), strict=True):
+        rows[place] = inner[entry]
+    state = ca.vertcat(*rows)
+    command = plant.inverse_function(state, response[list(plant.controlled_indices)], p)
+    rate = plant.forced_derivative_function(state, command, p, np.zeros(len(plant.names)))[places]
+    # Friction at a reversal is at rest until it is not: a step must not pass over the whole reversal.
+    longest = max(problem.period, problem.duration / _SHORTEST)
+    options = {
+        "reltol": _TOLERANCE,
+        "abstol": _TOLERANCE * 1e-3,
+        "max_num_steps": _STEPS,
+        "max_step_size": longest,
+        "disable_internal_warnings": True,
+    }
+    system = {"x": inner, "p": p, "t": t, "ode": rate}
+    return ca.integrator("fpirhc_inner", "cvodes", system, float(times[0]), [float(v) for v in times[1:]], options)
+
+
+def _weighed(problem: Problem) -> set[int]:
+    """Places of the states on which the cost of a stage depends."""
+    if problem.horizon is None or problem.cost is None:
+        return set()
+    try:
+        stage = transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, Limits()).stage_cost
+    except FpirhcError:
+        return set(range(problem.plant.state.size))
+    pattern = np.asarray(ca.DM(stage.jac_sparsity(0, 0), 1).full())
+    return {k for k in range(problem.plant.state.size) if pattern[0, k]}

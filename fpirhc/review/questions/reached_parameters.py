@@ -1,0 +1,70 @@
+"""Does the deformation reach the wrong parameters? It corrects the response of the controlled coordinates and nothing else.
+
+A parameter that is not in this response, such as the load behind a flexible shaft whose motor is controlled, leaves the response
+Jacobian that of a right model: there is nothing to adapt. Whether a parameter is in the response is a fact of the symbols. How much
+it counts is the change of the response,
+
+    |response(x^N, u*; exact, but this parameter believed) - response(x^N, u*; exact)|.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.plant.plant import Plant
+from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.grid import ReviewGrid, each
+from fpirhc.review.question import Case, ControllerQuestion
+
+TEXT = "Does the deformation reach the wrong parameters?"
+
+
+def reaches_parameters(case: Case) -> Answer:
+    """Return which wrong parameters are in the controlled response, and which are not."""
+    plant = case.problem.plant
+    names = plant.parameter.elements
+    wrong = [k for k, (believed, exact) in enumerate(zip(case.believed, plant.exact, strict=True)) if believed != exact]
+    if not wrong:
+        return Answer(TEXT, Verdict.YES, "every parameter of the model is right", "", {"wrong": 0.0, "reached": 0.0})
+    present = _present(plant)
+    reached, missed = ([names[k] for k in wrong if present[k] is there] for there in (True, False))
+    sizes = {names[k]: _effect(case.grid, case.believed, k) for k in wrong if present[k]}
+    numbers = {"wrong": float(len(wrong)), "reached": float(len(reached))}
+    numbers |= {f"effect_{name}": size for name, size in sizes.items()}
+    text = "; ".join([*_reached(sizes), *_missed(missed)])
+    if not missed:
+        return Answer(TEXT, Verdict.YES, text, "", numbers)
+    change = f"Control a coordinate in whose response {missed[0]} is, or correct {', '.join(missed)} in the model."
+    if reached:
+        return Answer(TEXT, Verdict.UNKNOWN, text, change, numbers)
+    return Answer(TEXT, Verdict.NO, text, f"{change} A deformation has nothing to correct.", numbers)
+
+
+def _reached(sizes: dict[str, float]) -> list[str]:
+    ordered = sorted(sizes.items(), key=lambda pair: -pair[1])
+    return ["the response changes by up to " + ", ".join(f"{v:.3g} ({n})" for n, v in ordered)] if ordered else []
+
+
+def _missed(names: list[str]) -> list[str]:
+    return [f"the response does not depend on {', '.join(names)}"] if names else []
+
+
+def _present(plant: Plant) -> list[bool]:
+    """Whether each parameter is in the controlled response, from the pattern of the symbols."""
+    pattern = np.asarray(ca.DM(plant.controlled_response_function.jac_sparsity(0, 2), 1).full())
+    return [bool(column.any()) for column in pattern.T]
+
+
+def _effect(grid: ReviewGrid, believed: np.ndarray, place: int) -> float:
+    """Largest change of the response along the reference where this parameter alone is the believed one."""
+    plant = grid.problem.plant
+    changed = plant.exact.copy()
+    changed[place] = believed[place]
+    rows = [np.tile(p, (len(grid.times), 1)) for p in (changed, plant.exact)]
+    with_it, without = (each(plant.controlled_response_function, grid.states, grid.commands[0], p) for p in rows)
+    change = np.linalg.norm(with_it - without, axis=1)
+    return float(change[np.isfinite(change)].max(initial=0.0))
+
+
+QUESTION = ControllerQuestion(ask=reaches_parameters, order=30)

@@ -1,0 +1,111 @@
+"""Poles of one step of an integrator beside those of the plant, and the integrator that would follow it.
+
+A step of length h follows a mode lambda where one of its poles is near exp(lambda h). An explicit step of a fast mode does not: its
+pole is a polynomial of lambda h and may lie outside the unit circle although the mode decays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import FpirhcError
+from fpirhc.plant.integrators import Integrator, RungeKutta4
+from fpirhc.plant.plant import Plant
+from fpirhc.review.grid import ReviewGrid
+from fpirhc.review.linear import response_slopes
+from fpirhc.review.state_matrix import state_matrices
+
+CLOSE = 0.05  # distance of a pole of the step from exp(pole of the plant x step)
+_SUBSTEPS = (2, 4, 8, 16, 32, 64)
+
+
+@dataclass(frozen=True)
+class StepPoles:
+    """Poles of one step beside those of the plant.
+
+    Args:
+        apart: largest distance of exp(lambda h) from the nearest pole of the step.
+        fastest: largest |lambda|, per unit of time.
+        largest: largest |pole| of the step.
+        decays: whether no mode of the plant grows.
+    """
+
+    apart: float
+    fastest: float
+    largest: float
+    decays: bool
+
+    @property
+    def unstable(self) -> bool:
+        """Whether the step grows although the plant does not."""
+        return self.decays and self.largest > 1 + CLOSE
+
+    @property
+    def follows(self) -> bool:
+        """Whether the step follows every mode."""
+        return not self.unstable and self.apart <= CLOSE
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A point at which a plant is linearised: state, input and parameters."""
+
+    state: np.ndarray
+    command: np.ndarray
+    parameters: np.ndarray
+
+
+def first_place(grid: ReviewGrid, parameters: np.ndarray) -> Place:
+    """Return the start of the reference with these parameters."""
+    return Place(grid.states[0], grid.needed(parameters)[0], parameters)
+
+
+def step_poles(plant: Plant, integrator: Integrator, step: float, place: Place) -> StepPoles:
+    """Return the poles of one step at a point.
+
+    Raises:
+        LinAlgError: the linearisation is not finite.
+    """
+    slopes = response_slopes(plant)(place.state, place.command, place.parameters)
+    rates = np.linalg.eigvals(state_matrices(plant, *(np.asarray(m.full()) for m in slopes))[0])
+    poles = np.linalg.eigvals(_matrix(plant, integrator, step, place))
+    exact = np.exp(rates * step)
+    apart = float(max(np.abs(poles - one).min() for one in exact))
+    return StepPoles(
+        apart, float(np.abs(rates).max()), float(np.abs(poles).max()), bool(np.abs(exact).max() <= 1 + 1e-9)
+    )
+
+
+def advice(plant: Plant, step: float, place: Place) -> str:
+    """Return the integrator that follows the plant: Runge-Kutta with the fewest sub-steps, else an implicit one."""
+    for count in _SUBSTEPS:
+        if step_poles(plant, RungeKutta4(count), step, place).follows:
+            return f"RungeKutta4(substeps={count}), which follows every mode, or RadauIIA() for modes that need not be followed"
+    return "RadauIIA(): no number of sub-steps up to 64 of RungeKutta4 follows it"
+
+
+def stiff_advice(grid: ReviewGrid, believed: np.ndarray, *, planned: bool) -> str:
+    """Return what to change where a step of the horizon or of the simulated plant grows by itself; empty where none does."""
+    problem, plant = grid.problem, grid.problem.plant
+    try:
+        place = first_place(grid, believed)
+        if planned and problem.horizon is not None:
+            horizon = problem.horizon
+            if step_poles(plant, horizon.discretisation, horizon.step, place).unstable:
+                return f"Its discretisation grows: use Horizon(discretisation={advice(plant, horizon.step, place)})."
+        if not problem.integrator.opaque and step_poles(plant, problem.integrator, problem.period, place).unstable:
+            return f"The integrator of the plant grows: use Problem(integrator={advice(plant, problem.period, place)})."
+    except (FpirhcError, np.linalg.LinAlgError):
+        return ""
+    return ""
+
+
+def _matrix(plant: Plant, integrator: Integrator, step: float, place: Place) -> np.ndarray:
+    """D x+ / d x of one step."""
+    function = integrator.step(plant, step)
+    x, u, p, w = (ca.SX.sym(function.name_in(k), function.size1_in(k)) for k in range(4))
+    slope = ca.Function("fpirhc_step_matrix", [x, u, p, w], [ca.jacobian(function(x, u, p, w), x)])
+    return np.asarray(slope(place.state, place.command, place.parameters, np.zeros(len(plant.names))).full())

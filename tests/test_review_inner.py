@@ -1,0 +1,213 @@
+"""What a review states about states that move by themselves: rate and sign, neutral ones, where they are linearised."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.review.grid import review_grid
+from fpirhc.review.inner import inner_motion, inner_places
+
+PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-3))
+LAW = fp.ComputedTorque(fp.Exponential(rate=2.0))
+
+
+def companion(rate: float, *, weigh: bool = False, **settings: Any) -> fp.Problem:
+    """A speed y' = u - y that is controlled, and a state z' = rate z + y that is not; the response does not read z."""
+    plant = fp.Plant(
+        coordinates={"y": "m", "z": "m"},
+        inputs={"u": "m/s"},
+        order=1,
+        controlled=("y",),
+        parameters={"a": fp.Parameter(1.2, 1.0, "1/s")},
+        response=lambda q, u, p: {"y": u.u - p.a * q.y, "z": rate * q.z + q.y},
+    )
+    usual: dict[str, Any] = {
+        "reference": fp.Trajectory(lambda t: {"y": ca.sin(t), "z": 0 * t}),
+        "start": {"y": 0.0, "z": 0.0},
+        "period": 0.02,
+        "duration": 5.0,
+        "horizon": fp.Horizon(stages=20, step=0.02),
+        "cost": fp.Quadratic(states={"y": 1.0} | ({"z": 1.0} if weigh else {}), deviation={"u": 1e-3}),
+    }
+    return fp.Problem(plant=plant, **(usual | settings))
+
+
+def answer(problem: fp.Problem, controller: fp.Controller, words: str) -> fp.Answer:
+    every = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).answers
+    [one] = [a for a in every if words in a.question]
+    return one
+
+
+@pytest.mark.parametrize(
+    ("rate", "controller", "verdict", "begin"),
+    [
+        (-32.9, LAW, "yes", "stable: while the reference is followed they decay at 32.9 1/s"),
+        (309.0, LAW, "no", "unstable: while the reference is followed they grow at up to 309 1/s"),
+        (-32.9, PLAN, "yes", "stable: while the reference is followed they decay at 32.9 1/s"),
+        (309.0, PLAN, "no", "unstable: while the reference is followed they grow at up to 309 1/s"),
+        (0.0, LAW, "yes", "they neither grow nor decay"),
+        (0.0, PLAN, "yes", "they neither grow nor decay"),
+    ],
+)
+def test_zero_dynamics_have_a_rate_and_a_sign(rate, controller, verdict, begin):
+    """The rate is an eigenvalue by construction; a neutral one that nothing reads is no fault."""
+    one = answer(companion(rate), controller, "zero dynamics")
+    assert (one.verdict, one.evidence[: len(begin)]) == (verdict, begin)
+    assert one.numbers["rate"] == pytest.approx(rate, abs=1e-9)
+
+
+@pytest.mark.parametrize("rate", [309.0, -32.9])
+def test_a_plan_without_a_linear_loop_has_the_sign_too(rate):
+    """A plan that is restarted and tracked has no linear loop: stable is yes, unstable is unknown with its rate."""
+    tracked = replace(PLAN, replanning=fp.FromMeasurementTracked(fp.Exponential(rate=2.0)))
+    one = answer(companion(rate), tracked, "zero dynamics")
+    assert one.verdict == ("yes" if rate < 0 else "unknown")
+    assert f"{abs(rate):.3g} 1/s" in one.evidence
+
+
+@pytest.mark.parametrize("controller", [LAW, PLAN])
+@pytest.mark.parametrize("words", ["rate x period", "margin"])
+def test_an_integral_that_nobody_judges_is_no_fault(controller, words):
+    """It stays where it is put, and no judged coordinate shows it; the horizon is not said to diverge either."""
+    one = answer(companion(0.0), controller, words)
+    assert one.verdict == "yes", one
+    assert answer(companion(0.0), controller, "horizon long").verdict == "yes"
+
+
+def test_an_integral_that_is_judged_is_not_called_stable():
+    """The same integral among the judged coordinates: its error stays, which is no yes."""
+    assert answer(companion(0.0, judged=("y", "z")), LAW, "zero dynamics").verdict == "unknown"
+    assert answer(companion(0.0, judged=("y", "z")), LAW, "margin").verdict == "unknown"
+
+
+def test_times_have_the_unit_of_the_problem():
+    """Rates, delays and horizons of a problem in minutes are in minutes."""
+    problem = companion(-0.5, time_unit="min")
+    every = fp.review(problem, {"it": LAW}, mismatch=0.0, seed=0).answers
+    text = " ".join(a.evidence for a in every)
+    assert "0.4 min" in text
+    assert "0.5 1/min" in text
+    assert " s " not in text
+    assert " 1/s" not in text
+
+
+# Inner states without a task
+
+
+def tissue(invented: float, **settings: Any) -> fp.Problem:
+    """A drug in the blood, y' = u - y + z, and in a tissue, z' = (y - z) / 2; the reference of the tissue is invented."""
+    plant = fp.Plant(
+        coordinates={"y": "mg/l", "z": "mg/l"},
+        inputs={"u": "mg/l/h"},
+        order=1,
+        controlled=("y",),
+        parameters={"a": fp.Parameter(1.5, 1.0, "1/h"), "k": fp.Parameter(1.0, 0.5, "1/h")},
+        response=lambda q, u, p: {"y": u.u - p.a * q.y + q.z, "z": p.k * (q.y - q.z)},
+    )
+    usual: dict[str, Any] = {
+        "reference": fp.Trajectory(lambda t: {"y": 2 + ca.sin(t), "z": invented + 0 * t}),
+        "start": {"y": 2.0, "z": 0.0},
+        "period": 0.02,
+        "duration": 12.0,
+        "time_unit": "h",
+    }
+    return fp.Problem(plant=plant, **(usual | settings))
+
+
+def in_tissue(t: np.ndarray, k: float) -> np.ndarray:
+    """Solution of z' = k (2 + sin t - z), z(0) = 0."""
+    particular = 2 + k * (k * np.sin(t) - np.cos(t)) / (k**2 + 1)
+    return np.asarray(particular - (2 - k / (k**2 + 1)) * np.exp(-k * t))
+
+
+@pytest.mark.parametrize("invented", [0.0, 40.0])
+def test_states_without_a_task_are_where_the_plant_takes_them(invented):
+    """The tissue fills by its own equation whatever its reference is, and the commands are those of this motion."""
+    grid = review_grid(tissue(invented), 20.0, 0)
+    assert grid.inner == (1,)
+    for k, states, commands in zip(grid.draws[:, 1], grid.drawn_states, grid.commands, strict=True):
+        assert states[:, 1] == pytest.approx(in_tissue(grid.times, k), abs=1e-5)
+        assert np.isfinite(commands).all()
+    y, t = 2 + np.sin(grid.times), grid.times
+    assert grid.commands[0, :, 0] == pytest.approx(np.cos(t) + y - in_tissue(t, 0.5), abs=1e-5)
+    assert grid.states_at(np.array([3.3]))[0] == pytest.approx(
+        [2 + np.sin(3.3), float(in_tissue(np.array(3.3), 0.5))], abs=1e-4
+    )
+    [well] = [a for a in fp.review(tissue(invented), {}, mismatch=0.0, seed=0).answers if "well posed" in a.question]
+    assert well.evidence.endswith("z has no task and is simulated")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"judged": ("y", "z")},
+        {
+            "horizon": fp.Horizon(stages=5, step=0.1),
+            "cost": fp.Quadratic(states={"y": 1.0, "z": 0.1}, effort={"u": 1e-3}),
+        },
+    ],
+)
+def test_states_with_a_task_are_on_their_reference(settings):
+    """A judged or a weighed state has a reference that is meant."""
+    grid = review_grid(tissue(1.0, **settings), 0.0, 0)
+    assert inner_places(grid.problem) == ()
+    assert (grid.drawn_states[..., 1] == 1.0).all()
+
+
+def test_states_that_leave_every_bound_are_left_on_the_reference():
+    """The motion z' = z^2 + y escapes in finite time."""
+    plant = fp.Plant(
+        coordinates={"y": "m", "z": "m"},
+        inputs={"u": "m/s"},
+        order=1,
+        controlled=("y",),
+        parameters={"a": fp.Parameter(1.2, 1.0, "1/s")},
+        response=lambda q, u, p: {"y": u.u - p.a * q.y, "z": q.z**2 + q.y},
+    )
+    problem = replace(companion(-1.0), plant=plant)
+    assert inner_motion(problem, [1], plant.exact[None, :], np.array([0.0, 5.0])) == [None]
+    grid = review_grid(problem, 0.0, 0)
+    assert grid.inner == ()
+    assert (grid.states[:, 1] == 0).all()
+
+
+def test_currents_of_the_nerve_cell_are_those_of_a_run():
+    """The gates move with the voltage: the exact model's commands in a run without a pulse, and not those of gates at rest."""
+    task = fp.load_problem("problems/gallery/hodgkin_huxley.py")
+    problem = replace(task.problem, disturbances={}, start=task.problem.start | {"V": -65.0})
+    run = fp.simulate(problem, fp.ExactModel(fp.ComputedTorque(fp.Exponential(rate=1.0))), seed=0)
+    grid = review_grid(problem, 0.0, 0)
+    needed = grid.commands[0, 1:-1, 0]
+    issued = np.interp(grid.times[1:-1], run.time, run["command"][:, 0])
+    assert needed == pytest.approx(issued, abs=1.0)
+    assert (needed.min(), needed.max()) == pytest.approx((-43.6, 71.4), abs=0.2)
+
+
+@pytest.mark.parametrize(("name", "most"), [("stick_slip", 0.7), ("turbojet", 0.8)])
+def test_parameters_of_a_plant_stay_together(name, most):
+    """Bristles and the friction that they carry are wrong together: the box needs little more than the plant itself."""
+    task = fp.load_problem(f"problems/gallery/{name}.py")
+    [one] = [a for a in fp.review(task.problem, {}, mismatch=0.0, seed=0).answers if "commands" in a.question]
+    assert one.verdict == "yes"
+    assert one.numbers["share_over_box"] < most
+
+
+def test_draws_are_between_the_range_and_the_model():
+    """Every draw is a mean of a point of the range and the approximate parameters, with one weight for all parameters."""
+    problem = tissue(0.0)
+    for mismatch, spread in ((0.0, 0.0), (20.0, 0.2)):
+        draws = review_grid(problem, mismatch, 3).draws
+        assert any(np.array_equal(row, problem.plant.approximate) for row in draws)
+        for row in draws:
+            # p - s p_approximate = (1 - s) p_exact (1 + d) with |d| within the mismatch, for some s that both share
+            shares = np.linspace(0.0, 1.0, 2001)[:-1]
+            rests = row - shares[:, None] * problem.plant.approximate
+            deviations = rests / ((1 - shares[:, None]) * problem.plant.exact) - 1
+            fits = (np.abs(deviations) <= spread + 1e-2).all(axis=1)
+            assert fits.any() or np.array_equal(row, problem.plant.approximate)

@@ -1,0 +1,157 @@
+"""What a review states about plans that weigh the change of their inputs, or must meet an end, against closed forms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+import scipy.linalg
+
+import fpirhc as fp
+from fpirhc.review.grid import review_grid
+from fpirhc.review.loops import loops_along
+from fpirhc.review.plan_feedback import plan_gains
+
+STEP = 0.05  # s
+
+
+def oscillator(**settings: Any) -> fp.Problem:
+    """M q'' = u - k q at rest; model and plant are the same."""
+    plant = fp.Plant(
+        coordinates={"q": "m"},
+        inputs={"u": "N"},
+        parameters={"m": fp.Parameter(1.0, 1.0, "kg"), "k": fp.Parameter(4.0, 4.0, "N/m")},
+        response=lambda q, v, u, p: {"q": (u.u - p.k * q.q) / p.m},
+    )
+    usual: dict[str, Any] = {
+        "reference": fp.Trajectory(lambda t: {"q": 0 * t}),
+        "start": {"q": 0.1},
+        "period": STEP,
+        "duration": 10.0,
+        "horizon": fp.Horizon(stages=60, step=STEP),
+        "cost": fp.Quadratic(states={"q": 1e2, "q'": 1.0}, rate={"u": 0.5}),
+    }
+    return fp.Problem(plant=plant, **(usual | settings))
+
+
+def model_of_a_stage() -> tuple[np.ndarray, np.ndarray]:
+    """A and B of the oscillator over one stage."""
+    whole = scipy.linalg.expm(np.array([[0, 1, 0], [-4, 0, 1], [0, 0, 0]]) * STEP)
+    return whole[:2, :2], whole[:2, 2:]
+
+
+def rate_weighted_gain(weight: float = 0.5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stationary gain of the state and the input before, with the matrices of this augmented system."""
+    a, b = model_of_a_stage()
+    wide, entry = scipy.linalg.block_diag(a, 0.0), np.vstack([b, [[1.0]]])
+    q, r, s = np.diag([1e2, 1.0, weight]), np.array([[weight]]), np.array([[0.0], [0.0], [-weight]])
+    value = scipy.linalg.solve_discrete_are(wide, entry, q, r, s=s)
+    gain = -np.linalg.solve(r + entry.T @ value @ entry, entry.T @ value @ wide + s.T)
+    return gain, wide, entry
+
+
+def answers(problem: fp.Problem, controller: fp.Controller) -> dict[str, fp.Answer]:
+    found = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0)
+    return {a.question: a for a in found.answers}
+
+
+def about(all_answers: dict[str, fp.Answer], words: str) -> fp.Answer:
+    [question] = [q for q in all_answers if words in q]
+    return all_answers[question]
+
+
+PLAIN = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-3))
+
+
+def test_rate_weights_make_the_input_before_part_of_the_feedback():
+    """The gains of a long plan are those of the Riccati equation of state and input before."""
+    problem = oscillator()
+    assert problem.horizon is not None
+    assert problem.cost is not None
+    [first] = plan_gains(problem, problem.horizon, problem.cost, [0.0], problem.plant.approximate)
+    gain, _, _ = rate_weighted_gain()
+    assert np.hstack([first.state, first.before]) == pytest.approx(gain, rel=1e-4)
+
+
+def test_loop_of_a_rate_weighted_plan_has_the_poles_of_its_closed_form():
+    """One cycle per stage: the poles of state and input before under the stationary gain."""
+    problem = oscillator()
+    [loop, *_] = loops_along(review_grid(problem, 0.0, 0), PLAIN).loops
+    gain, wide, entry = rate_weighted_gain()
+    expected = np.linalg.eigvals(wide + entry @ gain)
+    for pole in expected:
+        assert np.abs(loop.poles - pole).min() < 1e-3
+    assert loop.radius == pytest.approx(np.abs(expected).max(), abs=1e-4)
+
+
+def test_several_cycles_per_stage_change_the_input_as_slowly():
+    """Ten cycles per stage: a slow plan settles in the same time, not in a tenth of it."""
+    slow = fp.Quadratic(states={"q": 1e2, "q'": 1.0}, rate={"u": 1e4})
+    rates = []
+    for period in (STEP, STEP / 10):
+        problem = oscillator(cost=slow, period=period)
+        [loop, *_] = loops_along(review_grid(problem, 0.0, 0), PLAIN).loops
+        rates.append(np.log(loop.radius) / period)
+    assert rates[1] == pytest.approx(rates[0], rel=0.1)
+
+
+def test_nothing_is_unknown_about_a_rate_weighted_plan():
+    """Horizon, rates, zero dynamics, margins, convergence and box have answers of their own."""
+    adaptive = replace(PLAIN, deformation=fp.ModelReferenced(fp.Sigmoid(gain=-0.5, scale=20.0)))
+    every = answers(oscillator(), adaptive)
+    for words in ("horizon long", "rate x period", "zero dynamics", "margin", "deformation converge", "box of par"):
+        assert about(every, words).verdict == "yes", about(every, words)
+    assert "radius" in about(every, "margin").numbers
+
+
+def test_an_end_that_must_be_met_is_in_the_feedback():
+    """Two stages that must reach rest from any state: the deadbeat feedback, whatever the weights are."""
+    problem = oscillator(
+        horizon=fp.Horizon(stages=2, step=STEP, terminal=("q", "q'")),
+        cost=fp.Quadratic(states={"q": 1e2, "q'": 1.0}, effort={"u": 1e-3}),
+    )
+    assert problem.horizon is not None
+    assert problem.cost is not None
+    [first] = plan_gains(problem, problem.horizon, problem.cost, [0.0], problem.plant.approximate)
+    a, b = model_of_a_stage()
+    deadbeat = -np.linalg.solve(np.hstack([a @ b, b]), a @ a)[:1]
+    assert first.state == pytest.approx(deadbeat, rel=1e-4)
+
+
+def test_an_end_that_must_be_met_with_weighted_rates():
+    """Five stages against the solution of all stages at once, with the change of the input weighed from the one before."""
+    stages, weight = 5, 0.5
+    problem = oscillator(horizon=fp.Horizon(stages=stages, step=STEP, terminal=("q",)))
+    assert problem.horizon is not None
+    assert problem.cost is not None
+    [first] = plan_gains(problem, problem.horizon, problem.cost, [0.0], problem.plant.approximate)
+    a, b = model_of_a_stage()
+    u = ca.SX.sym("u", stages)
+    for place, start in enumerate(np.eye(3)):
+        x, before, cost = ca.DM(start[:2]), start[2], ca.SX(0)
+        for k in range(stages):
+            cost += STEP * (1e2 * x[0] ** 2 + x[1] ** 2 + weight * (u[k] - before) ** 2)
+            x, before = ca.DM(a) @ x + ca.DM(b) @ u[k], u[k]
+        cost += STEP * (1e2 * x[0] ** 2 + x[1] ** 2)
+        solver = ca.qpsol(
+            "reference", "qrqp", {"x": u, "f": cost, "g": x[0]}, {"print_iter": False, "print_header": False}
+        )
+        solution = solver(lbg=0, ubg=0)["x"]
+        assert np.hstack([first.state, first.before])[0, place] == pytest.approx(float(solution[0]), rel=1e-3, abs=1e-6)
+
+
+def test_blocks_have_a_feedback():
+    """Held inputs: the plan that holds its input over the whole horizon reacts less than one that is free."""
+    free = oscillator(cost=fp.Quadratic(states={"q": 1e2, "q'": 1.0}, effort={"u": 1e-3}))
+    blocked = replace(free, horizon=fp.Horizon(stages=60, step=STEP, blocks=(60,)))
+    assert about(answers(blocked, PLAIN), "horizon long").numbers["change"] > 0
+    for problem in (free, blocked):
+        assert problem.horizon is not None
+        assert problem.cost is not None
+    sizes = [
+        np.linalg.norm(plan_gains(p, p.horizon, p.cost, [0.0], p.plant.approximate)[0].state) for p in (free, blocked)
+    ]
+    assert sizes[1] < 0.5 * sizes[0]

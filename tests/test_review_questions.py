@@ -1,0 +1,156 @@
+"""Questions of a review that are files of their own: wrong parameters that nothing corrects, limits that the reference leaves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import abroad
+import casadi as ca
+import pytest
+
+import fpirhc as fp
+
+
+def answer(problem: fp.Problem, controllers: dict[str, fp.Controller], words: str) -> fp.Answer | None:
+    """The answer to the one question with these words; None where it is not asked."""
+    every = fp.review(problem, controllers, mismatch=0.0, seed=0).answers
+    return next((a for a in every if words in a.question), None)
+
+
+# Parameters
+
+
+def servo() -> fp.Problem:
+    """A motor that turns a load over a shaft; load and friction are wrong in the model, and the motor is controlled."""
+    return abroad.load("flexible_servo").problem
+
+
+ADAPTIVE = fp.ComputedTorque(fp.Exponential(rate=2.0), fp.Sigmoid(gain=-0.5, scale=50.0))
+
+
+def test_parameters_out_of_reach_are_named():
+    """The motor's response has neither the load's inertia nor its friction: a no that names both."""
+    one = answer(servo(), {"it": ADAPTIVE}, "reach the wrong parameters")
+    assert one is not None
+    assert (one.verdict, one.numbers["reached"]) == ("no", 0.0)
+    assert one.evidence == "the response does not depend on J_L, b_L"
+    assert "nothing to correct" in one.change
+
+
+def test_parameters_in_reach_have_their_effect():
+    """A stiffness 10 % wrong as well: 128.02 N m/rad of the twist / 20 / 0.5 kg m2 are felt, the load is not."""
+    problem = servo()
+    stiffness = fp.Parameter(approximate=0.9 * 1280.2, exact=1280.2, unit="N m/rad")
+    plant = replace(problem.plant, parameters=problem.plant.parameters | {"k": stiffness})
+    problem = replace(problem, plant=plant, reference=fp.Trajectory(lambda t: {"load": 0.1 * t, "motor": 2 * t + 1.0}))
+    one = answer(replace(problem, judged=("motor", "load")), {"it": ADAPTIVE}, "reach the wrong parameters")
+    assert one is not None
+    assert one.verdict == "unknown"
+    assert one.numbers["effect_k"] == pytest.approx(128.02 / 20 * (1.0 / 20) / 0.5)
+    assert one.evidence.endswith("the response does not depend on J_L, b_L")
+
+
+def test_a_right_model_has_nothing_out_of_reach():
+    """The exact model with the same deformation; without a deformation the question has no meaning."""
+    words = "reach the wrong parameters"
+    exact = answer(servo(), {"it": fp.ExactModel(ADAPTIVE)}, words)
+    assert exact is not None
+    assert (exact.verdict, exact.numbers["wrong"]) == ("yes", 0.0)
+    assert answer(servo(), {"it": replace(ADAPTIVE, deformation=fp.Identity())}, words) is None
+
+
+# Limits
+
+
+def mass(amplitude: float = 0.5, **limits: Any) -> fp.Problem:
+    """2 kg along A sin t with a plan; the force that this needs is -2 A sin t."""
+    plant = fp.Plant(
+        coordinates={"q": "m"},
+        inputs={"u": "N"},
+        parameters={"m": fp.Parameter(2.0, 2.0, "kg")},
+        response=lambda q, v, u, p: {"q": u.u / p.m},
+    )
+    return fp.Problem(
+        plant,
+        fp.Trajectory(lambda t: {"q": amplitude * ca.sin(t)}),
+        start={"q": 0.0, "q'": amplitude},
+        period=0.1,
+        duration=10.0,
+        limits=fp.Limits(**limits),
+        horizon=fp.Horizon(stages=10, step=0.1),
+        cost=fp.Quadratic(states={"q": 1.0}, effort={"u": 1e-3}),
+    )
+
+
+POWER = fp.PathConstraint(lambda view: view.input.u * view.state["q'"], lower=-0.2, upper=0.2, unit="W")
+KEEPS = "keep the limits of states"
+
+
+@pytest.mark.parametrize(
+    ("limits", "verdict"),
+    [
+        ({"states": {"q": (-0.6, 0.6)}}, "yes"),
+        ({"states": {"q": (-0.4, 0.6)}}, "no"),
+        ({"states": {"q": (-0.4, 0.6)}, "soft": {"q": 10.0}}, "unknown"),
+        ({"states": {"q": (-0.4, 0.6)}, "prices": {"q": 10.0}}, "unknown"),
+        ({"rates": {"u": (-1.2, 1.2)}}, "yes"),
+        ({"rates": {"u": (-0.8, 0.8)}}, "no"),
+        ({"paths": {"power": replace(POWER, lower=-0.3, upper=0.3)}}, "yes"),
+        ({"paths": {"power": POWER}}, "no"),
+    ],
+)
+def test_limits_that_the_reference_leaves(limits, verdict):
+    """The position reaches 0.5 m, the force changes by 1 N/s, the power by 0.25 W: -2 A^2 sin t cos t."""
+    one = answer(mass(**limits), {}, KEEPS)
+    assert one is not None
+    assert one.verdict == verdict
+    assert bool(one.change) == (verdict != "yes")
+
+
+def test_limits_that_are_touched_are_not_covered():
+    """At rest on the limit: the linear loop leaves it out, which is no yes."""
+    one = answer(mass(0.0, states={"q": (0.0, 1.0)}), {}, KEEPS)
+    assert one is not None
+    assert (one.verdict, one.numbers["room_q"]) == ("unknown", 0.0)
+
+
+def test_limits_inside_leave_the_linear_loop_known():
+    """State, rate and path limits that do not bind: no answer is unknown for their sake."""
+    limits = {
+        "states": {"q": (-1.0, 1.0)},
+        "rates": {"u": (-9.0, 9.0)},
+        "paths": {"power": replace(POWER, lower=-9.0, upper=9.0)},
+    }
+    plain = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3))
+    for words in ("rate x period", "margin", "horizon long", KEEPS):
+        one = answer(mass(**limits), {"it": plain}, words)
+        assert one is not None
+        assert "known" not in one.evidence
+        assert one.verdict != "unknown" or words == "horizon long"
+
+
+def test_without_such_limits_the_question_is_not_asked():
+    """Inputs have a question of their own."""
+    assert answer(mass(inputs={"u": (-2.0, 2.0)}), {}, KEEPS) is None
+
+
+# Reasons
+
+
+def test_a_learning_controller_has_a_reason_that_is_about_it():
+    """No list of a linearised plant's entries, and no name that the user should have meant."""
+    task = fp.load_problem("planar_arm")
+    one = answer(task.problem, {"AID": task.controllers["AID"]}, "margin")
+    assert one is not None
+    assert one.evidence == (
+        "no linear loop: AdaptiveInverseDynamics learns parameters by name, which a linearised plant does not have"
+    )
+
+
+def test_advice_for_a_controller_without_a_map_names_no_gain():
+    """A plan with small margins has no gain of a map that could be lowered."""
+    task = fp.load_problem("delayed_tanks")
+    one = answer(task.problem, {"RHC": task.controllers["RHC"]}, "margin")
+    assert one is not None
+    assert (one.verdict, one.change) == ("unknown", "Lower the rate, or weigh the inputs more.")
