@@ -128,6 +128,11 @@ class OptimalControl:
         return np.isinf(self.state_price)
 
     @property
+    def time_unit(self) -> str:
+        """Unit of time."""
+        return self.data["time"].entry_units[0]
+
+    @property
     def bounds_states(self) -> bool:
         """Whether some state is bounded."""
         return bool(np.isfinite(self.state_lower).any() or np.isfinite(self.state_upper).any())
@@ -140,7 +145,7 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
     """
     free = (scalar("free"),) if horizon.blocks else ()
     signals = (
-        scalar("time", "s"),
+        plant.time,
         Signal("reference", plant.state.elements, plant.state.units),
         Signal("feedforward", plant.input.elements, plant.input.units),
         plant.parameter,

@@ -55,7 +55,7 @@ class Plan:
             ("cost", f"{self.cost:.7g}"),
             ("stationarity", number(self.stationarity)),
             ("feasibility", number(self.feasibility)),
-            ("stages", f"{self.problem.stages} of {self.problem.step:g} s"),
+            ("stages", f"{self.problem.stages} of {self.problem.step:g} {self.problem.time_unit}"),
             ("iterations", f"{steps} in {self.calls} calls"),
         ]
 

@@ -18,6 +18,7 @@ from fpirhc.simulation.drawing import (
     literal,
     new_figure,
     thinned,
+    time_label,
 )
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
         unit = plant.state.units[k] if is_state else plant.input.units[k - plant.state.size]
         axis.set_ylabel(literal(f"{name} [{unit}]"))
     draw_legend(axes[0])
-    axes[-1].set_xlabel("time [s]")
+    axes[-1].set_xlabel(literal(f"time [{problem.time_unit}]"))
     return figure
 
 
@@ -124,7 +125,7 @@ def lyapunov_figure(comparison: Comparison) -> Figure | None:
         times = entry.run.period * np.arange(values.size)
         axis.semilogy(thinned(times), thinned(values), color=color, lw=1, label=literal(entry.name))
         axis.axhline(max(0.5 * view.bound**2, 1e-20), color=color, lw=0.8, ls="--")
-    axis.set_xlabel("time [s]")
+    axis.set_xlabel(time_label(views[0][0].run))
     axis.set_ylabel("V")
     axis.grid(visible=True, alpha=0.25)
     draw_legend(axis)
@@ -157,7 +158,7 @@ def _draw_trajectory(axis: Axes, run: Run) -> None:
     for k, name in enumerate(run.layout["error"].elements):
         draw_line(axis, run, f"reference.{name}", f"{name} nominal", PALETTE[k], "--")
         draw_line(axis, run, f"state.{name}", f"{name} realised", PALETTE[k])
-    axis.set_xlabel("time [s]")
+    axis.set_xlabel(time_label(run))
 
 
 def _draw_phase(axis: Axes, run: Run) -> None:
@@ -175,18 +176,18 @@ def _draw_phase(axis: Axes, run: Run) -> None:
 def _draw_error(axis: Axes, run: Run) -> None:
     for k, name in enumerate(run.layout["error"].elements):
         draw_line(axis, run, f"error.{name}", name, PALETTE[k])
-    axis.set_xlabel("time [s]")
+    axis.set_xlabel(time_label(run))
 
 
 def _draw_command(axis: Axes, run: Run) -> None:
     for k, name in enumerate(run.layout["command"].elements):
         draw_line(axis, run, f"command.{name}", name, PALETTE[k])
-    axis.set_xlabel("time [s]")
+    axis.set_xlabel(time_label(run))
 
 
 def _draw_responses(axis: Axes, run: Run) -> None:
     draw_responses(axis, run, run.layout["desired"].elements[0])
-    axis.set_xlabel("time [s]")
+    axis.set_xlabel(time_label(run))
 
 
 def _draw_factor(axis: Axes, entries: list[Entry]) -> None:

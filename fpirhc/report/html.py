@@ -96,7 +96,7 @@ def _table(comparison: Comparison) -> str:
     marked = ", ".join(
         dict.fromkeys(c.metric.heading for c in shown if c.metric.headline and c.metric.better != "neither")
     )
-    caption = f"Errors, effort and cost from t = {comparison.measure_from:g} s on; seed {comparison.seed}."
+    caption = f"Errors, effort and cost from t = {comparison.measure_from:g} {comparison.time_unit} on; seed {comparison.seed}."
     return (
         f"<section><h2>Controllers</h2><p>{caption} Marked are the best of: {_text(marked)}.</p>"
         f"<div class='scroll'><table><thead><tr>"

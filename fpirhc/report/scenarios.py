@@ -108,7 +108,7 @@ def _table(comparison: ScenarioComparison) -> str:
 def _conditions(comparison: ScenarioComparison) -> str:
     return (
         f"{comparison.count} scenarios of seed {comparison.seed}, exact parameters within {comparison.percent:g} % of the "
-        f"problem's, errors from t = {comparison.measure_from:g} s on."
+        f"problem's, errors from t = {comparison.measure_from:g} {comparison.time_unit} on."
     )
 
 

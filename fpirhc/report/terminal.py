@@ -119,7 +119,9 @@ def _table(comparison: Comparison) -> Table:
     table = Table(
         box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
-        title=literal(f"{comparison.problem}, from t = {comparison.measure_from:g} s, seed {comparison.seed}"),
+        title=literal(
+            f"{comparison.problem}, from t = {comparison.measure_from:g} {comparison.time_unit}, seed {comparison.seed}"
+        ),
     )
     table.add_column("controller", min_width=16)
     shown = columns([e.metrics for e in comparison.entries], headline=True)

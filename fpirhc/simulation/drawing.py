@@ -36,6 +36,11 @@ def literal(text: str) -> str:
     return printable(text).replace("$", r"\$")
 
 
+def time_label(run: Run) -> str:
+    """Return the label of a time axis: 'time [s]'."""
+    return literal(f"time [{run.time_unit}]")
+
+
 def draw_bands(axis: Axes, run: Run) -> None:
     """Draw time slots as shaded bands, named in the legend."""
     named: set[int] = set()

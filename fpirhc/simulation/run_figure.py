@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from fpirhc.simulation.drawing import PALETTE, draw_bands, draw_legend, draw_line, draw_responses, new_figure
+from fpirhc.simulation.drawing import (
+    PALETTE,
+    draw_bands,
+    draw_legend,
+    draw_line,
+    draw_responses,
+    new_figure,
+    time_label,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,5 +37,5 @@ def run_figure(run: Run) -> Figure:
         draw_bands(axis, run)
         axis.set_ylabel(what)
         draw_legend(axis)
-    axes[3].set_xlabel("time [s]")
+    axes[3].set_xlabel(time_label(run))
     return figure

@@ -175,7 +175,7 @@ def _run_chunks(
         bad = _first_bad(rows)
         if bad is not None:
             row, column = bad
-            return log[: at + row].copy(), _why(trace, at + row, column, problem.period)
+            return log[: at + row].copy(), _why(trace, at + row, column, problem)
         evaluator.arguments[0][:] = evaluator.results[0].reshape(CHUNK, start.size)[-1]
         if progress:
             progress(at + rows.shape[0], cycles)
@@ -195,8 +195,8 @@ def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:
     return row, int(np.argmin(finite[row]))
 
 
-def _why(trace: Layout, cycle: int, column: int, period: float) -> str:
+def _why(trace: Layout, cycle: int, column: int, problem: Problem) -> str:
     return (
-        f"signal '{trace.columns[column]}' is not finite at t = {cycle * period:g} s (cycle {cycle}); "
+        f"signal '{trace.columns[column]}' is not finite at t = {cycle * problem.period:g} {problem.time_unit} (cycle {cycle}); "
         "the run keeps the cycles before it"
     )

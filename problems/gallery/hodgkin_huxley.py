@@ -57,6 +57,7 @@ plant = fp.Plant(
     order=1,
     controlled=("V",),
     response=response,
+    time_unit="ms",
     parameters={
         "C": fp.Parameter(approximate=1.2, exact=1.0, unit="uF/cm^2"),
         "gNa": fp.Parameter(approximate=0.0, exact=120.0, unit="mS/cm^2"),
@@ -102,13 +103,12 @@ tuning = {
     "RHC offset-free": {"estimator.drift.V": fp.LogSpan(1.0, 1e5)},  # mV/ms^1.5
 }
 pictures = (
-    fp.Raster("Spikes", signal="state.V", threshold=-20.0, caption="Where V passes -20 mV upwards.", time="ms"),
+    fp.Raster("Spikes", signal="state.V", threshold=-20.0, caption="Where V passes -20 mV upwards."),
     fp.OverTime(
         "Voltage and current",
         panels=("state.V", "command.I"),
         caption="Dashed: -20 mV, above which a spike is counted, and the largest currents.",
         levels={"state.V": (-20.0,), "command.I": problem.limits.inputs["I"]},
-        time="ms",
         controllers=("CTC", "RHC", "RHC+FPI"),
     ),
     fp.Portrait(

@@ -41,6 +41,7 @@ plant = fp.Plant(
     inputs={"dose": "mg/kg/day"},
     order=2,
     response=response,
+    time_unit="day",
     parameters={
         "growth": fp.Parameter(approximate=1.2 * 0.27, exact=0.27, unit="1/day"),
         "effect": fp.Parameter(approximate=0.8 * 0.0074, exact=0.0074, unit="kg/mg/day"),
@@ -91,6 +92,5 @@ pictures = (
         "Volume and dose",
         panels=(fp.Quantity("volume", "mm^3", lambda run: np.exp(run["state.size"])), "command.dose"),
         levels={"command.dose": (0.0, 20.0)},
-        time="days",
     ),
 )

@@ -41,7 +41,7 @@ function draw(spec) {
   title.textContent = spec.title + " [" + spec.unit + "]";
   box.append(title);
   document.getElementById("charts").append(box);
-  const series = [{ label: "t [s]" }].concat(
+  const series = [{ label: "t [" + DATA.timeUnit + "]" }].concat(
     spec.series.map((s) => ({
       label: s.name,
       stroke: colors[s.name] || RESPONSES[s.name] || ink,

@@ -89,7 +89,7 @@ class Comparison:
         title: its title.
         description: its description.
         seed: of the disturbances and the noise.
-        measure_from: time from which errors count, s.
+        measure_from: time from which errors count.
         entries: the controllers that ran, in order.
         skipped: reasons why controllers were skipped, by name.
         verdict: the verdict in sentences.
@@ -98,6 +98,7 @@ class Comparison:
         settings: settings of the problem.
         elapsed: wall time of the comparison, s.
         pictures: pictures of the problem for the report.
+        time_unit: unit of time of the problem.
     """
 
     problem: str
@@ -113,6 +114,7 @@ class Comparison:
     settings: Mapping[str, Any]
     elapsed: float
     pictures: tuple[Picture, ...] = ()
+    time_unit: str = "s"
 
     def __repr__(self) -> str:
         counts = f"{len(self.entries)} controllers" + (f", {len(self.skipped)} skipped" if self.skipped else "")
@@ -198,6 +200,7 @@ def compare(
         settings=describe(task.problem),
         elapsed=time.perf_counter() - begin,
         pictures=task.pictures,
+        time_unit=task.problem.time_unit,
     )
 
 
