@@ -17,6 +17,7 @@ from fpirhc.simulation.drawing import (
     draw_responses,
     literal,
     new_figure,
+    quantity_label,
     thinned,
     time_label,
 )
@@ -71,9 +72,10 @@ def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
 
 def pair_figures(plain: Entry, adaptive: Entry) -> dict[str, Figure]:
     """Return the pictures of the method's papers as pairs, without adaptivity on the left and with it on the right."""
+    phase = {"Phase trajectories": _draw_phase} if _phase_names(plain.run) else {}
     draws = {
         "Trajectory tracking": _draw_trajectory,
-        "Phase trajectories": _draw_phase,
+        **phase,
         "Tracking error": _draw_error,
         "Command": _draw_command,
         "Second derivatives" if _is_second_order(plain.run) else "Highest derivatives": _draw_responses,
@@ -161,15 +163,19 @@ def _draw_trajectory(axis: Axes, run: Run) -> None:
     axis.set_xlabel(time_label(run))
 
 
+def _phase_names(run: Run) -> list[str]:
+    """The judged coordinates whose first derivative is a state: a coordinate of order one has no phase plane."""
+    return [name for name in run.layout["error"].elements if f"{name}'" in run.layout["state"].elements]
+
+
 def _draw_phase(axis: Axes, run: Run) -> None:
-    states = run.layout["state"].elements
-    for k, name in enumerate(run.layout["error"].elements):
-        if f"{name}'" in states:
-            for signal, style in (("reference", "--"), ("state", "-")):
-                x, y = run[f"{signal}.{name}"], run[f"{signal}.{name}'"]
-                axis.plot(thinned(x), thinned(y), style, color=PALETTE[k], lw=1, label=literal(f"{name} {signal}"))
-    axis.set_xlabel("q")
-    axis.set_ylabel("q'")
+    names = _phase_names(run)
+    for k, name in enumerate(names):
+        for signal, style in (("reference", "--"), ("state", "-")):
+            x, y = run[f"{signal}.{name}"], run[f"{signal}.{name}'"]
+            axis.plot(thinned(x), thinned(y), style, color=PALETTE[k], lw=1, label=literal(f"{name} {signal}"))
+    axis.set_xlabel(quantity_label(run, "state", names))
+    axis.set_ylabel(quantity_label(run, "state", [f"{name}'" for name in names]))
     axis.grid(visible=True, alpha=0.25)
 
 

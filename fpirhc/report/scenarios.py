@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fpirhc.report.page import page, picture, text, write_page
+from fpirhc.report.page import page, picture, text, wide_table, write_page
 from fpirhc.simulation.drawing import PALETTE
 from fpirhc.simulation.metrics.columns import Column
 from fpirhc.studies.scenarios.paired import Summary, percent, signed
@@ -88,7 +88,6 @@ def render_scenarios(comparison: ScenarioComparison) -> str:
 
 def _table(comparison: ScenarioComparison) -> str:
     heads = ["controller", *_heads(comparison), "statuses (cycles)"]
-    columns = "".join(f"<th scope='col'>{text(h)}</th>" for h in heads)
     rows = ""
     for one in comparison.summaries:
         cells = "".join(f"<td>{text(c)}</td>" for c in _cells(comparison, one))
@@ -101,7 +100,7 @@ def _table(comparison: ScenarioComparison) -> str:
         )
     return (
         f"<section><h2>Controllers</h2><p>{text(_conditions(comparison))} {text(_MEANING)}</p>"
-        f"<div class='scroll'><table><thead><tr>{columns}</tr></thead><tbody>{rows}</tbody></table></div></section>"
+        f"{wide_table(heads, rows, 'controllers and their metrics')}</section>"
     )
 
 

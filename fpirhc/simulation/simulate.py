@@ -128,13 +128,13 @@ def simulate(
         problem: the task.
         controller: its automatic settings are chosen here.
         seed: of the noise of disturbances and sensors.
-        name: of the controller in the results; '': the name of its class.
+        name: of the controller in the results; '': its name in the task from which it comes, else the name of its class.
         compiled: whether the loop is compiled to C where there is a compiler.
         flags: for the compiler, after its usual ones.
         progress: called with (cycles done, cycles in all).
     """
     ready = simulator(problem, controller, compiled=compiled, flags=flags)
-    run = ready.run(seed=seed, name=name or type(ready.controller).__name__, progress=progress)
+    run = ready.run(seed=seed, name=name or controller.label or type(controller).__name__, progress=progress)
     judged = judgements(problem, ready.controller, run.layout, run.log)
     log = np.hstack([run.log, *(values for _, values in judged)])
     log.setflags(write=False)
