@@ -117,8 +117,9 @@ def task(plant: fp.Plant, adaptive: int) -> Task:
 
 
 @pytest.fixture(scope="session")
-def reports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def reports(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Pages by name: ten controllers, two controllers on a plant of order one, scenarios."""
+    del browser  # pages are made only where there is one
     folder = tmp_path_factory.mktemp("reports")
     many, few = task(linear(1.6, 1.0), 9), task(chain(1), 1)
     paths = {name: folder / f"{name}.html" for name in ("many", "order_one", "scenarios")}
