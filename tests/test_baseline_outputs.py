@@ -41,7 +41,7 @@ def test_an_outline_groups_by_controller_and_knows_what_changed():
     assert [one.holds for one in EVERY.sections] == [True, False, False, False]
     assert [one.unclear for one in EVERY.sections] == [False, False, True, True]
     assert bad.headline == "bad: 2 of 4 metrics changed"
-    assert bad.lines[2].sentence == "RHC+FPI: effort.u was 1, is 2 (\u00b1 0.1): worse"
+    assert bad.lines[2].sentence == "RHC+FPI: effort.u was 1, is 2 (+100 %, band \u00b1 0.1): worse"
     assert bad.lines[3].sentence == "PID: outcome was finished, is ended early: changed"
 
 

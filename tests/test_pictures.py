@@ -52,15 +52,13 @@ ENERGY = fp.Quantity("energy", "J", lambda run: 0.5 * (run["state.q"] ** 2 + run
 def test_a_line_over_time_is_the_signal(runs):
     """One panel per signal, one line per run, with its numbers; levels are horizontal lines; times in the problem's unit."""
     figure = Figure()
-    fp.OverTime("t", panels=("command.u", ENERGY), levels={"energy": (3.0,)}, time="days", since=0.25).draw(
-        figure, runs
-    )
+    fp.OverTime("t", panels=("command.u", ENERGY), levels={"energy": (3.0,)}, since=0.25).draw(figure, runs)
     upper, lower = figure.axes
     np.testing.assert_array_equal(upper.lines[1].get_ydata(), runs["quick"]["command.u"][250:])
     np.testing.assert_array_equal(lower.lines[0].get_ydata(), ENERGY.values(runs["slow"])[250:])
     assert np.asarray(lower.lines[2].get_ydata())[0] == 3.0
     assert (upper.get_ylabel(), lower.get_ylabel()) == ("u [N]", "energy [J]")
-    assert lower.get_xlabel() == "time [days]"
+    assert lower.get_xlabel() == "time [s]"
 
 
 def test_an_alternating_command_is_drawn_as_wide_as_it_is():
@@ -87,7 +85,7 @@ def test_a_portrait_has_a_panel_for_each_run(runs):
 def test_a_raster_counts_passages_upwards(runs):
     """Two sines pass half their height twice upwards; a signal that begins above has not passed."""
     figure = Figure()
-    fp.Raster("r", signal="reference.q", threshold=0.5, time="ms").draw(figure, runs)
+    fp.Raster("r", signal="reference.q", threshold=0.5).draw(figure, runs)
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ["slow (2)", "quick (2)"]
     times = np.arange(6.0)
     np.testing.assert_array_equal(passages(times, np.array([2.0, 0, 2, 2, 1, 3]), 1.0), [2.0, 5.0])

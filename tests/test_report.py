@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
 import re
 from dataclasses import replace
@@ -78,7 +80,7 @@ def test_hostile_names_are_only_text(comparison):
     """Names from a problem file never become markup or code."""
     page = render(comparison)
     assert "<script>alert" not in page
-    assert page.count("</script>") == 2
+    assert page.count("</script>") == 3
     assert "&lt;script&gt;alert" in page
 
 
@@ -152,5 +154,25 @@ def test_folder_that_cannot_be_written(comparison, tmp_path):
 def test_run_draws_itself(comparison):
     """plot() returns a figure with its four panels."""
     figure = comparison["plain"].run.plot()
-    assert [a.get_ylabel() for a in figure.axes] == ["error", "position", "command", "responses of y"]
+    assert [a.get_ylabel() for a in figure.axes] == ["error of y [m]", "y [m]", "u [N]", "responses of y [m/s^2]"]
     assert np.isfinite(figure.axes[0].get_ylim()).all()
+
+
+def policy(page: str) -> str:
+    """The content security policy of a page."""
+    match = re.search(r'<meta http-equiv="Content-Security-Policy" content="([^"]*)">', page)
+    assert match
+    return match[1]
+
+
+def test_page_states_a_policy_that_allows_its_own_scripts_alone(comparison):
+    """Every script is named by its hash, no source elsewhere is allowed, and the policy stands before all scripts."""
+    page = render(comparison)
+    rules = dict(rule.strip().split(" ", 1) for rule in policy(page).split(";"))
+    scripts = re.findall(r"<script>(.*?)</script>", page, flags=re.DOTALL)
+    hashes = [f"'sha256-{base64.b64encode(hashlib.sha256(s.encode()).digest()).decode()}'" for s in scripts]
+    assert rules["script-src"].split() == hashes
+    assert rules["default-src"] == rules["base-uri"] == rules["form-action"] == "'none'"
+    assert rules["img-src"] == "data:"
+    assert "http" not in policy(page)
+    assert page.index("Content-Security-Policy") < page.index("<script")

@@ -88,7 +88,8 @@ def test_an_integral_that_is_judged_is_not_called_stable():
 
 def test_times_have_the_unit_of_the_problem():
     """Rates, delays and horizons of a problem in minutes are in minutes."""
-    problem = companion(-0.5, time_unit="min")
+    problem = companion(-0.5)
+    problem = replace(problem, plant=replace(problem.plant, time_unit="min"))
     every = fp.review(problem, {"it": LAW}, mismatch=0.0, seed=0).answers
     text = " ".join(a.evidence for a in every)
     assert "0.4 min" in text
@@ -107,6 +108,7 @@ def tissue(invented: float, **settings: Any) -> fp.Problem:
         inputs={"u": "mg/l/h"},
         order=1,
         controlled=("y",),
+        time_unit="h",
         parameters={"a": fp.Parameter(1.5, 1.0, "1/h"), "k": fp.Parameter(1.0, 0.5, "1/h")},
         response=lambda q, u, p: {"y": u.u - p.a * q.y + q.z, "z": p.k * (q.y - q.z)},
     )
@@ -115,7 +117,6 @@ def tissue(invented: float, **settings: Any) -> fp.Problem:
         "start": {"y": 2.0, "z": 0.0},
         "period": 0.02,
         "duration": 12.0,
-        "time_unit": "h",
     }
     return fp.Problem(plant=plant, **(usual | settings))
 

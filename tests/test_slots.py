@@ -482,7 +482,7 @@ SCHEDULES = {
         fp.Periodic({"cart": -1.0, "angle": 1e-3, "angel": 1.0}),
         [
             "coordinate 'angel' is unknown. Did you mean 'angle'?",
-            "duration of 'cart' must be a positive number of seconds, got -1.0",
+            "duration of 'cart' must be a positive number, in s, got -1.0",
             "duration of 'angle' is 0.001 s, shorter than one control cycle of 0.005 s",
         ],
     ),
@@ -492,7 +492,7 @@ SCHEDULES = {
             "weight of coordinate 'angel' is unknown. Did you mean 'angle'?",
             "the weight of 'cart' must be a positive number, got 0.0",
             "the weight of 'angle' must be a positive number, got None",
-            "dwell must be a positive number of seconds, got 0.0",
+            "dwell must be a positive number, in s, got 0.0",
             "hysteresis must be a number of at least 0, got -1.0",
         ],
     ),

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeGuard
 
 from fpirhc.baselines.bands import Expected, Metric
 from fpirhc.baselines.baseline import Baseline
@@ -15,6 +16,7 @@ from fpirhc.simulation import metrics as run_metrics
 
 HOLDS, BETTER, WORSE, CHANGED, GONE, NEW = "holds", "better", "worse", "changed", "gone", "new"
 OUTCOME = "outcome"
+NOTABLE = 1e-3  # share of the old value from which a change is called better or worse, and not just a change
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,42 @@ class Row:
         """Whether the fresh value is inside the band."""
         return self.verdict == HOLDS
 
+    @property
+    def change(self) -> float | None:
+        """(new - old) / |old|, infinite where the old value is zero; None where there are no two numbers."""
+        if not _is_number(self.old) or not _is_number(self.new):
+            return None
+        difference = self.new - self.old
+        return difference / abs(self.old) if self.old else math.copysign(math.inf, difference) if difference else 0.0
+
+    @property
+    def size(self) -> float:
+        """By which rows are sorted: what is no number counts as the largest change, what holds as none."""
+        if self.holds:
+            return -1.0
+        return math.inf if self.change is None else abs(self.change)
+
+
+def _is_number(value: Number | None) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A setting that is not that of the baseline, so that the baseline cannot judge what depends on it.
+
+    Args:
+        controller: name of the controller that has it; '' for a setting of the problem, on which everything depends.
+        text: the setting, its old and its new value.
+    """
+
+    controller: str
+    text: str
+
+    def explains(self, row: Row) -> bool:
+        """Whether a change of this row can be a consequence."""
+        return not row.holds and self.controller in ("", row.controller)
+
 
 @dataclass(frozen=True)
 class Judgement:
@@ -55,6 +93,7 @@ class Judgement:
         reason: reason of the baseline.
         date: date of the baseline.
         notes: further sentences.
+        causes: settings that are not those of the baseline.
     """
 
     problem: str
@@ -64,6 +103,7 @@ class Judgement:
     reason: str = ""
     date: str = ""
     notes: tuple[str, ...] = ()
+    causes: tuple[Cause, ...] = ()
 
     @property
     def changed(self) -> tuple[Row, ...]:
@@ -95,14 +135,16 @@ def judge(
     rows: list[Row] = []
     for name in names:
         rows += _rows(name, baseline.controllers.get(name), fresh.get(name), metrics)
+    causes = _stale(baseline, settings, list(fresh))
     notes = [f"{name}: {one.why}" for name, one in fresh.items() if one.why] + _old_names(baseline)
     return Judgement(
         baseline.problem,
         tuple(rows),
-        _stale(baseline, settings, list(fresh)),
+        tuple(f"stale: {cause.text}" for cause in causes),
         reason=baseline.reason,
         date=baseline.date,
         notes=tuple(notes),
+        causes=causes,
     )
 
 
@@ -113,13 +155,29 @@ def _old_names(baseline: Baseline) -> list[str]:
     return [f"the baseline has names of an older version and is read with those of today: {names}"]
 
 
-def _stale(baseline: Baseline, settings: Settings, names: Sequence[str]) -> tuple[str, ...]:
-    sentences = differences("problem", baseline.settings.problem, settings.problem)
+def ignoring(judgement: Judgement, share: float) -> Judgement:
+    """Return the judgement in which changes smaller than a share of the old value hold; counts and words never do.
+
+    Args:
+        judgement: the judgement.
+        share: of the old value; 0 ignores nothing.
+    """
+    small = [r for r in judgement.changed if r.band is not None and r.change is not None and abs(r.change) < share]
+    if not small:
+        return judgement
+    rows = tuple(replace(row, verdict=HOLDS) if row in small else row for row in judgement.rows)
+    note = f"{len(small)} changes below {100 * share:g} % are ignored"
+    return replace(judgement, rows=rows, notes=(*judgement.notes, note))
+
+
+def _stale(baseline: Baseline, settings: Settings, names: Sequence[str]) -> tuple[Cause, ...]:
+    causes = [Cause("", text) for text in differences("problem", baseline.settings.problem, settings.problem)]
     for name in names:
         before = baseline.settings.controllers.get(name)
         if before is not None:
-            sentences += differences(f"controller '{name}'", before, settings.controllers[name])
-    return tuple(f"stale: {text}" for text in sentences)
+            texts = differences(f"controller '{name}'", before, settings.controllers[name])
+            causes += [Cause(name, text) for text in texts]
+    return tuple(causes)
 
 
 def _rows(
@@ -165,6 +223,6 @@ def _verdict(better: run_metrics.Better, metric: Metric, fresh: Number | None) -
     # Written as "inside", so that no comparison with a number that is not finite holds.
     if abs(fresh - old) <= metric.band:
         return HOLDS
-    if better == "neither":
+    if better == "neither" or abs(fresh - old) < NOTABLE * abs(old):
         return CHANGED
     return BETTER if (fresh < old) == (better == "smaller") else WORSE

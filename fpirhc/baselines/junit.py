@@ -24,7 +24,9 @@ def _suite(root: Xml.Element, section: Section) -> None:
     suite = Xml.SubElement(root, "testsuite", {"name": section.problem, **{k: str(v) for k, v in counts.items()}})
     if section.unclear:
         case = Xml.SubElement(suite, "testcase", classname=section.problem, name="baseline")
-        Xml.SubElement(case, "error", message=section.headline).text = "\n".join(section.remarks)
+        Xml.SubElement(case, "error", message=section.headline).text = "\n".join(
+            [*(cause.text for cause in section.causes), *section.remarks]
+        )
     for one in section.cases:
         _case(suite, section.problem, one)
 

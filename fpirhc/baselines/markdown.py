@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from fpirhc.baselines.outline import Line, Outline
+from fpirhc.baselines.outline import Folded, Line, Outline
 from fpirhc.baselines.words import HEADS
 
 MARK = "<!-- fpirhc check -->"
@@ -17,20 +17,30 @@ def to_markdown(outline: Outline) -> str:
     parts = [MARK, f"### fpirhc check: {good} of {len(outline.sections)} problems hold", ""]
     for section in outline.sections:
         parts += [f"**{_escaped(section.headline)}**", ""]
-        parts += _table([line for line in section.lines if not line.holds])
+        for cause in section.causes:
+            parts += [f"- {_escaped(cause.text)}", *_folded(cause)]
+        parts += _table([line for line in section.by_size if not line.holds])
         parts += [f"- {_escaped(text)}" for text in section.remarks]
         parts.append("")
     parts += [f"- {_code(name)} is not checked: {_escaped(reason)}" for name, reason in outline.unchecked]
     return "\n".join(parts).rstrip() + "\n"
 
 
+def _folded(cause: Folded) -> list[str]:
+    """The consequences of a setting, which a reader may open."""
+    if not cause.lines:
+        return []
+    summary = f"<details><summary>{len(cause.lines)} metrics changed with it</summary>"
+    return ["", summary, "", *_table(cause.lines), "</details>", ""]
+
+
 def _table(lines: Sequence[Line]) -> list[str]:
     if not lines:
         return []
-    table = ["| " + " | ".join(HEADS) + " |", "| --- | --- | ---: | ---: | ---: | --- |"]
+    table = ["| " + " | ".join(HEADS) + " |", "| --- | --- | --- | ---: | ---: | ---: | ---: |"]
     for line in lines:
-        controller, metric, old, new, band, verdict = line.cells
-        texts = (_code(controller), _code(metric), _escaped(old), _escaped(new), _escaped(band), f"**{verdict}**")
+        controller, metric, verdict, *numbers = line.cells
+        texts = (_code(controller), _code(metric), f"**{verdict}**", *map(_escaped, numbers))
         table.append("| " + " | ".join(texts) + " |")
     return [*table, ""]
 

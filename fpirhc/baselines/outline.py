@@ -25,6 +25,7 @@ class Line:
         holds: whether it holds.
         in_summary: whether a summary shows it.
         sentence: the metric in one sentence.
+        size: of the change, by which lines are sorted.
     """
 
     cells: tuple[str, ...]
@@ -32,6 +33,20 @@ class Line:
     holds: bool
     in_summary: bool
     sentence: str
+    size: float
+
+
+@dataclass(frozen=True)
+class Folded:
+    """A setting that is not that of the baseline, with the changes that can be its consequences.
+
+    Args:
+        text: the setting in one sentence.
+        lines: the changes, the largest first; those of several settings stand under the first one.
+    """
+
+    text: str
+    lines: tuple[Line, ...]
 
 
 @dataclass(frozen=True)
@@ -59,6 +74,7 @@ class Section:
     Args:
         problem: name of the problem.
         headline: one sentence about it.
+        causes: settings that are not those of the baseline.
         cases: its controllers.
         remarks: everything about it that is no metric.
         holds: whether all metrics hold.
@@ -67,6 +83,7 @@ class Section:
 
     problem: str
     headline: str
+    causes: tuple[Folded, ...]
     cases: tuple[Case, ...]
     remarks: tuple[str, ...]
     holds: bool
@@ -76,6 +93,12 @@ class Section:
     def lines(self) -> tuple[Line, ...]:
         """The metrics of all controllers."""
         return tuple(line for case in self.cases for line in case.lines)
+
+    @property
+    def by_size(self) -> tuple[Line, ...]:
+        """The metrics that no setting explains, the largest change first, those that hold last."""
+        folded = {line for cause in self.causes for line in cause.lines}
+        return tuple(sorted((line for line in self.lines if line not in folded), key=lambda line: -line.size))
 
 
 @dataclass(frozen=True)
@@ -104,6 +127,7 @@ def _section(judgement: Judgement) -> Section:
     return Section(
         problem=clean(judgement.problem),
         headline=headline(judgement),
+        causes=tuple(_causes(judgement)),
         cases=tuple(Case(clean(name), tuple(map(_line, own))) for name, own in rows.items()),
         remarks=tuple(remarks(judgement)),
         holds=judgement.holds,
@@ -111,6 +135,17 @@ def _section(judgement: Judgement) -> Section:
     )
 
 
+def _causes(judgement: Judgement) -> list[Folded]:
+    """Every stale setting with its changes; each change stands once, under the first setting that can have caused it."""
+    left, causes = list(judgement.changed), []
+    for cause in judgement.causes:
+        own = [row for row in left if cause.explains(row)]
+        left = [row for row in left if row not in own]
+        lines = tuple(map(_line, sorted(own, key=lambda row: -row.size)))
+        causes.append(Folded(clean(f"stale: {cause.text}"), lines))
+    return causes
+
+
 def _line(row: Row) -> Line:
     summary = not row.holds or row.metric.startswith(_ALWAYS)
-    return Line(cells(row), row.verdict, row.holds, summary, sentence(row))
+    return Line(cells(row), row.verdict, row.holds, summary, sentence(row), row.size)

@@ -55,7 +55,7 @@ def fpirhc_check(request: pytest.FixtureRequest) -> Callable[..., Judgement | No
     def check(problem: str | Path, controller: str | None = None) -> Judgement | None:
         __tracebackhide__ = True
         from fpirhc.baselines.check import check_baseline
-        from fpirhc.baselines.words import headline, remarks, sentence
+        from fpirhc.baselines.words import clean, headline, remarks, sentence
         from fpirhc.problem_files.problem_file import load_problem
 
         path = config.rootpath / problem
@@ -67,7 +67,9 @@ def fpirhc_check(request: pytest.FixtureRequest) -> Callable[..., Judgement | No
             return None
         judgement = check_baseline(task, controllers=names, compiled=compiled)
         if not judgement.holds:
-            lines = [headline(judgement), *map(sentence, judgement.changed), *remarks(judgement)]
+            changed = sorted(judgement.changed, key=lambda row: -row.size)
+            causes = [f"stale: {clean(cause.text)}" for cause in judgement.causes]
+            lines = [headline(judgement), *causes, *map(sentence, changed), *remarks(judgement)]
             pytest.fail("\n".join(lines), pytrace=False)
         return judgement
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from fpirhc.baselines.bands import FACTOR, Metric
 from fpirhc.baselines.baseline import Baseline
-from fpirhc.baselines.outline import Outline
+from fpirhc.baselines.outline import Folded, Outline
 from fpirhc.baselines.words import HEADS, clean, number
+from fpirhc.report.folding import Column, Folding
 
+_NAMED = 3  # consequences of a setting that are named
 _MOSTLY = 0.9  # share of a band; its digits are rounded
 _STYLES = {"holds": "", "better": "bold green", "worse": "bold red"}
 
@@ -25,12 +24,17 @@ def show_check(outline: Outline, every: bool) -> None:
     """
     console = Console()
     for section in outline.sections:
-        lines = [line for line in section.lines if every or line.in_summary]
-        if lines:
-            table = _table(section.problem)
-            for line in lines:
-                table.add_row(*map(Text, line.cells), style=_STYLES.get(line.verdict, "bold yellow"))
-            console.print(table)
+        for cause in section.causes:
+            _say(console, f"{section.problem}: {cause.text}")
+            if cause.lines and not every:
+                _say(console, f"  {_consequences(cause)}")
+        lines = section.by_size if not every else sorted(section.lines, key=lambda line: -line.size)
+        shown = [line for line in lines if every or line.in_summary]
+        if shown:
+            table = Folding(section.problem, [Column(head, head == "verdict") for head in HEADS], names=2)
+            for line in shown:
+                table.add(line.cells, _STYLES.get(line.verdict, "bold yellow"))
+            table.show(console)
         _say(console, section.headline)
         for text in section.remarks:
             _say(console, f"  {text}")
@@ -38,25 +42,31 @@ def show_check(outline: Outline, every: bool) -> None:
         _say(console, f"{name}: not checked ({reason})")
 
 
+def _consequences(cause: Folded) -> str:
+    """How many changes a setting can explain, and the largest of them."""
+    largest = "; ".join(f"{line.cells[0]}: {line.cells[1]} {line.cells[3]}" for line in cause.lines[:_NAMED])
+    more = ", ..." if len(cause.lines) > _NAMED else ""
+    return f"{len(cause.lines)} metrics changed with it ({largest}{more}); --all shows them"
+
+
 def show_baseline(baseline: Baseline, path: str) -> None:
     """Print the metrics of an accepted baseline with their bands; only rms errors and metrics with loose bands."""
     console = Console()
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=Text(f"{clean(baseline.problem)}, baseline"))
-    for head in ("controller", "metric", "value", "band", "made of"):
-        table.add_column(head)
+    heads = ("controller", "metric", "value", "band", "made of")
+    table = Folding(f"{clean(baseline.problem)}, baseline", [Column(head, left=True) for head in heads], names=2)
     loose = []
     for name, one in baseline.controllers.items():
         if not one.metrics:
-            table.add_row(Text(clean(name)), "outcome", Text(clean(" or ".join(one.outcomes))), "", "")
+            table.add([clean(name), "outcome", clean(" or ".join(one.outcomes)), "", ""])
         for metric, value in one.metrics.items():
             if value.loose:
                 loose.append(f"{name}: {metric}")
             if value.loose or metric.startswith("rms_error."):
                 band = f"\u00b1 {value.band:.2g}"
-                table.add_row(Text(clean(name)), Text(clean(metric)), number(value.value), band, _source(value))
+                table.add([clean(name), clean(metric), number(value.value), band, _source(value)])
         for metric, why in one.not_compared.items():
             _say(console, f"not compared: {clean(name)}, {clean(metric)} ({clean(why)})")
-    console.print(table)
+    table.show(console)
     if loose:
         _say(console, f"{len(loose)} bands are wider than half their value, so that most changes stay inside")
     _say(console, f"wrote {clean(path)}")
@@ -67,13 +77,6 @@ def _source(metric: Metric) -> str:
     if FACTOR * metric.widest < _MOSTLY * metric.band:
         return "least width"
     return max(metric.spread, key=lambda s: metric.spread[s])
-
-
-def _table(problem: str) -> Table:
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=Text(problem))
-    for k, head in enumerate(HEADS):
-        table.add_column(head, justify="left" if k in (0, 1, 5) else "right")
-    return table
 
 
 def _say(console: Console, text: str) -> None:

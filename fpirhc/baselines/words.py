@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import unicodedata
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from fpirhc.baselines.judging import OUTCOME, Judgement, Row
 from fpirhc.baselines.measuring import Number
 from fpirhc.errors import OutputError
 
-HEADS = ("controller", "metric", "old", "new", "band", "verdict")
+HEADS = ("controller", "metric", "verdict", "change", "old", "new", "band")
 _UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")  # control, format, surrogate, private, line and paragraph marks
 
 
@@ -29,7 +30,15 @@ def number(value: Number | None) -> str:
 def cells(row: Row) -> tuple[str, ...]:
     """Return the entries of one row, in the order of HEADS."""
     band = "exact" if row.band is None else f"\u00b1 {row.band:.2g}"
-    return clean(row.controller), clean(row.metric), number(row.old), number(row.new), band, row.verdict
+    names = clean(row.controller), clean(row.metric)
+    return *names, row.verdict, change(row.change), number(row.old), number(row.new), band
+
+
+def change(share: float | None) -> str:
+    """Return a change in percent of the old value."""
+    if share is None:
+        return "-"
+    return f"{100 * share:+.3g} %" if math.isfinite(share) else "from zero"
 
 
 def headline(judgement: Judgement) -> str:
@@ -48,7 +57,7 @@ def headline(judgement: Judgement) -> str:
 
 def remarks(judgement: Judgement) -> list[str]:
     """Return everything about a problem that is no row: why it cannot be judged, why runs ended, and what to do."""
-    texts = [clean(text) for text in (judgement.broken, *judgement.unusable, *judgement.notes) if text]
+    texts = [clean(text) for text in (judgement.broken, *_unusable(judgement), *judgement.notes) if text]
     if judgement.changed or any(text.startswith("stale") for text in judgement.unusable):
         texts.append(
             f"baseline of {clean(judgement.date)}: {clean(judgement.reason)}. If the new numbers are right: "
@@ -57,10 +66,15 @@ def remarks(judgement: Judgement) -> list[str]:
     return texts
 
 
+def _unusable(judgement: Judgement) -> list[str]:
+    """Reasons why nothing can be concluded, without the settings that changed: those stand first, with their consequences."""
+    return [text for text in judgement.unusable if text not in {f"stale: {cause.text}" for cause in judgement.causes}]
+
+
 def sentence(row: Row) -> str:
     """Return one comparison as a line of plain text."""
-    controller, metric, old, new, band, verdict = cells(row)
-    within = "" if row.metric == OUTCOME else f" ({band})"
+    controller, metric, verdict, percent, old, new, band = cells(row)
+    within = "" if row.metric == OUTCOME else f" ({band})" if row.change is None else f" ({percent}, band {band})"
     return f"{controller}: {metric} was {old}, is {new}{within}: {verdict}"
 
 

@@ -34,7 +34,7 @@ def controller_reads(problem: Problem, controller: Controller) -> Layout:
     """Return what a controller reads in every cycle: time, state, realised response, parameters."""
     plant, response = problem.plant, controller.response(problem)
     realised = response.signal if response else plant.response_signal("realised")
-    return Layout((scalar("time", "s"), plant.state, realised, plant.parameter))
+    return Layout((plant.time, plant.state, realised, plant.parameter))
 
 
 def compose_controller(problem: Problem, controller: Controller, *, ahead: bool = False) -> Composite:
@@ -88,7 +88,7 @@ def reference_block(problem: Problem) -> Block:
             "error": state[places] - s.state[places],
         }
 
-    reads = Layout((scalar("time", "s"), plant.state))
+    reads = Layout((plant.time, plant.state))
     writes = (
         like(plant.state, "reference"),
         plant.response_signal("_reference_response"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
@@ -93,9 +94,18 @@ class Controller(ABC):
         deformation: Deformation
         inner = None
 
+    label: str = ""
+    """Name under which a loaded task has the controller, for results; it is no setting."""
+
     @abstractmethod
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks of one control cycle, from (time, state, realised, parameters) to 'command', and what they remember."""
+
+    def labelled(self, name: str) -> Self:
+        """Return the same controller with a name for results."""
+        other = copy(self)
+        object.__setattr__(other, "label", name)
+        return other
 
     def around(self, inner: Controller) -> Self:
         """Return the same wrapper around another controller.

@@ -125,7 +125,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     solve = optimiser.step(ocp)
     feedforward_of = _feedforward(problem)
     reads = (
-        scalar("time", "s"),
+        plant.time,
         like(plant.state, "_plan_state"),
         plant.parameter,
         like(plant.input, "_command_shift_last"),

@@ -42,10 +42,13 @@ class ConstraintState:
 
 
 def rates(limits: Limits, plant: Plant, view: View, step: float) -> list[ConstraintState]:
-    """Change of inputs per second, (u_i - u_{i-1}) / step, for inputs with a limited rate."""
+    """Change of inputs per unit of time, (u_i - u_{i-1}) / step, for inputs with a limited rate."""
     return [
         ConstraintState(
-            f"{name} rate", f"{plant.inputs[name]}/s", (view.input[name] - view.input_before[name]) / step, *bounds
+            f"{name} rate",
+            plant.derivative_unit(plant.inputs[name], 1),
+            (view.input[name] - view.input_before[name]) / step,
+            *bounds,
         )
         for name, bounds in limits.rates.items()
     ]

@@ -140,6 +140,11 @@ class OptimalControl:
         return np.isinf(self.state_price)
 
     @property
+    def time_unit(self) -> str:
+        """Unit of time."""
+        return self.data["time"].entry_units[0]
+
+    @property
     def bounds_states(self) -> bool:
         """Whether some state is bounded."""
         return bool(np.isfinite(self.state_lower).any() or np.isfinite(self.state_upper).any())
@@ -155,7 +160,7 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
     names = tuple(horizon.margins)
     margin = (Signal("margin", names, tuple(units[e] for e in names)),) if names else ()
     signals = (
-        scalar("time", "s"),
+        plant.time,
         Signal("reference", plant.state.elements, plant.state.units),
         Signal("feedforward", plant.input.elements, plant.input.units),
         plant.parameter,

@@ -57,7 +57,7 @@ class Plan:
             ("cost", _shown(self.cost, lambda v: f"{v:.7g}")),
             ("stationarity", _shown(self.stationarity, number)),
             ("feasibility", _shown(self.feasibility, number)),
-            ("stages", f"{self.problem.stages} of {self.problem.step:g} s"),
+            ("stages", f"{self.problem.stages} of {self.problem.step:g} {self.problem.time_unit}"),
             ("iterations", f"{steps} in {self.calls} calls"),
         ]
 

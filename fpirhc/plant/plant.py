@@ -7,13 +7,16 @@ derivatives, the inputs u and the parameters p,
 
 The controller computes with the approximate parameters, and the simulated plant moves with the exact ones. The state vector is
 derivative-major: all q, then the q' of the coordinates with order >= 2, and so on; its entries are named q1, q1', q1''.
+
+The plant names the unit of time. Every time and rate of a problem (its period, a tracking law's rate) is in this unit; the numbers
+themselves are not converted anywhere.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import casadi as ca
@@ -24,7 +27,7 @@ from fpirhc.plant.inverse import inverse_by_newton, inverse_by_user, inverse_of_
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_response
 from fpirhc.plant.structural_order import structural_order
-from fpirhc.symbolic.layout import Expression, Named, Signal, vector
+from fpirhc.symbolic.layout import Expression, Named, Signal, scalar, vector
 
 __all__ = ["Parameter", "Plant", "derivative_unit", "structural_order"]
 
@@ -45,6 +48,7 @@ class Plant:
         inverse: optional function of (q, q', ..., r, p) that returns {input: command} for wanted responses r of the
             controlled coordinates. None: the inverse is derived where the response is affine in the inputs, and computed by
             Newton's method otherwise.
+        time_unit: unit of time of the equations ('s', 'ms', 'day'), and so of every time and rate of the problem.
 
     Raises:
         InvalidProblem: all mistakes together.
@@ -57,6 +61,7 @@ class Plant:
     order: int | Mapping[str, int] = 2
     controlled: Sequence[str] | None = None
     inverse: Callable[..., Mapping[str, Expression]] | None = None
+    time_unit: str = field(default="s", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("plant")
@@ -85,7 +90,7 @@ class Plant:
             for c, r in zip(self.names, self.orders, strict=True):
                 if r > k:
                     names.append(c + "'" * k)
-                    units.append(derivative_unit(self.coordinates[c], k))
+                    units.append(self.derivative_unit(self.coordinates[c], k))
         return vector("state", names, units)
 
     @cached_property
@@ -120,9 +125,18 @@ class Plant:
         return tuple(self.names.index(c) for c in self.controlled_names)
 
     @cached_property
+    def time(self) -> Signal:
+        """The time's signal."""
+        return scalar("time", self.time_unit)
+
+    def derivative_unit(self, unit: str, derivative: int) -> str:
+        """Return the unit of a time derivative of a quantity in `unit`."""
+        return derivative_unit(unit, derivative, self.time_unit)
+
+    @cached_property
     def response_units(self) -> tuple[str, ...]:
         """Units of the highest derivative of every coordinate."""
-        return tuple(derivative_unit(u, r) for u, r in zip(self.coordinates.values(), self.orders, strict=True))
+        return tuple(self.derivative_unit(u, r) for u, r in zip(self.coordinates.values(), self.orders, strict=True))
 
     def response_signal(self, name: str) -> Signal:
         """Return a signal that holds a highest derivative of every controlled coordinate."""
@@ -239,8 +253,8 @@ class Plant:
         return Named(tuple(self.parameters), p, "parameter")
 
 
-def derivative_unit(unit: str, derivative: int) -> str:
-    """Return the unit of a time derivative: 'm' -> 'm/s' -> 'm/s^2'."""
+def derivative_unit(unit: str, derivative: int, time: str = "s") -> str:
+    """Return the unit of a time derivative, with the unit of time: 'm' -> 'm/s' -> 'm/s^2'."""
     if derivative == 0:
         return unit
-    return f"{unit}/s" if derivative == 1 else f"{unit}/s^{derivative}"
+    return f"{unit}/{time}" if derivative == 1 else f"{unit}/{time}^{derivative}"

@@ -26,6 +26,10 @@ def check_names(plant: Plant, mistakes: Mistakes) -> None:
                 mistakes.add(f"{what}: '{name}' has no unit; write {{'{name}': 'm'}} (or '1' for none)")
             if not str(name).isidentifier():
                 mistakes.add(f"{what}: '{name}' is not an identifier; use letters, digits and underscores")
+    if not isinstance(plant.time_unit, str) or not plant.time_unit:
+        mistakes.add(
+            f"time_unit is {plant.time_unit!r}; write the unit of time of the equations, such as 's', 'ms' or 'day'"
+        )
     every = [*plant.coordinates, *plant.inputs]
     for name in sorted({n for n in every if every.count(n) > 1}):
         mistakes.add(f"'{name}' names both a coordinate and an input; rename one")

@@ -228,7 +228,14 @@ def _with_theta(regressor: Regressor) -> Plant:
         forces = regressor.force_function(ca.vertcat(q.vector, v.vector), r.vector, theta, known)
         return dict(zip(plant.inputs, ca.vertsplit(forces), strict=True))
 
-    return Plant(plant.coordinates, plant.inputs, {**regressor._own, **others}, response, inverse=inverse)
+    return Plant(
+        plant.coordinates,
+        plant.inputs,
+        {**regressor._own, **others},
+        response,
+        inverse=inverse,
+        time_unit=plant.time_unit,
+    )
 
 
 def _check_plant(plant: Plant) -> None:

@@ -16,7 +16,7 @@ from functools import cached_property
 import casadi as ca
 
 from fpirhc.errors import InvalidName, NotInvertible, nearest
-from fpirhc.plant.plant import Plant, derivative_unit
+from fpirhc.plant.plant import Plant
 from fpirhc.plant.structural_order import structural_order
 
 
@@ -29,6 +29,7 @@ class OutputChain:
         input: name of the input.
         unit: of the coordinate.
         order: the relative order r.
+        response_unit: of y^(r).
         states: Function (state, parameters) -> (y, y', ..., y^(r-1)), shape (r,).
         response: Function (state, input, parameters, forcing) -> y^(r), scalar; `forcing` adds to the plant's responses.
         gain: Function (state, input, parameters) -> d y^(r) / d input, scalar.
@@ -38,14 +39,10 @@ class OutputChain:
     input: str
     unit: str
     order: int
+    response_unit: str
     states: ca.Function
     response: ca.Function
     gain: ca.Function
-
-    @property
-    def response_unit(self) -> str:
-        """Unit of y^(r)."""
-        return derivative_unit(self.unit, self.order)
 
     @cached_property
     def affine(self) -> bool:
@@ -114,6 +111,7 @@ def _chain(
         name,
         plant.coordinates[coordinate],
         len(derivatives),
+        plant.derivative_unit(plant.coordinates[coordinate], len(derivatives)),
         ca.Function("fpirhc_chain", [x, p], [undisturbed[0]]),
         ca.Function("fpirhc_chain_response", [x, u, p, w], [ca.densify(response)]),
         ca.Function("fpirhc_chain_gain", [x, u, p], [gain]),

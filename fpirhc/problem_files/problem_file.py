@@ -37,7 +37,7 @@ class Task:
         title: first line of the file's docstring.
         description: the other lines.
         problem: the file's problem.
-        controllers: by name.
+        controllers: by name; runs of them have this name.
         headline: names of the controllers without and with adaptation that the verdict compares.
         tuning: ranges of settings by controller.
         metrics: all metrics of the problem's runs.
@@ -58,6 +58,8 @@ class Task:
     def __post_init__(self) -> None:
         if self.problem.name != self.name:
             object.__setattr__(self, "problem", replace(self.problem, name=self.name))
+        named = {name: controller.labelled(name) for name, controller in self.controllers.items()}
+        object.__setattr__(self, "controllers", named)
 
 
 def shipped_folders() -> list[Path]:

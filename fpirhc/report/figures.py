@@ -17,7 +17,9 @@ from fpirhc.simulation.drawing import (
     draw_responses,
     literal,
     new_figure,
+    quantity_label,
     thinned,
+    time_label,
 )
 
 if TYPE_CHECKING:
@@ -64,15 +66,16 @@ def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
         unit = plant.state.units[k] if is_state else plant.input.units[k - plant.state.size]
         axis.set_ylabel(literal(f"{name} [{unit}]"))
     draw_legend(axes[0])
-    axes[-1].set_xlabel("time [s]")
+    axes[-1].set_xlabel(literal(f"time [{problem.time_unit}]"))
     return figure
 
 
 def pair_figures(plain: Entry, adaptive: Entry) -> dict[str, Figure]:
     """Return the pictures of the method's papers as pairs, without adaptivity on the left and with it on the right."""
+    phase = {"Phase trajectories": _draw_phase} if _phase_names(plain.run) else {}
     draws = {
         "Trajectory tracking": _draw_trajectory,
-        "Phase trajectories": _draw_phase,
+        **phase,
         "Tracking error": _draw_error,
         "Command": _draw_command,
         "Second derivatives" if _is_second_order(plain.run) else "Highest derivatives": _draw_responses,
@@ -124,7 +127,7 @@ def lyapunov_figure(comparison: Comparison) -> Figure | None:
         times = entry.run.period * np.arange(values.size)
         axis.semilogy(thinned(times), thinned(values), color=color, lw=1, label=literal(entry.name))
         axis.axhline(max(0.5 * view.ultimate**2, 1e-20), color=color, lw=0.8, ls="--")
-    axis.set_xlabel("time [s]")
+    axis.set_xlabel(time_label(views[0][0].run))
     axis.set_ylabel("V")
     axis.grid(visible=True, alpha=0.25)
     draw_legend(axis)
@@ -157,36 +160,40 @@ def _draw_trajectory(axis: Axes, run: Run) -> None:
     for k, name in enumerate(run.layout["error"].elements):
         draw_line(axis, run, f"reference.{name}", f"{name} nominal", PALETTE[k], "--")
         draw_line(axis, run, f"state.{name}", f"{name} realised", PALETTE[k])
-    axis.set_xlabel("time [s]")
+    axis.set_xlabel(time_label(run))
+
+
+def _phase_names(run: Run) -> list[str]:
+    """The judged coordinates whose first derivative is a state: a coordinate of order one has no phase plane."""
+    return [name for name in run.layout["error"].elements if f"{name}'" in run.layout["state"].elements]
 
 
 def _draw_phase(axis: Axes, run: Run) -> None:
-    states = run.layout["state"].elements
-    for k, name in enumerate(run.layout["error"].elements):
-        if f"{name}'" in states:
-            for signal, style in (("reference", "--"), ("state", "-")):
-                x, y = run[f"{signal}.{name}"], run[f"{signal}.{name}'"]
-                axis.plot(thinned(x), thinned(y), style, color=PALETTE[k], lw=1, label=literal(f"{name} {signal}"))
-    axis.set_xlabel("q")
-    axis.set_ylabel("q'")
+    names = _phase_names(run)
+    for k, name in enumerate(names):
+        for signal, style in (("reference", "--"), ("state", "-")):
+            x, y = run[f"{signal}.{name}"], run[f"{signal}.{name}'"]
+            axis.plot(thinned(x), thinned(y), style, color=PALETTE[k], lw=1, label=literal(f"{name} {signal}"))
+    axis.set_xlabel(quantity_label(run, "state", names))
+    axis.set_ylabel(quantity_label(run, "state", [f"{name}'" for name in names]))
     axis.grid(visible=True, alpha=0.25)
 
 
 def _draw_error(axis: Axes, run: Run) -> None:
     for k, name in enumerate(run.layout["error"].elements):
         draw_line(axis, run, f"error.{name}", name, PALETTE[k])
-    axis.set_xlabel("time [s]")
+    axis.set_xlabel(time_label(run))
 
 
 def _draw_command(axis: Axes, run: Run) -> None:
     for k, name in enumerate(run.layout["command"].elements):
         draw_line(axis, run, f"command.{name}", name, PALETTE[k])
-    axis.set_xlabel("time [s]")
+    axis.set_xlabel(time_label(run))
 
 
 def _draw_responses(axis: Axes, run: Run) -> None:
     draw_responses(axis, run, run.layout["desired"].elements[0])
-    axis.set_xlabel("time [s]")
+    axis.set_xlabel(time_label(run))
 
 
 def _draw_factor(axis: Axes, entries: list[Entry]) -> None:

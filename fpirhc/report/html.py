@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from fpirhc.report.figures import contraction_figure, lyapunov_figure, pair_figures
 from fpirhc.report.outcomes import css_class, sentences
 from fpirhc.report.page import asset as _asset
-from fpirhc.report.page import page, write_page
+from fpirhc.report.page import page, wide_table, write_page
 from fpirhc.report.page import picture as _picture
 from fpirhc.report.page import text as _text
 from fpirhc.report.series import chart_data
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _CAPTIONS = {
     "Trajectory tracking": "Nominal (dashed) and realised motion over time.",
-    "Phase trajectories": "Velocity against position.",
+    "Phase trajectories": "First derivative against coordinate.",
     "Tracking error": "Nominal minus realised. Mind the different scales.",
     "Command": "After clipping.",
     "Second derivatives": "With adaptation the realised acceleration lies on the desired one, although the deformed request "
@@ -60,9 +60,7 @@ def render(comparison: Comparison) -> str:
         _lyapunov(comparison),
         _settings(comparison),
     ]
-    scripts = (
-        f"<script>{_asset('uPlot.iife.min.js')}</script>\n<script>const DATA={data};\n{_asset('report.js')}</script>"
-    )
+    scripts = (_asset("uPlot.iife.min.js"), f"const DATA={data};\n{_asset('report.js')}")
     return page(comparison.title, ("uPlot.min.css", "report.css"), "\n".join(parts), scripts)
 
 
@@ -93,15 +91,13 @@ def _table(comparison: Comparison) -> str:
         f"<tr><th scope='row'>{_text(n)}</th><td class='words' colspan='{len(heads) - 1}'>not run: {_text(w)}</td></tr>"
         for n, w in comparison.skipped.items()
     )
-    top = "".join(f"<th scope='col'>{_text(h)}</th>" for h in heads)
     marked = ", ".join(
         dict.fromkeys(c.metric.heading for c in shown if c.metric.headline and c.metric.better != "neither")
     )
-    caption = f"Errors, effort and cost from t = {comparison.measure_from:g} s on; seed {comparison.seed}."
+    caption = f"Errors, effort and cost from t = {comparison.measure_from:g} {comparison.time_unit} on; seed {comparison.seed}."
     return (
         f"<section><h2>Controllers</h2><p>{caption} Marked are the best of: {_text(marked)}.</p>"
-        f"<div class='scroll'><table><thead><tr>"
-        f"{top}</tr></thead><tbody>{rows}{skipped}</tbody></table></div></section>"
+        f"{wide_table(heads, rows + skipped, 'controllers and their metrics')}</section>"
     )
 
 
@@ -223,8 +219,12 @@ def _settings(comparison: Comparison) -> str:
             *((e.name, {k: v for k, v in e.run.settings.items() if k != "problem"}) for e in comparison.entries),
         ]
     )
-    command = f"<pre class='command'>{_text(comparison.command)}</pre>" if comparison.command else ""
+    command = (
+        f"<p>This report is reproduced by</p><pre class='command'>{_text(comparison.command)}</pre>"
+        if comparison.command
+        else ""
+    )
     return (
         f"<section><h2>Settings</h2>{dumps}<p>{_text(versions)}; took {comparison.elapsed:.1f} s.</p>"
-        f"<p>This report is reproduced by</p>{command}</section>"
+        f"{command}</section>"
     )

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fpirhc.report.page import page, picture, text, write_page
+from fpirhc.report.page import page, picture, text, wide_table, write_page
 from fpirhc.simulation.drawing import PALETTE
-from fpirhc.simulation.metrics.columns import Column
+from fpirhc.simulation.metrics.columns import Column as Metric
 from fpirhc.studies.scenarios.paired import Summary, percent, signed
 
 if TYPE_CHECKING:
@@ -88,7 +88,6 @@ def render_scenarios(comparison: ScenarioComparison) -> str:
 
 def _table(comparison: ScenarioComparison) -> str:
     heads = ["controller", *_heads(comparison), "statuses (cycles)"]
-    columns = "".join(f"<th scope='col'>{text(h)}</th>" for h in heads)
     rows = ""
     for one in comparison.summaries:
         cells = "".join(f"<td>{text(c)}</td>" for c in _cells(comparison, one))
@@ -101,14 +100,14 @@ def _table(comparison: ScenarioComparison) -> str:
         )
     return (
         f"<section><h2>Controllers</h2><p>{text(_conditions(comparison))} {text(_MEANING)}</p>"
-        f"<div class='scroll'><table><thead><tr>{columns}</tr></thead><tbody>{rows}</tbody></table></div></section>"
+        f"{wide_table(heads, rows, 'controllers and their metrics')}</section>"
     )
 
 
 def _conditions(comparison: ScenarioComparison) -> str:
     return (
         f"{comparison.count} scenarios of seed {comparison.seed}, exact parameters within {comparison.percent:g} % of the "
-        f"problem's, errors from t = {comparison.measure_from:g} s on."
+        f"problem's, errors from t = {comparison.measure_from:g} {comparison.time_unit} on."
     )
 
 
@@ -137,7 +136,7 @@ def _cells(comparison: ScenarioComparison, one: Summary) -> list[str]:
     ]
 
 
-def _median(column: Column, one: Summary) -> str:
+def _median(column: Metric, one: Summary) -> str:
     value = one.metrics.get(column.metric.name, {}).get(column.element)
     return column.metric.text(value) if value is not None and np.isfinite(value) else "none"
 
@@ -168,24 +167,20 @@ def _settings(comparison: ScenarioComparison) -> str:
 
 def show_scenarios(comparison: ScenarioComparison, report: Path) -> None:
     """Print the verdict, the table, and the path of the report."""
-    from rich.box import SIMPLE_HEAD
     from rich.console import Console
-    from rich.table import Table
 
-    from fpirhc.report.terminal import literal, say
+    from fpirhc.report.folding import Column, Folding
+    from fpirhc.report.terminal import say
 
     console = Console()
     for line in (comparison.title, *(f"- {sentence}" for sentence in comparison.verdict)):
         say(console, line)
-    title = literal(f"{comparison.problem}: {_conditions(comparison)}")
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title)
-    table.add_column("controller", min_width=16)
-    for head in ("median", "difference (95 %)", "ratio", "worst", "failed"):
-        table.add_column(head, justify="right")
+    heads = ("controller", "median", "difference (95 %)", "ratio", "worst", "failed")
+    table = Folding(f"{comparison.problem}: {_conditions(comparison)}", [Column(head) for head in heads])
     for one in comparison.summaries:
         cells = _cells(comparison, one)
-        table.add_row(literal(one.name), *cells[:3], percent(one.worst), str(one.failures))
-    console.print(table)
+        table.add([one.name, *cells[:3], percent(one.worst), str(one.failures)])
+    table.show(console)
     for name, note in comparison.tuning.items():
         say(console, f"{name}: {note}")
     for name, why in comparison.skipped.items():

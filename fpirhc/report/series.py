@@ -20,7 +20,7 @@ def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]
     """Return the data of the page's charts: controllers with their colours, and charts with one series per controller."""
     entries = [e for e in comparison.entries if e.run.cycles > 1]
     if not entries:
-        return {"controllers": [], "charts": [], "time": []}
+        return {"controllers": [], "charts": [], "time": [], "timeUnit": comparison.time_unit}
     longest = max(entries, key=lambda e: e.run.cycles).run
     edges = _edges(longest.cycles)
     first = entries[0].run
@@ -45,6 +45,7 @@ def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]
         "controllers": [
             {"name": e.name, "color": palette[k % len(palette)], "slots": _slots(e.run)} for k, e in enumerate(entries)
         ],
+        "timeUnit": comparison.time_unit,
         "time": _round(np.repeat(longest.time[edges[:-1]], 2) + _halves(longest, edges)),
         "charts": charts,
     }

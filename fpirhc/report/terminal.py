@@ -8,14 +8,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
-from rich.table import Table
 from rich.text import Text
 
+from fpirhc.report.folding import Column, Folding
 from fpirhc.report.outcomes import sentences, terminal_style
-from fpirhc.simulation.metrics.columns import Column, columns
+from fpirhc.simulation.metrics.columns import Column as Metric
+from fpirhc.simulation.metrics.columns import columns
 from fpirhc.simulation.simulate import SWITCHED_OFF
 from fpirhc.status import Status
 from fpirhc.summary import printable
@@ -57,9 +57,9 @@ def show(comparison: Comparison, report: Path) -> None:
     say(console, comparison.title, style="bold")
     for sentence, outcome in sentences(comparison):
         say(console, f"- {sentence}", style=terminal_style(outcome))
-    console.print(_table(comparison))
+    _table(comparison).show(console)
     if sum(e.optimality is not None for e in comparison.entries) > 1:
-        console.print(_plans(comparison))
+        _plans(comparison).show(console)
     for entry in comparison.entries:
         for note in entry.notes:
             say(console, f"{entry.name}: {note}")
@@ -84,13 +84,11 @@ def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
     caption = (
         "K: contraction factor; du <: bound of the error of every input; dV <: bound of the cost above the optimum"
     )
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=literal(f"{task}, first horizon"), caption=caption)
-    table.add_column("optimiser", no_wrap=True)
-    for head in ("cost", "residual", "iter", "K", "du <", "dV <", "status"):
-        table.add_column(head, justify="right", no_wrap=True)
+    heads = ("optimiser", "cost", "residual", "iter", "K", "du <", "dV <", "status")
+    table = Folding(f"{task}, first horizon", [Column(head) for head in heads], caption)
     for one in solved:
-        table.add_row(*_plan_row(one))
-    console.print(table)
+        table.add(_plan_row(one))
+    table.show(console)
     for one in solved:
         for text in one.plan.violations():
             say(console, f"{one.name}: {text}")
@@ -103,11 +101,11 @@ def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
     say(console, f"picture: {picture}", wrap=False)
 
 
-def _plan_row(solved: Solved) -> list[str | Text]:
+def _plan_row(solved: Solved) -> list[str]:
     plan, known = solved.plan, solved.certificate
     bounds = [f"{known.factor:.3f}", f"{known.input_error:.1e}", f"{known.suboptimality:.1e}"] if known else ["-"] * 3
     return [
-        literal(solved.name),
+        solved.name,
         "-" if plan.cost is None else f"{plan.cost:.7g}",
         "-" if plan.stationarity is None else f"{plan.stationarity:.0e}",
         f"{plan.iterations:.0f}" if plan.iterations >= 0 else "-",
@@ -116,49 +114,38 @@ def _plan_row(solved: Solved) -> list[str | Text]:
     ]
 
 
-def _table(comparison: Comparison) -> Table:
-    table = Table(
-        box=SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-        title=literal(f"{comparison.problem}, from t = {comparison.measure_from:g} s, seed {comparison.seed}"),
-    )
-    table.add_column("controller", min_width=16)
+def _table(comparison: Comparison) -> Folding:
+    """Table of the controllers: their headline metrics, time of a cycle, and how they ended."""
     shown = columns([e.metrics for e in comparison.entries], headline=True)
-    for column in shown:
-        table.add_column(literal(column.short), justify="right")
-    table.add_column("cycle us", justify="right")
-    table.add_column("status", no_wrap=True)
+    table = Folding(
+        f"{comparison.problem}, from t = {comparison.measure_from:g} {comparison.time_unit}, seed {comparison.seed}",
+        [Column("controller"), *(Column(c.short) for c in shown), Column("cycle us"), Column("status", left=True)],
+    )
     for entry in comparison.entries:
-        table.add_row(*_row(entry, shown))
+        table.add(_row(entry, shown))
     return table
 
 
-def _row(entry: Entry, shown: Sequence[Column]) -> list[str | Text]:
+def _row(entry: Entry, shown: Sequence[Metric]) -> list[str]:
     metrics, cycle = entry.metrics, entry.cycle
-    numbers = [literal(c.text(c.number(metrics), missing="", none="-")) for c in shown]
+    numbers = [c.text(c.number(metrics), missing="", none="-") for c in shown]
     fine = metrics.statuses.get("OK", 0) / max(sum(metrics.statuses.values()), 1)
     status = "ended early" if entry.run.stop else "ok" if fine == 1 else f"ok {100 * fine:.3g} %"
-    return [literal(entry.name), *numbers, f"{cycle.median:.2g}" if cycle else "", status]
+    return [entry.name, *numbers, f"{cycle.median:.2g}" if cycle else "", status]
 
 
-def _plans(comparison: Comparison) -> Table:
+def _plans(comparison: Comparison) -> Folding:
     """Table of the optimisers: cost above the converged optimum, iterations, time of the cycles that plan."""
+    heads = ("controller", "iter", "residual", "gap", "plan us", "p99 us", "max us", "first us")
     caption = "gap: cost above the converged optimum, relative; plan us: the cycles that plan"
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title="plans", caption=caption)
-    table.add_column("controller", no_wrap=True)
-    for head in ("iter", "residual", "gap", "plan us", "p99 us", "max us", "first us"):
-        table.add_column(head, justify="right")
+    table = Folding("plans", [Column(head) for head in heads], caption)
     for entry in comparison.entries:
         metrics, cycle, excess = entry.metrics, entry.cycle, entry.optimality
         if not metrics.solve:
             continue
         times = [_micro(v) for v in (cycle.planning, cycle.p99, cycle.maximum, cycle.first)] if cycle else [""] * 4
-        table.add_row(
-            literal(entry.name),
-            *(metrics.text(f"solve.{name}") for name in ("median_iterations", "median_stationarity")),
-            f"{excess.median:.0e}" if excess else "-",
-            *times,
-        )
+        solves = [metrics.text(f"solve.{name}") for name in ("median_iterations", "median_stationarity")]
+        table.add([entry.name, *solves, f"{excess.median:.0e}" if excess else "-", *times])
     return table
 
 

@@ -179,7 +179,9 @@ def linear_plant(plant: Plant, sign: float) -> Plant:
     names = [f"d{k}" for k in range(max(plant.orders))] + ["u", "p"]
     vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(name, kind) for name in names])
     order = dict(zip(plant.names, plant.orders, strict=True))
-    return Plant(plant.coordinates, plant.inputs, parameters, response, order, plant.controlled_names)
+    return Plant(
+        plant.coordinates, plant.inputs, parameters, response, order, plant.controlled_names, time_unit=plant.time_unit
+    )
 
 
 def loop_matrices(problem: Problem, controller: Controller) -> LoopMatrices:

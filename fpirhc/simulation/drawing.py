@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,6 +35,17 @@ def new_figure(width: float, height: float, title: str) -> Figure:
 def literal(text: str) -> str:
     """Return a name or unit as matplotlib shows it literally: a pair of dollar signs would be read as a formula."""
     return printable(text).replace("$", r"\$")
+
+
+def time_label(run: Run) -> str:
+    """Return the label of a time axis: 'time [s]'."""
+    return literal(f"time [{run.time_unit}]")
+
+
+def quantity_label(run: Run, signal: str, names: Sequence[str]) -> str:
+    """Return the label of an axis that shows these entries of a signal, with their unit where they have one in common."""
+    units = list(dict.fromkeys(run.unit(f"{signal}.{name}") for name in names))
+    return literal(", ".join(names) + (f" [{units[0]}]" if len(units) == 1 else ""))
 
 
 def draw_bands(axis: Axes, run: Run) -> None:

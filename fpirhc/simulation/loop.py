@@ -35,7 +35,7 @@ def close_loop(problem: Problem, controller: Controller) -> Composite:
         problem, ready.response(problem), predicts="state_ahead" in [n for b in blocks for n in b.writes.names]
     )
     own = with_measured_state(problem.plant, blocks)
-    around = [_clock_block(problem.period), *seeing, *own, *_actuate(problem, disturbed)]
+    around = [_clock_block(problem.plant.time, problem.period), *seeing, *own, *_actuate(problem, disturbed)]
     return compose(
         "loop", Layout((*disturbed, *problem.sensing.drawn)), around, [*_plant_delays(problem, ready), *delays]
     )
@@ -82,13 +82,13 @@ def _forcing(plant: Plant, name: str) -> Signal:
     return Signal(name, plant.names, plant.response_units)
 
 
-def _clock_block(period: float) -> Block:
+def _clock_block(time: Signal, period: float) -> Block:
     """Block -> time, computed from a counter so that no rounding error grows in a long run."""
 
     def step(s: Signals) -> dict[str, Expression]:
         return {"time": s.cycle * period, "cycle_next": s.cycle + 1}
 
-    return Block("clock", Layout(), Layout((scalar("time", "s"),)), step, Layout((scalar("cycle"),)))
+    return Block("clock", Layout(), Layout((time,)), step, Layout((scalar("cycle"),)))
 
 
 def _sense_blocks(problem: Problem, other: Response | None, *, predicts: bool) -> list[Block]:
@@ -125,7 +125,7 @@ def _truth_block(problem: Problem, state: Signal) -> Block:
     def step(s: Signals) -> dict[str, Expression]:
         return {"true_error": (function(s.time)[0] - getattr(s, state.name))[places]}
 
-    return Block("truth", Layout((scalar("time", "s"), state)), writes, step, opaque=problem.reference.opaque)
+    return Block("truth", Layout((plant.time, state)), writes, step, opaque=problem.reference.opaque)
 
 
 def _own_response(plant: Plant) -> Response:

@@ -33,7 +33,7 @@ class Run:
         problem: its name; '' for a problem without a name.
         controller: its name.
         seed: of disturbances and noise.
-        period: of the control cycle, s.
+        period: of the control cycle.
         layout: the logged signals. Every run has 'plant_state' and 'plant_realised', state and response of the plant, and
             'true_error', the reference minus the plant's state at the same time.
         log: values of all signals, shape (cycles, layout.size), read-only.
@@ -66,7 +66,7 @@ class Run:
     def _facts(self) -> tuple[str, ...]:
         how = "compiled C" if self.compiled else "virtual machine"
         ended = f"ended early: {self.stop}" if self.stop else "complete"
-        return f"{self.cycles} cycles of {self.period:g} s", f"seed {self.seed}", how, ended
+        return f"{self.cycles} cycles of {self.period:g} {self.time_unit}", f"seed {self.seed}", how, ended
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name in self.layout:
@@ -78,8 +78,13 @@ class Run:
 
     @property
     def time(self) -> np.ndarray:
-        """Time of every cycle, shape (cycles,), s."""
+        """Time of every cycle, shape (cycles,), in `time_unit`."""
         return self["time"][:, 0]
+
+    @property
+    def time_unit(self) -> str:
+        """Unit of time, as the plant names it."""
+        return self.unit("time")
 
     @property
     def cycles(self) -> int:
@@ -87,7 +92,7 @@ class Run:
         return int(self.log.shape[0])
 
     def spans(self) -> list[tuple[float, float, int]]:
-        """Return the time slots as (start in s, end in s, number of the slot); empty where the controller has none."""
+        """Return the time slots as (start, end, number of the slot); empty where the controller has none."""
         if "slot" not in self.layout or not self.cycles:
             return []
         slots = self["slot"][:, 0].astype(int)
@@ -103,7 +108,9 @@ class Run:
         """Return all signals as a pandas DataFrame with one column per entry, indexed by time."""
         import pandas as pd
 
-        return pd.DataFrame(self.log, columns=list(self.layout.columns), index=pd.Index(self.time, name="time [s]"))
+        return pd.DataFrame(
+            self.log, columns=list(self.layout.columns), index=pd.Index(self.time, name=f"time [{self.time_unit}]")
+        )
 
     def plot(self) -> Figure:
         """Return errors, commands and responses over time as a matplotlib Figure."""

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from fpirhc.simulation.drawing import PALETTE, draw_bands, draw_legend, draw_line, draw_responses, new_figure
+from fpirhc.simulation.drawing import (
+    PALETTE,
+    draw_bands,
+    draw_legend,
+    draw_line,
+    draw_responses,
+    new_figure,
+    quantity_label,
+    time_label,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -13,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def run_figure(run: Run) -> Figure:
-    """Return a figure with errors, positions, commands and responses of one run over time."""
+    """Return a figure with errors, coordinates, commands and responses of one run over time."""
     figure = new_figure(10, 9, f"{run.controller}" + (f" ({run.stop})" if run.stop else ""))
     names = run.layout["error"].elements
     axes = figure.subplots(4, 1, sharex=True)
@@ -25,9 +34,15 @@ def run_figure(run: Run) -> Figure:
         draw_line(axes[2], run, f"command.{name}", name, PALETTE[k])
     first = run.layout["desired"].elements[0]
     draw_responses(axes[3], run, first)
-    for axis, what in zip(axes, ("error", "position", "command", f"responses of {first}"), strict=True):
+    labels = (
+        f"error of {quantity_label(run, 'error', names)}",
+        quantity_label(run, "state", names),
+        quantity_label(run, "command", run.layout["command"].elements),
+        f"responses of {quantity_label(run, 'desired', [first])}",
+    )
+    for axis, label in zip(axes, labels, strict=True):
         draw_bands(axis, run)
-        axis.set_ylabel(what)
+        axis.set_ylabel(label)
         draw_legend(axis)
-    axes[3].set_xlabel("time [s]")
+    axes[3].set_xlabel(time_label(run))
     return figure

@@ -128,7 +128,7 @@ def simulate(
         problem: the task.
         controller: its automatic settings are chosen here.
         seed: of the noise of disturbances and sensors.
-        name: of the controller in the results; '': the name of its class.
+        name: of the controller in the results; '': its name in the task from which it comes, else the name of its class.
         compiled: whether the loop is compiled to C where there is a compiler.
         flags: for the compiler, after its usual ones.
         progress: called with (cycles done, cycles in all).
@@ -143,10 +143,12 @@ def judged_run(ready: Simulator, *, seed: int, name: str = "", progress: Progres
     Args:
         ready: from `simulator`.
         seed: of the noise of disturbances and sensors.
-        name: of the controller in the results; '': the name of its class.
+        name: of the controller in the results; '': its label, or the name of its class.
         progress: called with (cycles done, cycles in all).
     """
-    run = ready.run(seed=seed, name=name, progress=progress)
+    run = ready.run(
+        seed=seed, name=name or ready.controller.label or type(ready.controller).__name__, progress=progress
+    )
     judged = judgements(ready.problem, ready.controller, run.layout, run.log)
     log = np.hstack([run.log, *(values for _, values in judged)])
     log.setflags(write=False)
@@ -187,7 +189,7 @@ def _run_chunks(
         bad = _first_bad(rows)
         if bad is not None:
             row, column = bad
-            return log[: at + row].copy(), _why(trace, at + row, column, problem.period)
+            return log[: at + row].copy(), _why(trace, at + row, column, problem)
         evaluator.arguments[0][:] = evaluator.results[0].reshape(CHUNK, start.size)[-1]
         if progress:
             progress(at + rows.shape[0], cycles)
@@ -207,8 +209,8 @@ def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:
     return row, int(np.argmin(finite[row]))
 
 
-def _why(trace: Layout, cycle: int, column: int, period: float) -> str:
+def _why(trace: Layout, cycle: int, column: int, problem: Problem) -> str:
     return (
-        f"signal '{trace.columns[column]}' is not finite at t = {cycle * period:g} s (cycle {cycle}); "
+        f"signal '{trace.columns[column]}' is not finite at t = {cycle * problem.period:g} {problem.time_unit} (cycle {cycle}); "
         "the run keeps the cycles before it"
     )

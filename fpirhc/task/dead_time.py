@@ -49,7 +49,7 @@ class DeadTime:
         Raises:
             InvalidProblem: all mistakes together.
         """
-        mistakes = Mistakes("dead_time")
+        mistakes, unit = Mistakes("dead_time"), plant.time_unit
         mistakes.unknown("input", self.inputs, plant.inputs)
         mistakes.unknown("before: input", self.before, plant.inputs)
         for name, value in self.before.items():
@@ -57,10 +57,11 @@ class DeadTime:
                 mistakes.add(f"before: '{name}' must be a finite number, got {value!r}")
         for name, value in [*self.inputs.items(), ("measurement", self.measurement)]:
             if not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
-                mistakes.add(f"'{name}' must be a number of seconds of at least 0, got {value!r}")
+                mistakes.add(f"'{name}' must be a number of at least 0, in {unit}, got {value!r}")
             elif value > MOST * period:
                 mistakes.add(
-                    f"'{name}' is {value:g} s, more than {MOST} control cycles of {period:g} s; use a longer period for the run"
+                    f"'{name}' is {value:g} {unit}, more than {MOST} control cycles of {period:g} {unit}; "
+                    "use a longer period for the run"
                 )
         mistakes.raise_if_any()
 

@@ -170,7 +170,7 @@ class Formula(Disturbance):
     """A CasADi expression of time: Formula(lambda t: 3 * ca.tanh(t - 1)).
 
     Args:
-        expression: function of the time in seconds.
+        expression: function of the time.
     """
 
     expression: Callable[[Expression], Expression]
@@ -186,7 +186,7 @@ class Formula(Disturbance):
         samples = np.asarray(function.map(times.size)(times[None, :]).full()).ravel()
         if not np.all(np.isfinite(samples)):
             where = times[np.argmin(np.isfinite(samples))]
-            raise InvalidValue(f"a disturbance expression is not finite at t = {where:g} s")
+            raise InvalidValue(f"a disturbance expression is not finite at t = {where:g}")
         return samples
 
 

@@ -30,8 +30,8 @@ class Problem:
         plant: the system, with approximate and exact parameters.
         reference: the nominal motion of every coordinate.
         start: first value of every coordinate by name; derivatives (q1', ...) that are not named start at zero.
-        period: control cycle, s.
-        duration: length of a run, s.
+        period: control cycle, in the plant's unit of time, as are all times.
+        duration: length of a run.
         limits: of inputs, states, rates and paths.
         disturbances: by name of the input or coordinate to which they add.
         dead_time: of inputs and measurement. A controller may assume another one.
@@ -39,10 +39,9 @@ class Problem:
         horizon: stages over which a receding-horizon controller plans.
         cost: of such a plan.
         integrator: of the simulated plant.
-        measure_from: time from which metrics count, s; the transient before it is left out.
+        measure_from: time from which metrics count; the transient before it is left out.
         judged: coordinates whose errors are logged and measured; None: the controlled ones.
         name: of the problem in results; the problem of a file has the name of the file.
-        time_unit: unit of every time in the problem (period, duration, steps, rates); texts use it, no calculation does.
 
     Raises:
         InvalidProblem: all mistakes together.
@@ -63,7 +62,6 @@ class Problem:
     measure_from: float = 0.0
     judged: Sequence[str] | None = None
     name: str = field(default="", kw_only=True, metadata={"setting": False})
-    time_unit: str = field(default="s", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("problem")
@@ -86,6 +84,11 @@ class Problem:
         mistakes.raise_if_any()
         _check_inverse(self, mistakes)
         mistakes.raise_if_any()
+
+    @property
+    def time_unit(self) -> str:
+        """Unit of every time and rate, as the plant names it."""
+        return self.plant.time_unit
 
     @property
     def cycles(self) -> int:
@@ -128,23 +131,24 @@ class Problem:
 
 
 def _check_times(problem: Problem, mistakes: Mistakes) -> None:
+    unit = problem.time_unit
     for name in ("period", "duration"):
         value = getattr(problem, name)
         if not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
-            mistakes.add(f"{name} must be a positive number of seconds, got {value!r}")
+            mistakes.add(f"{name} must be a positive number, in {unit}, got {value!r}")
             return
     if problem.duration < problem.period:
-        mistakes.add(f"duration {problem.duration} s is shorter than one period of {problem.period} s")
+        mistakes.add(f"duration {problem.duration} {unit} is shorter than one period of {problem.period} {unit}")
     if not 0 <= problem.measure_from < problem.duration:
         mistakes.add(f"measure_from must lie in [0, {problem.duration}), got {problem.measure_from}")
     if problem.horizon is not None:
         try:
-            cycles_per_stage(problem.horizon, problem.period)
+            cycles_per_stage(problem.horizon, problem.period, unit)
         except InvalidValue as error:
             mistakes.add(str(error))
 
 
-def cycles_per_stage(horizon: Horizon, period: float) -> int:
+def cycles_per_stage(horizon: Horizon, period: float, unit: str = "s") -> int:
     """Return how many control cycles one stage of the horizon lasts.
 
     Raises:
@@ -154,8 +158,8 @@ def cycles_per_stage(horizon: Horizon, period: float) -> int:
     if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-6 * ratio:
         whole = max(1, round(ratio))
         raise InvalidValue(
-            f"period {period:g} s does not divide the horizon step {horizon.step:g} s; "
-            f"use a step of {whole * period:g} s or a period of {horizon.step / whole:g} s"
+            f"period {period:g} {unit} does not divide the horizon step {horizon.step:g} {unit}; "
+            f"use a step of {whole * period:g} {unit} or a period of {horizon.step / whole:g} {unit}"
         )
     return round(ratio)
 

@@ -46,7 +46,7 @@ def error_signal(plant: Plant) -> Signal:
 
 def integral_signal(plant: Plant, name: str) -> Signal:
     """Integral of the error of every controlled coordinate, under the given name."""
-    units = [f"{plant.coordinates[c]} s" for c in plant.controlled_names]
+    units = [f"{plant.coordinates[c]} {plant.time_unit}" for c in plant.controlled_names]
     return vector(name, plant.controlled_names, units)
 
 

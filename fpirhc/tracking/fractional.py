@@ -72,7 +72,7 @@ class Fractional(Tracking):
             )
         if self.memory is not None and not 1 <= self.rate * self.memory < math.inf:
             raise InvalidValue(
-                f"Fractional(memory={self.memory!r}): expected at least 1 / rate = {1 / self.rate:.4g} s; 20 / rate is usual"
+                f"Fractional(memory={self.memory!r}): expected at least 1 / rate = {1 / self.rate:.4g}; 20 / rate is usual"
             )
 
     def cycles(self, period: float) -> int:
@@ -85,7 +85,7 @@ class Fractional(Tracking):
         cycles = math.ceil(memory / period - 1e-9)
         if cycles > MOST:
             raise InvalidValue(
-                f"Fractional: a memory of {memory:g} s is {cycles} control cycles of {period:g} s, more than {MOST}; "
+                f"Fractional: a memory of {memory:g} is {cycles} control cycles of {period:g}, more than {MOST}; "
                 f"give memory={MOST * period:g} or less"
             )
         return max(cycles, 1)

@@ -57,6 +57,7 @@ plant = fp.Plant(
     order=1,
     controlled=("V",),
     response=response,
+    time_unit="ms",
     parameters={
         "C": fp.Parameter(approximate=1.2, exact=1.0, unit="uF/cm^2", spread=fp.Uniform(relative=0.1)),
         "gNa": fp.Parameter(approximate=0.0, exact=120.0, unit="mS/cm^2", spread=fp.LogNormal(factor=1.2)),
@@ -79,7 +80,6 @@ problem = fp.Problem(
     horizon=fp.Horizon(stages=50, step=0.1),  # ms
     cost=fp.Quadratic(states={"V": 1.0}, deviation={"I": 1e-5}),
     measure_from=10.0,  # ms
-    time_unit="ms",
 )
 
 tracking = fp.Exponential(rate=1.0)  # 1/ms
@@ -103,13 +103,12 @@ tuning = {
     "RHC offset-free": {"estimator.drift.V": fp.LogSpan(1.0, 1e5)},  # mV/ms^1.5
 }
 pictures = (
-    fp.Raster("Spikes", signal="state.V", threshold=-20.0, caption="Where V passes -20 mV upwards.", time="ms"),
+    fp.Raster("Spikes", signal="state.V", threshold=-20.0, caption="Where V passes -20 mV upwards."),
     fp.OverTime(
         "Voltage and current",
         panels=("state.V", "command.I"),
         caption="Dashed: -20 mV, above which a spike is counted, and the largest currents.",
         levels={"state.V": (-20.0,), "command.I": problem.limits.inputs["I"]},
-        time="ms",
         controllers=("CTC", "RHC", "RHC+FPI"),
     ),
     fp.Portrait(

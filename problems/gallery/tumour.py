@@ -41,6 +41,7 @@ plant = fp.Plant(
     inputs={"dose": "mg/kg/day"},
     order=2,
     response=response,
+    time_unit="day",
     parameters={
         "growth": fp.Parameter(approximate=1.2 * 0.27, exact=0.27, unit="1/day"),
         "effect": fp.Parameter(approximate=0.8 * 0.0074, exact=0.0074, unit="kg/mg/day"),
@@ -61,7 +62,6 @@ problem = fp.Problem(
     horizon=fp.Horizon(stages=14, step=1.0),  # day
     cost=fp.Quadratic(states={"size": 1.0, "size'": 10.0}, deviation={"dose": 1e-5}),
     measure_from=60.0,  # days
-    time_unit="day",
 )
 
 tracking = fp.Exponential(rate=0.15)  # 1/day
@@ -92,6 +92,5 @@ pictures = (
         "Volume and dose",
         panels=(fp.Quantity("volume", "mm^3", lambda run: np.exp(run["state.size"])), "command.dose"),
         levels={"command.dose": (0.0, 20.0)},
-        time="days",
     ),
 )

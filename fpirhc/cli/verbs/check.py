@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +22,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write Markdown, for a pull request")
     text = "show every metric, not only those that changed and the rms errors"
     parser.add_argument("--all", action="store_true", help=text)
+    text = "changes smaller than this share of the old value hold, such as 0.1%%; counts and outcomes are never ignored"
+    parser.add_argument("--ignore-below", type=_share, default=0.0, metavar="PERCENT", help=text)
     add_baselines(parser)
     add_processes(parser)
     add_no_compile(parser)
@@ -28,6 +31,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.baselines import junit, markdown
+    from fpirhc.baselines.judging import ignoring
     from fpirhc.baselines.outline import outline
     from fpirhc.baselines.places import problems_here, write_whole
     from fpirhc.baselines.terminal import show_check
@@ -37,7 +41,8 @@ def _run(options: argparse.Namespace) -> ExitCode:
         if path:
             check_replaceable(path, mark)
     problems, unchecked = (options.problems, {}) if options.problems else problems_here(Path(), options.baselines)
-    judgements = _judgements(options, list(dict.fromkeys(map(str, problems))))
+    measured = _judgements(options, list(dict.fromkeys(map(str, problems))))
+    judgements = [ignoring(judgement, options.ignore_below) for judgement in measured]
     contents = outline(judgements, list(unchecked.items()))
     show_check(contents, options.all)
     if options.junit:
@@ -45,6 +50,17 @@ def _run(options: argparse.Namespace) -> ExitCode:
     if options.markdown:
         write_whole(markdown.to_markdown(contents), options.markdown, "report")
     return _code(judgements)
+
+
+def _share(text: str) -> float:
+    """A percentage, '0.1%' or '0.1', as a share."""
+    try:
+        percent = float(text.strip().removesuffix("%"))
+    except ValueError:
+        percent = math.nan
+    if not 0 <= percent < 100:
+        raise argparse.ArgumentTypeError(f"'{text}' is no percentage from 0 to below 100; write 0.1%")
+    return percent / 100
 
 
 def _judgements(options: argparse.Namespace, problems: Sequence[str]) -> list[Judgement]:
@@ -88,11 +104,14 @@ VERB = Verb(
     examples=(
         ("fpirhc check", "every problem of ./problems, or of this folder"),
         ("fpirhc check my_arm.py two_mass", "these problems"),
+        ("fpirhc check --ignore-below 0.1%", "another machine or library, whose last digits differ"),
         ("fpirhc check --junit check.xml --markdown check.md", "for a pull request"),
     ),
     notes="""
 A baseline is baselines/NAME.json beside the problem file; commit it. Without names, a problem in the folder that has
 no baseline fails, unless baselines/unchecked.toml gives a reason, such as: chain_of_masses = "takes a minute".
+Changes are sorted by size. A setting that changed stands first, with what changed along with it below; a change below
+0.1 % is called neither better nor worse.
 Of several problems, the exit code is the first of 2, 6 and 5 that applies to one of them.
 """,
 )

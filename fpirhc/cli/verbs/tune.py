@@ -59,27 +59,21 @@ def _run(options: argparse.Namespace) -> ExitCode:
 
 
 def _show(tuning: Tuning, saved: Path) -> None:
-    from rich.box import SIMPLE_HEAD
     from rich.console import Console
-    from rich.table import Table
 
-    from fpirhc.report.terminal import literal, say
+    from fpirhc.report.folding import Column, Folding
+    from fpirhc.report.terminal import say
 
     console = Console()
     title = (
         f"{tuning.problem}: {tuning.trials} trials each, seed {tuning.seed}, {tuning.conditions}, cost: {tuning.metric}"
     )
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=literal(title))
-    table.add_column("controller, setting", no_wrap=True)
-    for head in ("before", "after", "failed"):
-        table.add_column(head, justify="right")
+    table = Folding(title, [Column(head) for head in ("controller, setting", "before", "after", "failed")])
     for entry in tuning.entries:
-        table.add_row(
-            literal(f"{entry.name}: cost"), f"{entry.cost_before:.4g}", f"{entry.cost:.4g}", str(entry.failed)
-        )
+        table.add([f"{entry.name}: cost", f"{entry.cost_before:.4g}", f"{entry.cost:.4g}", str(entry.failed)])
         for path, value in entry.settings.items():
-            table.add_row(literal(f"  {path}"), f"{entry.before[path]:.4g}", f"{value:.4g}", "")
-    console.print(table)
+            table.add([f"  {path}", f"{entry.before[path]:.4g}", f"{value:.4g}", ""])
+    table.show(console)
     if tuning.untouched:
         say(console, f"not tuned: {', '.join(tuning.untouched)}")
     print(f"for the problem file, below its controllers:\n\n{tuning.python()}\n")

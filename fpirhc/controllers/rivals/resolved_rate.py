@@ -119,7 +119,7 @@ def _nominal_block(problem: Problem) -> Block:
         later = function(s.time + problem.period)[1][controlled]
         return {"nominal": s._reference_response, "_nominal_later": later}
 
-    reads = Layout((scalar("time", "s"), plant.response_signal("_reference_response")))
+    reads = Layout((plant.time, plant.response_signal("_reference_response")))
     writes = Layout((plant.response_signal("nominal"), plant.response_signal("_nominal_later")))
     return Block("nominal", reads, writes, step, opaque=problem.reference.opaque)
 

@@ -92,7 +92,7 @@ class SlidingMode(Controller):
 
     def _surface_block(self, plant: Plant) -> Block:
         """Block (state, reference, nominal) -> (S, desired)."""
-        units = [f"{plant.response_units[k]} s" for k in plant.controlled_indices]
+        units = [f"{plant.response_units[k]} {plant.time_unit}" for k in plant.controlled_indices]
 
         def step(s: Signals) -> dict[str, Expression]:
             surfaces, drifts = [], []

@@ -171,7 +171,7 @@ class SlotineLi(Controller):
 def _rates(problem: Problem, name: str) -> Signal:
     """A signal with a velocity of every coordinate."""
     plant = problem.plant
-    return vector(name, plant.names, [f"{plant.coordinates[c]}/s" for c in plant.names])
+    return vector(name, plant.names, [plant.derivative_unit(plant.coordinates[c], 1) for c in plant.names])
 
 
 EXAMPLES = (

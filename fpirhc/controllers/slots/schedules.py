@@ -57,27 +57,34 @@ class FixedSchedule(Schedule):
 
     def check(self, names: Sequence[str], problem: Problem, mistakes: Mistakes) -> None:
         """Note unknown and missing coordinates, overlaps, gaps, and spans beyond the run."""
+        unit = problem.time_unit
         wrong = [span for span in self.spans if not _is_span(span)]
         for span in wrong:
-            mistakes.add(f"FixedSchedule: {span!r} is no span; expected (coordinate, start, end) with times in s")
+            mistakes.add(f"FixedSchedule: {span!r} is no span; expected (coordinate, start, end) with times in {unit}")
         if wrong:
             return
         _check_visits("FixedSchedule", [c for c, _, _ in self.spans], names, mistakes)
         at, half = 0.0, 0.5 * problem.period
         for name, start, end in self._ordered():
-            where = f"FixedSchedule: '{name}' from {start:g} to {end:g} s"
+            where = f"FixedSchedule: '{name}' from {start:g} to {end:g} {unit}"
             if end - start < problem.period * (1 - 1e-9):
-                mistakes.add(f"{where} is shorter than one control cycle of {problem.period:g} s; let it end later")
+                mistakes.add(
+                    f"{where} is shorter than one control cycle of {problem.period:g} {unit}; let it end later"
+                )
             if start < at - half:
-                mistakes.add(f"{where} overlaps the slot before it, which ends at {at:g} s; let it start there")
+                mistakes.add(f"{where} overlaps the slot before it, which ends at {at:g} {unit}; let it start there")
             elif start > at + half:
-                mistakes.add(f"FixedSchedule: no slot from {at:g} to {start:g} s; let '{name}' start at {at:g} s")
+                mistakes.add(
+                    f"FixedSchedule: no slot from {at:g} to {start:g} {unit}; let '{name}' start at {at:g} {unit}"
+                )
             at = max(at, end)
         end = problem.duration
         if at > end + half:
-            mistakes.add(f"FixedSchedule: the last slot ends at {at:g} s, after the run's {end:g} s; let it end there")
+            mistakes.add(
+                f"FixedSchedule: the last slot ends at {at:g} {unit}, after the run's {end:g} {unit}; let it end there"
+            )
         elif at < end - half:
-            mistakes.add(f"FixedSchedule: no slot from {at:g} s to the end of the run at {end:g} s; add one")
+            mistakes.add(f"FixedSchedule: no slot from {at:g} {unit} to the end of the run at {end:g} {unit}; add one")
 
     def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
         """Return the longest stretch of each coordinate; adjacent spans of one coordinate count as one."""
@@ -151,10 +158,11 @@ def _check_visits(owner: str, visited: Iterable[str], names: Sequence[str], mist
 
 def check_stretch(what: str, value: float, problem: Problem, mistakes: Mistakes) -> None:
     """Note a length of time that is no positive number or shorter than one control cycle."""
+    unit = problem.time_unit
     if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
-        mistakes.add(f"{what} must be a positive number of seconds, got {value!r}")
+        mistakes.add(f"{what} must be a positive number, in {unit}, got {value!r}")
     elif value < problem.period * (1 - 1e-9):
-        mistakes.add(f"{what} is {value:g} s, shorter than one control cycle of {problem.period:g} s")
+        mistakes.add(f"{what} is {value:g} {unit}, shorter than one control cycle of {problem.period:g} {unit}")
 
 
 def _timed(problem: Problem, channels: Sequence[Channel], starts: Sequence[tuple[str, float]], cycles: float) -> Block:
@@ -170,4 +178,4 @@ def _timed(problem: Problem, channels: Sequence[Channel], starts: Sequence[tuple
             slot += (number - before) * (phase > start - 0.5)
         return {"slot": slot}
 
-    return Block("schedule", Layout((scalar("time", "s"),)), Layout((scalar("slot"),)), step)
+    return Block("schedule", Layout((problem.plant.time,)), Layout((scalar("slot"),)), step)

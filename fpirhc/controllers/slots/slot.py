@@ -137,7 +137,8 @@ def _light_plant(plant: Plant, chain: OutputChain) -> Plant:
     names = [f"d{k}" for k in range(chain.order)] + ["u", "p"]
     kind = inspect.Parameter.POSITIONAL_ONLY
     vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(n, kind) for n in names])
-    return Plant({chain.coordinate: chain.unit}, {chain.input: plant.inputs[chain.input]}, {}, response, chain.order)
+    inputs = {chain.input: plant.inputs[chain.input]}
+    return Plant({chain.coordinate: chain.unit}, inputs, {}, response, chain.order, time_unit=plant.time_unit)
 
 
 def for_channel(

@@ -42,7 +42,7 @@ def reference_block(problem: Problem) -> Block:
         return {"reference": reference, "error": reference[places] - s.state[places]}
 
     writes = Layout((like(plant.state, "reference"), error_signal(problem, "error")))
-    reads = Layout((scalar("time", "s"), plant.state))
+    reads = Layout((plant.time, plant.state))
     return Block("reference", reads, writes, step, opaque=problem.reference.opaque)
 
 
@@ -73,7 +73,7 @@ def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
     elements = one.plant.state.elements
     writes = [one.signal(n, elements) for n in ("state", "target")]
     writes += [one.signal(n) for n in ("nominal", "free", "gain", "good", "divisor")]
-    reads = Layout((scalar("time", "s"), plant.state, plant.parameter, like(plant.input, "_command_before")))
+    reads = Layout((plant.time, plant.state, plant.parameter, like(plant.input, "_command_before")))
     return Block(f"slot_state_{one.number}", reads, Layout(tuple(writes)), step, opaque=problem.reference.opaque)
 
 

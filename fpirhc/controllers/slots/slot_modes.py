@@ -96,7 +96,7 @@ def _set_point(problem: Problem, parameters: np.ndarray) -> tuple[np.ndarray, np
     state, response = (np.asarray(v.full()).ravel() for v in reference_end)
     moving = [abs(v) for e, v in zip(plant.state.elements, state, strict=True) if "'" in e]
     if max([*moving, *np.abs(response)]) > _STILL:
-        return f"the reference still moves at its end, t = {problem.duration:g} s"
+        return f"the reference still moves at its end, t = {problem.duration:g} {problem.time_unit}"
     x, u, p = plant.symbols()
     rate = plant.derivative_function(x, u, p)
     function = ca.Function("fpirhc_rate", [x, u, p], [rate, ca.densify(ca.jacobian(rate, u))])

@@ -129,8 +129,8 @@ class Slotted(Controller):
         )
         verb = "shrink" if floquet.radius < 1 else "grow"
         return (
-            f"Floquet radius {floquet.radius:.3g} per period of {floquet.period:g} s: near the set-point errors of ideal slots "
-            f"{verb} (largest real part in each slot alone, 1/s: {alone})",
+            f"Floquet radius {floquet.radius:.3g} per period of {floquet.period:g} {problem.time_unit}: near the set-point errors "
+            f"of ideal slots {verb} (largest real part in each slot alone, 1/{problem.time_unit}: {alone})",
         )
 
     def channels(self, problem: Problem) -> list[Channel]:
@@ -164,14 +164,14 @@ class Slotted(Controller):
         """Raise where zero dynamics grow too much by the model at the reference's last point; it needs a set-point there."""
         modes, _ = linear_modes(problem, channels, problem.plant.approximate, 0.0)
         dwells = self.schedule.dwells([c.slot.coordinate for c in channels], problem)
-        mistakes = Mistakes("Slotted")
+        mistakes, unit = Mistakes("Slotted"), problem.time_unit
         for one, mode in zip(channels, modes, strict=False):
             name, exponent = one.slot.coordinate, mode.rate * dwells[one.slot.coordinate]
             if exponent > math.log(self.largest_growth):
                 mistakes.add(
-                    f"slot '{name}' lasts {dwells[name]:g} s, in which its zero dynamics, diverging at {mode.rate:.3g} 1/s, grow "
-                    f"e^{exponent:.3g} times, more than largest_growth = {self.largest_growth:g}; make it shorter than "
-                    f"{math.log(self.largest_growth) / mode.rate:.3g} s"
+                    f"slot '{name}' lasts {dwells[name]:g} {unit}, in which its zero dynamics, diverging at {mode.rate:.3g} "
+                    f"1/{unit}, grow e^{exponent:.3g} times, more than largest_growth = {self.largest_growth:g}; make it shorter "
+                    f"than {math.log(self.largest_growth) / mode.rate:.3g} {unit}"
                 )
         mistakes.raise_if_any()
 

@@ -34,7 +34,7 @@ from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.dead_time import MOST, DeadTime
 from fpirhc.task.problem import Problem
 
@@ -208,7 +208,7 @@ class Predicted(Controller):
         if not cycles:
             return self.controller.blocks(problem)
         inner = compose_controller(problem, self.controller, ahead=True)
-        ahead = {"time": scalar("time_ahead", "s"), "state": like(plant.state, "state_ahead")}
+        ahead = {"time": like(plant.time, "time_ahead"), "state": like(plant.state, "state_ahead")}
         feeds = {**ahead, MEASURED: plant.state}
         sent = self.by.sent(plant)
         before = Signal("_sent_before", sent.elements, sent.units, self.by.sent_at_start(problem))
@@ -230,7 +230,7 @@ def _predict_block(
     advance = by.advance(plant, problem.period)
     corrected = _residual(plant, by.residual_time, problem.period) if by.residual_time else None
     responses = (plant.response_signal("realised"),) if corrected else ()
-    reads = (scalar("time", "s"), plant.state, *responses, plant.parameter, before)
+    reads = (plant.time, plant.state, *responses, plant.parameter, before)
     own = (queue, residual) if corrected else (queue,)
 
     def step(s: Signals) -> dict[str, Expression]:

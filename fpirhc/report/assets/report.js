@@ -1,8 +1,12 @@
 "use strict";
 // Linked charts: one cursor, one zoom, one set of shown controllers. DATA is written by the page.
+const HEIGHT = 220; // of a chart, px
+const labelled = { size: 30, labelSize: 18, labelGap: 0, labelFont: "12px system-ui,sans-serif" };
 const RESPONSES = { nominal: "#009e73", desired: "#0072b2", deformed: "#e69f00", realised: "#d55e00" };
-const colors = Object.fromEntries(DATA.controllers.map((c) => [c.name, c.color]));
 const ink = getComputedStyle(document.documentElement).getPropertyValue("--ink").trim();
+// The palette's black is the page's ink, which is light where the page is dark.
+const tone = (color) => (color === "#111111" ? ink : color);
+const colors = Object.fromEntries(DATA.controllers.map((c) => [c.name, tone(c.color)]));
 const faint = getComputedStyle(document.documentElement).getPropertyValue("--line").trim();
 const shown = new Set(DATA.controllers.map((c) => c.name));
 const sync = uPlot.sync("time");
@@ -34,14 +38,19 @@ function bands(chart, spec) {
   ctx.restore();
 }
 
-function draw(spec) {
+// All boxes stand in the grid before a chart is drawn: a box that is alone in it is as wide as the page.
+function place(spec) {
   const box = document.createElement("div");
   box.className = "chart";
   const title = document.createElement("h3");
   title.textContent = spec.title + " [" + spec.unit + "]";
   box.append(title);
   document.getElementById("charts").append(box);
-  const series = [{ label: "t [s]" }].concat(
+  return { box, spec };
+}
+
+function draw({ box, spec }) {
+  const series = [{ label: "t [" + DATA.timeUnit + "]" }].concat(
     spec.series.map((s) => ({
       label: s.name,
       stroke: colors[s.name] || RESPONSES[s.name] || ink,
@@ -52,18 +61,26 @@ function draw(spec) {
   );
   const axis = { stroke: ink, grid: { stroke: faint, width: 1 }, ticks: { stroke: faint, width: 1 } };
   const options = {
-    width: box.clientWidth || 520,
-    height: 210,
+    width: box.clientWidth,
+    height: HEIGHT,
     series,
     // What was predicted before the run, between its two edges.
     bands: spec.band ? [{ series: spec.band, fill: "#0072b222" }] : [],
     scales: { x: { time: false } },
-    axes: [{ ...axis }, { ...axis, size: 62 }],
+    axes: [{ ...axis, ...labelled, label: "t [" + DATA.timeUnit + "]" }, { ...axis, size: 62 }],
     cursor: { sync: { key: sync.key } },
     hooks: { setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)] },
   };
   const chart = new uPlot(options, [DATA.time, ...spec.series.map((s) => s.values)], box);
   plots.push({ chart, box, spec });
+}
+
+// A chart is as wide as its box, also after the box was hidden. The next frame, because a new size inside the callback starts it anew.
+function fit() {
+  requestAnimationFrame(() => {
+    for (const { chart, box } of plots)
+      if (box.clientWidth && box.clientWidth !== chart.width) chart.setSize({ width: box.clientWidth, height: HEIGHT });
+  });
 }
 
 function show() {
@@ -89,14 +106,14 @@ function control(controller) {
   });
   const swatch = document.createElement("span");
   swatch.className = "swatch";
-  swatch.style.background = controller.color;
+  swatch.style.background = colors[controller.name];
   label.append(box, swatch, document.createTextNode(controller.name));
   document.getElementById("controllers").append(label);
   return { box, name: controller.name };
 }
 
 const boxes = DATA.controllers.map(control);
-DATA.charts.forEach(draw);
+DATA.charts.map(place).forEach(draw);
 // Begin with the controllers of the verdict's first sentence, so that a diverged one does not set every scale.
 if (DATA.begin.length) {
   shown.clear();
@@ -106,4 +123,5 @@ if (DATA.begin.length) {
   }
 }
 show();
-addEventListener("resize", () => plots.forEach(({ chart, box }) => box.hidden || chart.setSize({ width: box.clientWidth, height: 210 })));
+const observer = new ResizeObserver(fit);
+plots.forEach(({ box }) => observer.observe(box));

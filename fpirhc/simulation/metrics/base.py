@@ -51,7 +51,7 @@ class Metric:
         compared: how baselines compare it: 'banded' (inside a computed band), 'tight' (to 1e-6), 'exact', 'not'.
         finite: whether a run that finished must have a finite number.
         floor: size of a difference up to which two numbers count as equal.
-        step: (period in s, number of cycles) -> the smallest step of a number that counts cycles.
+        step: (period, number of cycles) -> the smallest step of a number that counts cycles.
         order: place among the columns, smallest first.
 
     Raises:

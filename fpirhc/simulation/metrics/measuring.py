@@ -62,7 +62,7 @@ class Metrics:
 
     @property
     def settling(self) -> Mapping[str, float]:
-        """Settling time by coordinate, s; NaN where the run did not settle."""
+        """Settling time by coordinate; NaN where the run did not settle."""
         return self["settling"]
 
     @property

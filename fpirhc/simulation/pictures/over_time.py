@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fpirhc.simulation import drawing
 from fpirhc.simulation.pictures.base import Picture, Quantity, caption_axes, extremes, label, numbers
 from fpirhc.simulation.run import Run
 
@@ -24,8 +25,7 @@ class OverTime(Picture):
         panels: one entry for each panel: the name of a signal ("command.u"), or a Quantity.
         caption: of the picture.
         levels: values at which a panel has a dashed line (thresholds, limits), by the panel's signal or quantity name.
-        time: unit of the problem's time.
-        since: time from which the lines are drawn, in that unit.
+        since: time from which the lines are drawn.
         controllers: names of those shown; empty: all.
     """
 
@@ -33,7 +33,6 @@ class OverTime(Picture):
     panels: tuple[str | Quantity, ...]
     caption: str = ""
     levels: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    time: str = "s"
     since: float = 0.0
     controllers: tuple[str, ...] = ()
 
@@ -58,5 +57,5 @@ class OverTime(Picture):
             for level in self.levels.get(what if isinstance(what, str) else what.name, ()):
                 axis.axhline(level, color="#777777", lw=0.8, ls="--")
             caption_axes(axis, "", up)
-        axes[-1].set_xlabel(f"time [{self.time}]")
+        axes[-1].set_xlabel(drawing.time_label(next(iter(runs.values()))))
         axes[0].legend(fontsize=7, loc="best", framealpha=0.8)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fpirhc.simulation import drawing
 from fpirhc.simulation.pictures.base import Picture, Quantity, caption_axes, numbers
 from fpirhc.simulation.run import Run
 
@@ -24,7 +25,6 @@ class Raster(Picture):
         signal: the name of a signal ("state.V"), or a Quantity.
         threshold: in the unit of the signal.
         caption: of the picture.
-        time: unit of the problem's time.
         controllers: names of those shown; empty: all.
     """
 
@@ -32,7 +32,6 @@ class Raster(Picture):
     signal: str | Quantity
     threshold: float
     caption: str = ""
-    time: str = "s"
     controllers: tuple[str, ...] = ()
 
     def size(self, count: int) -> tuple[float, float]:
@@ -52,7 +51,7 @@ class Raster(Picture):
         axis.set_yticks(np.arange(len(runs)), counts, fontsize=8)
         axis.set_ylim(len(runs) - 0.5, -0.5)
         axis.set_xlim(0, max(float(run.time[-1]) for run in runs.values()))
-        caption_axes(axis, f"time [{self.time}]", "")
+        caption_axes(axis, drawing.time_label(next(iter(runs.values()))), "")
 
 
 def passages(times: np.ndarray, values: np.ndarray, threshold: float) -> np.ndarray:

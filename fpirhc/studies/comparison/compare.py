@@ -106,7 +106,7 @@ class Comparison:
         title: its title.
         description: its description.
         seed: of the disturbances and the noise.
-        measure_from: time from which errors count, s.
+        measure_from: time from which errors count.
         entries: the controllers that ran, in order.
         skipped: reasons why controllers were skipped, by name.
         findings: the verdict, sentence by sentence with outcomes; the headline pair is first.
@@ -116,6 +116,7 @@ class Comparison:
         elapsed: wall time of the comparison, s.
         pictures: pictures of the problem for the report.
         null: what adaptation does where there is nothing to adapt, for the first pair; None without one.
+        time_unit: unit of time of the problem.
     """
 
     problem: str
@@ -132,6 +133,7 @@ class Comparison:
     elapsed: float
     pictures: tuple[Picture, ...] = ()
     null: NullTest | None = None
+    time_unit: str = "s"
 
     @property
     def verdict(self) -> tuple[str, ...]:
@@ -232,6 +234,7 @@ def compare(
         elapsed=time.perf_counter() - begin,
         pictures=task.pictures,
         null=_null(task.problem, judged[0], entries, loops, sizes, seed),
+        time_unit=task.problem.time_unit,
     )
 
 

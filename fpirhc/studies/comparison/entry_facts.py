@@ -83,4 +83,4 @@ def _discretisation(problem: Problem, controller: Controller) -> list[str]:
         return []
     if answer is None or answer.verdict == Verdict.YES:
         return []
-    return [f"the discretisation of its horizon does not follow the plant ({answer.found})"]
+    return [f"the discretisation of its horizon does not follow the plant ({answer.evidence})"]

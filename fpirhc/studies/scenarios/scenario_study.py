@@ -38,7 +38,7 @@ class ScenarioComparison:
         count: number of scenarios.
         percent: range of the exact parameters' draws, percent.
         seed: of all draws.
-        measure_from: time from which errors count, s.
+        measure_from: time from which errors count.
         columns: columns of the summaries' metrics in a short table.
         summaries: summaries in the controllers' order, the baseline first.
         records: records of the scenarios, by controller.
@@ -49,6 +49,7 @@ class ScenarioComparison:
         versions: versions of fpirhc and of what its numbers depend on.
         command: the command line.
         elapsed: wall time of the study, s.
+        time_unit: unit of time of the problem.
     """
 
     problem: str
@@ -68,6 +69,7 @@ class ScenarioComparison:
     versions: Mapping[str, str]
     command: str
     elapsed: float
+    time_unit: str = "s"
 
     def __getitem__(self, name: str) -> Summary:
         for summary in self.summaries:
@@ -135,6 +137,7 @@ def compare_scenarios(
         percent=float(percent),
         seed=seed,
         measure_from=task.problem.measure_from,
+        time_unit=task.problem.time_unit,
         columns=_columns(task, summaries),
         summaries=summaries,
         records=records,

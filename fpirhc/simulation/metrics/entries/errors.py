@@ -35,7 +35,7 @@ METRICS = (
         "iae",
         iae,
         by="coordinate",
-        unit=lambda problem, name: f"{coordinate_unit(problem, name)} s",
+        unit=lambda problem, name: f"{coordinate_unit(problem, name)} {problem.time_unit}",
         report=False,
         finite=True,
         order=30,

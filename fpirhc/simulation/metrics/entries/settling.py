@@ -29,5 +29,13 @@ def _settling(run: Run, coordinate: str) -> float:
 
 
 METRICS = (
-    Metric("settling", settling, by="coordinate", unit="s", title="settled", step=lambda period, _: period, order=40),
+    Metric(
+        "settling",
+        settling,
+        by="coordinate",
+        unit=lambda problem, _: problem.time_unit,
+        title="settled",
+        step=lambda period, _: period,
+        order=40,
+    ),
 )

@@ -1,0 +1,248 @@
+"""Reports in a real browser: nothing overlaps, nothing is cut without a hint, nothing is fetched, nothing is complained about.
+
+Every test is skipped, with the reason, where there is no browser.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import pytest
+from plants import chain, linear
+
+import fpirhc as fp
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.report.html import write_report
+from fpirhc.report.scenarios import write_scenarios
+from fpirhc.studies.comparison.compare import compare
+from fpirhc.studies.scenarios.scenario_study import compare_scenarios
+
+pytestmark = pytest.mark.browser
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+BOXES = Path(__file__).with_name("browser_boxes.js").read_text(encoding="utf-8")
+SCREENS = ((1280, "light"), (1280, "dark"), (390, "light"), (390, "dark"))
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """Chromium, of the system or of Playwright."""
+    api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: ./scripts/browser-test")
+    with api.sync_playwright() as playwright:
+        own = playwright.chromium.executable_path
+        path = next(filter(None, map(shutil.which, NAMES)), own if Path(own).exists() else None)
+        if path is None:
+            pytest.skip("no browser is installed: neither Chromium nor Chrome is on the PATH, and Playwright has none")
+        # As root Chromium starts without its sandbox only; the pages are those of this project.
+        sandbox = ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
+        chromium = playwright.chromium.launch(executable_path=path, args=sandbox)
+        yield chromium
+        chromium.close()
+
+
+@dataclass
+class Opened:
+    """A page in the browser.
+
+    Args:
+        page: the page.
+        complaints: what the console and the page complained about.
+        requests: addresses that the page asked for.
+        refusals: reasons why nothing came, by address.
+    """
+
+    page: Any
+    complaints: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
+    refusals: dict[str, str] = field(default_factory=dict)
+
+
+@pytest.fixture
+def visit(browser: Any) -> Iterator[Any]:
+    """Function (path of a page, width, colour scheme) -> the opened page, after its first frames."""
+    contexts = []
+
+    def opened(path: Path, width: int = 1280, scheme: str = "light") -> Opened:
+        contexts.append(browser.new_context(viewport={"width": width, "height": 800}, color_scheme=scheme))
+        one = Opened(contexts[-1].new_page())
+        one.page.on("console", lambda m: one.complaints.append(m.text) if m.type in ("error", "warning") else None)
+        one.page.on("pageerror", lambda error: one.complaints.append(str(error)))
+        one.page.on("requestfailed", lambda request: one.refusals.update({request.url: request.failure}))
+        one.page.on("request", lambda request: one.requests.append(request.url))
+        one.page.goto(path.as_uri())
+        settle(one.page)
+        return one
+
+    yield opened
+    for context in contexts:
+        context.close()
+
+
+def settle(page: Any) -> None:
+    """Wait until the page has drawn two more frames."""
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
+@pytest.fixture(scope="session")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder in which pictures of the pages are kept."""
+    wanted = os.environ.get("FPIRHC_PICTURES")
+    folder = Path(wanted) if wanted else tmp_path_factory.mktemp("pictures")
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def task(plant: fp.Plant, adaptive: int) -> Task:
+    """A sine on a plant with a wrong model; a controller without adaptation and some with it, one with a long name."""
+    track = fp.Exponential(rate=6.0)
+    gains = {f"adaptive {k}": -0.2 - 0.1 * k for k in range(adaptive - 1)} | {
+        "adaptive, with a name that is long": -0.9
+    }
+    maps = {name: fp.ComputedTorque(track, fp.Sigmoid(gain=gain, scale=50.0)) for name, gain in gains.items()}
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}),
+        start={"y": 0.3},
+        period=2e-3,
+        duration=1.0,
+    )
+    controllers = {"plain": fp.ComputedTorque(track), **maps}
+    return Task("case", Path(__file__), "A plant with a wrong model", "Its description.", problem, controllers)
+
+
+@pytest.fixture(scope="session")
+def reports(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Pages by name: ten controllers, two controllers on a plant of order one, scenarios."""
+    del browser  # pages are made only where there is one
+    folder = tmp_path_factory.mktemp("reports")
+    many, few = task(linear(1.6, 1.0), 9), task(chain(1), 1)
+    paths = {name: folder / f"{name}.html" for name in ("many", "order_one", "scenarios")}
+    write_report(compare(many, seed=0, compiled=False), paths["many"])
+    write_report(compare(few, seed=0, compiled=False), paths["order_one"])
+    study = compare_scenarios(few, count=3, percent=10.0, seed=0, folder=folder, compiled=False)
+    write_scenarios(study, paths["scenarios"])
+    return paths
+
+
+@pytest.mark.parametrize("name", ["many", "order_one", "scenarios"])
+@pytest.mark.parametrize(("width", "scheme"), SCREENS)
+def test_a_page_lies_well_at_first_load(name, width, scheme, reports, visit, pictures):
+    """No two boxes overlap, no chart sticks out of its box, the page is no wider than the window, the console is silent."""
+    one = visit(reports[name], width, scheme)
+    one.page.screenshot(path=pictures / f"{name}-{width}-{scheme}.png")
+    one.page.screenshot(path=pictures / f"{name}-{width}-{scheme}-whole.png", full_page=True)
+    found = one.page.evaluate(BOXES)
+    assert found["count"] > 8
+    assert (found["charts"] > 2) == (name != "scenarios")
+    assert found["overlaps"] == []
+    assert found["outside"] == []
+    assert one.page.evaluate("document.documentElement.scrollWidth") <= width
+    assert one.complaints == []
+
+
+def test_charts_lie_side_by_side_on_a_desktop_and_below_each_other_on_a_telephone(reports, visit):
+    """Every shown chart is as wide as its box, two in a row at 1280 px and one at 390 px."""
+    lefts = "[...new Set([...document.querySelectorAll('.chart:not([hidden])')].map((e) => e.getBoundingClientRect().left))]"
+    for width, columns in ((1280, 2), (390, 1)):
+        page = visit(reports["many"], width).page
+        assert len(page.evaluate(lefts)) == columns
+        widths = page.evaluate("plots.filter((p) => !p.box.hidden).map((p) => p.chart.width - p.box.clientWidth)")
+        assert widths
+        assert set(widths) == {0}
+
+
+def test_a_chart_that_was_hidden_fits_when_it_is_shown(reports, visit):
+    """Charts of one controller's responses are hidden while three are shown; meanwhile the window has become smaller."""
+    one = visit(reports["many"])
+    hidden = "document.querySelectorAll('.chart[hidden]').length"
+    before = one.page.evaluate(hidden)
+    third = one.page.query_selector("#controllers input:not(:checked)")
+    third.click()
+    assert one.page.evaluate(hidden) > before
+    one.page.set_viewport_size({"width": 800, "height": 800})
+    third.click()
+    settle(one.page)
+    settle(one.page)
+    assert one.page.evaluate(hidden) == before
+    assert one.page.evaluate("plots.every((p) => p.box.hidden || p.chart.width === p.box.clientWidth)")
+    assert one.page.evaluate(BOXES)["overlaps"] == []
+    assert one.complaints == []
+
+
+def test_axes_of_charts_name_time_and_its_unit(reports, visit):
+    """The label is part of the axis, so that a picture of a chart says what is drawn."""
+    page = visit(reports["many"]).page
+    assert page.evaluate("[...new Set(plots.map((p) => p.chart.axes[0].label))]") == ["t [s]"]
+
+
+def test_a_table_that_is_cut_says_so(reports, visit):
+    """The hint is there where the table is wider than the window, and only there; at its end the shade is gone."""
+    page = visit(reports["many"], 1280).page
+    assert page.is_visible(".more")
+    assert page.evaluate("document.querySelector('.scroll').classList.contains('cut')")
+    page.evaluate("document.querySelector('.scroll').scrollLeft = 1e6")
+    page.wait_for_function("!document.querySelector('.scroll').classList.contains('cut')")
+    page.add_style_tag(content="th:nth-child(n+5), td:nth-child(n+5) { display: none }")
+    page.wait_for_selector(".more", state="hidden")
+    narrow = visit(reports["many"], 390).page
+    assert narrow.is_visible(".more")
+    heads = narrow.evaluate(
+        "[...document.querySelectorAll('.scroll tbody th')].map((e) => e.getBoundingClientRect().right)"
+    )
+    assert max(heads) < 200  # so that numbers stand beside the names
+
+
+def test_the_tenth_colour_is_seen_on_dark_paper(reports, visit):
+    """No swatch has the colour of the page; the palette's last colour is black."""
+    page = visit(reports["many"], 1280, "dark").page
+    background = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    swatches = page.evaluate(
+        "[...document.querySelectorAll('.swatch')].map((e) => getComputedStyle(e).backgroundColor)"
+    )
+    assert len(swatches) == 10
+    assert min(abs(luminance(s) - luminance(background)) for s in swatches) > 0.04
+
+
+def luminance(colour: str) -> float:
+    """Relative luminance of 'rgb(r, g, b)', between 0 and 1 (WCAG 2.1)."""
+    shares = [int(v) / 255 for v in colour.removeprefix("rgb(").removesuffix(")").split(",")]
+    linear_shares = [s / 12.92 if s <= 0.04045 else ((s + 0.055) / 1.055) ** 2.4 for s in shares]
+    return sum(w * s for w, s in zip((0.2126, 0.7152, 0.0722), linear_shares, strict=True))
+
+
+PROBES = {
+    "a picture from elsewhere": "const e = document.createElement('img'); e.src = 'https://example.invalid/x.png';",
+    "a script from elsewhere": "const e = document.createElement('script'); e.src = 'https://example.invalid/x.js';",
+    "a script in the page": "const e = document.createElement('script'); e.textContent = 'window.intruder = 1';",
+    "a style from elsewhere": (
+        "const e = document.createElement('link'); e.rel = 'stylesheet'; e.href = 'https://example.invalid/x.css';"
+    ),
+    "a frame": "const e = document.createElement('iframe'); e.src = 'https://example.invalid/';",
+}
+
+
+@pytest.mark.parametrize("name", ["many", "scenarios"])
+def test_nothing_is_loaded_from_anywhere(name, reports, visit):
+    """The page asks for itself alone; whatever gets into it is refused by the page's own policy."""
+    one: Any = visit(reports[name])
+    assert [r for r in one.requests if not r.startswith("data:")] == [reports[name].as_uri()]
+    for what, probe in PROBES.items():
+        refused = one.page.evaluate(
+            """(probe) => new Promise((done) => {
+                document.addEventListener('securitypolicyviolation', (e) => done(e.effectiveDirective), { once: true });
+                const make = new Function(probe + 'document.body.append(e)');
+                make();
+                setTimeout(() => done(''), 2000);
+            })""",
+            probe,
+        )
+        assert refused, what
+    assert one.page.evaluate("window.intruder") is None
+    elsewhere = [r for r in one.requests if not r.startswith("file:")]
+    assert {one.refusals[r] for r in elsewhere} == {"csp"}  # a network that fails would say so in other words

@@ -1,0 +1,148 @@
+"""What a check says about changes: in percent, the largest first, a stale setting before its consequences, a floor."""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+import pytest
+
+from fpirhc.baselines.bands import BANDED, Expected, Metric
+from fpirhc.baselines.baseline import Baseline
+from fpirhc.baselines.judging import BETTER, CHANGED, HOLDS, WORSE, Judgement, Row, ignoring, judge
+from fpirhc.baselines.junit import to_junit
+from fpirhc.baselines.markdown import to_markdown
+from fpirhc.baselines.measuring import FINISHED, Measurement
+from fpirhc.baselines.outline import outline
+from fpirhc.baselines.settings import Settings
+from fpirhc.baselines.terminal import show_check
+from fpirhc.baselines.words import change
+from fpirhc.cli.verbs.check import _share
+
+
+def expected(**values: float) -> Expected:
+    """Metrics with bands of a millionth."""
+    return Expected((FINISHED,), {n: Metric(BANDED, v, 1e-6 * abs(v), {}) for n, v in values.items()}, {})
+
+
+def judged(old: dict[str, dict[str, float]], new: dict[str, dict[str, float]], before: Settings, now: Settings):
+    """The judgement of controllers with these metrics."""
+    baseline = Baseline(
+        problem="case",
+        reason="first",
+        date="2026-01-01",
+        seed=0,
+        versions={},
+        varied={},
+        settings=before,
+        controllers={name: expected(**values) for name, values in old.items()},
+    )
+    fresh = {name: Measurement(FINISHED, "", dict(values)) for name, values in new.items()}
+    return judge(baseline, now, fresh)
+
+
+def errors(**values: float) -> dict[str, float]:
+    """Rms errors by coordinate."""
+    return {f"rms_error.{name}": value for name, value in values.items()}
+
+
+SAME = Settings({"period": 1e-3}, {"RHC": {"gain": 1.0}, "PID": {"gain": 2.0}})
+
+
+def test_two_millionths_are_a_change_and_not_worse():
+    """From a tenth of a percent on the direction counts; the value just inside and just outside."""
+    old = {"RHC": errors(a=1.0, b=1.0, c=1.0, d=1.0), "PID": {}}
+    new = {"RHC": errors(a=1 + 2e-6, b=1.0009, c=1.0011, d=0.9), "PID": {}}
+    verdicts = {row.metric[-1]: row.verdict for row in judged(old, new, SAME, SAME).rows}
+    assert {k: verdicts[k] for k in "abcd"} == {"a": CHANGED, "b": CHANGED, "c": WORSE, "d": BETTER}
+
+
+def test_changes_are_in_percent_of_the_old_value():
+    """Also of a negative one, and of one that was zero."""
+    rows = [Row("c", "m", old, new, 0.1, CHANGED) for old, new in ((2.0, 3.0), (-2.0, -1.0), (0.0, 1.0), (0.0, 0.0))]
+    assert [row.change for row in rows] == [0.5, 0.5, math.inf, 0.0]
+    assert [change(row.change) for row in rows] == ["+50 %", "+50 %", "from zero", "+0 %"]
+    assert Row("c", "outcome", "finished", "ended early", None, CHANGED).change is None
+    assert Row("c", "m", True, False, None, CHANGED).change is None
+
+
+def test_the_largest_change_stands_first(capsys):
+    """An outcome before all numbers; what holds comes last."""
+    old = {"RHC": errors(a=1.0, b=1.0, c=1.0, d=1.0), "PID": errors(a=1.0)}
+    new = {"RHC": errors(a=1.1, b=3.0, c=0.5, d=1.0), "PID": errors(a=1.2)}
+    section = outline([judged(old, new, SAME, SAME)]).sections[0]
+    assert [(line.cells[0], line.cells[3]) for line in section.by_size if not line.holds] == [
+        ("RHC", "+200 %"),
+        ("RHC", "-50 %"),
+        ("PID", "+20 %"),
+        ("RHC", "+10 %"),
+    ]
+    assert section.by_size[-1].holds
+    show_check(outline([judged(old, new, SAME, SAME)]), every=False)
+    shown = capsys.readouterr().out
+    assert shown.index("+200 %") < shown.index("-50 %") < shown.index("+20 %") < shown.index("+10 %")
+
+
+def test_a_stale_setting_stands_first_with_its_consequences_folded(capsys):
+    """The changes of its controller are counted under it, not listed; a change that it cannot cause is listed."""
+    now = Settings(SAME.problem, {**SAME.controllers, "RHC": {"gain": 1.5}})
+    old = {"RHC": errors(a=1.0, b=1.0), "PID": errors(a=1.0)}
+    new = {"RHC": errors(a=1.1, b=3.0), "PID": errors(a=1.2)}
+    judgement = judged(old, new, SAME, now)
+    contents = outline([judgement])
+    [cause] = contents.sections[0].causes
+    assert cause.text == "stale: controller 'RHC': gain was 1.0, is 1.5"
+    assert [line.cells[3] for line in cause.lines] == ["+200 %", "+10 %"]
+    assert [line.cells[3] for line in contents.sections[0].by_size if not line.holds] == ["+20 %"]
+    show_check(contents, every=False)
+    shown = " ".join(capsys.readouterr().out.split())
+    assert shown.startswith("case: stale: controller 'RHC': gain was 1.0, is 1.5")
+    assert "2 metrics changed with it (RHC: rms_error.b +200 %; RHC: rms_error.a +10 %); --all shows them" in shown
+    assert shown.index("gain was") < shown.index("2 metrics changed") < shown.index("+20 %")
+    assert shown.count("gain was") == 1
+    page = to_markdown(contents)
+    assert page.index("gain") < page.index("<details><summary>2 metrics changed with it") < page.index("+20 ")
+    assert page.index("+200 ") < page.index("</details>") < page.index("+20 ")
+    assert "gain was 1.0" in to_junit(contents)
+    show_check(contents, every=True)
+    assert "+10 %" in capsys.readouterr().out
+
+
+def test_a_setting_of_the_problem_explains_every_change():
+    """And each change stands once, under the first setting that can have caused it."""
+    now = Settings({"period": 2e-3}, {**SAME.controllers, "RHC": {"gain": 1.5}})
+    old = {"RHC": errors(a=1.0), "PID": errors(a=1.0)}
+    new = {"RHC": errors(a=1.1), "PID": errors(a=1.2)}
+    section = outline([judged(old, new, SAME, now)]).sections[0]
+    assert [len(cause.lines) for cause in section.causes] == [2, 0]
+    assert section.unclear
+    assert all(line.holds for line in section.by_size)
+
+
+def test_a_floor_ignores_small_changes_and_nothing_else():
+    """Counts, outcomes and metrics that are gone stay; what was ignored is counted."""
+    rows = (
+        Row("c", "small", 1.0, 1.0004, 1e-6, CHANGED),
+        Row("c", "large", 1.0, 1.002, 1e-6, WORSE),
+        Row("c", "count", 10_000, 10_001, None, CHANGED),
+        Row("c", "gone", 1.0, None, 1e-6, CHANGED),
+        Row("c", "outcome", "finished", "ended early", None, CHANGED),
+    )
+    left = ignoring(Judgement("case", rows), 1e-3)
+    assert [row.verdict for row in left.rows] == [HOLDS, WORSE, CHANGED, CHANGED, CHANGED]
+    assert left.notes == ("1 changes below 0.1 % are ignored",)
+    assert ignoring(Judgement("case", rows), 0.0) == Judgement("case", rows)
+    assert ignoring(Judgement("case", rows[:1]), 1e-3).holds
+
+
+@pytest.mark.parametrize(("text", "share"), [("0.1%", 1e-3), ("0.1", 1e-3), ("0", 0.0), ("2 %", 0.02)])
+def test_the_floor_is_a_percentage(text, share):
+    """With or without the sign."""
+    assert _share(text) == pytest.approx(share)
+
+
+@pytest.mark.parametrize("text", ["-1%", "a bit", "100%", "nan"])
+def test_a_wrong_floor_is_refused(text):
+    """The message shows how to write one."""
+    with pytest.raises(argparse.ArgumentTypeError, match=r"write 0\.1%"):
+        _share(text)
