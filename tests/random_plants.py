@@ -88,21 +88,21 @@ def _plant(random: np.random.Generator, n: int, order: int, bend: float, inner: 
         wrong |= {f"b{k}": -wrong[f"b{k}"] for k in range(n * n)}
     cubic = 0.1 * bend * float(random.uniform() < 0.25)  # a response that is not affine in the inputs
 
-    def response(*given):
-        *derivatives, u, p = given
+    def response(*arguments):
+        *derivatives, u, p = arguments
         q = derivatives[0]
         x = [d[f"q{k}"] for d in derivatives for k in range(n)]
         pushed = [u[f"u{k}"] + cubic * u[f"u{k}"] ** 3 for k in range(n)]
-        found = {}
+        collected = {}
         for i in range(n):
             free = sum(p[f"a{i * size + j}"] * x[j] for j in range(size))
             bent = p.c * (ca.sin(3 * q[f"q{i}"]) + x[size - 1] * q["q0"] - q[f"q{i}"] ** 3)
             gain = 1 + p.s * ca.sin(2 * q[f"q{i}"])
-            found[f"q{i}"] = free + bent + gain * sum(p[f"b{i * n + k}"] * pushed[k] for k in range(n))
+            collected[f"q{i}"] = free + bent + gain * sum(p[f"b{i * n + k}"] * pushed[k] for k in range(n))
         if inner:
-            found["q0"] += p.back * q["z"]
-            found["z"] = q["q0"] - p.decay * q["z"]
-        return found
+            collected["q0"] += p.back * q["z"]
+            collected["z"] = q["q0"] - p.decay * q["z"]
+        return collected
 
     names = [f"d{k}" for k in range(order)] + ["u", "p"]
     kind = inspect.Parameter.POSITIONAL_ONLY
@@ -131,12 +131,14 @@ def _deformation(random: np.random.Generator, largest: float, cycles: float):
     product = float(random.uniform(0.05, 3.5))
     if cycles and random.uniform() < 0.5:
         product *= 0.5
-    chosen = MAPS[int(random.integers(len(MAPS)))]
+    deformation = MAPS[int(random.integers(len(MAPS)))]
     gain = product / largest
-    chosen = chosen.with_effective_gain(min(gain, 1.0) if isinstance(chosen, fp.Rotation) else gain)
+    deformation = deformation.with_effective_gain(min(gain, 1.0) if isinstance(deformation, fp.Rotation) else gain)
     if not cycles:
-        return chosen
-    return [chosen, fp.Paired(chosen, cycles=cycles), fp.Increment(chosen, cycles=cycles)][int(random.integers(3))]
+        return deformation
+    return [deformation, fp.Paired(deformation, cycles=cycles), fp.Increment(deformation, cycles=cycles)][
+        int(random.integers(3))
+    ]
 
 
 def dies_out(case: Case) -> bool:

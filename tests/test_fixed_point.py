@@ -47,12 +47,12 @@ def test_random_box_constrained_problems_are_solved_or_honestly_not(seed, low, h
     ocp, data = CACHE["ocp"]
     bounds = np.array([low]), np.array([high])
     first = np.random.default_rng(seed).normal(size=2) * 2
-    inputs, told, _ = (v.full() for v in CACHE["step"](first, data, *bounds, CACHE["memory"]))
+    inputs, diagnostics, _ = (v.full() for v in CACHE["step"](first, data, *bounds, CACHE["memory"]))
     cost, residual, _ = (float(v) for v in CACHE["judge"](inputs, first, data, *bounds, np.zeros((2, ocp.stages))))
-    assert told.ravel()[0] == pytest.approx(cost, rel=1e-10)
-    assert told.ravel()[1] == pytest.approx(residual, rel=1e-6, abs=1e-11)
-    assert (told.ravel()[4] == fp.Status.OK) == (told.ravel()[1] <= 1e-8)
-    assert told.ravel()[4] == fp.Status.OK
+    assert diagnostics.ravel()[0] == pytest.approx(cost, rel=1e-10)
+    assert diagnostics.ravel()[1] == pytest.approx(residual, rel=1e-6, abs=1e-11)
+    assert (diagnostics.ravel()[4] == fp.Status.OK) == (diagnostics.ravel()[1] <= 1e-8)
+    assert diagnostics.ravel()[4] == fp.Status.OK
     assert low <= inputs.min() <= inputs.max() <= high
 
 
@@ -85,17 +85,17 @@ def test_a_fixed_point_stays_fixed():
     first = np.array([0.5, 0.0])
     optimiser = fp.FixedPoint(iterations=20, tolerance=1e-9)
     inputs, _, memory = call(optimiser, ocp, data, first, ocp.input_lower, ocp.input_upper)
-    again, told, _ = call(optimiser, ocp, data, first, ocp.input_lower, ocp.input_upper, memory)
+    again, diagnostics, _ = call(optimiser, ocp, data, first, ocp.input_lower, ocp.input_upper, memory)
     np.testing.assert_allclose(again, inputs, atol=1e-8)
-    assert told.ravel()[1] < 1e-9
+    assert diagnostics.ravel()[1] < 1e-9
 
 
 @pytest.mark.parametrize("optimiser", [fp.FixedPoint(iterations=6, tolerance=1e-6)], ids=["default"])
 def test_linear_quadratic_problems_need_one_step(optimiser):
     """The Riccati sweep is exact there: from any plan, the next one is the optimum."""
     ocp, data, first = linear_problem()
-    _, told, _ = call(replace(optimiser, iterations=1), ocp, data, first, ocp.input_lower, ocp.input_upper)
-    assert told.ravel()[1] < 1e-10
+    _, diagnostics, _ = call(replace(optimiser, iterations=1), ocp, data, first, ocp.input_lower, ocp.input_upper)
+    assert diagnostics.ravel()[1] < 1e-10
 
 
 def linear_problem():
@@ -172,7 +172,7 @@ def predicted_contraction(ocp, data, first, best):
     none = np.zeros((ocp.state.size, ocp.stages))
     _, slope, states, _ = reduced_gradient(ocp)(first, inputs, data, none)
     hessian = ca.Function("h", [inputs], [ca.jacobian(ca.vec(slope), ca.vec(inputs))])(best).full()
-    moved = ca.Function("j", [inputs], [ca.jacobian(ca.vec(states[:, 1:]), ca.vec(inputs))])(best).full()
+    sensitivity = ca.Function("j", [inputs], [ca.jacobian(ca.vec(states[:, 1:]), ca.vec(inputs))])(best).full()
     trajectory = ca.Function("x", [inputs], [states])(best).full()
     s, u, theta = ca.SX.sym("s", 2), ca.SX.sym("u"), ca.SX.sym("t", ocp.data.size)
     by_state = ca.Function("q", [s, u, theta], [ca.hessian(ocp.stage_cost(s, u, theta)[0], s)[0]])
@@ -181,10 +181,14 @@ def predicted_contraction(ocp, data, first, best):
     model = np.zeros_like(hessian)
     for i in range(ocp.stages):
         model[i, i] += float(by_input(trajectory[:, i], best[:, i], data[:, i]))
-        rows = moved[2 * i : 2 * i + 2]
+        rows = sensitivity[2 * i : 2 * i + 2]
         at_end = i + 1 == ocp.stages
-        after, told = trajectory[:, i + 1], data[:, i + 1]
-        model += rows.T @ (final(after, told) if at_end else by_state(after, best[:, i + 1], told)).full() @ rows
+        after, diagnostics = trajectory[:, i + 1], data[:, i + 1]
+        model += (
+            rows.T
+            @ (final(after, diagnostics) if at_end else by_state(after, best[:, i + 1], diagnostics)).full()
+            @ rows
+        )
     return np.abs(1 - np.linalg.eigvals(np.linalg.solve(model, hessian))).max(), model
 
 
@@ -302,9 +306,9 @@ def test_a_poisoned_memory_is_forgotten(poison):
     memory = np.full(optimiser.memory(ocp).size, poison)
     statuses = []
     for _ in range(5):
-        inputs, told, memory = call(optimiser, ocp, data, np.zeros(2), np.array([-1.0]), np.array([1.0]), memory)
+        inputs, diagnostics, memory = call(optimiser, ocp, data, np.zeros(2), np.array([-1.0]), np.array([1.0]), memory)
         assert np.isfinite(inputs).all()
-        statuses.append(int(told.ravel()[4]))
+        statuses.append(int(diagnostics.ravel()[4]))
     assert statuses[-1] == fp.Status.OK
 
 
@@ -330,8 +334,8 @@ def test_single_iterations_get_out_of_a_bad_plan():
     memory[optimiser.memory(ocp).slice("plan_inputs")] = np.linspace(40.0, 0.0, horizon.stages)
     statuses = []
     for _ in range(40):
-        inputs, told, memory = call(optimiser, ocp, data, first, ocp.input_lower, ocp.input_upper, memory)
-        statuses.append(int(told.ravel()[4]))
+        inputs, diagnostics, memory = call(optimiser, ocp, data, first, ocp.input_lower, ocp.input_upper, memory)
+        statuses.append(int(diagnostics.ravel()[4]))
     assert statuses[-1] == fp.Status.OK
     np.testing.assert_allclose(inputs, best.inputs, atol=1e-4)
 
@@ -350,12 +354,12 @@ def test_overflowing_models_are_told_and_survived():
     ocp = transcribe(plant, reference, horizon, cost, fp.Limits(inputs={"u": (-1.0, 1.0)}))
     data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate).full()
     optimiser = fp.FixedPoint(iterations=6, tolerance=1e-6)
-    inputs, told, memory = call(optimiser, ocp, data, np.array([30.0]), ocp.input_lower, ocp.input_upper)
-    assert int(told.ravel()[4]) == fp.Status.NON_FINITE
+    inputs, diagnostics, memory = call(optimiser, ocp, data, np.array([30.0]), ocp.input_lower, ocp.input_upper)
+    assert int(diagnostics.ravel()[4]) == fp.Status.NON_FINITE
     assert np.isfinite(inputs).all()
     for _ in range(4):
-        _, told, memory = call(optimiser, ocp, data, np.array([0.3]), ocp.input_lower, ocp.input_upper, memory)
-    assert int(told.ravel()[4]) == fp.Status.OK
+        _, diagnostics, memory = call(optimiser, ocp, data, np.array([0.3]), ocp.input_lower, ocp.input_upper, memory)
+    assert int(diagnostics.ravel()[4]) == fp.Status.OK
 
 
 def test_feedback_keeps_unstable_plants_together():
@@ -373,11 +377,11 @@ def test_feedback_keeps_unstable_plants_together():
     data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate).full()
     optimiser = fp.FixedPoint(iterations=3, tolerance=1e-6)
     _, _, memory = call(optimiser, ocp, data, np.zeros(1), ocp.input_lower, ocp.input_upper)
-    _, told, _ = call(optimiser, ocp, data, np.array([0.1]), ocp.input_lower, ocp.input_upper, memory)
-    assert told.ravel()[1] < 1.0
+    _, diagnostics, _ = call(optimiser, ocp, data, np.array([0.1]), ocp.input_lower, ocp.input_upper, memory)
+    assert diagnostics.ravel()[1] < 1.0
     without = np.where(np.arange(memory.size) < ocp.stages, memory.ravel(), 0.0)
-    _, told, _ = call(optimiser, ocp, data, np.array([0.1]), ocp.input_lower, ocp.input_upper, without)
-    assert int(told.ravel()[4]) != fp.Status.OK
+    _, diagnostics, _ = call(optimiser, ocp, data, np.array([0.1]), ocp.input_lower, ocp.input_upper, without)
+    assert int(diagnostics.ravel()[4]) != fp.Status.OK
 
 
 @pytest.mark.parametrize(
