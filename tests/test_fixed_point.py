@@ -115,9 +115,9 @@ def linear_problem():
 
 def test_clipping_a_newton_step_is_not_done():
     """Clipping gives (1, 0); the minimiser of the box QP is (1, 0.4), and the input at its bound gets no feedback."""
-    bend, centre = np.array([[1, 0.9], [0.9, 1]]), np.array([2.0, -0.5])
-    slope = -bend @ centre
-    move, gain = box_policy(2, 1)(slope, bend, np.ones((2, 1)), np.zeros(2), np.ones(2))
+    matrix, centre = np.array([[1, 0.9], [0.9, 1]]), np.array([2.0, -0.5])
+    slope = -matrix @ centre
+    move, gain = box_policy(2, 1)(slope, matrix, np.ones((2, 1)), np.zeros(2), np.ones(2))
     np.testing.assert_allclose(move.full().ravel(), [1.0, 0.4], atol=1e-12)
     np.testing.assert_allclose(gain.full().ravel(), [0.0, -1.0], atol=1e-12)
 
@@ -130,17 +130,17 @@ def test_stage_box_programs_against_scipy(seed, size):
 
     random = np.random.default_rng(seed)
     root = random.normal(size=(size + 2, size))
-    bend, slope = root.T @ root + 0.1 * np.eye(size), random.normal(size=size) * 3
+    matrix, slope = root.T @ root + 0.1 * np.eye(size), random.normal(size=size) * 3
     low, high = -random.uniform(0, 2, size), random.uniform(0, 2, size)
     policy = POLICIES.setdefault(size, box_policy(size, 1))
-    move = policy(slope, bend, np.ones((size, 1)), low, high)[0].full().ravel()
-    value = slope @ move + 0.5 * move @ bend @ move
-    factor = np.linalg.cholesky(bend).T
+    move = policy(slope, matrix, np.ones((size, 1)), low, high)[0].full().ravel()
+    value = slope @ move + 0.5 * move @ matrix @ move
+    factor = np.linalg.cholesky(matrix).T
     best = lsq_linear(factor, -np.linalg.solve(factor.T, slope), (low - 1e-12, high + 1e-12), tol=1e-14).x
     assert value <= 0
     assert np.all(move >= low)
     assert np.all(move <= high)
-    MISSED.append(value > slope @ best + 0.5 * best @ bend @ best + 1e-8)
+    MISSED.append(value > slope @ best + 0.5 * best @ matrix @ best + 1e-8)
     assert sum(MISSED) <= 0.03 * max(len(MISSED), 100)
 
 
@@ -291,10 +291,10 @@ def test_exact_hessian_converges_quadratically():
     first = np.array([2.5, 0.0])
     near = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=0.1), first, data).inputs
     iterations = {}
-    for bend in (fp.GaussNewton(), fp.ExactHessian()):
-        plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-10, hessian=bend), first, data, start=near)
+    for model in (fp.GaussNewton(), fp.ExactHessian()):
+        plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-10, hessian=model), first, data, start=near)
         assert plan.status == fp.Status.OK
-        iterations[type(bend).__name__] = plan.iterations
+        iterations[type(model).__name__] = plan.iterations
     assert iterations["ExactHessian"] <= 5 < 2 * 5 <= iterations["GaussNewton"]
 
 

@@ -165,8 +165,8 @@ def test_sliding_friction_is_the_printed_curve():
         def bristle(z, speed=speed):
             return rate_of(plant, 0.0)(0, [0.0, z, speed])[1]
 
-        bend = brentq(bristle, -1e-2, 1e-2, xtol=1e-16)
-        needed = plant.inverse_function([0.0, bend, speed], 0.0, plant.exact)
+        deflection = brentq(bristle, -1e-2, 1e-2, xtol=1e-16)
+        needed = plant.inverse_function([0.0, deflection, speed], 0.0, plant.exact)
         assert float(needed) == pytest.approx(curve, rel=1e-9), speed
 
 

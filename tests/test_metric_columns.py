@@ -209,13 +209,13 @@ def test_spectrum_is_sampled_from_the_second_to_the_last_cycle(adaptive, monkeyp
     from fpirhc.simulation.metrics.entries import contraction
 
     task, result = adaptive
-    asked = []
+    sampled_cycles = []
     monkeypatch.setattr(
-        contraction, "spectrum_over_run", lambda plant, x, r, approximate: asked.append((x, r, approximate))
+        contraction, "spectrum_over_run", lambda plant, x, r, approximate: sampled_cycles.append((x, r, approximate))
     )
     for cycles in (1000, 50):
         sampled_spectrum(task, cut(result, cycles))
-    (long, requests, believed), (short, *_) = asked
+    (long, requests, believed), (short, *_) = sampled_cycles
     assert (len(long), len(requests), len(short)) == (200, 200, 49)
     np.testing.assert_array_equal(long[[0, -1]], result["state"][[1, 999]])
     np.testing.assert_array_equal(requests[[0, -1]], result["deformed"][[1, 999]])

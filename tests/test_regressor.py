@@ -165,9 +165,9 @@ def test_plants_without_a_regressor_are_refused():
     """Fewer inputs than coordinates; an inverse that only a root finder has."""
     with pytest.raises(NotSupported, match="fully actuated"):
         fp.Regressor(fp.load_problem("cart_pole").problem.plant, ("m",))
-    bent = fp.Plant(
+    nonlinear = fp.Plant(
         {"y": "m"}, {"u": "N"}, {"m": fp.Parameter(1, 1, "kg")}, lambda q, v, u, p: {"y": ca.sinh(u.u) / p.m}
     )
     with pytest.raises(NotSupported, match="root finder"):
-        fp.Regressor(bent, ("m",))
+        fp.Regressor(nonlinear, ("m",))
     assert fp.linear_parameters(chain(1)) == ("m",)
