@@ -19,8 +19,8 @@ from fpirhc.simulation.loop import close_loop
 def chain(order: int = 2, eigenvalue: float = 1.0, period: float = 1e-3, **settings) -> fp.Problem:
     """y^(order) = u at rest, with a model that takes y^(order) for u / eigenvalue: f = eigenvalue r."""
 
-    def respond(*given):
-        *_, u, p = given
+    def respond(*arguments):
+        *_, u, p = arguments
         return {"y": u.u / p.m}
 
     kind = inspect.Parameter.POSITIONAL_ONLY
@@ -55,15 +55,15 @@ def linear_loop(problem: fp.Problem, controller: fp.ComputedTorque) -> LinearLoo
 
 def errors_after_request(problem: fp.Problem, controller: fp.ComputedTorque, requests, cycles: int) -> np.ndarray:
     """Response errors f - d (cycles, n, starts) of a loop at rest whose last request was each of these."""
-    chosen = checked(problem, controller)
-    loop = close_loop(problem, chosen)
+    ready = checked(problem, controller)
+    loop = close_loop(problem, ready)
     run = loop.function.mapaccum("run", cycles)
-    believed = np.diag(1 / chosen.parameters(problem.plant)[:1]) if len(requests[0]) == 1 else np.eye(2)
-    found = []
+    believed = np.diag(1 / ready.parameters(problem.plant)[:1]) if len(requests[0]) == 1 else np.eye(2)
+    collected = []
     for request in requests:
         memory = loop.memory.split(ca.DM(loop.memory.start()))
         memory["_deformed_last"], memory["warm_up"] = ca.DM(request), ca.DM(1)
         memory["_acting_before"] = ca.DM(np.linalg.solve(believed, request))
         trace = run(loop.memory.join(memory))[1].full()
-        found.append((trace[loop.trace.slice("realised")] - trace[loop.trace.slice("desired")]).T)
-    return np.stack(found, axis=-1)
+        collected.append((trace[loop.trace.slice("realised")] - trace[loop.trace.slice("desired")]).T)
+    return np.stack(collected, axis=-1)

@@ -45,9 +45,9 @@ def random_case(seed: int) -> Case:
     """
     random = np.random.default_rng(seed)
     n, order = int(random.integers(1, 4)), int(random.integers(1, 4))
-    bend = float(random.choice([0.0, 0.3, 1.0, 2.0]))  # how nonlinear
+    nonlinearity = float(random.choice([0.0, 0.3, 1.0, 2.0]))  # how nonlinear
     inner = bool(random.uniform() < 0.25)
-    plant = _plant(random, n, order, bend, inner)
+    plant = _plant(random, n, order, nonlinearity, inner)
     cycles = float(random.choice([0, 0, 0, 0.5, 1, 2, 4]))
     start = {f"q{k}": float(random.uniform(-0.1, 0.1)) for k in range(n)}
     problem = fp.Problem(
@@ -60,7 +60,7 @@ def random_case(seed: int) -> Case:
     )
     law = fp.Exponential(rate=float(random.uniform(2.0, 5.0)), integral=bool(random.integers(2)))
     deformation = _deformation(random, _largest(problem), cycles)
-    name = f"{seed}: {n} x order {order}, bend {bend}, inner {inner}, dead time {cycles}, {deformation}"
+    name = f"{seed}: {n} x order {order}, bend {nonlinearity}, inner {inner}, dead time {cycles}, {deformation}"
     return Case(name, problem, fp.ComputedTorque(law, deformation))
 
 
@@ -74,35 +74,35 @@ def _motion(random: np.random.Generator, n: int, inner: bool):
     return motion
 
 
-def _plant(random: np.random.Generator, n: int, order: int, bend: float, inner: bool) -> fp.Plant:
+def _plant(random: np.random.Generator, n: int, order: int, nonlinearity: float, inner: bool) -> fp.Plant:
     """q^(r) = A x + bend (sin, products, cubes) + g(q) B u, the model's entries wrong by factors, at times of wrong sign."""
     size = n * order
     exact = {f"a{k}": float(v) for k, v in enumerate(random.uniform(-3.0, 1.0, n * size))}
     gains = np.eye(n) * random.uniform(0.5, 2.0, n) + (1 - np.eye(n)) * random.uniform(-0.3, 0.3, (n, n))
     exact |= {f"b{k}": float(v) for k, v in enumerate(gains.ravel())}
-    exact |= {"c": bend, "s": 0.4 * min(bend, 1.0)}
+    exact |= {"c": nonlinearity, "s": 0.4 * min(nonlinearity, 1.0)}
     if inner:
         exact |= {"decay": float(random.choice([-3.0, 2.0, 5.0])), "back": 1.0}
     wrong = {name: value * float(random.uniform(0.4, 2.0)) for name, value in exact.items()}
     if random.uniform() < 0.1:
         wrong |= {f"b{k}": -wrong[f"b{k}"] for k in range(n * n)}
-    cubic = 0.1 * bend * float(random.uniform() < 0.25)  # a response that is not affine in the inputs
+    cubic = 0.1 * nonlinearity * float(random.uniform() < 0.25)  # a response that is not affine in the inputs
 
-    def response(*given):
-        *derivatives, u, p = given
+    def response(*arguments):
+        *derivatives, u, p = arguments
         q = derivatives[0]
         x = [d[f"q{k}"] for d in derivatives for k in range(n)]
         pushed = [u[f"u{k}"] + cubic * u[f"u{k}"] ** 3 for k in range(n)]
-        found = {}
+        collected = {}
         for i in range(n):
             free = sum(p[f"a{i * size + j}"] * x[j] for j in range(size))
-            bent = p.c * (ca.sin(3 * q[f"q{i}"]) + x[size - 1] * q["q0"] - q[f"q{i}"] ** 3)
+            term = p.c * (ca.sin(3 * q[f"q{i}"]) + x[size - 1] * q["q0"] - q[f"q{i}"] ** 3)
             gain = 1 + p.s * ca.sin(2 * q[f"q{i}"])
-            found[f"q{i}"] = free + bent + gain * sum(p[f"b{i * n + k}"] * pushed[k] for k in range(n))
+            collected[f"q{i}"] = free + term + gain * sum(p[f"b{i * n + k}"] * pushed[k] for k in range(n))
         if inner:
-            found["q0"] += p.back * q["z"]
-            found["z"] = q["q0"] - p.decay * q["z"]
-        return found
+            collected["q0"] += p.back * q["z"]
+            collected["z"] = q["q0"] - p.decay * q["z"]
+        return collected
 
     names = [f"d{k}" for k in range(order)] + ["u", "p"]
     kind = inspect.Parameter.POSITIONAL_ONLY
@@ -131,12 +131,14 @@ def _deformation(random: np.random.Generator, largest: float, cycles: float):
     product = float(random.uniform(0.05, 3.5))
     if cycles and random.uniform() < 0.5:
         product *= 0.5
-    chosen = MAPS[int(random.integers(len(MAPS)))]
+    deformation = MAPS[int(random.integers(len(MAPS)))]
     gain = product / largest
-    chosen = chosen.with_effective_gain(min(gain, 1.0) if isinstance(chosen, fp.Rotation) else gain)
+    deformation = deformation.with_effective_gain(min(gain, 1.0) if isinstance(deformation, fp.Rotation) else gain)
     if not cycles:
-        return chosen
-    return [chosen, fp.Paired(chosen, cycles=cycles), fp.Increment(chosen, cycles=cycles)][int(random.integers(3))]
+        return deformation
+    return [deformation, fp.Paired(deformation, cycles=cycles), fp.Increment(deformation, cycles=cycles)][
+        int(random.integers(3))
+    ]
 
 
 def dies_out(case: Case) -> bool:

@@ -28,7 +28,7 @@ def poles(response, order: int, rate: float, period: float, gain: float, *, plai
     whole[range(n - 1), range(1, n)] = 1.0
     whole[n - 1, n : n + m] = c
     whole[n : n + m, n : n + m], whole[n : n + m, -1] = a, b
-    moved = expm(whole * period)
+    transition = expm(whole * period)
     gains = [math.comb(n + 1, s) * rate ** (n + 1 - s) for s in range(n + 1)]
 
     def cycle(z: np.ndarray) -> np.ndarray:
@@ -36,9 +36,9 @@ def poles(response, order: int, rate: float, period: float, gain: float, *, plai
         realised = c @ x[n:]
         desired = -(gains[0] * integral + np.dot(gains[1:], x[:n]))
         error = realised - (desired if plain else wish)
-        following = (request if plain else desired + request - wish) - gain * error
-        state = moved[:-1, :-1] @ x + moved[:-1, -1] * following
-        return np.concatenate([state, [integral + period * x[0], following, desired]])
+        next_value = (request if plain else desired + request - wish) - gain * error
+        state = transition[:-1, :-1] @ x + transition[:-1, -1] * next_value
+        return np.concatenate([state, [integral + period * x[0], next_value, desired]])
 
     size = n + m + 3
     return np.linalg.eigvals(np.column_stack([cycle(e) for e in np.eye(size)]))

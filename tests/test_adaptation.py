@@ -18,8 +18,8 @@ def stepping(deformation, size=1):
     """Function (request, response, desired, memory) -> (request, memory) and the memory's layout."""
     layout = deformation.memory(tuple(f"q{k}" for k in range(size)))
     symbols = [ca.SX.sym(n, size) for n in ("r", "f", "d")] + [ca.SX.sym("m", layout.size)]
-    request, following = deformation.step(*symbols[:3], layout.split(symbols[3]))
-    return ca.Function("step", symbols, [ca.densify(request), ca.densify(layout.join(following))]), layout
+    request, next_memory = deformation.step(*symbols[:3], layout.split(symbols[3]))
+    return ca.Function("step", symbols, [ca.densify(request), ca.densify(layout.join(next_memory))]), layout
 
 
 def run(deformation, plant, desired, noise=None):
@@ -220,7 +220,7 @@ def test_noise_gain_is_the_predicted_one():
 def run_affine(gain, noise):
     """The affine map on f = r, accumulated in one call."""
     r, w = ca.SX.sym("r"), ca.SX.sym("w")
-    following, _ = fp.Affine(gain=-2 * gain).step(r, r + w, ca.SX(0), {})
-    accumulated = ca.Function("s", [r, w], [following]).mapaccum("run", noise.size - 1)
+    next_memory, _ = fp.Affine(gain=-2 * gain).step(r, r + w, ca.SX(0), {})
+    accumulated = ca.Function("s", [r, w], [next_memory]).mapaccum("run", noise.size - 1)
     requests = accumulated(0.0, noise[None, 1:]).full().ravel()
     return requests, np.concatenate([[0.0], requests[:-1]]), None, None

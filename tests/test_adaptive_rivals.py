@@ -99,9 +99,9 @@ def test_learning_ends_the_tracking_error(name, motion):
 def test_parameters_converge_under_excitation(name):
     """The well-excited ones (b, k) to 6 % in 20 s, the whole vector to a quarter of its first error."""
     exact, first = (np.array(v) for v in ((1.0, 0.5, 20.0, 3.0), (1.5, 0.0, 12.0, 0.0)))
-    found = ran(name, rich)["estimate"][-1]
-    np.testing.assert_allclose(found[[1, 2]], exact[[1, 2]], rtol=0.08)
-    assert np.linalg.norm(found - exact) < 0.25 * np.linalg.norm(first - exact)
+    result = ran(name, rich)["estimate"][-1]
+    np.testing.assert_allclose(result[[1, 2]], exact[[1, 2]], rtol=0.08)
+    assert np.linalg.norm(result - exact) < 0.25 * np.linalg.norm(first - exact)
 
 
 def test_parameters_need_not_converge_without_excitation():
@@ -131,12 +131,12 @@ def test_learning_costs_precision_and_brings_some_back():
 
 def test_deformation_takes_the_lyapunov_rule_its_lessons():
     """The rule learns from tracking errors, projection from the model's: with deformation the first learns far less."""
-    moved = {
+    shifted = {
         n: np.linalg.norm(ran(n)["estimate"][2000] - ran(n)["estimate"][0])
         for n in ("AID", "AID+FPI", "NLMS", "NLMS+FPI")
     }
-    assert moved["AID+FPI"] < 0.5 * moved["AID"]
-    assert moved["NLMS+FPI"] > 0.8 * moved["NLMS"]
+    assert shifted["AID+FPI"] < 0.5 * shifted["AID"]
+    assert shifted["NLMS+FPI"] > 0.8 * shifted["NLMS"]
 
 
 def test_lyapunov_function_of_slotine_and_li_falls():
@@ -214,8 +214,8 @@ def test_slotine_li_and_its_demand_are_one_law():
     steps = [compose_controller(problem, c) for c in (plain, replace(plain, deformation=fp.Affine(gain=-0.5)))]
     random = np.random.default_rng(0)
     for _ in range(5):
-        given = (0.3, random.standard_normal(4), np.zeros(2), problem.plant.approximate)
-        direct, demanded = (step.function(step.memory.start(), *given)[2].full() for step in steps)
+        values = (0.3, random.standard_normal(4), np.zeros(2), problem.plant.approximate)
+        direct, demanded = (step.function(step.memory.start(), *values)[2].full() for step in steps)
         np.testing.assert_allclose(demanded, direct, rtol=1e-10)
 
 
@@ -334,26 +334,28 @@ def settled(name, controllers, duration, measure_from):
     """Rms error, over the coordinates, of shortened runs: {controller: number}."""
     task = fp.load_problem(name)
     problem = replace(task.problem, duration=duration, measure_from=measure_from)
-    found = {}
+    collected = {}
     for controller in controllers:
         run = fp.simulate(problem, task.controllers[controller], seed=0, compiled=False)
-        found[controller] = (np.linalg.norm(list(fp.measure(problem, run).rms_error.values())), run)
-    return found
+        collected[controller] = (np.linalg.norm(list(fp.measure(problem, run).rms_error.values())), run)
+    return collected
 
 
 def test_planar_arm():
     """FPI is 20 times better than computed torque; Slotine-Li catches up; projection and FPI together are the best."""
-    found = {n: v for n, (v, _) in settled("planar_arm", ("CT", "CT+FPI", "AID+FPI", "Slotine-Li"), 5.5, 3.0).items()}
-    assert found["CT"] > 20 * found["CT+FPI"]
-    assert found["Slotine-Li"] < found["CT+FPI"]
-    assert found["AID+FPI"] < 0.5 * found["Slotine-Li"]
+    errors_by_name = {
+        n: v for n, (v, _) in settled("planar_arm", ("CT", "CT+FPI", "AID+FPI", "Slotine-Li"), 5.5, 3.0).items()
+    }
+    assert errors_by_name["CT"] > 20 * errors_by_name["CT+FPI"]
+    assert errors_by_name["Slotine-Li"] < errors_by_name["CT+FPI"]
+    assert errors_by_name["AID+FPI"] < 0.5 * errors_by_name["Slotine-Li"]
 
 
 def test_slotine_li_is_the_better_choice_behind_coarse_encoders():
     """More precise, and the torque changes a tenth as much per cycle; 4096 counts are seen as 140 rad/s^2."""
-    found = settled("three_link_arm", ("CT+FPI", "Slotine-Li"), 7.0, 4.0)
-    precise = {name: value for name, (value, _) in found.items()}
-    rough = {name: np.std(np.diff(run["command.tau1"])) for name, (_, run) in found.items()}
+    errors_by_name = settled("three_link_arm", ("CT+FPI", "Slotine-Li"), 7.0, 4.0)
+    precise = {name: value for name, (value, _) in errors_by_name.items()}
+    rough = {name: np.std(np.diff(run["command.tau1"])) for name, (_, run) in errors_by_name.items()}
     assert precise["Slotine-Li"] < 0.9 * precise["CT+FPI"]
     assert rough["Slotine-Li"] < 0.1 * rough["CT+FPI"]
 

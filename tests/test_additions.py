@@ -149,11 +149,11 @@ def test_review_speaks_of_members_from_abroad(abroad: Path) -> None:
     """Every controller gets answers, none is a stranger."""
     answer = run(abroad, "-m", "fpirhc", "review", "masses.py", "--json")
     assert answer.returncode in (0, 1), answer.stderr
-    told = json.loads(answer.stdout)["controllers"]
-    assert set(told) == {"poles", "poles+clipped", "saturated+FPI", "learner", "RHC"}
-    texts = json.dumps(told)
+    document = json.loads(answer.stdout)["controllers"]
+    assert set(document) == {"poles", "poles+clipped", "saturated+FPI", "learner", "RHC"}
+    texts = json.dumps(document)
     assert "does not have" not in texts
-    [verdict] = [a for a in told["poles+clipped"] if a["question"] == "Does the deformation converge?"]
+    [verdict] = [a for a in document["poles+clipped"] if a["question"] == "Does the deformation converge?"]
     assert verdict["verdict"] == "yes"
 
 
@@ -161,11 +161,12 @@ def test_compare_runs_members_from_abroad(abroad: Path) -> None:
     """The table has them all, the plan's metrics reach through two wrappers, and the optimiser is a choice."""
     answer = run(abroad, "-m", "fpirhc", "compare", "masses.py", "--json", "--no-compile")
     assert answer.returncode == 0, answer.stderr
-    told = json.loads(answer.stdout)
-    assert set(told["controllers"]) == {"poles", "poles+clipped", "saturated+FPI", "learner", "RHC"}
-    assert told["controllers"]["RHC"]["optimality"]["plans"] > 0
+    document = json.loads(answer.stdout)
+    assert set(document["controllers"]) == {"poles", "poles+clipped", "saturated+FPI", "learner", "RHC"}
+    assert document["controllers"]["RHC"]["optimality"]["plans"] > 0
     assert (
-        told["controllers"]["poles+clipped"]["rms_error"]["q1"] < 0.5 * told["controllers"]["poles"]["rms_error"]["q1"]
+        document["controllers"]["poles+clipped"]["rms_error"]["q1"]
+        < 0.5 * document["controllers"]["poles"]["rms_error"]["q1"]
     )
     words = (
         "compare",

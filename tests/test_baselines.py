@@ -71,8 +71,8 @@ def test_rate_of_the_full_space_form_is_set_by_the_condition_number_squared():
     """(kappa^2 - 1)/(kappa^2 + 1), measured on a linear-quadratic problem of three stages."""
     ocp, data, first = linear_problem()
     ocp, data = replace(ocp, stages=3, nodes=short(ocp.nodes)), data[:, :4]
-    states, inputs, given = ocp.nodes
-    hessian = auxiliary_hessian(ocp)(states[:, 1:], inputs, np.zeros((2, 3)), states[:, 0], given).full()
+    states, inputs, values = ocp.nodes
+    hessian = auxiliary_hessian(ocp)(states[:, 1:], inputs, np.zeros((2, 3)), states[:, 0], values).full()
     singular = np.abs(np.linalg.eigvalsh(hessian))
     squared = (singular.max() / singular.min()) ** 2
     gain = 2 / (singular.min() ** 2 + singular.max() ** 2)
@@ -130,10 +130,10 @@ def test_poison_is_told_and_forgotten(kind):
     optimiser = kind(iterations=50, tolerance=1e-6)
     memory, step = np.full(optimiser.memory(ocp).size, np.nan), optimiser.step(ocp)
     bounds = (ocp.input_lower, ocp.input_upper)
-    inputs, told, memory = step(FIRST, data * np.nan, *bounds, memory)
-    assert int(told[4]) == fp.Status.NON_FINITE
+    inputs, diagnostics, memory = step(FIRST, data * np.nan, *bounds, memory)
+    assert int(diagnostics[4]) == fp.Status.NON_FINITE
     assert np.isfinite(inputs.full()).all()
     for _ in range(3):
-        _, told, memory = step(FIRST, data, *bounds, memory)
-    assert int(told[4]) in (fp.Status.OK, fp.Status.NOT_CONVERGED)
+        _, diagnostics, memory = step(FIRST, data, *bounds, memory)
+    assert int(diagnostics[4]) in (fp.Status.OK, fp.Status.NOT_CONVERGED)
     assert np.isfinite(memory.full()).all()

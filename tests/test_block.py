@@ -28,11 +28,11 @@ def summing() -> Block:
 
 def run(composite, inputs):
     """Traces of the first column for a sequence of scalar inputs."""
-    memory, found = composite.memory.start(), []
+    memory, collected = composite.memory.start(), []
     for u in inputs:
         memory, trace = composite.function(memory, u)[:2]
-        found.append(float(trace[0]))
-    return found
+        collected.append(float(trace[0]))
+    return collected
 
 
 def test_blocks_are_wired_by_name():

@@ -29,8 +29,8 @@ def iterates(ocp, data, first, count):
     bounds, memory, step = (ocp.input_lower, ocp.input_upper), optimiser.memory(ocp).start(), optimiser.step(ocp)
     best = fp.solve(ocp, replace(optimiser, tolerance=1e-9), first, data)
     for _ in range(count):
-        inputs, told, memory = (v.full() for v in step(first, data, *bounds, memory))
-        yield replace(best, inputs=inputs, states=best.states, cost=float(told.ravel()[0])), best
+        inputs, diagnostics, memory = (v.full() for v in step(first, data, *bounds, memory))
+        yield replace(best, inputs=inputs, states=best.states, cost=float(diagnostics.ravel()[0])), best
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -39,17 +39,17 @@ def test_no_bound_is_below_the_true_error(name):
     from fpirhc.horizon.rollout import rollout
 
     ocp, data, first = first_horizon(name)
-    said = 0
+    counted = 0
     for plan, best in iterates(ocp, data, first, 14):
         plan = replace(plan, states=rollout(ocp)(first, plan.inputs, data)[0].full())
         certificate = fp.certify(plan)
         if not np.isfinite(certificate.input_error):
             continue
-        said += 1
+        counted += 1
         slack = 1e-7 * (1 + np.abs(best.inputs).max())
         assert np.abs(plan.inputs - best.inputs).max() <= certificate.input_error + slack
         assert plan.cost - best.cost <= certificate.suboptimality + 1e-11 * (1 + abs(best.cost))
-    assert said >= 2
+    assert counted >= 2
 
 
 def test_factor_on_a_linear_quadratic_problem_is_zero():

@@ -62,11 +62,11 @@ def test_compare_writes_a_report_and_says_what_it_found(folder, capsys):
 def test_json_is_one_object_on_standard_output(folder, capsys):
     """Machines read the same numbers that people see."""
     assert main(["compare", "line.py", "--json", "--seed", "3", "--no-compile"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["problem"] == "line"
-    assert found["seed"] == 3
-    assert set(found["versions"]) >= {"fpirhc", "casadi"}
-    plain, adaptive = found["controllers"]["CTC"], found["controllers"]["CTC+FPI"]
+    document = json.loads(capsys.readouterr().out)
+    assert document["problem"] == "line"
+    assert document["seed"] == 3
+    assert set(document["versions"]) >= {"fpirhc", "casadi"}
+    plain, adaptive = document["controllers"]["CTC"], document["controllers"]["CTC+FPI"]
     assert adaptive["rms_error"]["y"] < 0.2 * plain["rms_error"]["y"]
     assert plain["contraction"] is None
     assert adaptive["contraction"]["predicted"] == pytest.approx(1 - 0.5 * 0.396737 * 1.6, abs=1e-3)

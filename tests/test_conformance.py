@@ -84,8 +84,8 @@ class Altered(fp.Exponential):
 
     def feedback(self, order):
         """As the contract says, but for the change."""
-        told = super().feedback(order)
-        return replace(told, rate=2 * self.rate) if self.change == "tells another rate" else told
+        law_facts = super().feedback(order)
+        return replace(law_facts, rate=2 * self.rate) if self.change == "tells another rate" else law_facts
 
     def law(self, plant, period):
         """As the contract says, but for the change."""
@@ -97,16 +97,16 @@ class Altered(fp.Exponential):
                 s.state = ca.fmin(1e3, ca.fmax(-1e3, s.state))
             if self.change == "remembers":
                 s.warm_up = 1 + 0 * s.warm_up
-            given = dict(block.step(s))
+            signals_value = dict(block.step(s))
             if self.change == "offset":
-                given["desired"] = given["desired"] + 1e-3
+                signals_value["desired"] = signals_value["desired"] + 1e-3
             if self.change == "sign":
-                given["_target_error"] = -given["_target_error"]
+                signals_value["_target_error"] = -signals_value["_target_error"]
             if self.change == "pushes away":
-                given["desired"] = 2 * s.nominal - given["desired"]
+                signals_value["desired"] = 2 * s.nominal - signals_value["desired"]
             if self.change == "extra":
-                given["more"] = s.warm_up
-            return given
+                signals_value["more"] = s.warm_up
+            return signals_value
 
         return Block(block.name, reads, block.writes, step, block.memory)
 
@@ -213,26 +213,28 @@ class Dishonest(Optimiser):
         """As the contract says, but for the change."""
         size = self.within.memory(ocp).size
         sizes = {"s": ocp.state.size, "data": (ocp.data.size, ocp.stages + 1), "l": 1, "u": 1, "memory": size}
-        s, data, lower, upper, memory = given = [ca.MX.sym(n, *np.atleast_1d(k).tolist()) for n, k in sizes.items()]
+        s, data, lower, upper, memory = symbols = [ca.MX.sym(n, *np.atleast_1d(k).tolist()) for n, k in sizes.items()]
         if self.change == "own bounds":
             lower, upper = ca.DM(ocp.input_lower), ca.DM(ocp.input_upper)
         if self.change == "hides NaN":
             s = ca.fmin(1e3, ca.fmax(-1e3, s))
         inner = self.within.step(ocp)
-        inputs, said, following = inner(s, data, lower, upper, memory)
+        inputs, diagnostics, next_memory = inner(s, data, lower, upper, memory)
         if self.change == "poisoned":
-            following = ca.if_else(ca.sum1(ca.fabs(memory)) <= 1e300, following, memory)
+            next_memory = ca.if_else(ca.sum1(ca.fabs(memory)) <= 1e300, next_memory, memory)
         if self.change in ("always OK", "one step OK"):
-            said = ca.vertcat(said[:4], 0)
+            diagnostics = ca.vertcat(diagnostics[:4], 0)
         if self.change == "off":
             inputs = inputs + 1e-2
         if self.change == "never feasible":
-            said = ca.vertcat(said[:2], ca.if_else(said[2] > 1e-4, 0, said[2]), said[3:])
+            diagnostics = ca.vertcat(
+                diagnostics[:2], ca.if_else(diagnostics[2] > 1e-4, 0, diagnostics[2]), diagnostics[3:]
+            )
         if self.change == "ignores bounds":
-            inputs, said, following = inner(s, data, -math.inf, math.inf, memory)
+            inputs, diagnostics, next_memory = inner(s, data, -math.inf, math.inf, memory)
         if self.change == "cost":
-            said = ca.vertcat(2 * said[0], said[1:])
-        return ca.Function("dishonest", given, [inputs, said, following])
+            diagnostics = ca.vertcat(2 * diagnostics[0], diagnostics[1:])
+        return ca.Function("dishonest", symbols, [inputs, diagnostics, next_memory])
 
 
 @pytest.mark.parametrize(
@@ -336,16 +338,16 @@ class Faulty(fp.ComputedTorque):
         def limited(s):
             if self.change == "clamps first":
                 s.command_unclipped = ca.fmin(30, ca.fmax(-30, s.command_unclipped))
-            given = dict(limit.step(s))
+            signals_value = dict(limit.step(s))
             if self.change == "no limits":
-                given["command"] = s.command_unclipped
+                signals_value["command"] = s.command_unclipped
             if self.change == "random":
-                given["command"] = given["command"] * (1 - 1e-6 * random.random())
+                signals_value["command"] = signals_value["command"] * (1 - 1e-6 * random.random())
             if self.change == "counts":
-                given["command"] = given["command"] * (1 - 1e-6 * COUNTER(s.command_unclipped[0]))
+                signals_value["command"] = signals_value["command"] * (1 - 1e-6 * COUNTER(s.command_unclipped[0]))
             if self.change == "trusts responses":
-                given["command"] = ca.if_else(s.realised[0] > 1e9, s.realised, given["command"])
-            return given
+                signals_value["command"] = ca.if_else(s.realised[0] > 1e9, s.realised, signals_value["command"])
+            return signals_value
 
         def judged(s):
             return {"status": 0 * s._held} if self.change == "says OK" else judge.step(s)
@@ -362,7 +364,7 @@ class Faulty(fp.ComputedTorque):
     def _summing(self, problem, blocks, delays):
         """A filter of the measured state whose memory keeps a NaN for ever, seen by the law of the next cycle."""
         plant = problem.plant
-        kept, new = (Signal(n, plant.state.elements) for n in ("_filtered_before", "filtered"))
+        parts, new = (Signal(n, plant.state.elements) for n in ("_filtered_before", "filtered"))
         law = next(k for k, b in enumerate(blocks) if b.name == "tracking")
         inner = blocks[law]
 
@@ -371,9 +373,9 @@ class Faulty(fp.ComputedTorque):
             s.state = seen
             return {**inner.step(s), "filtered": seen}
 
-        reads, writes = Layout((*inner.reads.signals, kept)), Layout((*inner.writes.signals, new))
+        reads, writes = Layout((*inner.reads.signals, parts)), Layout((*inner.writes.signals, new))
         blocks[law] = Block("tracking", reads, writes, step)
-        return blocks, [*delays, Delay(kept, "filtered")]
+        return blocks, [*delays, Delay(parts, "filtered")]
 
 
 @dataclass(frozen=True)

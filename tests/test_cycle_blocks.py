@@ -73,20 +73,20 @@ BELIEVED, STATE = [1.0, 8.0], [0.0, 0.0, 0.0, 0.0]
 def test_a_command_inside_its_limits_is_passed():
     """The stored request is the wanted one, nothing is clipped and nothing held."""
     wanted = {"command_unclipped": [2.5, 99.0], "_deformed_unclipped": [7.0, 8.0], "desired": [1.0, 1.0]}
-    found = cycle(closing(LIMITED)["limit"], **wanted, state=STATE, parameters=BELIEVED)
-    assert found["command"].tolist() == [2.5, 99.0]
-    assert found["deformed"].tolist() == [7.0, 8.0]
-    assert (found["clipped"].item(), found["_held"].item()) == (0.0, 0.0)
+    result = cycle(closing(LIMITED)["limit"], **wanted, state=STATE, parameters=BELIEVED)
+    assert result["command"].tolist() == [2.5, 99.0]
+    assert result["deformed"].tolist() == [7.0, 8.0]
+    assert (result["clipped"].item(), result["_held"].item()) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(("unclipped", "clipped"), [(5.0, 3.0), (-5.0, -2.0)])
 def test_a_clipped_command_changes_the_stored_request(unclipped, clipped):
     """By what the model's input gain, 1 / 1 kg, makes of the difference: the request that the command meant."""
     wanted = {"command_unclipped": [unclipped, 99.0], "_deformed_unclipped": [7.0, 8.0], "desired": [1.0, 1.0]}
-    found = cycle(closing(LIMITED)["limit"], **wanted, state=STATE, parameters=BELIEVED)
-    assert found["command"].tolist() == [clipped, 99.0]
-    assert found["deformed"] == pytest.approx([7.0 + clipped - unclipped, 8.0])
-    assert (found["clipped"].item(), found["_held"].item()) == (1.0, 0.0)
+    result = cycle(closing(LIMITED)["limit"], **wanted, state=STATE, parameters=BELIEVED)
+    assert result["command"].tolist() == [clipped, 99.0]
+    assert result["deformed"] == pytest.approx([7.0 + clipped - unclipped, 8.0])
+    assert (result["clipped"].item(), result["_held"].item()) == (1.0, 0.0)
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
@@ -94,10 +94,10 @@ def test_a_command_that_is_not_finite_is_held(wrong):
     """One entry is enough: the last command goes on, clipped, and the next cycle begins from the desired response."""
     wanted = {"command_unclipped": [1.0, wrong], "_deformed_unclipped": [7.0, 8.0], "desired": [1.5, 2.5]}
     last = {"_command_before": [4.0, 5.0], "state": STATE, "parameters": BELIEVED}
-    found = cycle(closing(LIMITED)["limit"], **wanted, **last)
-    assert found["command"].tolist() == [3.0, 5.0]
-    assert found["deformed"].tolist() == [1.5, 2.5]
-    assert found["_held"].item() == 1.0
+    result = cycle(closing(LIMITED)["limit"], **wanted, **last)
+    assert result["command"].tolist() == [3.0, 5.0]
+    assert result["deformed"].tolist() == [1.5, 2.5]
+    assert result["_held"].item() == 1.0
 
 
 def test_a_response_that_is_not_affine_is_evaluated_where_it_was_clipped():
@@ -119,8 +119,8 @@ def test_a_response_that_is_not_affine_is_evaluated_where_it_was_clipped():
     )
     block = closing(problem)["limit"]
     for command, request, stored in ((3.0, 27.0, 8.0), (1.0, 1.0 + 1e-15, 1.0 + 1e-15)):
-        found = cycle(block, command_unclipped=command, _deformed_unclipped=request, state=[0.0, 0.0], parameters=1.0)
-        assert found["deformed"].item() == stored
+        result = cycle(block, command_unclipped=command, _deformed_unclipped=request, state=[0.0, 0.0], parameters=1.0)
+        assert result["deformed"].item() == stored
 
 
 def test_clip_takes_one_side_or_both():
@@ -151,9 +151,9 @@ def test_the_request_is_deformed_once_the_pair_is_valid(counted, blind, valid):
     """Affine(-1): request + 0.5 (desired - realised) = 10 + 0.5 (4 - 2); before that the desired response."""
     block = deform_block(masses().plant, fp.Affine(-1.0), blind)
     pair = {"_deformed_last": [10.0, 20.0], "realised": [2.0, 3.0], "desired": [4.0, 4.0]}
-    found = cycle(block, **pair, warm_up=float(counted))
-    assert found["_deformed_unclipped"].tolist() == ([11.0, 20.5] if valid else [4.0, 4.0])
-    assert found["_deformation"].tolist() == ([7.0, 16.5] if valid else [0.0, 0.0])
+    result = cycle(block, **pair, warm_up=float(counted))
+    assert result["_deformed_unclipped"].tolist() == ([11.0, 20.5] if valid else [4.0, 4.0])
+    assert result["_deformation"].tolist() == ([7.0, 16.5] if valid else [0.0, 0.0])
 
 
 def test_one_blind_cycle_where_nothing_else_is_said():
@@ -175,17 +175,17 @@ def test_a_predicting_controller_reads_the_measured_state_too():
 
 def test_command_of_a_request():
     """The believed masses of 1 and 8 kg and the force of 3 N."""
-    found = cycle(invert_block(masses().plant), state=STATE, _deformed_unclipped=[5.0, 0.5], parameters=BELIEVED)
-    assert found["command_unclipped"].tolist() == [5.0, 7.0]
+    result = cycle(invert_block(masses().plant), state=STATE, _deformed_unclipped=[5.0, 0.5], parameters=BELIEVED)
+    assert result["command_unclipped"].tolist() == [5.0, 7.0]
 
 
 def test_error_is_of_the_judged_coordinates():
     """Reference minus state, in their units; the response is that of the controlled ones."""
     problem = masses(judged=("b",))
-    found = cycle(reference_block(problem), time=0.5, state=[0.1, 0.2, 0.3, 0.4])
-    assert found["error"] == pytest.approx([np.cos(0.5) - 0.2])
-    assert found["_reference_response"] == pytest.approx([-4 * np.sin(1.0), -np.cos(0.5)])
-    assert found["reference"] == pytest.approx([np.sin(1.0), np.cos(0.5), 2 * np.cos(1.0), -np.sin(0.5)])
+    result = cycle(reference_block(problem), time=0.5, state=[0.1, 0.2, 0.3, 0.4])
+    assert result["error"] == pytest.approx([np.cos(0.5) - 0.2])
+    assert result["_reference_response"] == pytest.approx([-4 * np.sin(1.0), -np.cos(0.5)])
+    assert result["reference"] == pytest.approx([np.sin(1.0), np.cos(0.5), 2 * np.cos(1.0), -np.sin(0.5)])
     assert reference_block(problem).writes["error"].units == ("rad",)
 
 
@@ -289,11 +289,11 @@ def test_a_controller_that_stands_alone_has_no_facts_of_others():
 def test_automatic_settings_are_chosen_and_others_kept():
     """A controller without automatic settings comes back as it is, within wrappers too."""
     problem = masses()
-    given = fp.ExactModel(fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5, scale=3.0)))
-    assert resolved(problem, given) is given
-    chosen: Any = resolved(problem, fp.ExactModel(fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5))))
-    exact = given.inner_problem(problem)
-    assert chosen.deformation == fp.Sigmoid(gain=-0.5).suited(reference_demand(exact, TRACK))
+    values = fp.ExactModel(fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5, scale=3.0)))
+    assert resolved(problem, values) is values
+    resolved_controller: Any = resolved(problem, fp.ExactModel(fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5))))
+    exact = values.inner_problem(problem)
+    assert resolved_controller.deformation == fp.Sigmoid(gain=-0.5).suited(reference_demand(exact, TRACK))
 
 
 def test_checks_before_a_run():

@@ -29,9 +29,9 @@ def iteration_radius(deformation: Deformation, delay: int) -> float:
     size = delay + 1  # requests on their way, newest first
     z = ca.SX.sym("z", size + layout.size)
     memory = layout.split(z[size:])
-    request, following = deformation.step(z[0], z[delay], ca.SX(0), memory)
+    request, next_memory = deformation.step(z[0], z[delay], ca.SX(0), memory)
     on = ca.vertcat(request, z[: size - 1]) if delay else request
-    function = ca.Function("one", [z], [ca.jacobian(ca.vertcat(on, layout.join(following)), z)])
+    function = ca.Function("one", [z], [ca.jacobian(ca.vertcat(on, layout.join(next_memory)), z)])
     start = layout.start()
     if "queue_filled" in layout.names:
         start[layout.slice("queue_filled")] = 1e6
@@ -49,8 +49,8 @@ def limit(stable, low: float, high: float) -> float:
 @pytest.mark.parametrize("delay", DELAYS)
 def test_unpaired_limit(delay):
     """z^(d+1) - z^d + a = 0 is stable up to a = 2 sin(pi / (2 (2 d + 1)))."""
-    found = limit(lambda a: iteration_radius(affine(a), delay) < 1, 0.01, 3.0)
-    assert found == pytest.approx(2 * np.sin(np.pi / (2 * (2 * delay + 1))), rel=1e-3)
+    limit_value = limit(lambda a: iteration_radius(affine(a), delay) < 1, 0.01, 3.0)
+    assert limit_value == pytest.approx(2 * np.sin(np.pi / (2 * (2 * delay + 1))), rel=1e-3)
 
 
 @pytest.mark.parametrize("form", [fp.Paired, fp.Increment])
@@ -152,9 +152,9 @@ def test_prediction_with_the_exact_model_undoes_the_dead_time():
         late = replace(problem, dead_time=dead_time)
         predicted = fp.Predicted(law, inputs=dead_time.inputs["torque"], measurement=dead_time.measurement)
         run = fp.simulate(late, fp.ExactModel(predicted), seed=0)
-        moved = run["plant_state" if dead_time.measurement else "state"]
+        measured_log = run["plant_state" if dead_time.measurement else "state"]
         shift = round(dead_time.inputs["torque"] / problem.period)
-        np.testing.assert_allclose(moved[shift:], free["state"][:-shift], atol=2e-8)
+        np.testing.assert_allclose(measured_log[shift:], free["state"][:-shift], atol=2e-8)
 
 
 def test_desired_responses_predict_an_ideal_plant():

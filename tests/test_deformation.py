@@ -361,8 +361,8 @@ def test_rotation_is_the_rotation(fraction: float, seed: int) -> None:
 def test_rotation_is_nearly_linear(radius: float, tolerance: float) -> None:
     """r+ = r - fraction h up to third order: the deviation falls with the square of size over radius."""
     r, f, d = np.array([6.0, -3.0]), np.array([4.0, 5.0]), np.array([7.0, 2.0])
-    moved = advance(Rotation(0.4, radius), r, f, d) - r
-    assert moved == pytest.approx(-0.4 * (f - d), abs=tolerance)
+    change = advance(Rotation(0.4, radius), r, f, d) - r
+    assert change == pytest.approx(-0.4 * (f - d), abs=tolerance)
 
 
 def test_rotation_outgrows_its_radius() -> None:

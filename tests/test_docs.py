@@ -33,8 +33,8 @@ def test_tutorial_does_what_it_says(tmp_path, monkeypatch, capsys):
     text = "\n".join(blocks(DOCS / "tutorial.md")).partition("run = fp.simulate")[0]
     Path("drone.py").write_text(text)
     assert main(["compare", "drone.py"]) == 0
-    said = capsys.readouterr().out.replace("\n", " ")
-    assert "from 0.0235 to 0.00011 m" in said
+    output = capsys.readouterr().out.replace("\n", " ")
+    assert "from 0.0235 to 0.00011 m" in output
     Path("turned.py").write_text(text.replace("gain=-0.5", "gain=0.5"))
     assert main(["compare", "turned.py"]) == 2
     assert "has the wrong sign" in capsys.readouterr().err

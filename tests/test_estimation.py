@@ -115,13 +115,13 @@ def test_the_gain_is_that_of_the_stationary_filter():
     b, c = np.array([[h**2 / 2], [h], [0]]), np.array([[1.0, 0, 0]])
     q, r = 0.5**2 * b @ b.T + np.diag([0, 0, 2.0**2 * h]), np.array([[1e-6]])
     p = scipy.linalg.solve_discrete_are(a.T, c.T, q, r)
-    found = filter.gain(replace(problem, plant=filter.model(problem.plant)))
-    np.testing.assert_allclose(found, p @ c.T / (c @ p @ c.T + r), rtol=1e-8)
+    result = filter.gain(replace(problem, plant=filter.model(problem.plant)))
+    np.testing.assert_allclose(result, p @ c.T / (c @ p @ c.T + r), rtol=1e-8)
     s = np.eye(3)
     for _ in range(3000):
         gain = s @ c.T @ np.linalg.inv(c @ s @ c.T + r)
         s = a @ (s - gain @ c @ s) @ a.T + q
-    np.testing.assert_allclose(found, gain, rtol=1e-6)
+    np.testing.assert_allclose(result, gain, rtol=1e-6)
 
 
 def test_the_disturbance_is_seen_through_a_nonlinear_model():
@@ -141,9 +141,9 @@ class Fed:
         layout, plant = estimator.memory(problem), problem.plant
         symbols = [ca.MX.sym(n, k) for n, k in (("x", 2), ("u", 1), ("f", 1), ("valid", 1), ("m", layout.size))]
         x, u, f, valid, memory = symbols
-        given = Seen(*(expression(v) for v in (x, u, f, ca.DM(plant.approximate), valid)))
-        parameter_change, following = estimator.step(problem)(given, layout.split(memory))
-        self.function = ca.Function("fed", symbols, [parameter_change, layout.join(following)])
+        values = Seen(*(expression(v) for v in (x, u, f, ca.DM(plant.approximate), valid)))
+        parameter_change, next_memory = estimator.step(problem)(values, layout.split(memory))
+        self.function = ca.Function("fed", symbols, [parameter_change, layout.join(next_memory)])
         self.memory = layout.start()
 
     def __call__(self, x, u, f):
@@ -178,9 +178,9 @@ def test_recursive_least_squares_are_the_batch_ones(time):
     problem, factor = task(plant), math.exp(-PERIOD / time)
     fed, data = Fed(problem, fp.RecursiveLeastSquares(SPRING, NOISE, time)), list(pairs(60, plant))
     for k, pair in enumerate(data, 1):
-        found = fed(*pair)
+        estimates = fed(*pair)
         expected, *_ = batch(plant, data[:k], factor ** np.arange(k - 1, -1, -1), factor**k)
-        np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-10)
+        np.testing.assert_allclose(estimates, expected, rtol=1e-7, atol=1e-10)
 
 
 @pytest.mark.parametrize("window", [60, 7])
@@ -190,9 +190,9 @@ def test_moving_horizon_is_the_batch_estimate_of_a_linear_model(window):
     fed = Fed(task(plant), fp.MovingHorizon(SPRING, NOISE, window, math.inf))
     data = list(pairs(60, plant))
     for k, pair in enumerate(data, 1):
-        found = fed(*pair)
+        estimates = fed(*pair)
         expected, *_ = batch(plant, data[:k], np.ones(k), 1.0)
-        np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-10)
+        np.testing.assert_allclose(estimates, expected, rtol=1e-7, atol=1e-10)
 
 
 def test_moving_horizon_stops_at_the_constrained_optimum():
@@ -203,27 +203,27 @@ def test_moving_horizon_stops_at_the_constrained_optimum():
     data = [(x, 0.8 * x[:1] + 0.2 * u, f) for x, u, f in pairs(40, plant)]
     fed = Fed(task(plant), fp.MovingHorizon(narrow, NOISE, 40, math.inf, iterations=3))
     for pair in data:
-        found = fed(*pair)
+        estimates = fed(*pair)
     free, rows, right = batch(plant, data, np.ones(40), 1.0)
     scale = np.array([known.deviation for known in narrow.values()])
     lower = (np.array([v.lower for v in narrow.values()]) - plant.approximate) / scale
     upper = (np.array([v.upper for v in narrow.values()]) - plant.approximate) / scale
     best = scipy.optimize.lsq_linear(np.vstack([rows, np.eye(2)]), np.r_[right, 0, 0], bounds=(lower, upper), tol=1e-12)
-    np.testing.assert_allclose(found, scale * best.x, atol=1e-5)
-    assert abs(found[1] - free[1]) > 0.05
+    np.testing.assert_allclose(estimates, scale * best.x, atol=1e-5)
+    assert abs(estimates[1] - free[1]) > 0.05
 
 
 @pytest.mark.parametrize("build", [fp.RecursiveLeastSquares, lambda p, n, t: fp.MovingHorizon(p, n, 10, t)])
 def test_forgetting_follows_a_jump(build):
     """The gain b doubles: with forgetting the estimate is there soon, without it stays in between."""
     before, after = spring(b=1.0), spring(b=2.0)
-    found = {}
+    collected = {}
     for time in (0.3, math.inf):
         fed = Fed(task(before), build(SPRING, NOISE, time))
         for pair in [*pairs(300, before), *pairs(150, after, seed=4)]:
-            found[time] = fed(*pair) + before.approximate
-    assert found[0.3][1] == pytest.approx(2.0, abs=0.1)
-    assert found[math.inf][1] < 1.6
+            collected[time] = fed(*pair) + before.approximate
+    assert collected[0.3][1] == pytest.approx(2.0, abs=0.1)
+    assert collected[math.inf][1] < 1.6
 
 
 @pytest.mark.parametrize("build", [fp.RecursiveLeastSquares, lambda p, n, t: fp.MovingHorizon(p, n, 10, t)])
@@ -273,14 +273,14 @@ def test_a_disturbed_plant():
         return {"u": (r.y + p.k * q.y) / p.b}
 
     for plant in (spring(), replace(spring(), inverse=inverse)):
-        found = fp.disturbed(plant, ("y",))
-        assert found.parameters["w_y"] == fp.Parameter(0.0, 0.0, "m/s^2")
+        result = fp.disturbed(plant, ("y",))
+        assert result.parameters["w_y"] == fp.Parameter(0.0, 0.0, "m/s^2")
         x, u, p = np.array([0.3, 0.1]), np.array([0.7]), np.array([2.0, 1.5, 0.4])
-        r = found.response_function(x, u, p)
+        r = result.response_function(x, u, p)
         assert float(r) == pytest.approx(1.5 * 0.7 - 2.0 * 0.3 + 0.4)
-        assert float(found.inverse_function(x, r, p)) == pytest.approx(0.7)
+        assert float(result.inverse_function(x, r, p)) == pytest.approx(0.7)
     with pytest.raises(InvalidProblem, match="parameter 'w_y' already"):
-        fp.disturbed(found, ("y",))
+        fp.disturbed(result, ("y",))
     with pytest.raises(InvalidProblem, match=r"'z' is unknown.*Valid: y"):
         fp.disturbed(plant, ("z",))
 
@@ -392,7 +392,7 @@ def test_adaptation_against_tuned_rivals(duffing):
 
 def test_where_offset_free_control_is_the_better_choice():
     """An error of the model where the input does not act: a deformation cannot reach it, a disturbance model can."""
-    found = errors("leaking_tanks", "h2")
-    assert found["RHC offset-free"] <= 1.3 * found["RHC exact model"]
-    assert found["RHC offset-free"] < 0.05 * found["RHC"]
-    assert found["RHC+FPI"] > 0.5 * found["RHC"]
+    result = errors("leaking_tanks", "h2")
+    assert result["RHC offset-free"] <= 1.3 * result["RHC exact model"]
+    assert result["RHC offset-free"] < 0.05 * result["RHC"]
+    assert result["RHC+FPI"] > 0.5 * result["RHC"]

@@ -188,8 +188,10 @@ def test_facts_go_through_wrappers():
 def test_a_users_controller_takes_the_recommended_map(wrap):
     """The scale of Sigmoid(gain=-0.5) is chosen for it as for a shipped controller on the same reference."""
     problem = mass(reference=fp.Trajectory(lambda t: {"q": 40.0 * t**3}), start={"q": 0.0}, period=2e-2)
-    chosen: Any = resolved(problem, wrap(Follower(fp.Sigmoid(gain=-0.5)))).deformation
-    assert chosen.scale == pytest.approx(2 * 2e-2 * 240.0, rel=1e-2)  # twice what q'' = 240 t changes in one cycle
+    resolved_controller: Any = resolved(problem, wrap(Follower(fp.Sigmoid(gain=-0.5)))).deformation
+    assert resolved_controller.scale == pytest.approx(
+        2 * 2e-2 * 240.0, rel=1e-2
+    )  # twice what q'' = 240 t changes in one cycle
     run = fp.simulate(mass(duration=0.1), wrap(Follower(fp.Sigmoid(gain=-0.5))), seed=0, compiled=False)
     assert run.stop is None
     limit: Any = run.settings["step_limit"]
@@ -259,10 +261,10 @@ def test_optimality_and_lyapunov_see_through_wrappers():
     problem = mass(**LOOKING_AHEAD)
     for controller in (PLAN, twice(PLAN)):
         run = fp.simulate(problem, controller, seed=0, compiled=False)
-        found = measure_optimality(problem, controller, run, compiled=False)
-        assert found is not None
-        assert found.plans > 10
-        assert 0 <= found.worst < 1e-2
+        optimality = measure_optimality(problem, controller, run, compiled=False)
+        assert optimality is not None
+        assert optimality.plans > 10
+        assert 0 <= optimality.worst < 1e-2
     estimating = fp.Estimating(PLAN, FILTER)
     run = fp.simulate(problem, estimating, seed=0, compiled=False)
     assert measure_optimality(problem, estimating, run, compiled=False) is None
@@ -281,9 +283,9 @@ def test_plans_on_a_predicted_state_are_judged_from_there():
     problem = mass(dead_time=fp.DeadTime(inputs={"u": 2e-3}), **LOOKING_AHEAD)
     controller = fp.Predicted(PLAN, inputs=2e-3)
     run = fp.simulate(problem, controller, seed=0, compiled=False)
-    found = measure_optimality(problem, controller, run, compiled=False)
-    assert found is not None
-    assert -1e-6 < found.worst < 1e-2
+    optimality = measure_optimality(problem, controller, run, compiled=False)
+    assert optimality is not None
+    assert -1e-6 < optimality.worst < 1e-2
     assert lyapunov_view(problem, fp.Predicted(fp.ComputedTorque(TRACK), inputs=2e-3), run) is None
 
 
@@ -395,11 +397,11 @@ BUILDS = {
 
 def contracts() -> tuple[type, ...]:
     """The families' contracts."""
-    found = []
+    collected = []
     for path in CONTRACTS:
         module, _, name = path.rpartition(".")
-        found.append(getattr(importlib.import_module(f"fpirhc.{module}"), name))
-    return tuple(found)
+        collected.append(getattr(importlib.import_module(f"fpirhc.{module}"), name))
+    return tuple(collected)
 
 
 def named_members(path: Path, used: set[str]) -> set[str]:
@@ -412,19 +414,19 @@ def named_members(path: Path, used: set[str]) -> set[str]:
 
 def asked_classes(tree: ast.AST) -> set[str]:
     """Names of classes in isinstance, issubclass, `type(x) is` and class patterns."""
-    found: list[ast.AST] = []
+    collected: list[ast.AST] = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("isinstance", "issubclass"):
-            found.append(node.args[1])
+            collected.append(node.args[1])
         elif isinstance(node, ast.MatchClass):
-            found.append(node.cls)
+            collected.append(node.cls)
         elif (
             isinstance(node, ast.Compare)
             and isinstance(node.left, ast.Call)
             and getattr(node.left.func, "id", "") == "type"
         ):
-            found += node.comparators
-    return {n.id for one in found for n in ast.walk(one) if isinstance(n, ast.Name)}
+            collected += node.comparators
+    return {n.id for one in collected for n in ast.walk(one) if isinstance(n, ast.Name)}
 
 
 def files() -> list[Path]:
@@ -444,7 +446,7 @@ def test_nobody_is_asked_for_his_class():
 
 def test_generic_code_names_no_members():
     """It imports contracts; the few values that it builds for itself are listed above."""
-    found = {}
+    collected = {}
     for path in files():
         name = path.relative_to(PACKAGE).as_posix()
         if name.split("/")[0] not in GENERIC and name not in GENERIC_FILES:
@@ -453,8 +455,8 @@ def test_generic_code_names_no_members():
         imported = {a.asname or a.name for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for a in n.names}
         members = {m for m in named_members(path, imported) if _is_foreign(path, m)}
         if members:
-            found[name] = members
-    assert found == BUILDS
+            collected[name] = members
+    assert collected == BUILDS
 
 
 def _is_foreign(path: Path, name: str) -> bool:

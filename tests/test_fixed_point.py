@@ -47,12 +47,12 @@ def test_random_box_constrained_problems_are_solved_or_honestly_not(seed, low, h
     ocp, data = CACHE["ocp"]
     bounds = np.array([low]), np.array([high])
     first = np.random.default_rng(seed).normal(size=2) * 2
-    inputs, told, _ = (v.full() for v in CACHE["step"](first, data, *bounds, CACHE["memory"]))
+    inputs, diagnostics, _ = (v.full() for v in CACHE["step"](first, data, *bounds, CACHE["memory"]))
     cost, residual, _ = (float(v) for v in CACHE["judge"](inputs, first, data, *bounds, np.zeros((2, ocp.stages))))
-    assert told.ravel()[0] == pytest.approx(cost, rel=1e-10)
-    assert told.ravel()[1] == pytest.approx(residual, rel=1e-6, abs=1e-11)
-    assert (told.ravel()[4] == fp.Status.OK) == (told.ravel()[1] <= 1e-8)
-    assert told.ravel()[4] == fp.Status.OK
+    assert diagnostics.ravel()[0] == pytest.approx(cost, rel=1e-10)
+    assert diagnostics.ravel()[1] == pytest.approx(residual, rel=1e-6, abs=1e-11)
+    assert (diagnostics.ravel()[4] == fp.Status.OK) == (diagnostics.ravel()[1] <= 1e-8)
+    assert diagnostics.ravel()[4] == fp.Status.OK
     assert low <= inputs.min() <= inputs.max() <= high
 
 
@@ -85,17 +85,17 @@ def test_a_fixed_point_stays_fixed():
     first = np.array([0.5, 0.0])
     optimiser = fp.FixedPoint(iterations=20, tolerance=1e-9)
     inputs, _, memory = call(optimiser, ocp, data, first, ocp.input_lower, ocp.input_upper)
-    again, told, _ = call(optimiser, ocp, data, first, ocp.input_lower, ocp.input_upper, memory)
+    again, diagnostics, _ = call(optimiser, ocp, data, first, ocp.input_lower, ocp.input_upper, memory)
     np.testing.assert_allclose(again, inputs, atol=1e-8)
-    assert told.ravel()[1] < 1e-9
+    assert diagnostics.ravel()[1] < 1e-9
 
 
 @pytest.mark.parametrize("optimiser", [fp.FixedPoint(iterations=6, tolerance=1e-6)], ids=["default"])
 def test_linear_quadratic_problems_need_one_step(optimiser):
     """The Riccati sweep is exact there: from any plan, the next one is the optimum."""
     ocp, data, first = linear_problem()
-    _, told, _ = call(replace(optimiser, iterations=1), ocp, data, first, ocp.input_lower, ocp.input_upper)
-    assert told.ravel()[1] < 1e-10
+    _, diagnostics, _ = call(replace(optimiser, iterations=1), ocp, data, first, ocp.input_lower, ocp.input_upper)
+    assert diagnostics.ravel()[1] < 1e-10
 
 
 def linear_problem():
@@ -115,9 +115,9 @@ def linear_problem():
 
 def test_clipping_a_newton_step_is_not_done():
     """Clipping gives (1, 0); the minimiser of the box QP is (1, 0.4), and the input at its bound gets no feedback."""
-    bend, centre = np.array([[1, 0.9], [0.9, 1]]), np.array([2.0, -0.5])
-    slope = -bend @ centre
-    move, gain = box_policy(2, 1)(slope, bend, np.ones((2, 1)), np.zeros(2), np.ones(2))
+    matrix, centre = np.array([[1, 0.9], [0.9, 1]]), np.array([2.0, -0.5])
+    slope = -matrix @ centre
+    move, gain = box_policy(2, 1)(slope, matrix, np.ones((2, 1)), np.zeros(2), np.ones(2))
     np.testing.assert_allclose(move.full().ravel(), [1.0, 0.4], atol=1e-12)
     np.testing.assert_allclose(gain.full().ravel(), [0.0, -1.0], atol=1e-12)
 
@@ -130,17 +130,17 @@ def test_stage_box_programs_against_scipy(seed, size):
 
     random = np.random.default_rng(seed)
     root = random.normal(size=(size + 2, size))
-    bend, slope = root.T @ root + 0.1 * np.eye(size), random.normal(size=size) * 3
+    matrix, slope = root.T @ root + 0.1 * np.eye(size), random.normal(size=size) * 3
     low, high = -random.uniform(0, 2, size), random.uniform(0, 2, size)
     policy = POLICIES.setdefault(size, box_policy(size, 1))
-    move = policy(slope, bend, np.ones((size, 1)), low, high)[0].full().ravel()
-    value = slope @ move + 0.5 * move @ bend @ move
-    factor = np.linalg.cholesky(bend).T
+    move = policy(slope, matrix, np.ones((size, 1)), low, high)[0].full().ravel()
+    value = slope @ move + 0.5 * move @ matrix @ move
+    factor = np.linalg.cholesky(matrix).T
     best = lsq_linear(factor, -np.linalg.solve(factor.T, slope), (low - 1e-12, high + 1e-12), tol=1e-14).x
     assert value <= 0
     assert np.all(move >= low)
     assert np.all(move <= high)
-    MISSED.append(value > slope @ best + 0.5 * best @ bend @ best + 1e-8)
+    MISSED.append(value > slope @ best + 0.5 * best @ matrix @ best + 1e-8)
     assert sum(MISSED) <= 0.03 * max(len(MISSED), 100)
 
 
@@ -172,7 +172,7 @@ def predicted_contraction(ocp, data, first, best):
     none = np.zeros((ocp.state.size, ocp.stages))
     _, slope, states, _ = reduced_gradient(ocp)(first, inputs, data, none)
     hessian = ca.Function("h", [inputs], [ca.jacobian(ca.vec(slope), ca.vec(inputs))])(best).full()
-    moved = ca.Function("j", [inputs], [ca.jacobian(ca.vec(states[:, 1:]), ca.vec(inputs))])(best).full()
+    sensitivity = ca.Function("j", [inputs], [ca.jacobian(ca.vec(states[:, 1:]), ca.vec(inputs))])(best).full()
     trajectory = ca.Function("x", [inputs], [states])(best).full()
     s, u, theta = ca.SX.sym("s", 2), ca.SX.sym("u"), ca.SX.sym("t", ocp.data.size)
     by_state = ca.Function("q", [s, u, theta], [ca.hessian(ocp.stage_cost(s, u, theta)[0], s)[0]])
@@ -181,10 +181,14 @@ def predicted_contraction(ocp, data, first, best):
     model = np.zeros_like(hessian)
     for i in range(ocp.stages):
         model[i, i] += float(by_input(trajectory[:, i], best[:, i], data[:, i]))
-        rows = moved[2 * i : 2 * i + 2]
+        rows = sensitivity[2 * i : 2 * i + 2]
         at_end = i + 1 == ocp.stages
-        after, told = trajectory[:, i + 1], data[:, i + 1]
-        model += rows.T @ (final(after, told) if at_end else by_state(after, best[:, i + 1], told)).full() @ rows
+        after, diagnostics = trajectory[:, i + 1], data[:, i + 1]
+        model += (
+            rows.T
+            @ (final(after, diagnostics) if at_end else by_state(after, best[:, i + 1], diagnostics)).full()
+            @ rows
+        )
     return np.abs(1 - np.linalg.eigvals(np.linalg.solve(model, hessian))).max(), model
 
 
@@ -287,10 +291,10 @@ def test_exact_hessian_converges_quadratically():
     first = np.array([2.5, 0.0])
     near = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=0.1), first, data).inputs
     iterations = {}
-    for bend in (fp.GaussNewton(), fp.ExactHessian()):
-        plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-10, hessian=bend), first, data, start=near)
+    for model in (fp.GaussNewton(), fp.ExactHessian()):
+        plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-10, hessian=model), first, data, start=near)
         assert plan.status == fp.Status.OK
-        iterations[type(bend).__name__] = plan.iterations
+        iterations[type(model).__name__] = plan.iterations
     assert iterations["ExactHessian"] <= 5 < 2 * 5 <= iterations["GaussNewton"]
 
 
@@ -302,9 +306,9 @@ def test_a_poisoned_memory_is_forgotten(poison):
     memory = np.full(optimiser.memory(ocp).size, poison)
     statuses = []
     for _ in range(5):
-        inputs, told, memory = call(optimiser, ocp, data, np.zeros(2), np.array([-1.0]), np.array([1.0]), memory)
+        inputs, diagnostics, memory = call(optimiser, ocp, data, np.zeros(2), np.array([-1.0]), np.array([1.0]), memory)
         assert np.isfinite(inputs).all()
-        statuses.append(int(told.ravel()[4]))
+        statuses.append(int(diagnostics.ravel()[4]))
     assert statuses[-1] == fp.Status.OK
 
 
@@ -330,8 +334,8 @@ def test_single_iterations_get_out_of_a_bad_plan():
     memory[optimiser.memory(ocp).slice("plan_inputs")] = np.linspace(40.0, 0.0, horizon.stages)
     statuses = []
     for _ in range(40):
-        inputs, told, memory = call(optimiser, ocp, data, first, ocp.input_lower, ocp.input_upper, memory)
-        statuses.append(int(told.ravel()[4]))
+        inputs, diagnostics, memory = call(optimiser, ocp, data, first, ocp.input_lower, ocp.input_upper, memory)
+        statuses.append(int(diagnostics.ravel()[4]))
     assert statuses[-1] == fp.Status.OK
     np.testing.assert_allclose(inputs, best.inputs, atol=1e-4)
 
@@ -350,12 +354,12 @@ def test_overflowing_models_are_told_and_survived():
     ocp = transcribe(plant, reference, horizon, cost, fp.Limits(inputs={"u": (-1.0, 1.0)}))
     data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate).full()
     optimiser = fp.FixedPoint(iterations=6, tolerance=1e-6)
-    inputs, told, memory = call(optimiser, ocp, data, np.array([30.0]), ocp.input_lower, ocp.input_upper)
-    assert int(told.ravel()[4]) == fp.Status.NON_FINITE
+    inputs, diagnostics, memory = call(optimiser, ocp, data, np.array([30.0]), ocp.input_lower, ocp.input_upper)
+    assert int(diagnostics.ravel()[4]) == fp.Status.NON_FINITE
     assert np.isfinite(inputs).all()
     for _ in range(4):
-        _, told, memory = call(optimiser, ocp, data, np.array([0.3]), ocp.input_lower, ocp.input_upper, memory)
-    assert int(told.ravel()[4]) == fp.Status.OK
+        _, diagnostics, memory = call(optimiser, ocp, data, np.array([0.3]), ocp.input_lower, ocp.input_upper, memory)
+    assert int(diagnostics.ravel()[4]) == fp.Status.OK
 
 
 def test_feedback_keeps_unstable_plants_together():
@@ -373,11 +377,11 @@ def test_feedback_keeps_unstable_plants_together():
     data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate).full()
     optimiser = fp.FixedPoint(iterations=3, tolerance=1e-6)
     _, _, memory = call(optimiser, ocp, data, np.zeros(1), ocp.input_lower, ocp.input_upper)
-    _, told, _ = call(optimiser, ocp, data, np.array([0.1]), ocp.input_lower, ocp.input_upper, memory)
-    assert told.ravel()[1] < 1.0
+    _, diagnostics, _ = call(optimiser, ocp, data, np.array([0.1]), ocp.input_lower, ocp.input_upper, memory)
+    assert diagnostics.ravel()[1] < 1.0
     without = np.where(np.arange(memory.size) < ocp.stages, memory.ravel(), 0.0)
-    _, told, _ = call(optimiser, ocp, data, np.array([0.1]), ocp.input_lower, ocp.input_upper, without)
-    assert int(told.ravel()[4]) != fp.Status.OK
+    _, diagnostics, _ = call(optimiser, ocp, data, np.array([0.1]), ocp.input_lower, ocp.input_upper, without)
+    assert int(diagnostics.ravel()[4]) != fp.Status.OK
 
 
 @pytest.mark.parametrize(

@@ -17,18 +17,18 @@ from fpirhc.symbolic.native import find_compiler
 
 def problem(order=1, *, period=1e-3, duration=2.002, **settings):
     """A chain of integrators that is to stand still, from an error of 1 m."""
-    given = {"start": {"y": -1.0}, "reference": fp.Trajectory(lambda t: {"y": 0 * t}), **settings}
-    return fp.Problem(plant=chain(order), period=period, duration=duration, **given)
+    settings_in_use = {"start": {"y": -1.0}, "reference": fp.Trajectory(lambda t: {"y": 0 * t}), **settings}
+    return fp.Problem(plant=chain(order), period=period, duration=duration, **settings_in_use)
 
 
 def run(task, tracking, *, compiled=False):
     return fp.simulate(task, fp.ComputedTorque(tracking), seed=0, compiled=compiled)
 
 
-def decaying(found, order, rate):
+def decaying(result, order, rate):
     """S = (d/dt + rate)^n e_int of every cycle, from the logged state and integral."""
-    integral = np.concatenate([[0.0], found["integral.y"][:-1]])
-    chain_of_errors = [integral, *(-found["state"].T)]
+    integral = np.concatenate([[0.0], result["integral.y"][:-1]])
+    chain_of_errors = [integral, *(-result["state"].T)]
     return sum(math.comb(order, s) * rate ** (order - s) * chain_of_errors[s] for s in range(order + 1))
 
 
@@ -47,8 +47,8 @@ def test_series_is_the_exponential_and_the_cosine():
 @pytest.mark.parametrize(("beta", "after"), [(0.6, 0.300584), (0.8, 0.223547), (1.0, 0.135335)])
 def test_closed_loop_follows_mittag_leffler(order, beta, after):
     """S(t) / S_0 = E_beta(-(rate t)^beta) on the ideal plant, whatever its relative order; `after` is E at rate t = 2."""
-    found = run(problem(order), fp.Fractional(rate=1.0, order=beta, memory=2.002))
-    surface = decaying(found, order, 1.0)
+    result = run(problem(order), fp.Fractional(rate=1.0, order=beta, memory=2.002))
+    surface = decaying(result, order, 1.0)
     assert surface[2000] / surface[0] == pytest.approx(after, abs=1e-3)
     late = np.arange(100, 2001, 100)
     expected = [mittag_leffler(beta, (k * 1e-3) ** beta) for k in late]
@@ -57,8 +57,8 @@ def test_closed_loop_follows_mittag_leffler(order, beta, after):
 
 def test_order_above_one_overshoots():
     """For beta = 1.5 S swings through zero, as E_1.5 does; S'(0) is zero."""
-    found = run(problem(duration=4.0), fp.Fractional(rate=1.0, order=1.5, memory=4.0))
-    surface = decaying(found, 1, 1.0)
+    result = run(problem(duration=4.0), fp.Fractional(rate=1.0, order=1.5, memory=4.0))
+    surface = decaying(result, 1, 1.0)
     late = np.arange(100, 4000, 100)
     expected = [mittag_leffler(1.5, (k * 1e-3) ** 1.5) for k in late]
     np.testing.assert_allclose(surface[late] / surface[0], expected, atol=1e-3)
@@ -115,8 +115,8 @@ def test_memory_is_static_and_bounded():
 
 def test_shortest_memory_runs():
     """A memory of one cycle is one number."""
-    found = run(problem(duration=0.2, period=0.01), fp.Fractional(rate=100.0, order=0.9, memory=0.01))
-    assert np.isfinite(found["desired"]).all()
+    result = run(problem(duration=0.2, period=0.01), fp.Fractional(rate=100.0, order=0.9, memory=0.01))
+    assert np.isfinite(result["desired"]).all()
 
 
 def test_a_fresh_start_forgets():

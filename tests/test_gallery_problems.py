@@ -50,8 +50,8 @@ def rms(name, controller):
 
 def rate_of(plant, command):
     """Right-hand side f(t, x) of the plant with its exact parameters under a constant command or a function of time."""
-    given = command if callable(command) else lambda t: command
-    return lambda t, x: plant.derivative_function(x, given(t), plant.exact).full().ravel()
+    values = command if callable(command) else lambda t: command
+    return lambda t, x: plant.derivative_function(x, values(t), plant.exact).full().ravel()
 
 
 # Hodgkin and Huxley
@@ -87,10 +87,10 @@ def test_the_cell_rests_at_minus_65_mV():
 
 def test_the_cell_fires_68_times_a_second():
     """At a constant 10 uA/cm^2: 68.3 Hz, once the first spikes are over."""
-    found = solve_ivp(
+    solution = solve_ivp(
         rate_of(task("hodgkin_huxley").problem.plant, 10.0), (0, 300), REST, "LSODA", rtol=1e-7, atol=1e-9, max_step=0.5
     )
-    spikes = found.t[1:][(found.y[0, 1:] > 0) & (found.y[0, :-1] <= 0)]
+    spikes = solution.t[1:][(solution.y[0, 1:] > 0) & (solution.y[0, :-1] <= 0)]
     assert 1e3 / np.diff(spikes[-10:]).mean() == pytest.approx(68.3, abs=0.1)
 
 
@@ -124,8 +124,8 @@ def test_spikes_are_counted_and_suppressed():
 def test_four_lags_let_go():
     """From q = 1 at rest, without a force: q = exp(-t) (1 + t + t^2/2 + t^3/6)."""
     plant = task("order_four").problem.plant
-    found = solve_ivp(rate_of(plant, 0.0), (0, 5), [1.0, 0, 0, 0], rtol=1e-10, atol=1e-12).y[0, -1]
-    assert found == pytest.approx(np.exp(-5) * (1 + 5 + 25 / 2 + 125 / 6), rel=1e-7)
+    solution = solve_ivp(rate_of(plant, 0.0), (0, 5), [1.0, 0, 0, 0], rtol=1e-10, atol=1e-12).y[0, -1]
+    assert solution == pytest.approx(np.exp(-5) * (1 + 5 + 25 / 2 + 125 / 6), rel=1e-7)
 
 
 def test_a_gain_beyond_two_thirds_doubles_every_error():
@@ -145,9 +145,10 @@ def test_noisy_positions_refuse_the_gain_or_lose():
     with pytest.raises(NotContractive, match=r"24\.5 cycles late"):
         fp.simulate(problem, quiet.controllers["CTC+FPI"], seed=0)
     late = fp.Increment(fp.RFPT(offset=1e6, sign=-1.0, gain=5e-8), cycles=problem.response_delay)
-    told = fp.ComputedTorque(quiet.controllers["CTC"].tracking, late)
+    diagnostics = fp.ComputedTorque(quiet.controllers["CTC"].tracking, late)
     errors = [
-        fp.measure(problem, fp.simulate(problem, c, seed=0)).rms_error["q"] for c in (quiet.controllers["CTC"], told)
+        fp.measure(problem, fp.simulate(problem, c, seed=0)).rms_error["q"]
+        for c in (quiet.controllers["CTC"], diagnostics)
     ]
     assert errors[1] > 3 * errors[0]
 
@@ -164,8 +165,8 @@ def test_sliding_friction_is_the_printed_curve():
         def bristle(z, speed=speed):
             return rate_of(plant, 0.0)(0, [0.0, z, speed])[1]
 
-        bend = brentq(bristle, -1e-2, 1e-2, xtol=1e-16)
-        needed = plant.inverse_function([0.0, bend, speed], 0.0, plant.exact)
+        deflection = brentq(bristle, -1e-2, 1e-2, xtol=1e-16)
+        needed = plant.inverse_function([0.0, deflection, speed], 0.0, plant.exact)
         assert float(needed) == pytest.approx(curve, rel=1e-9), speed
 
 
@@ -174,12 +175,12 @@ def test_it_breaks_away_at_the_static_friction(force, slides):
     """Raised slowly to F < F_S it creeps by -F_S / sigma0 ln(1 - F / F_S), as dz = dx (1 - sigma0 z / F_S); beyond it slides."""
     plant = task("stick_slip").problem.plant
     raised = rate_of(plant, lambda t: min(t / 10, 1.0) * force)
-    found = solve_ivp(raised, (0, 12), np.zeros(3), "LSODA", rtol=1e-8, atol=1e-12, max_step=0.05)
-    moved = found.y[0, -1]
+    solution = solve_ivp(raised, (0, 12), np.zeros(3), "LSODA", rtol=1e-8, atol=1e-12, max_step=0.05)
+    displacement = solution.y[0, -1]
     if slides:
-        assert moved > 0.05
+        assert displacement > 0.05
     else:
-        assert moved == pytest.approx(-1.5e-4 * np.log(1 - force / 1.5), rel=0.02)
+        assert displacement == pytest.approx(-1.5e-4 * np.log(1 - force / 1.5), rel=0.02)
 
 
 def test_sub_steps_follow_the_bristles():
@@ -226,8 +227,8 @@ def test_the_logarithm_is_drexlers_model():
         lambda t, x: [(a - b * x[1]) * x[0], dose(t) - c * x[1]], (0, 30), [2000.0, 0.0], rtol=1e-10, atol=1e-12
     )
     plant = task("tumour").problem.plant
-    found = solve_ivp(rate_of(plant, dose), (0, 30), [np.log(2000.0), a], rtol=1e-10, atol=1e-12)
-    assert found.y[0, -1] == pytest.approx(np.log(volumes.y[0, -1]), rel=1e-8)
+    solution = solve_ivp(rate_of(plant, dose), (0, 30), [np.log(2000.0), a], rtol=1e-10, atol=1e-12)
+    assert solution.y[0, -1] == pytest.approx(np.log(volumes.y[0, -1]), rel=1e-8)
 
 
 def test_a_dose_of_a_c_over_b_holds_the_tumour():
@@ -264,12 +265,12 @@ def test_steady_thrust(throttle, small, large):
         v = throttle + p["B_UU"] * throttle**2
         root = np.roots([p["K_TT"], p["K_T"] + p["B_T"] * v, p["c"] + p["B_U"] * v]).max()
         assert root == pytest.approx(expected, abs=0.06)
-        found = solve_ivp(
+        solution = solve_ivp(
             lambda t, x, q=parameters: plant.derivative_function(x, throttle, q).full().ravel(),
             (0, 30),
             [0.95 * root, 0.0],
         )
-        assert found.y[0, -1] == pytest.approx(root, rel=2e-3)
+        assert solution.y[0, -1] == pytest.approx(root, rel=2e-3)
 
 
 def test_the_throttle_is_found_for_every_thrust():

@@ -34,9 +34,9 @@ COSTS = {
 
 def built(cost, horizon=None, plant=None, limits=None):
     """(ocp, data) of a pendulum's horizon."""
-    chosen, steps = plant or pendulum(), horizon or fp.Horizon(stages=8, step=0.05)
-    ocp = transcribe(chosen, PENDULUM_REFERENCE, steps, cost, limits or fp.Limits())
-    return ocp, stage_data(chosen, PENDULUM_REFERENCE, steps, cost)(0.2, chosen.approximate)
+    selection, steps = plant or pendulum(), horizon or fp.Horizon(stages=8, step=0.05)
+    ocp = transcribe(selection, PENDULUM_REFERENCE, steps, cost, limits or fp.Limits())
+    return ocp, stage_data(selection, PENDULUM_REFERENCE, steps, cost)(0.2, selection.approximate)
 
 
 def point(ocp, seed=0):
@@ -66,9 +66,9 @@ def test_adjoint_gradient_agrees_with_finite_differences(name):
     slope = reduced_gradient(ocp)(s0, inputs, data, np.zeros((ocp.state.size, ocp.stages)))[1].full()
     value = rollout(ocp)
     for k in (0, 3, ocp.stages - 1):
-        moved = np.zeros_like(inputs)
-        moved[0, k] = 1e-5
-        high, low = (float(value(s0, inputs + sign * moved, data)[1]) for sign in (1, -1))
+        direction = np.zeros_like(inputs)
+        direction[0, k] = 1e-5
+        high, low = (float(value(s0, inputs + sign * direction, data)[1]) for sign in (1, -1))
         assert slope[0, k] == pytest.approx((high - low) / 2e-5, rel=1e-5, abs=1e-7)
 
 
@@ -122,8 +122,8 @@ def test_lqr_terminal_makes_a_short_horizon_endless():
 def test_feedforward_makes_the_reference_free():
     """On the reference, with the model's own input, a cost of corrections is zero."""
     ocp, data = built(COSTS["deviation"])
-    given = ocp.data.split(data[:, 0])
-    value, _ = ocp.stage_cost(given["reference"], given["feedforward"], data[:, 0])
+    values = ocp.data.split(data[:, 0])
+    value, _ = ocp.stage_cost(values["reference"], values["feedforward"], data[:, 0])
     assert float(value) == pytest.approx(0.0, abs=1e-20)
 
 
@@ -207,6 +207,6 @@ def test_a_table_serves_as_a_reference():
     table = fp.Table(times, {"angle": 0.5 * np.sin(2 * times)})
     horizon, plant = fp.Horizon(stages=8, step=0.05), pendulum()
     _, expected = built(COSTS["deviation"])
-    given = stage_data(plant, table, horizon, COSTS["deviation"])(0.2, plant.approximate)
-    np.testing.assert_allclose(given.full(), expected.full(), atol=1e-5)
+    values = stage_data(plant, table, horizon, COSTS["deviation"])(0.2, plant.approximate)
+    np.testing.assert_allclose(values.full(), expected.full(), atol=1e-5)
     transcribe(plant, table, horizon, COSTS["deviation"], fp.Limits())

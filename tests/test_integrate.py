@@ -85,8 +85,8 @@ def test_implicit_methods_are_exact_on_linear_plants_with_one_newton_step():
     z = -0.6
     expected = {fp.ImplicitMidpoint: (1 + z / 2) / (1 - z / 2), fp.RadauIIA: (1 + z / 3) / (1 - 2 * z / 3 + z**2 / 6)}
     for method, pole in expected.items():
-        moved = method(newton=1).step(plant, 0.2)([1.0], [0.0], plant.exact, [0.0])
-        assert float(moved) == pytest.approx(pole, rel=1e-14)
+        next_state = method(newton=1).step(plant, 0.2)([1.0], [0.0], plant.exact, [0.0])
+        assert float(next_state) == pytest.approx(pole, rel=1e-14)
 
 
 @pytest.mark.parametrize("method", [fp.ImplicitMidpoint, fp.RadauIIA, fp.Euler])

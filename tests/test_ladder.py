@@ -36,10 +36,10 @@ class Never(Optimiser):
 
     def step(self, ocp):
         """No solution."""
-        given = [ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size, ocp.stages + 1)]
-        given += [ca.MX.sym("lower", 1), ca.MX.sym("upper", 1), ca.MX.sym("memory", ocp.stages)]
-        told = ca.vertcat(ca.MX.zeros(4), int(fp.Status.NON_FINITE))
-        return ca.Function("never", given, [given[4].T, told, given[4]])
+        symbols = [ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size, ocp.stages + 1)]
+        symbols += [ca.MX.sym("lower", 1), ca.MX.sym("upper", 1), ca.MX.sym("memory", ocp.stages)]
+        diagnostics = ca.vertcat(ca.MX.zeros(4), int(fp.Status.NON_FINITE))
+        return ca.Function("never", symbols, [symbols[4].T, diagnostics, symbols[4]])
 
 
 NEVER = Never()
@@ -58,13 +58,13 @@ def test_the_second_is_asked_where_the_first_has_no_usable_plan_and_counted():
     first, layout = np.array([0.1, 0.0]), ladder.memory(ocp)
     bounds, memory = (ocp.input_lower, ocp.input_upper), ca.DM(layout.start())
     for _ in range(2):
-        inputs, told, memory = ladder.step(ocp)(first, data, *bounds, memory)
-    assert int(told[4]) == fp.Status.OK
+        inputs, diagnostics, memory = ladder.step(ocp)(first, data, *bounds, memory)
+    assert int(diagnostics[4]) == fp.Status.OK
     best = fp.solve(ocp, FIXED, first, data)
     np.testing.assert_allclose(inputs.full(), best.inputs, atol=1e-5)
-    kept = layout.unpack(memory.full().ravel())
-    assert kept["plan_second_plans"][0] == 2
-    np.testing.assert_array_equal(kept["plan_inputs"], inputs.full().ravel(order="F"))
+    parts = layout.unpack(memory.full().ravel())
+    assert parts["plan_second_plans"][0] == 2
+    np.testing.assert_array_equal(parts["plan_inputs"], inputs.full().ravel(order="F"))
 
 
 def test_the_second_is_left_alone_where_the_first_succeeds():
@@ -73,10 +73,10 @@ def test_the_second_is_left_alone_where_the_first_succeeds():
     ladder, first = fp.Ladder(FIXED, NEVER), np.array([0.1, 0.0])
     bounds, memory, own = (ocp.input_lower, ocp.input_upper), ladder.memory(ocp).start(), FIXED.memory(ocp).start()
     for _ in range(3):
-        inputs, told, memory = ladder.step(ocp)(first, data, *bounds, memory)
-        alone, said, own = FIXED.step(ocp)(first, data, *bounds, own)
+        inputs, diagnostics, memory = ladder.step(ocp)(first, data, *bounds, memory)
+        alone, other_diagnostics, own = FIXED.step(ocp)(first, data, *bounds, own)
     np.testing.assert_array_equal(inputs.full(), alone.full())
-    assert int(told[4]) == int(said[4]) == fp.Status.OK
+    assert int(diagnostics[4]) == int(other_diagnostics[4]) == fp.Status.OK
     assert float(memory[-1]) == 0
 
 

@@ -52,10 +52,10 @@ def test_poles_and_margins():
     }
     for product, poles in table.items():
         for wrong, pole in zip((1, 2, 3, 5, 10), poles, strict=True):
-            found = fp.leaky_pole(product, wrong)
-            assert found == pytest.approx(pole, abs=0.006)
-            assert 4 * found / (1 - found) ** 2 == pytest.approx(product * (2 + product) * wrong**2, rel=1e-12)
-            assert fp.leaky_margin(product, found) == pytest.approx(wrong, rel=1e-12)
+            result = fp.leaky_pole(product, wrong)
+            assert result == pytest.approx(pole, abs=0.006)
+            assert 4 * result / (1 - result) ** 2 == pytest.approx(product * (2 + product) * wrong**2, rel=1e-12)
+            assert fp.leaky_margin(product, result) == pytest.approx(wrong, rel=1e-12)
     assert fp.leaky_pole(1.0, 0) == 0
 
 
@@ -86,9 +86,11 @@ def test_the_map_itself_follows_the_theorem(form):
         wrong = max(1, math.ceil(0.1 * believed))
         true = max(0, believed + int(random.integers(-wrong, wrong + 1)))
         deformation = form(affine(1.0), cycles=believed)
-        found = iteration_radius(deformation, true) if form is fp.Increment else referenced_radius(deformation, true)
-        assert found < 1
-        assert found == pytest.approx(radius(1.0, deformation.leak, believed, true), abs=1e-6)
+        limit_value = (
+            iteration_radius(deformation, true) if form is fp.Increment else referenced_radius(deformation, true)
+        )
+        assert limit_value < 1
+        assert limit_value == pytest.approx(radius(1.0, deformation.leak, believed, true), abs=1e-6)
     assert iteration_radius(fp.Increment(affine(1.0), cycles=20, uncertainty=0), 21) > 1
 
 
@@ -101,9 +103,9 @@ def referenced_radius(deformation: fp.ModelReferenced, delay: int) -> float:
     layout, size = deformation.memory(("q",)), max(delay, believed) + 1
     z = ca.SX.sym("z", size + layout.size)
     memory = layout.split(z[size:])
-    request, following = deformation.step(z[believed], z[delay], ca.SX(0), memory)
+    request, next_memory = deformation.step(z[believed], z[delay], ca.SX(0), memory)
     on = ca.vertcat(request, z[: size - 1]) if size > 1 else request
-    function = ca.Function("one", [z], [ca.jacobian(ca.vertcat(on, layout.join(following)), z)])
+    function = ca.Function("one", [z], [ca.jacobian(ca.vertcat(on, layout.join(next_memory)), z)])
     return float(np.abs(np.linalg.eigvals(function(np.zeros(z.numel())).full())).max())
 
 
@@ -162,10 +164,12 @@ def test_limit_agrees_with_the_roots(referenced):
         weights /= weights.sum()
         cycles, leak = float(random.integers(0, 6)), float(random.uniform(0.2, 0.8))
         pole, ratio = float(random.choice([0.0, 0.6])), float(random.uniform(0.4, 2.5))
-        found = leaking_limit(weights, cycles=cycles, leak=leak, pole=pole, eigenvalue=ratio, referenced=referenced)
-        assert found > 0
-        for share, inside in ((0.98, True), (1.02, False)) if np.isfinite(found) else ():
-            row = loop_polynomial(weights, share * found, cycles, leak, pole, ratio, referenced)
+        limit_value = leaking_limit(
+            weights, cycles=cycles, leak=leak, pole=pole, eigenvalue=ratio, referenced=referenced
+        )
+        assert limit_value > 0
+        for share, inside in ((0.98, True), (1.02, False)) if np.isfinite(limit_value) else ():
+            row = loop_polynomial(weights, share * limit_value, cycles, leak, pole, ratio, referenced)
             assert (np.abs(np.roots(row.real)).max() < 1) == inside
 
 

@@ -101,7 +101,7 @@ def condensed(ocp, first, data):
     values = ca.Function("f", [inputs], [hessian, slope, ca.jacobian(rows, inputs), rows, total])
     h, g, a, at, _ = (np.asarray(v.full()) for v in values(np.zeros(nu * n)))
     solver = ca.conic("qp", "qrqp", {"h": ca.DM(h).sparsity(), "a": ca.DM(a).sparsity()}, QUIET)
-    found = solver(
+    result = solver(
         h=h,
         g=g,
         a=a,
@@ -110,7 +110,7 @@ def condensed(ocp, first, data):
         lbx=np.tile(ocp.input_lower, n),
         ubx=np.tile(ocp.input_upper, n),
     )
-    return solver.stats()["success"], np.asarray(found["x"].full()).ravel(), float(values(found["x"])[4])
+    return solver.stats()["success"], np.asarray(result["x"].full()).ravel(), float(values(result["x"])[4])
 
 
 QUIET = {"print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False}
@@ -136,14 +136,14 @@ def same_optimum(seed: int) -> bool:
     parameters = np.concatenate([random.normal(size=4) * 1.5, np.eye(2).ravel() + 0.4 * random.normal(size=4)])
     data = np.asarray(data_of(0.0, parameters).full())
     first = random.uniform([-0.5, -0.8], [0.6, 0.5])
-    inputs, told, _ = (np.asarray(v.full()) for v in step(first, data, ocp.input_lower, ocp.input_upper, start))
+    inputs, diagnostics, _ = (np.asarray(v.full()) for v in step(first, data, ocp.input_lower, ocp.input_upper, start))
     solvable, best, value = condensed(ocp, first, data)
     if solvable:
-        assert int(told[4, 0]) == fp.Status.OK
-        assert told[0, 0] == pytest.approx(value, rel=1e-7, abs=1e-9)
+        assert int(diagnostics[4, 0]) == fp.Status.OK
+        assert diagnostics[0, 0] == pytest.approx(value, rel=1e-7, abs=1e-9)
         np.testing.assert_allclose(inputs.ravel(order="F"), best, atol=1e-5)
     else:
-        assert int(told[4, 0]) != fp.Status.OK
+        assert int(diagnostics[4, 0]) != fp.Status.OK
     return solvable
 
 
@@ -157,11 +157,11 @@ def test_driver_and_graph_agree_with_limits(iterations, realtime):
     assert compiled.compiled
     memories = [np.zeros(graph.size1_in(4))] * 2
     for k in range(4):
-        given = first + np.array([0.0, 0.6 * k, 0.0]), data, ocp.input_lower, ocp.input_upper
-        results = [f(*given, m) for f, m in zip((graph, compiled.function), memories, strict=True)]
-        (one, told, _), (other, said, _) = results
-        np.testing.assert_array_equal(told.full()[3:], said.full()[3:])
-        np.testing.assert_allclose(told.full()[:3], said.full()[:3], rtol=1e-5, atol=1e-6)
+        values = first + np.array([0.0, 0.6 * k, 0.0]), data, ocp.input_lower, ocp.input_upper
+        results = [f(*values, m) for f, m in zip((graph, compiled.function), memories, strict=True)]
+        (one, diagnostics, _), (other, other_diagnostics, _) = results
+        np.testing.assert_array_equal(diagnostics.full()[3:], other_diagnostics.full()[3:])
+        np.testing.assert_allclose(diagnostics.full()[:3], other_diagnostics.full()[:3], rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(one.full(), other.full(), atol=1e-5)
         memories = [r[2] for r in results]
 

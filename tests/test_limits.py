@@ -83,8 +83,8 @@ def test_soft_limits_are_violated_at_their_price():
     assert lowest[0] < lowest[1] < lowest[2] < -0.5 + 1e-12
     assert lowest[2] > -0.51
     assert all(p > 0 for p in prices)
-    kept, data, first = horizon_of(fp.Limits(states={"angle'": (-50.0, 50.0)}, soft={"angle'": 10.0}))
-    assert fp.solve(kept, FIXED, first, data).slacks() == {"angle'": 0.0}
+    parts, data, first = horizon_of(fp.Limits(states={"angle'": (-50.0, 50.0)}, soft={"angle'": 10.0}))
+    assert fp.solve(parts, FIXED, first, data).slacks() == {"angle'": 0.0}
 
 
 def test_soft_rates_and_paths():
@@ -98,8 +98,8 @@ def test_soft_rates_and_paths():
     assert steps[0] > steps[1] * 1.01
 
 
-def swapped(given):
-    ocp, data, first = given
+def swapped(arguments):
+    ocp, data, first = arguments
     return ocp, FIXED, first, data
 
 
@@ -108,10 +108,10 @@ def test_violations_are_named_with_values_the_first_state_first():
     ocp, data, _ = horizon_of(fp.Limits(inputs={"torque": (-0.1, 0.1)}, states={"angle": (0.9, 1.0)}))
     plan = fp.solve(ocp, FIXED, FIRST, data, calls=4)
     assert plan.status == fp.Status.INFEASIBLE
-    told = plan.violations()
-    assert len(told) == 5
-    assert told[0] == "'angle' is 0.6 rad, below 0.9, at stage 0"
-    assert "below 0.9, at stage" in told[1]
+    diagnostics = plan.violations()
+    assert len(diagnostics) == 5
+    assert diagnostics[0] == "'angle' is 0.6 rad, below 0.9, at stage 0"
+    assert "below 0.9, at stage" in diagnostics[1]
 
 
 LOOPS = {
@@ -221,10 +221,10 @@ def test_priced_limits_are_kept_exactly_below_their_price_and_given_up_beyond():
     ocp, data, first = horizon_of(fp.Limits(states={"angle'": (-0.5, 0.5)}))
     strict = fp.solve(ocp, FIXED, first, data)
     largest = np.abs(strict.state_multipliers).max() / ocp.step
-    kept = fp.solve(*swapped(priced(1.1 * largest)))
-    assert kept.status == fp.Status.OK
-    np.testing.assert_allclose(kept.inputs, strict.inputs, atol=1e-6)
-    assert kept.slacks() == {"angle'": pytest.approx(0.0, abs=1e-6)}
+    plan_inside = fp.solve(*swapped(priced(1.1 * largest)))
+    assert plan_inside.status == fp.Status.OK
+    np.testing.assert_allclose(plan_inside.inputs, strict.inputs, atol=1e-6)
+    assert plan_inside.slacks() == {"angle'": pytest.approx(0.0, abs=1e-6)}
     given_up = fp.solve(*swapped(priced(0.3 * largest)))
     assert given_up.status == fp.Status.OK
     assert given_up.states[1, 1:].min() < -0.51

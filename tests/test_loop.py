@@ -53,11 +53,11 @@ def test_exact_model_needs_no_deformation():
     exact = replace(
         problem.plant, parameters={n: replace(p, exact=p.approximate) for n, p in problem.plant.parameters.items()}
     )
-    found = run(replace(problem, plant=exact), fp.Sigmoid(gain=-0.5, scale=10.0))
-    difference = np.abs(found["deformed.angle"] - found["desired.angle"])
-    slew = np.abs(np.diff(found["desired.angle"])).max()
+    result = run(replace(problem, plant=exact), fp.Sigmoid(gain=-0.5, scale=10.0))
+    difference = np.abs(result["deformed.angle"] - result["desired.angle"])
+    slew = np.abs(np.diff(result["desired.angle"])).max()
     assert difference.max() < 20 * slew
-    assert np.abs(found["error.angle"][-1000:]).max() < 1e-3
+    assert np.abs(result["error.angle"][-1000:]).max() < 1e-3
 
 
 def test_wrong_model_is_cured_by_deformation():
@@ -69,15 +69,15 @@ def test_wrong_model_is_cured_by_deformation():
 
 def test_identity_asks_for_what_is_desired():
     """No adaptation is q^Def = q^Des in every cycle."""
-    found = run(swing())
-    assert np.array_equal(found["deformed"], found["desired"])
+    result = run(swing())
+    assert np.array_equal(result["deformed"], result["desired"])
 
 
 def test_adaptation_waits_for_a_valid_pair():
     """In the first cycle nothing has been realised yet, so the request is the desired response."""
-    found = run(swing(), fp.Sigmoid(gain=-0.5, scale=10.0))
-    assert found["deformed.angle"][0] == found["desired.angle"][0]
-    assert found["deformed.angle"][5] != found["desired.angle"][5]
+    result = run(swing(), fp.Sigmoid(gain=-0.5, scale=10.0))
+    assert result["deformed.angle"][0] == result["desired.angle"][0]
+    assert result["deformed.angle"][5] != result["desired.angle"][5]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -86,8 +86,8 @@ def test_in_loop_contraction_equals_prediction(seed):
     gain = np.random.default_rng(seed).uniform(0.5, 1.8)
     deformation = fp.Sigmoid(gain=-0.5, scale=1e6)
     still = fp.Exponential(rate=1e-3, integral=False)
-    found = fp.simulate(line(gain, 1.0, duration=0.05), fp.ComputedTorque(still, deformation), seed=0, compiled=False)
-    error = found["realised.y"][1:] - found["desired.y"][1:]
+    result = fp.simulate(line(gain, 1.0, duration=0.05), fp.ComputedTorque(still, deformation), seed=0, compiled=False)
+    error = result["realised.y"][1:] - result["desired.y"][1:]
     ratios = error[5:15] / error[4:14]
     np.testing.assert_allclose(ratios, 1 - deformation.effective_gain() * gain, atol=1e-3, equal_nan=False)
 
@@ -95,13 +95,13 @@ def test_in_loop_contraction_equals_prediction(seed):
 def test_clipped_command_defines_the_stored_request():
     """Anti-windup: while clipped, the stored request is what the clipped command means to the model."""
     problem = line(1.0, 1.3, limits=fp.Limits(inputs={"u": (-2.0, 2.0)}), duration=0.2)
-    found = run(problem, fp.Sigmoid(gain=-0.5, scale=10.0))
-    clipped = found["clipped"][:, 0] > 0
+    result = run(problem, fp.Sigmoid(gain=-0.5, scale=10.0))
+    clipped = result["clipped"][:, 0] > 0
     assert clipped.any()
     np.testing.assert_allclose(
-        found["deformed.y"][clipped], 1.3 * found["command.u"][clipped], rtol=1e-12, equal_nan=False
+        result["deformed.y"][clipped], 1.3 * result["command.u"][clipped], rtol=1e-12, equal_nan=False
     )
-    assert np.abs(found["command.u"]).max() <= 2.0
+    assert np.abs(result["command.u"]).max() <= 2.0
 
 
 def test_anti_windup_settles_where_windup_would_not():
@@ -109,17 +109,17 @@ def test_anti_windup_settles_where_windup_would_not():
     problem = line(1.0, 1.3, reference=fp.Trajectory(lambda t: {"y": 2 + 0 * t}), duration=4.0)
     problem = replace(problem, limits=fp.Limits(inputs={"u": (-20.0, 20.0)}))
     controller = fp.ComputedTorque(fp.Exponential(6.0, bumpless=False), fp.Sigmoid(gain=-0.5, scale=10.0))
-    found = fp.simulate(problem, controller, seed=0, compiled=False)
-    assert np.abs(found["deformed.y"]).max() <= 26.0 + 1e-9
-    assert -found["error.y"].min() < 1.5
-    assert np.abs(found["error.y"][-200:]).max() < 0.02
+    result = fp.simulate(problem, controller, seed=0, compiled=False)
+    assert np.abs(result["deformed.y"]).max() <= 26.0 + 1e-9
+    assert -result["error.y"].min() < 1.5
+    assert np.abs(result["error.y"][-200:]).max() < 0.02
 
 
 def test_over_gained_iteration_stays_bounded():
     """Beyond the sector bound eq (6) ends in a bounded oscillation, not in an explosion."""
-    found = run(line(1.0, 1.0, duration=1.0), fp.Sigmoid(gain=-6.0, scale=1.0))
-    assert found.stop is None
-    late = np.diff(found["deformed.y"][-50:])
+    result = run(line(1.0, 1.0, duration=1.0), fp.Sigmoid(gain=-6.0, scale=1.0))
+    assert result.stop is None
+    late = np.diff(result["deformed.y"][-50:])
     assert 0.01 < np.abs(late).max() <= 2 * fp.Sigmoid(gain=-6.0, scale=1.0).largest_step()
 
 
@@ -154,12 +154,12 @@ def test_stepping_by_hand_repeats_the_run():
         swing(duration=0.2, measure_from=0.0),
         fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5, scale=10.0)),
     )
-    found = fp.simulate(problem, controller, seed=0, compiled=False)
+    result = fp.simulate(problem, controller, seed=0, compiled=False)
     stepper = fp.Stepper(problem, controller, compiled=False)
     memory = stepper.start()
-    for k in range(found.cycles):
-        command, memory = stepper.step(found.time[k], found["state"][k], found["realised"][k], memory)
-        np.testing.assert_allclose(command, found["command"][k], rtol=1e-12, atol=1e-12, equal_nan=False)
+    for k in range(result.cycles):
+        command, memory = stepper.step(result.time[k], result["state"][k], result["realised"][k], memory)
+        np.testing.assert_allclose(command, result["command"][k], rtol=1e-12, atol=1e-12, equal_nan=False)
 
 
 def test_nan_measurement_never_reaches_the_plant():
@@ -185,40 +185,40 @@ def test_run_stops_where_a_signal_is_not_finite():
         inverse=lambda q, v, r, p: {"u": r.y},
     )
     problem = line(1.0, 1.0, plant=bomb, reference=fp.Trajectory(lambda t: {"y": 3 * t}), duration=2.0)
-    found = run(problem)
-    assert found.stop is not None
-    assert "not finite at t = 0." in found.stop
-    assert 0 < found.cycles < problem.cycles
-    assert np.isfinite(found.log).all()
-    metrics = fp.measure(problem, found)
+    result = run(problem)
+    assert result.stop is not None
+    assert "not finite at t = 0." in result.stop
+    assert 0 < result.cycles < problem.cycles
+    assert np.isfinite(result.log).all()
+    metrics = fp.measure(problem, result)
     assert metrics.worst_status == "NON_FINITE"
     assert np.isnan(metrics.rms_error["y"])
 
 
 def test_save_and_load(tmp_path):
     """A run survives the disk; a damaged file is refused."""
-    found = run(swing(duration=0.1, measure_from=0.0))
-    found.save(tmp_path / "run.npz")
+    result = run(swing(duration=0.1, measure_from=0.0))
+    result.save(tmp_path / "run.npz")
     again = fp.load_run(tmp_path / "run.npz")
-    assert np.array_equal(again.log, found.log)
-    assert again.layout.columns == found.layout.columns
+    assert np.array_equal(again.log, result.log)
+    assert again.layout.columns == result.layout.columns
     settings: Any = again.settings
     assert settings["controller"]["is"] == "ComputedTorque"
     (tmp_path / "bad.npz").write_bytes((tmp_path / "run.npz").read_bytes()[:200])
     with pytest.raises(fp.FpirhcError, match="cannot read"):
         fp.load_run(tmp_path / "bad.npz")
     with pytest.raises(fp.FpirhcError, match="cannot write"):
-        found.save(tmp_path / "no" / "run.npz")
+        result.save(tmp_path / "no" / "run.npz")
 
 
 def test_signals_by_name():
     """By signal, by column, as a table; a misspelt name gets the nearest."""
-    found = run(swing(duration=0.1, measure_from=0.0))
-    assert found["state"].shape == (100, 2)
-    assert found["state.angle'"].shape == (100,)
-    assert "error.angle" in found.to_dataframe().columns
+    result = run(swing(duration=0.1, measure_from=0.0))
+    assert result["state"].shape == (100, 2)
+    assert result["state.angle'"].shape == (100,)
+    assert "error.angle" in result.to_dataframe().columns
     with pytest.raises(InvalidName, match="Did you mean 'desired'"):
-        found["desird"]
+        result["desird"]
 
 
 BAD: dict[str, dict[str, Any]] = {

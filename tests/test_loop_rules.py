@@ -70,11 +70,11 @@ def test_slowest_iteration_solves_its_polynomial():
     assert slowest_iteration(1) == 0
 
 
-@pytest.mark.parametrize("given", [(0, 6.0, PERIOD), (3, -1.0, PERIOD), (3, 6.0, 0.0)])
-def test_least_product_refuses_what_is_no_loop(given):
+@pytest.mark.parametrize("arguments", [(0, 6.0, PERIOD), (3, -1.0, PERIOD), (3, 6.0, 0.0)])
+def test_least_product_refuses_what_is_no_loop(arguments):
     """No poles, no rate, no period."""
     with pytest.raises(InvalidValue, match="expected"):
-        least_product(*given)
+        least_product(*arguments)
 
 
 # The basin of the plain form
@@ -123,8 +123,10 @@ def test_automatic_scale_covers_the_basin():
     )
     still = fp.Trajectory(lambda t: {"q": 0 * t})
     problem = fp.Problem(plant, still, start={"q": 0.0}, period=PERIOD, duration=2.0, measure_from=1.5)
-    chosen: Any = resolved(problem, torque(80.0, fp.Sigmoid(gain=-0.5)))
-    assert chosen.deformation.scale == pytest.approx(1.55 * least_product(3, 80.0, PERIOD) * 100.0, rel=0.01)
+    resolved_controller: Any = resolved(problem, torque(80.0, fp.Sigmoid(gain=-0.5)))
+    assert resolved_controller.deformation.scale == pytest.approx(
+        1.55 * least_product(3, 80.0, PERIOD) * 100.0, rel=0.01
+    )
     settled, grown = (
         fp.simulate(problem, torque(80.0, fp.Sigmoid(gain=-0.5, scale=scale)), seed=0, compiled=False)
         for scale in (None, 1.0)

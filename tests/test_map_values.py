@@ -86,7 +86,7 @@ def test_sigmoid(gain, shift):
 def test_scale_of_the_sigmoid():
     """The step covers a jump, or twice a change that goes on (S then, 0.81 S the step), the recovery too; S is at least 1."""
     free, step = fp.Sigmoid(gain=-0.5), fp.Sigmoid(gain=-0.5, scale=1.0).largest_step()
-    chosen = {
+    selection = {
         Demand(50.0, sudden=True): 50.0 / step,
         Demand(50.0, sudden=False): 100.0,
         Demand(50.0, sudden=False, recovery=200.0): 200.0 / step,
@@ -94,7 +94,7 @@ def test_scale_of_the_sigmoid():
         Demand(0.9, sudden=True): 0.9 / step,
     }
     assert step == pytest.approx(0.81, abs=5e-3)  # with the usual shift of 0.3
-    for demand, scale in chosen.items():
+    for demand, scale in selection.items():
         assert free.suited(demand).scale == pytest.approx(scale, rel=5e-3)
     assert (free.automatic, free.with_scale(2.0).automatic) == (("scale",), ())
     assert free.with_scale(2.0).suited(Demand(50.0, sudden=True)).scale == 2.0

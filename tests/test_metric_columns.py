@@ -46,10 +46,10 @@ def adaptive():
 
 def test_columns_of_a_report(adaptive):
     """Errors, settling, effort, clipping, cost, contraction, solves: from what users ask first to what explains it."""
-    task, found = adaptive
+    task, result = adaptive
     solve = np.column_stack([np.arange(CYCLES)] * 5)
     made = run(0.0, cost=(Signal("cost", ("states",)), 1.0), solve=(Signal("solve", SOLVE), solve))
-    metrics = [fp.measure(problem(), made), fp.measure(task, found)]
+    metrics = [fp.measure(problem(), made), fp.measure(task, result)]
     assert [c.heading for c in columns(metrics)] == [
         "rms error y [m]",
         "max error y [m]",
@@ -117,27 +117,27 @@ def test_numbers_as_texts():
 def test_a_run_that_ended_at_once_has_no_numbers():
     """Without a cycle nothing is known but the end."""
     solve = (Signal("solve", SOLVE), np.ones((CYCLES, 5)))
-    found = fp.measure(problem(), cut(run(1.0, stop="signal 'x' is not finite", solve=solve), 0))
-    assert np.isnan([found.clipped_share, found.settling["y"], found.effort["u"], found.rms_error["y"]]).all()
-    assert found.solve == {}
-    assert found.statuses == {"NON_FINITE": 1}
-    assert found["cycles"] == {"": 0}
+    metrics = fp.measure(problem(), cut(run(1.0, stop="signal 'x' is not finite", solve=solve), 0))
+    assert np.isnan([metrics.clipped_share, metrics.settling["y"], metrics.effort["u"], metrics.rms_error["y"]]).all()
+    assert metrics.solve == {}
+    assert metrics.statuses == {"NON_FINITE": 1}
+    assert metrics["cycles"] == {"": 0}
 
 
 def test_one_cycle_is_enough_for_a_solve():
     """Its plan is one plan."""
     solve = (Signal("solve", SOLVE), np.ones((CYCLES, 5)))
-    found = fp.measure(problem(measure_from=0.0), cut(run(0.0, solve=solve), 1))
-    assert found.solve["plans"] == 1
-    assert found.solve["worst_iterations"] == 1
+    metrics = fp.measure(problem(measure_from=0.0), cut(run(0.0, solve=solve), 1))
+    assert metrics.solve["plans"] == 1
+    assert metrics.solve["worst_iterations"] == 1
 
 
 def test_end_of_a_run_counts_beside_other_cycles_that_were_not_finite():
     """Two held cycles of that status, and the one in which the run ended; a status that never occurred counts zero."""
     status = np.where(np.arange(CYCLES) < 2, float(Status.NON_FINITE), 0.0)
-    found = fp.measure(problem(), run(0.0, status=status, stop="signal 'x' is not finite"))
-    assert found.statuses == {"OK": 23, "NON_FINITE": 3}
-    assert found["status"] == {s.name: {"OK": 23, "NON_FINITE": 3}.get(s.name, 0) for s in Status}
+    metrics = fp.measure(problem(), run(0.0, status=status, stop="signal 'x' is not finite"))
+    assert metrics.statuses == {"OK": 23, "NON_FINITE": 3}
+    assert metrics["status"] == {s.name: {"OK": 23, "NON_FINITE": 3}.get(s.name, 0) for s in Status}
 
 
 def test_settling_is_the_cycle_after_the_last_one_outside():
@@ -187,19 +187,19 @@ def test_a_run_that_ended_early_has_no_cost():
 
 def test_contraction_needs_ten_cycles(adaptive):
     """Fewer say nothing; ten do."""
-    task, found = adaptive
+    task, result = adaptive
     for cycles, names in ((9, set()), (10, {"contraction.predicted", "contraction.measured"})):
-        metrics = fp.measure(task, cut(found, cycles))
+        metrics = fp.measure(task, cut(result, cycles))
         assert {m.name for m, _, _ in metrics if m.name.startswith("contraction")} == names
 
 
 def test_contraction_is_that_of_an_adapting_controller(adaptive):
     """Neither a controller without a logged contraction nor one without a gain has a factor."""
-    task, found = adaptive
-    layout = type(found.layout)(tuple(s for s in found.layout.signals if s.name != "contraction"))
-    columns_left = [k for k, c in enumerate(found.layout.columns) if c in layout.columns]
-    silent = replace(found, layout=layout, log=found.log[:, columns_left])
-    gainless = replace(found, settings={k: v for k, v in found.settings.items() if k != "effective_gain"})
+    task, result = adaptive
+    layout = type(result.layout)(tuple(s for s in result.layout.signals if s.name != "contraction"))
+    columns_left = [k for k, c in enumerate(result.layout.columns) if c in layout.columns]
+    silent = replace(result, layout=layout, log=result.log[:, columns_left])
+    gainless = replace(result, settings={k: v for k, v in result.settings.items() if k != "effective_gain"})
     for other in (silent, gainless):
         assert fp.measure(task, other)["contraction.predicted"] == {}
 
@@ -208,16 +208,16 @@ def test_spectrum_is_sampled_from_the_second_to_the_last_cycle(adaptive, monkeyp
     """The first cycle has no request before it; a long run is thinned to 200 cycles."""
     from fpirhc.simulation.metrics.entries import contraction
 
-    task, found = adaptive
-    asked = []
+    task, result = adaptive
+    sampled_cycles = []
     monkeypatch.setattr(
-        contraction, "spectrum_over_run", lambda plant, x, r, approximate: asked.append((x, r, approximate))
+        contraction, "spectrum_over_run", lambda plant, x, r, approximate: sampled_cycles.append((x, r, approximate))
     )
     for cycles in (1000, 50):
-        sampled_spectrum(task, cut(found, cycles))
-    (long, requests, believed), (short, *_) = asked
+        sampled_spectrum(task, cut(result, cycles))
+    (long, requests, believed), (short, *_) = sampled_cycles
     assert (len(long), len(requests), len(short)) == (200, 200, 49)
-    np.testing.assert_array_equal(long[[0, -1]], found["state"][[1, 999]])
-    np.testing.assert_array_equal(requests[[0, -1]], found["deformed"][[1, 999]])
-    np.testing.assert_array_equal(short, found["state"][1:50])
+    np.testing.assert_array_equal(long[[0, -1]], result["state"][[1, 999]])
+    np.testing.assert_array_equal(requests[[0, -1]], result["deformed"][[1, 999]])
+    np.testing.assert_array_equal(short, result["state"][1:50])
     assert believed == pytest.approx([1.0])

@@ -40,8 +40,8 @@ def test_iae_is_an_integral_over_time():
 def test_settling_is_within_two_per_cent_of_the_references_range(after, settled):
     """The reference moves by 1 m. The band is 0.02 m: an error of 0.019 m has settled, one of 0.021 m has not."""
     first = step(0.5, after, 30)
-    found = fp.measure(problem(), run(first)).settling["y"]
-    assert found == pytest.approx(settled, nan_ok=True)
+    metrics = fp.measure(problem(), run(first)).settling["y"]
+    assert metrics == pytest.approx(settled, nan_ok=True)
 
 
 def test_settling_takes_the_first_error_where_the_reference_rests():
@@ -66,26 +66,26 @@ def test_effort_is_of_the_measured_part():
 def test_cost_is_the_sum_of_the_measured_part_by_term():
     """Terms 1 and 0.5 in fifty cycles, and their total; other values before do not count."""
     cost = np.column_stack([step(9.0, 1.0, 50), step(9.0, 0.5, 50)])
-    found = fp.measure(problem(), run(0.0, cost=(Signal("cost", ("states", "deviation")), cost)))
-    assert found.cost == pytest.approx({"states": 50.0, "deviation": 25.0, "total": 75.0})
+    metrics = fp.measure(problem(), run(0.0, cost=(Signal("cost", ("states", "deviation")), cost)))
+    assert metrics.cost == pytest.approx({"states": 50.0, "deviation": 25.0, "total": 75.0})
     assert fp.measure(problem(), run(0.0)).cost == {}
 
 
 def test_statuses_are_counted_and_the_worst_is_told():
     """Ninety cycles as they should be, seven not converged, three held."""
     status = np.repeat([Status.OK, Status.NOT_CONVERGED, Status.HELD], [90, 7, 3])
-    found = fp.measure(problem(), run(0.0, status=status))
-    assert found.statuses == {"OK": 90, "NOT_CONVERGED": 7, "HELD": 3}
-    assert found.worst_status == "HELD"
-    assert found["cycles"] == {"": 100}
+    metrics = fp.measure(problem(), run(0.0, status=status))
+    assert metrics.statuses == {"OK": 90, "NOT_CONVERGED": 7, "HELD": 3}
+    assert metrics.worst_status == "HELD"
+    assert metrics["cycles"] == {"": 100}
 
 
 def test_solves_are_summed_up_over_the_whole_run():
     """Iterations 1 to 100, residuals of a tenth of that; a plan that is held for ten cycles is one plan."""
     iterations = np.repeat(np.arange(1.0, 11.0), 10)
     solve = np.column_stack([0 * iterations, iterations / 10, iterations / 100, iterations, 0 * iterations])
-    found = fp.measure(problem(), run(0.0, solve=(Signal("solve", SOLVE), solve)))
-    assert found.solve == pytest.approx(
+    metrics = fp.measure(problem(), run(0.0, solve=(Signal("solve", SOLVE), solve)))
+    assert metrics.solve == pytest.approx(
         {
             "median_iterations": 5.5,
             "worst_iterations": 10,
@@ -100,11 +100,11 @@ def test_solves_are_summed_up_over_the_whole_run():
 
 def test_a_run_that_ended_early_has_no_errors():
     """Its errors are NaN, it never settled, and the cycle in which it ended counts as not finite."""
-    found = fp.measure(problem(), run(1.0, stop="signal 'x' is not finite"))
-    for numbers in (found.rms_error, found.max_error, found.iae, found.settling, found.effort):
+    metrics = fp.measure(problem(), run(1.0, stop="signal 'x' is not finite"))
+    for numbers in (metrics.rms_error, metrics.max_error, metrics.iae, metrics.settling, metrics.effort):
         assert np.isnan(list(numbers.values())).all()
-    assert found.statuses == {"OK": 25, "NON_FINITE": 1}
-    assert found.worst_status == "NON_FINITE"
+    assert metrics.statuses == {"OK": 25, "NON_FINITE": 1}
+    assert metrics.worst_status == "NON_FINITE"
 
 
 def test_contraction_is_the_factor_of_the_plant_and_the_gain():
@@ -125,23 +125,23 @@ def test_every_run_has_the_same_columns(late):
     """What the plant did is there with ideal and with late measurement; a loop that is told it does not log it twice."""
     dead_time = fp.DeadTime(measurement=0.2) if late else fp.DeadTime()
     task = problem(dead_time=dead_time, start={"y": 0.3}, measure_from=0.0)
-    found = fp.simulate(task, fp.ComputedTorque(fp.Exponential(rate=1.0)), seed=0, compiled=False)
-    assert {"plant_state", "plant_realised", "true_error"} <= set(found.layout.names)
-    np.testing.assert_array_equal(found["true_error"], found["reference"][:, :1] - found["plant_state"][:, :1])
-    assert np.array_equal(found["plant_state"], found["state"]) != late
-    assert np.array_equal(found["plant_realised"], found["realised"]) != late
-    assert np.array_equal(found["true_error"], found["error"]) != late
-    assert found.unit("plant_realised.y") == found.unit("realised.y")
+    result = fp.simulate(task, fp.ComputedTorque(fp.Exponential(rate=1.0)), seed=0, compiled=False)
+    assert {"plant_state", "plant_realised", "true_error"} <= set(result.layout.names)
+    np.testing.assert_array_equal(result["true_error"], result["reference"][:, :1] - result["plant_state"][:, :1])
+    assert np.array_equal(result["plant_state"], result["state"]) != late
+    assert np.array_equal(result["plant_realised"], result["realised"]) != late
+    assert np.array_equal(result["true_error"], result["error"]) != late
+    assert result.unit("plant_realised.y") == result.unit("realised.y")
 
 
 def test_a_run_of_an_older_version_gets_its_columns(tmp_path):
     """A file without them is read as if it had them."""
-    found = run(np.linspace(1.0, 0.0, CYCLES))
-    old = Layout(tuple(s for s in found.layout.signals if s.name not in ("plant_state", "true_error")))
-    replace(found, layout=old, log=found.log[:, : old.size]).save(tmp_path / "old.npz")
+    result = run(np.linspace(1.0, 0.0, CYCLES))
+    old = Layout(tuple(s for s in result.layout.signals if s.name not in ("plant_state", "true_error")))
+    replace(result, layout=old, log=result.log[:, : old.size]).save(tmp_path / "old.npz")
     again = fp.load_run(tmp_path / "old.npz")
-    np.testing.assert_array_equal(again["true_error"], found["true_error"])
-    assert fp.measure(problem(), again).rms_error == fp.measure(problem(), found).rms_error
+    np.testing.assert_array_equal(again["true_error"], result["true_error"])
+    assert fp.measure(problem(), again).rms_error == fp.measure(problem(), result).rms_error
 
 
 def test_a_problem_has_a_name_that_is_no_setting():

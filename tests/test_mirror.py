@@ -89,11 +89,11 @@ def test_null_at_other_orders(order):
 def test_wrong_model_behind_estimators(estimator):
     """The twin keeps to a plant that it models wrongly: tracking is ten times better than without adaptation."""
     problem = replace(TWO_MASS, sensing=fp.Sensing(estimator=estimator), duration=6.0)
-    none, found = (
+    none, result = (
         max(fp.measure(problem, fp.simulate(problem, fp.ComputedTorque(LAW, d), seed=0)).rms_error.values())
         for d in (fp.Identity(), fp.ModelReferenced(SIGMOID.with_effective_gain(0.4)))
     )
-    assert found < 0.1 * none
+    assert result < 0.1 * none
 
 
 def test_twin_is_the_instant_where_the_response_is_measured():
@@ -177,9 +177,9 @@ def test_paired_through_the_lag_the_command_is_quiet(lag):
 def test_any_gain_through_the_lag():
     """The gain may be anything: .02 to .8, quiet and alike; without the lag in the mirror the loop is at its limit."""
     problem = lagging(0.1)
-    found = [through(problem, fp.ModelReferenced(fp.Affine(gain=-2 * a), lag=0.1)) for a in (0.02, 0.2, 0.8)]
-    assert max(step for _, step in found) < 0.01
-    assert max(e for e, _ in found) < 1.3 * min(e for e, _ in found)
+    result = [through(problem, fp.ModelReferenced(fp.Affine(gain=-2 * a), lag=0.1)) for a in (0.02, 0.2, 0.8)]
+    assert max(step for _, step in result) < 0.01
+    assert max(e for e, _ in result) < 1.3 * min(e for e, _ in result)
     assert through(problem, fp.ModelReferenced(fp.Affine(gain=-0.4)))[1] > 1.0
 
 

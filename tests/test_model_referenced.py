@@ -112,12 +112,12 @@ def null_change(name: str) -> float:
 
 
 def adaptive_problems() -> list[str]:
-    found = []
+    collected = []
     for name in sorted(shipped_problems()):
         module: Any = fp.load_problem(name)
         adaptive = resolved(module.problem, module.controllers[module.headline[1]]).deformation
-        found += [] if isinstance(adaptive, fp.Identity) else [name]
-    return found
+        collected += [] if isinstance(adaptive, fp.Identity) else [name]
+    return collected
 
 
 @pytest.mark.parametrize("name", adaptive_problems())
@@ -149,7 +149,7 @@ def drift_of_trapezoid(period: float) -> float:
     pole, errors = 2.0, {}
     decay = np.exp(-pole * period)
     for adapts in (False, True):
-        x, u, memory, found = 0.0, 0.0, layout.start(), []
+        x, u, memory, collected = 0.0, 0.0, layout.start(), []
         before = x
         for k in range(round(6.0 / period)):
             t = k * period
@@ -159,10 +159,10 @@ def drift_of_trapezoid(period: float) -> float:
                 mean, model = (x - before) / period, -0.5 * pole * (x + before) + u
                 wanted, memory = step(model, mean, desired, memory)
                 request = float(wanted)
-            found.append(np.sin(t) - x)
+            collected.append(np.sin(t) - x)
             u, before = request + pole * x, x
             x = decay * x + (1 - decay) / pole * u
-        errors[adapts] = np.sqrt(np.mean(np.square(found[len(found) // 2 :])))
+        errors[adapts] = np.sqrt(np.mean(np.square(collected[len(collected) // 2 :])))
     return abs(errors[True] - errors[False])
 
 
@@ -244,11 +244,11 @@ def test_every_map_on_two_coordinates(map):
         problem = replace(problem, dead_time=fp.DeadTime())
     else:
         problem, law = TWO_MASS.problem, LAW
-    none, found = (
+    none, result = (
         fp.measure(problem, fp.simulate(problem, fp.ComputedTorque(law, d), seed=0)).rms_error
         for d in (fp.Identity(), fp.ModelReferenced(map))
     )
-    assert all(found[name] < 0.02 * none[name] for name in none)
+    assert all(result[name] < 0.02 * none[name] for name in none)
 
 
 def test_where_it_loses():

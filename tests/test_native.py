@@ -40,9 +40,9 @@ def _libraries(cache):
 def test_same_numbers_as_the_virtual_machine(cache):
     """Contraction of multiply-add is off, so both round alike."""
     x = np.linspace(-3, 3, 3)
-    found = native(model(2.0))
-    assert found.compiled
-    np.testing.assert_array_equal(found.function(x).full(), model(2.0)(x).full())
+    result = native(model(2.0))
+    assert result.compiled
+    np.testing.assert_array_equal(result.function(x).full(), model(2.0)(x).full())
 
 
 @needs_compiler
@@ -52,8 +52,8 @@ def test_accumulated_functions_are_compiled_under_a_fixed_name(cache):
     step = ca.Function("fpirhc_step", [x, u], [0.5 * x + u, x - u])
     many = step.mapaccum("fpirhc_many", 37)
     values = np.arange(37.0)
-    for found, expected in zip(native(many).function(1.0, values), many(1.0, values), strict=True):
-        np.testing.assert_array_equal(found.full(), expected.full())
+    for result, expected in zip(native(many).function(1.0, values), many(1.0, values), strict=True):
+        np.testing.assert_array_equal(result.full(), expected.full())
 
 
 @needs_compiler
@@ -95,8 +95,8 @@ def _work(arguments):
     import os
 
     os.environ["FPIRHC_CACHE"] = folder
-    found = native(model(factor))
-    return found.compiled, found.function(np.ones(3)).full().ravel().tolist()
+    result = native(model(factor))
+    return result.compiled, result.function(np.ones(3)).full().ravel().tolist()
 
 
 @needs_compiler
@@ -115,10 +115,10 @@ def test_no_compiler_is_announced(cache, monkeypatch):
     """Turned off, the Function itself comes back with the reason."""
     monkeypatch.setenv("FPIRHC_CC", "none")
     function = model(2.0)
-    found = native(function)
-    assert not found.compiled
-    assert found.function is function
-    assert "FPIRHC_CC=none" in found.reason
+    result = native(function)
+    assert not result.compiled
+    assert result.function is function
+    assert "FPIRHC_CC=none" in result.reason
 
 
 def test_failing_compiler_falls_back_with_its_message(cache, monkeypatch, tmp_path):
@@ -127,10 +127,10 @@ def test_failing_compiler_falls_back_with_its_message(cache, monkeypatch, tmp_pa
     broken.write_text("#!/bin/sh\necho 'no space left' >&2\nexit 1\n")
     broken.chmod(broken.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setenv("FPIRHC_CC", str(broken))
-    found = native(model(2.0))
-    assert not found.compiled
-    assert "no space left" in found.reason
-    assert float(found.function(0.0)[0]) == 0.0
+    result = native(model(2.0))
+    assert not result.compiled
+    assert "no space left" in result.reason
+    assert float(result.function(0.0)[0]) == 0.0
 
 
 @needs_compiler
@@ -157,10 +157,10 @@ def test_solver_calls_stay_in_the_virtual_machine(cache):
     program: dict[str, ca.MX] = {"x": x, "p": p, "f": (x - p) ** 2}
     options: Any = {"ipopt.sb": "yes", "ipopt.print_level": 0, "print_time": False}
     solver = ca.nlpsol("solver", "ipopt", program, options)
-    given = ca.MX.sym("given")
-    found = native(ca.Function("fpirhc_solve", [given], [solver(p=given)["x"]]))
-    assert not found.compiled
-    assert float(found.function(3.0)) == pytest.approx(3.0)
+    symbols = ca.MX.sym("given")
+    result = native(ca.Function("fpirhc_solve", [symbols], [solver(p=symbols)["x"]]))
+    assert not result.compiled
+    assert float(result.function(3.0)) == pytest.approx(3.0)
 
 
 def test_evaluator_speaks_column_major():
@@ -223,14 +223,14 @@ def test_a_compiled_function_cannot_be_written_as_c_again():
     compiled = native(model(2.0)).function
     assert native(compiled).compiled
     x = ca.MX.sym("x", 3)
-    found = native(ca.Function("fpirhc_outer", [x], [compiled(x)]))
-    assert not found.compiled
-    assert "compile the whole instead" in found.reason
+    result = native(ca.Function("fpirhc_outer", [x], [compiled(x)]))
+    assert not result.compiled
+    assert "compile the whole instead" in result.reason
 
 
 def test_a_compiler_asked_for_is_never_replaced(monkeypatch):
     """A missing FPIRHC_CC is announced by name, and no other compiler is taken."""
     monkeypatch.setenv("FPIRHC_CC", "no-such-compiler")
-    found = native(model(3.0))
-    assert not found.compiled
-    assert "'no-such-compiler', asked for by FPIRHC_CC, was not found" in found.reason
+    result = native(model(3.0))
+    assert not result.compiled
+    assert "'no-such-compiler', asked for by FPIRHC_CC, was not found" in result.reason

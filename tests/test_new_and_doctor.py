@@ -37,10 +37,10 @@ def test_new_files_work_at_once(folder, capsys):
     task = fp.load_problem(str(folder / "arms" / "left" / "my_arm.py"))
     assert task.title.startswith("my_arm: ")
     short = replace(task, problem=replace(task.problem, duration=1.6, measure_from=1.0))
-    found = fp.compare(short, seed=0, controllers=list(task.headline or ()), compiled=False)
-    assert found["RHC+FPI"].metrics.rms_error["y"] < 0.2 * found["RHC"].metrics.rms_error["y"]
+    comparison = fp.compare(short, seed=0, controllers=list(task.headline or ()), compiled=False)
+    assert comparison["RHC+FPI"].metrics.rms_error["y"] < 0.2 * comparison["RHC"].metrics.rms_error["y"]
     fp.check_plant(task.problem.plant, seed=1)
-    assert set(found["RHC+FPI"].metrics.statuses) == {"OK"}
+    assert set(comparison["RHC+FPI"].metrics.statuses) == {"OK"}
 
 
 def test_written_test_passes(folder):
@@ -116,10 +116,10 @@ def test_new_into_a_file(folder, capsys):
 def test_hostile_names_are_refused_with_the_fix(folder, capsys, name, fix):
     """Exit code 2, nothing written, nothing that a terminal would obey, and the offered name is accepted."""
     assert main(["new", name]) == 2
-    said = capsys.readouterr().err
-    assert f"Try '{fix}'" in said
-    assert "\x1b" not in said
-    assert len(said) < 400
+    output = capsys.readouterr().err
+    assert f"Try '{fix}'" in output
+    assert "\x1b" not in output
+    assert len(output) < 400
     assert not list(folder.iterdir())
     assert len(create_problem(fix, folder)) == 2
 
@@ -132,10 +132,10 @@ def test_doctor_finds_this_installation_in_order(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
     assert main(["doctor", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert {"fpirhc", "casadi", "numpy", "python"} <= set(found["versions"])
-    assert found["outcome"] in ("ok", "warn")
-    checks = {c["name"]: c for c in found["checks"]}
+    document = json.loads(capsys.readouterr().out)
+    assert {"fpirhc", "casadi", "numpy", "python"} <= set(document["versions"])
+    assert document["outcome"] in ("ok", "warn")
+    checks = {c["name"]: c for c in document["checks"]}
     assert list(checks) == [check.__name__.replace("_", "-") for check in machine.CHECKS]
     assert str(tmp_path / "cache") in checks["cache"]["evidence"]
 
@@ -143,9 +143,9 @@ def test_doctor_finds_this_installation_in_order(capsys, tmp_path, monkeypatch):
 def test_a_missing_compiler_is_a_warning(monkeypatch):
     """Everything works without one, more slowly; what to do is said."""
     monkeypatch.setenv("FPIRHC_CC", "none")
-    outcome, found, remedy = machine.c_compiler()
+    outcome, result, remedy = machine.c_compiler()
     assert outcome == Outcome.WARN
-    assert "FPIRHC_CC=none" in found
+    assert "FPIRHC_CC=none" in result
     assert "gcc" in remedy
 
 
@@ -154,9 +154,9 @@ def test_a_cache_that_others_may_write_fails(tmp_path, monkeypatch):
     """What is loaded from the cache is run, so nobody else may put a library there."""
     monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path))
     tmp_path.chmod(0o777)
-    outcome, found, remedy = machine.cache()
+    outcome, result, remedy = machine.cache()
     assert outcome == Outcome.FAIL
-    assert "can be written by everybody" in found
+    assert "can be written by everybody" in result
     assert "chmod 700" in remedy
     tmp_path.chmod(0o700)
     assert machine.cache()[0] == Outcome.OK
@@ -165,16 +165,16 @@ def test_a_cache_that_others_may_write_fails(tmp_path, monkeypatch):
 def test_a_cache_that_cannot_be_made_is_a_warning(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path / "file" / "cache"))
-    outcome, found, _ = machine.cache()
+    outcome, result, _ = machine.cache()
     assert outcome == Outcome.WARN
-    assert "temporary folder" in found
+    assert "temporary folder" in result
 
 
 def test_missing_solvers_are_named(monkeypatch):
     monkeypatch.setattr("casadi.has_nlpsol", lambda name: name != "fatrop")
-    outcome, found, _ = machine.solver_plugins()
+    outcome, result, _ = machine.solver_plugins()
     assert outcome == Outcome.WARN
-    assert "missing fatrop" in found
+    assert "missing fatrop" in result
 
 
 def test_a_compiler_that_computes_wrongly_fails(monkeypatch):
@@ -182,9 +182,9 @@ def test_a_compiler_that_computes_wrongly_fails(monkeypatch):
     x = ca.SX.sym("x")
     wrong = Native(ca.Function("fpirhc_step", [x], [3 * x]), True, "")
     monkeypatch.setattr(machine, "native", lambda function: wrong)
-    outcome, found, remedy = machine.c_compiler()
+    outcome, result, remedy = machine.c_compiler()
     assert outcome == Outcome.FAIL
-    assert "3 * 2 + 1 = 6" in found
+    assert "3 * 2 + 1 = 6" in result
     assert "FPIRHC_CC" in remedy
 
 
@@ -207,18 +207,18 @@ def test_a_folder_without_room_for_results_is_a_warning(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert machine.results_folder()[0] == Outcome.OK
     monkeypatch.setattr("tempfile.TemporaryFile", full)
-    outcome, found, remedy = machine.results_folder()
+    outcome, result, remedy = machine.results_folder()
     assert outcome == Outcome.WARN
-    assert "No space left" in found
+    assert "No space left" in result
     assert "--out" in remedy
 
 
 def test_a_python_without_its_lock_fails(monkeypatch):
     """CasADi's Functions are not made for threads that run at once."""
     monkeypatch.setattr(sys, "_is_gil_enabled", lambda: False, raising=False)
-    outcome, found, remedy = machine.python_threads()
+    outcome, result, remedy = machine.python_threads()
     assert outcome == Outcome.FAIL
-    assert "global lock off" in found
+    assert "global lock off" in result
     assert "processes" in remedy
 
 

@@ -68,10 +68,12 @@ def plan() -> fp.Plan:
     problem = hostile_problem()
     assert problem.horizon is not None
     assert problem.cost is not None
-    given = problem.plant, problem.reference, problem.horizon, problem.cost
+    values = problem.plant, problem.reference, problem.horizon, problem.cost
     limits = fp.Limits(states={"y": (0.9, 1.0)}, inputs={"u": (-1.0, 1.0)})
-    data = np.asarray(stage_data(*given)(0.0, problem.plant.approximate).full())
-    return fp.solve(transcribe(*given, limits), fp.FixedPoint(iterations=5, tolerance=1e-3), np.array([0.5, 0.0]), data)
+    data = np.asarray(stage_data(*values)(0.0, problem.plant.approximate).full())
+    return fp.solve(
+        transcribe(*values, limits), fp.FixedPoint(iterations=5, tolerance=1e-3), np.array([0.5, 0.0]), data
+    )
 
 
 class Tags(HTMLParser):
@@ -119,30 +121,30 @@ KINDS = ("comparison", "run", "metrics", "contraction", "plan", "certificate")
 def test_results_show_themselves(kind, comparison, plan):
     """A line that names the class, and a table of nothing but text."""
     value = shown(comparison, plan)[kind]
-    said, page = repr(value), read(value._repr_html_())
-    assert said.startswith(f"{type(value).__name__}(")
-    assert "\n" not in said
-    assert len(said) < 1000
-    assert "array(" not in said
-    assert str(value) == said
-    assert "\x1b" not in said + page.text
+    other_diagnostics, page = repr(value), read(value._repr_html_())
+    assert other_diagnostics.startswith(f"{type(value).__name__}(")
+    assert "\n" not in other_diagnostics
+    assert len(other_diagnostics) < 1000
+    assert "array(" not in other_diagnostics
+    assert str(value) == other_diagnostics
+    assert "\x1b" not in other_diagnostics + page.text
     assert page.tags <= {"div", "table", "caption", "tr", "th", "td", "p"}
     assert not page.attributes
 
 
 def test_what_is_shown_is_what_was_found(comparison, plan):
     """Numbers and names, each where it is looked for."""
-    found = {kind: read(value._repr_html_()).text for kind, value in shown(comparison, plan).items()}
+    result = {kind: read(value._repr_html_()).text for kind, value in shown(comparison, plan).items()}
     rms = f"{comparison[HOSTILE].metrics.rms_error['y']:.4g}"
-    assert comparison[HOSTILE].metrics.text("rms_error", "y") in found["comparison"]
-    assert rms in found["metrics"]
-    assert MARKED in found["comparison"]
-    assert printable(HOSTILE) in found["comparison"]
-    assert printable(comparison.verdict[0]) in found["comparison"]
-    assert UNIT in found["run"]
-    assert f"{comparison[HOSTILE].run['command.u'].max():.4g}" in found["run"]
-    assert comparison[HOSTILE].contraction.report.text in found["contraction"]
-    assert "below 0.9, at stage 0" in found["plan"]
+    assert comparison[HOSTILE].metrics.text("rms_error", "y") in result["comparison"]
+    assert rms in result["metrics"]
+    assert MARKED in result["comparison"]
+    assert printable(HOSTILE) in result["comparison"]
+    assert printable(comparison.verdict[0]) in result["comparison"]
+    assert UNIT in result["run"]
+    assert f"{comparison[HOSTILE].run['command.u'].max():.4g}" in result["run"]
+    assert comparison[HOSTILE].contraction.report.text in result["contraction"]
+    assert "below 0.9, at stage 0" in result["plan"]
     assert plan.status.name in repr(plan)
 
 

@@ -97,9 +97,9 @@ def test_random_box_constrained_problems_are_solved_or_honestly_not(seed, low, h
     first = random.normal(size=2)
     inputs, diagnostics, _ = step(first, data, *ocp_bounds, memory)
     _, residual, _ = judge(ocp)(inputs, first, data, *ocp_bounds, np.zeros((2, ocp.stages)))
-    told = diagnostics.full().ravel()
-    assert told[1] == pytest.approx(float(residual), rel=1e-9, abs=1e-12)
-    assert (told[4] == fp.Status.OK) == (told[1] <= GRADIENT.tolerance)
+    diagnostics_value = diagnostics.full().ravel()
+    assert diagnostics_value[1] == pytest.approx(float(residual), rel=1e-9, abs=1e-12)
+    assert (diagnostics_value[4] == fp.Status.OK) == (diagnostics_value[1] <= GRADIENT.tolerance)
     assert low - 1e-12 <= inputs.full().min() <= inputs.full().max() <= high + 1e-12
     assert weight > 0
 
@@ -121,13 +121,13 @@ def test_poisoned_problem_keeps_the_last_plan_and_recovers(optimiser):
     step, memory = optimiser.step(ocp), optimiser.memory(ocp).start()
     bounds = (ocp.input_lower, ocp.input_upper)
     good, _, memory = step(first, data, *bounds, memory)
-    poisoned, told, memory = step(first * np.nan, data, *bounds, memory)
-    assert int(told[4]) == fp.Status.NON_FINITE
+    poisoned, diagnostics, memory = step(first * np.nan, data, *bounds, memory)
+    assert int(diagnostics[4]) == fp.Status.NON_FINITE
     np.testing.assert_allclose(poisoned.full(), good.full(), atol=1e-12)
     assert np.isfinite(memory.full()).all()
     for _ in range(5):
-        _, told, memory = step(first, data, *bounds, memory)
-    assert int(told[4]) == fp.Status.OK
+        _, diagnostics, memory = step(first, data, *bounds, memory)
+    assert int(diagnostics[4]) == fp.Status.OK
 
 
 @pytest.mark.parametrize("optimiser", EVERY, ids=ids)
@@ -136,10 +136,10 @@ def test_memory_is_shifted_by_one_stage(optimiser):
     ocp, data, first = two_mass(BOXES["free"])
     layout = optimiser.memory(ocp)
     inputs, _, memory = optimiser.step(ocp)(first, data, ocp.input_lower, ocp.input_upper, layout.start())
-    moved = ca.MX.sym("m", layout.size)
-    shifted = ca.Function("fpirhc_shifted", [moved], [optimiser.shifted(ocp, moved)])(memory)
-    kept = shifted.full().ravel()[layout.slice("plan_inputs")].reshape(ocp.stages, 2).T
-    np.testing.assert_array_equal(kept, np.hstack([inputs.full()[:, 1:], inputs.full()[:, -1:]]))
+    shifted_value = ca.MX.sym("m", layout.size)
+    shifted = ca.Function("fpirhc_shifted", [shifted_value], [optimiser.shifted(ocp, shifted_value)])(memory)
+    later_inputs = shifted.full().ravel()[layout.slice("plan_inputs")].reshape(ocp.stages, 2).T
+    np.testing.assert_array_equal(later_inputs, np.hstack([inputs.full()[:, 1:], inputs.full()[:, -1:]]))
 
 
 def test_settings_are_checked():
@@ -210,8 +210,8 @@ POLICIES = {"HoldPlan": (fp.HoldPlan(), fp.Status.HELD), "Feedforward": (fp.Feed
 @pytest.mark.parametrize("policy", POLICIES)
 def test_failed_solves_are_counted_and_follow_the_policy(policy):
     """An infeasible limit from the start: the policy acts, the run goes on, the status counts it."""
-    chosen, status = POLICIES[policy]
-    problem, controller = receding(fp.Ipopt(iterations=30), on_failure=chosen)
+    selection, status = POLICIES[policy]
+    problem, controller = receding(fp.Ipopt(iterations=30), on_failure=selection)
     problem = replace(
         problem,
         limits=fp.Limits(inputs={"Q1": (-5.0, 5.0)}, states={"q1": (3.0, 4.0)}),
@@ -284,15 +284,15 @@ def scaled(factor):
 @pytest.mark.parametrize("iterations", [1, 40])
 def test_the_size_of_the_weights_changes_neither_plan_nor_status(factor, iterations):
     """A cost in other units is the same problem: tiny weights must not make every plan look converged."""
-    told = {}
+    diagnostics = {}
     for name, problem in (("one", TASK.problem), ("scaled", scaled(factor))):
         ocp = transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, BOXES["active"])
         data = stage_data(problem.plant, problem.reference, problem.horizon, problem.cost)(
             0.0, problem.plant.approximate
         )
         optimiser = fp.ReducedGradient(iterations=iterations, tolerance=1e-3)
-        told[name] = fp.solve(ocp, optimiser, problem.start_state, data, calls=1)
-    one, other = told.values()
+        diagnostics[name] = fp.solve(ocp, optimiser, problem.start_state, data, calls=1)
+    one, other = diagnostics.values()
     assert other.status == one.status == (fp.Status.NOT_CONVERGED if iterations == 1 else fp.Status.OK)
     np.testing.assert_allclose(other.inputs, one.inputs, atol=1e-4)
     assert other.cost == pytest.approx(factor * one.cost, rel=1e-8)
@@ -347,13 +347,13 @@ def test_broken_problems_are_statuses_and_leave_no_trace(optimiser, capfd):
     bounds = (ocp.input_lower, ocp.input_upper)
     _, _, warm = step(first, data, *bounds, start)
     for name, (arguments, status) in broken(ocp, data, first).items():
-        inputs, told, memory = step(*arguments, warm)
-        assert int(told[4]) == status, name
+        inputs, diagnostics, memory = step(*arguments, warm)
+        assert int(diagnostics[4]) == status, name
         assert np.isfinite(inputs.full()).all(), name
         assert np.isfinite(memory.full()).all(), name
         for _ in range(3):
-            _, told, memory = step(first, data, *bounds, memory)
-        assert int(told[4]) == fp.Status.OK, name
+            _, diagnostics, memory = step(first, data, *bounds, memory)
+        assert int(diagnostics[4]) == fp.Status.OK, name
     printed = capfd.readouterr()
     assert printed.out == ""
 
@@ -366,9 +366,9 @@ def test_poisoned_warm_start_is_forgotten(optimiser, limits, poison):
     ocp, data, first = two_mass(limits)
     step, memory = optimiser.step(ocp), np.full(optimiser.memory(ocp).size, poison)
     for _ in range(3):
-        inputs, told, memory = step(first, data, ocp.input_lower, ocp.input_upper, memory)
+        inputs, diagnostics, memory = step(first, data, ocp.input_lower, ocp.input_upper, memory)
         assert np.isfinite(inputs.full()).all()
-    assert int(told[4]) == fp.Status.OK
+    assert int(diagnostics[4]) == fp.Status.OK
 
 
 RIDING = {
@@ -392,8 +392,8 @@ def test_multipliers_of_state_limits_are_verified_without_the_solver(optimiser, 
     assert multipliers.min() >= 0
     np.testing.assert_allclose(plan.states[:, 1:][active], np.tile(bound[:, None], ocp.stages)[active], atol=1e-4)
     for wrong in (0.0, -1.0):
-        given = wrong * plan.state_multipliers
-        _, residual, _ = judge(ocp)(plan.inputs, plan.states[:, 0], data, ocp.input_lower, ocp.input_upper, given)
+        values = wrong * plan.state_multipliers
+        _, residual, _ = judge(ocp)(plan.inputs, plan.states[:, 0], data, ocp.input_lower, ocp.input_upper, values)
         assert float(residual) > 1.0
 
 
@@ -426,9 +426,9 @@ def test_random_boxes_have_the_same_optimum_by_two_methods(seed, width, centre):
     box = (np.array([centre - width]), np.array([centre + width]))
     plans = []
     for step, memory in (gradient, exact):
-        inputs, told, _ = step(first, data, *box, memory)
-        assert int(told[4]) == fp.Status.OK
-        plans.append((inputs.full(), float(told[0])))
+        inputs, diagnostics, _ = step(first, data, *box, memory)
+        assert int(diagnostics[4]) == fp.Status.OK
+        plans.append((inputs.full(), float(diagnostics[0])))
     assert plans[0][1] == pytest.approx(plans[1][1], rel=1e-7, abs=1e-10)
     np.testing.assert_allclose(plans[0][0], plans[1][0], atol=1e-3)
 

@@ -71,12 +71,12 @@ def test_json_terminal_and_report_have_it(task, capsys):
 
 def test_scenarios_have_it(task, tmp_path):
     """In the ledger of every scenario, and as a median; where more is better the ones without it are the worst."""
-    found = fp.compare_scenarios(task, count=3, percent=10.0, seed=1, folder=tmp_path, compiled=False)
+    study = fp.compare_scenarios(task, count=3, percent=10.0, seed=1, folder=tmp_path, compiled=False)
     lines = [json.loads(line) for line in (tmp_path / "scenarios.jsonl").read_text().splitlines()[1:]]
     leads = [r["metrics"]["largest_lead"]["y"] for r in lines if r["controller"] == "CTC"]
     assert len(set(leads)) == 3
-    assert found["CTC"].metrics["largest_lead"]["y"] == pytest.approx(np.median(leads))
-    assert [c.short for c in found.columns][-2:] == ["largest lead y [m]", "share inside"]
+    assert study["CTC"].metrics["largest_lead"]["y"] == pytest.approx(np.median(leads))
+    assert [c.short for c in study.columns][-2:] == ["largest lead y [m]", "share inside"]
     with pytest.raises(fp.FpirhcError, match="results are never mixed: metrics was"):
         fp.compare_scenarios(
             replace(task, metrics=task.metrics[:-1]), count=3, percent=10.0, seed=1, folder=tmp_path, compiled=False

@@ -107,18 +107,18 @@ pictures = (%s,)
 
 
 @pytest.mark.parametrize(
-    ("written", "said"),
+    ("written", "message"),
     [
         ("'phase'", r"pictures must hold pictures such as Portrait\(\.\.\.\), got 'phase'"),
         ("fp.Portrait('p', x='state.q', y='state.q', controllers=('CTX',))", r"picture 'p': controller 'CTX'.*CTC"),
     ],
 )
-def test_mistakes_in_a_file_are_told_when_it_is_loaded(written, said, tmp_path, monkeypatch):
+def test_mistakes_in_a_file_are_told_when_it_is_loaded(written, message, tmp_path, monkeypatch):
     """What is no picture, and controllers that are not there."""
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
     path = tmp_path / "spring.py"
     path.write_text(FILE % written)
-    with pytest.raises(ProblemFileError, match=said):
+    with pytest.raises(ProblemFileError, match=message):
         fp.load_problem(str(path))
 
 

@@ -25,8 +25,8 @@ def undisturbed(name: str) -> fp.Problem:
 
 def controller(name: str, which: str, gain: float, form=lambda m: m) -> Any:
     """A controller of a shipped problem with the sigmoid of that gain."""
-    chosen = fp.load_problem(name).controllers[which]
-    return chosen.with_deformation(form(fp.Sigmoid(gain=gain, shift=0.3, scale=SCALES.get(name, 50.0))))
+    controllers_value = fp.load_problem(name).controllers[which]
+    return controllers_value.with_deformation(form(fp.Sigmoid(gain=gain, shift=0.3, scale=SCALES.get(name, 50.0))))
 
 
 @cache
@@ -43,9 +43,9 @@ def increment(map_):
 @pytest.mark.parametrize("which", ["CTC", "RHC"])
 def test_recursion_predicts_the_loop(which, form, gain):
     """Two masses, a lambda up to 0.9: the largest and the rms response error of the run within 5 % of the prediction."""
-    problem, chosen = undisturbed("two_mass"), controller("two_mass", which, gain, form)
-    run = fp.simulate(problem, chosen, seed=0)
-    predicted = response_errors(nominal("two_mass", which), deformation=chosen.deformation).error[3000:]
+    problem, tested = undisturbed("two_mass"), controller("two_mass", which, gain, form)
+    run = fp.simulate(problem, tested, seed=0)
+    predicted = response_errors(nominal("two_mass", which), deformation=tested.deformation).error[3000:]
     plant = problem.plant
     exact = np.repeat(plant.exact[:, None], run.cycles, axis=1)
     respond = plant.controlled_response_function.map(run.cycles)
@@ -75,11 +75,11 @@ def test_right_model_and_no_deformation_leave_no_error():
 @pytest.mark.parametrize(("gain", "form"), [(-0.5, lambda m: m), (-0.5, increment), (-1.5, lambda m: m)])
 def test_null_run_is_predicted(gain, form):
     """The model for the plant, with adaptation: the run's response error, which harms nobody but is not zero, within 5 %."""
-    problem, chosen = undisturbed("two_mass"), controller("two_mass", "RHC", gain, form)
+    problem, tested = undisturbed("two_mass"), controller("two_mass", "RHC", gain, form)
     right = {n: replace(p, exact=p.approximate) for n, p in problem.plant.parameters.items()}
     exact = replace(problem, plant=replace(problem.plant, parameters=right))
-    run, model = fp.simulate(exact, chosen, seed=0), nominal("two_mass", "RHC")
-    predicted = response_errors(model, deformation=chosen.deformation, exact=model.believed).error[3000:]
+    run, model = fp.simulate(exact, tested, seed=0), nominal("two_mass", "RHC")
+    predicted = response_errors(model, deformation=tested.deformation, exact=model.believed).error[3000:]
     respond = exact.plant.controlled_response_function.map(run.cycles)
     believed = np.repeat(exact.plant.exact[:, None], run.cycles, axis=1)
     real = (respond(run["state"].T, run["command"].T, believed).full().T - run["desired"])[3000:]
@@ -89,8 +89,8 @@ def test_null_run_is_predicted(gain, form):
 
 def test_informed_controller_has_nothing_to_adapt_to():
     """Told the exact parameters, a controller with a deformation is its own null run."""
-    told = fp.ExactModel(controller("two_mass", "CTC", -0.5))
-    predicted = fp.predict_response(replace(undisturbed("two_mass"), duration=0.5, measure_from=0.2), told)
+    diagnostics = fp.ExactModel(controller("two_mass", "CTC", -0.5))
+    predicted = fp.predict_response(replace(undisturbed("two_mass"), duration=0.5, measure_from=0.2), diagnostics)
     np.testing.assert_array_equal(predicted.adapted.error, predicted.null.error)
     assert max(predicted.rms(predicted.without).values()) < 1e-9
     assert not predicted.helps
@@ -98,9 +98,9 @@ def test_informed_controller_has_nothing_to_adapt_to():
 
 def contained(name: str, which: str, gain: float) -> None:
     """Every state of the run is inside the tube, widened by a tenth of its largest half-width."""
-    problem, chosen = undisturbed(name), controller(name, which, gain)
-    predicted: Any = fp.predict_response(problem, chosen)
-    run = fp.simulate(problem, chosen, seed=0)
+    problem, tested = undisturbed(name), controller(name, which, gain)
+    predicted: Any = fp.predict_response(problem, tested)
+    run = fp.simulate(problem, tested, seed=0)
     assert run.stop is None
     assert predicted.helps
     first = round(problem.measure_from / problem.period)
@@ -161,12 +161,12 @@ def test_majorant_is_above_the_error(gain):
 
 def test_box_widens_the_tube():
     """With a box of parameters the tube is the largest of its draws, so nowhere narrower."""
-    problem, chosen = (
+    problem, selection = (
         replace(undisturbed("mrac_pendulum"), duration=2.0, measure_from=1.0),
         controller("mrac_pendulum", "CTC", -0.5),
     )
-    own: Any = fp.predict_response(problem, chosen)
-    boxed: Any = fp.predict_response(problem, chosen, mismatch=20.0)
+    own: Any = fp.predict_response(problem, selection)
+    boxed: Any = fp.predict_response(problem, selection, mismatch=20.0)
     assert (boxed.tube >= own.tube - 1e-12).all()
     assert boxed.tube.max() > 1.05 * own.tube.max()
     assert "helps" in repr(own)
@@ -186,15 +186,15 @@ def test_no_tube_where_the_loop_does_not_converge():
 
 def test_prediction_refuses_what_it_does_not_cover():
     """Dead time, estimated responses, no adaptation, a mismatch out of range; a coordinate that is not controlled has no tube."""
-    problem, chosen = undisturbed("two_mass"), controller("two_mass", "CTC", -0.5)
+    problem, controllers_value = undisturbed("two_mass"), controller("two_mass", "CTC", -0.5)
     with pytest.raises(NotSupported, match="dead time"):
-        fp.predict_response(replace(problem, dead_time=fp.DeadTime(inputs={"Q1": 1e-3})), chosen)
+        fp.predict_response(replace(problem, dead_time=fp.DeadTime(inputs={"Q1": 1e-3})), controllers_value)
     with pytest.raises(NotSupported, match="estimated response"):
-        fp.predict_response(replace(problem, sensing=fp.Sensing(estimator=fp.PositionDifference())), chosen)
+        fp.predict_response(replace(problem, sensing=fp.Sensing(estimator=fp.PositionDifference())), controllers_value)
     with pytest.raises(NotSupported, match="no deformation"):
         fp.predict_response(problem, fp.ComputedTorque(fp.Exponential(rate=6.0)))
     with pytest.raises(InvalidValue, match="mismatch"):
-        fp.predict_response(problem, chosen, mismatch=-1.0)
+        fp.predict_response(problem, controllers_value, mismatch=-1.0)
     motor = fp.load_problem("mrac_pendulum")
     with pytest.raises(NotSupported, match="ForceMRAC"):
         fp.predict_response(motor.problem, motor.controllers["force MRAC"])

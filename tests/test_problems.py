@@ -40,8 +40,8 @@ def test_one_iteration_per_cycle_is_as_good_as_converged_solving(name):
     for controller in ("RHC", "RHC+FPI"):
         once: Any = task.controllers[controller]
         costs = []
-        for chosen in (once, once.with_optimiser(replace(once.planner.optimiser, iterations=12))):
-            run = fp.simulate(problem, chosen, seed=0)
+        for selection in (once, once.with_optimiser(replace(once.planner.optimiser, iterations=12))):
+            run = fp.simulate(problem, selection, seed=0)
             assert run.stop is None
             costs.append(run["cost"].sum())
         assert costs[0] <= 1.01 * costs[1]
@@ -63,11 +63,11 @@ def test_iterations_in_closed_loop(name):
     shift = shifted(optimiser, ocp)
     for k in range(60):
         first = ocp.start(state, before)
-        inputs, told, memory = solve(
+        inputs, diagnostics, memory = solve(
             first, data_of(k * step, plant.approximate), ocp.input_lower, ocp.input_upper, memory
         )
-        assert int(told[4]) in (fp.Status.OK, fp.Status.NOT_CONVERGED)
-        iterations.append(float(told[3]))
+        assert int(diagnostics[4]) in (fp.Status.OK, fp.Status.NOT_CONVERGED)
+        iterations.append(float(diagnostics[3]))
         before, memory = inputs.full()[:, 0], shift(memory)
         active += bool(np.any(np.isclose(before, ocp.input_upper) | np.isclose(before, ocp.input_lower)))
         state = advance(state, before, plant.exact, np.zeros(len(plant.names))).full().ravel()

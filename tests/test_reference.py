@@ -14,9 +14,9 @@ from fpirhc.errors import InvalidProblem, InvalidShape, InvalidValue
 def test_derivatives_up_to_the_order():
     """For y = sin 2t the k-th derivative is 2^k sin(2t + k pi/2)."""
     state, response = fp.Trajectory(lambda t: {"y": ca.sin(2 * t)}).function(chain(4))(0.3)
-    found = np.append(state.full().ravel(), float(response))
+    result = np.append(state.full().ravel(), float(response))
     expected = [2**k * np.sin(0.6 + k * np.pi / 2) for k in range(5)]
-    np.testing.assert_allclose(found, expected, rtol=1e-12, equal_nan=False)
+    np.testing.assert_allclose(result, expected, rtol=1e-12, equal_nan=False)
 
 
 def test_table_agrees_with_the_expression_it_samples():
@@ -25,8 +25,8 @@ def test_table_agrees_with_the_expression_it_samples():
     table = fp.Table(times, {"y": np.sin(2 * times)}).function(chain(2))
     exact = fp.Trajectory(lambda t: {"y": ca.sin(2 * t)}).function(chain(2))
     for t in (0.5, 1.234, 2.5):
-        for found, expected in zip(table(t), exact(t), strict=True):
-            np.testing.assert_allclose(found.full(), expected.full(), atol=1e-6, equal_nan=False)
+        for result, expected in zip(table(t), exact(t), strict=True):
+            np.testing.assert_allclose(result.full(), expected.full(), atol=1e-6, equal_nan=False)
 
 
 def test_table_is_held_outside():

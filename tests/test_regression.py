@@ -58,11 +58,11 @@ def folder(blessed, tmp_path, monkeypatch) -> Path:
 
 def test_a_band_is_three_times_the_spread():
     """Of all sources the widest counts, and each is kept beside the band."""
-    found = expected(VARIANTS, measured(1.0, 1.1, 0.99, 1.0), 1e-3).metrics["rms_error.y"]
-    assert found.kind == BANDED
-    assert found.band == pytest.approx(0.3, rel=0.01)
-    assert found.band >= 3 * 0.1
-    assert found.spread == pytest.approx({SEEDS: 0.1, ROUNDING: 0.01})
+    band_value = expected(VARIANTS, measured(1.0, 1.1, 0.99, 1.0), 1e-3).metrics["rms_error.y"]
+    assert band_value.kind == BANDED
+    assert band_value.band == pytest.approx(0.3, rel=0.01)
+    assert band_value.band >= 3 * 0.1
+    assert band_value.spread == pytest.approx({SEEDS: 0.1, ROUNDING: 0.01})
 
 
 def test_another_draw_of_the_noise_stays_in_the_band():
@@ -70,11 +70,11 @@ def test_another_draw_of_the_noise_stays_in_the_band():
     draws = np.random.default_rng(0).normal(size=(400_000, 9))
     outside = np.abs(draws[:, 8] - draws[:, 0]) > FACTOR * np.ptp(draws[:, :8], axis=1)
     assert outside.mean() == pytest.approx(1.2e-4, rel=1.0)
-    chosen = [VARIANTS[0], *[VARIANTS[1]] * 7]
+    selection = [VARIANTS[0], *[VARIANTS[1]] * 7]
     for row in draws[:20]:
-        found = expected(chosen, measured(*row[:8]), 1e-3).metrics["rms_error.y"]
-        assert found.band == pytest.approx(FACTOR * np.ptp(row[:8]), rel=0.011)
-        assert found.band >= FACTOR * np.ptp(row[:8])
+        band_value = expected(selection, measured(*row[:8]), 1e-3).metrics["rms_error.y"]
+        assert band_value.band == pytest.approx(FACTOR * np.ptp(row[:8]), rel=0.011)
+        assert band_value.band >= FACTOR * np.ptp(row[:8])
 
 
 def test_a_band_is_never_narrower_than_rounding():
@@ -108,10 +108,10 @@ def test_what_only_some_variants_have_is_not_compared():
 def test_a_run_that_may_diverge_compares_only_how_it_ends(blessed):
     """Whatever its numbers; another class of outcome is a change."""
     results = [*measured(1.0, 1.0, 1.0), Measurement(DIVERGED, "at 3 s", {})]
-    found = expected(VARIANTS, results, 1e-3)
-    assert found == Expected((FINISHED, DIVERGED), {}, {})
+    band = expected(VARIANTS, results, 1e-3)
+    assert band == Expected((FINISHED, DIVERGED), {}, {})
     task = fp.load_problem(str(blessed / "noisy.py"))
-    whole = replace(read_baseline(blessed / "baselines" / "noisy.json"), controllers={"CTC": found})
+    whole = replace(read_baseline(blessed / "baselines" / "noisy.json"), controllers={"CTC": band})
     for outcome, holds in ((FINISHED, True), (DIVERGED, True), ("refused (NotSupported)", False)):
         fresh = {"CTC": Measurement(outcome, "", {"rms_error.y": 1e9})}
         assert judge(whole, settings_of(task), fresh).holds == holds
@@ -121,10 +121,10 @@ def test_seeds_are_varied_only_where_there_is_noise(blessed):
     """Without noise every seed gives the same run; with noise there are as many as asked for."""
     for name, count in (("line", 0), ("noisy", 4)):
         problem = fp.load_problem(str(blessed / f"{name}.py")).problem
-        chosen = variants(problem, seed=3, seeds=5, compiled=False)
-        assert chosen[0] == Variant(NOMINAL, "nominal", 3, False)
-        assert [v.seed for v in chosen if v.source == SEEDS] == [4, 5, 6, 7][:count]
-        assert {v.source for v in chosen} >= {ROUNDING, INTEGRATOR}
+        selection = variants(problem, seed=3, seeds=5, compiled=False)
+        assert selection[0] == Variant(NOMINAL, "nominal", 3, False)
+        assert [v.seed for v in selection if v.source == SEEDS] == [4, 5, 6, 7][:count]
+        assert {v.source for v in selection} >= {ROUNDING, INTEGRATOR}
 
 
 def test_every_measured_metric_is_in_the_catalogue(blessed):
@@ -299,8 +299,8 @@ def test_unchecked_problems_need_a_reason(text, message, folder, capsys):
 def test_what_counts_as_a_problem_file(text, counts, folder):
     """Whatever defines both names, however it does; one with a mistake in it must not be passed over."""
     (folder / "other.py").write_text(text)
-    found, unchecked = problems_here(folder)
-    assert [path.name for path in found] == ["line.py", "noisy.py", "other.py"][: 2 + counts]
+    files, unchecked = problems_here(folder)
+    assert [path.name for path in files] == ["line.py", "noisy.py", "other.py"][: 2 + counts]
     assert unchecked == {}
 
 
@@ -313,8 +313,8 @@ def test_folders_of_a_problems_folder_are_checked_too(tmp_path):
         path.write_text("problem, controllers = 1, {}")
     (inner / "baselines" / "gone.json").write_text("{}")
     (inner / "baselines" / "unchecked.toml").write_text('three = "slow"')
-    found, unchecked = problems_here(tmp_path)
-    assert [str(p.relative_to(tmp_path / "problems")) for p in found] == ["gallery/gone.py", "one.py", "gallery/two.py"]
+    files, unchecked = problems_here(tmp_path)
+    assert [str(p.relative_to(tmp_path / "problems")) for p in files] == ["gallery/gone.py", "one.py", "gallery/two.py"]
     assert unchecked == {"three": "slow"}
 
 

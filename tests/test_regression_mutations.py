@@ -83,8 +83,8 @@ def wrong_way(folder, patch):
     ordinary = fp.Sigmoid.step
 
     def step(self, before, response, desired, memory):
-        deformed, following = ordinary(self, before, response, desired, memory)
-        return 2 * before - deformed, following
+        deformed, next_memory = ordinary(self, before, response, desired, memory)
+        return 2 * before - deformed, next_memory
 
     patch.setattr(fp.Sigmoid, "step", step)
 
@@ -155,7 +155,7 @@ def plan(change):
         patch.setattr(
             measuring,
             "first_plan",
-            lambda *given: {k: change.get(k, lambda v: v)(v) for k, v in ordinary(*given).items()},
+            lambda *arguments: {k: change.get(k, lambda v: v)(v) for k, v in ordinary(*arguments).items()},
         )
 
     return fault
@@ -164,7 +164,9 @@ def plan(change):
 def ends_early(folder, patch):
     """A run that diverges."""
     ordinary = vars(measuring)["simulate"]
-    patch.setattr(measuring, "simulate", lambda *given, **more: replace(ordinary(*given, **more), stop="it diverged"))
+    patch.setattr(
+        measuring, "simulate", lambda *arguments, **more: replace(ordinary(*arguments, **more), stop="it diverged")
+    )
 
 
 def refused(folder, patch):
@@ -181,7 +183,7 @@ def swapped_results(folder, patch):
     from fpirhc.baselines import check
 
     ordinary = vars(check)["measure_all"]
-    patch.setattr(check, "measure_all", lambda *given, **more: ordinary(*given, **more)[::-1])
+    patch.setattr(check, "measure_all", lambda *arguments, **more: ordinary(*arguments, **more)[::-1])
 
 
 def louder_noise(folder, patch):

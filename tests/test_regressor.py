@@ -38,12 +38,12 @@ numbers = st.lists(st.floats(-2, 2), min_size=80, max_size=80)
 
 def drawn(values, name):
     """State, response, a second velocity, theta and parameters from one list of numbers."""
-    chosen = regressor(name)
-    n, plant = len(chosen.plant.names), chosen.plant
+    model = regressor(name)
+    n, plant = len(model.plant.names), model.plant
     values = np.array(values)
     x, r, v = values[: 2 * n], 5 * values[20 : 20 + n], values[30 : 30 + n]
     p = plant.exact * (1 + 0.2 * values[40 : 40 + plant.exact.size])
-    return chosen, x, r, v, p, chosen.theta_function(p).full().ravel()
+    return model, x, r, v, p, model.theta_function(p).full().ravel()
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -51,9 +51,9 @@ def drawn(values, name):
 @given(values=numbers)
 def test_regressor_is_the_inverse_dynamics(name, values):
     """Y theta + Q0 = Q at any state, response and parameters, to rounding."""
-    chosen, x, r, _, p, theta = drawn(values, name)
-    y, rest = chosen.function(x, r, p)
-    wanted = chosen.plant.inverse_function(x, r, p).full().ravel()
+    model, x, r, _, p, theta = drawn(values, name)
+    y, rest = model.function(x, r, p)
+    wanted = model.plant.inverse_function(x, r, p).full().ravel()
     np.testing.assert_allclose(
         (y @ theta + rest).full().ravel(), wanted, rtol=1e-8, atol=1e-8 * (1 + np.abs(wanted).max())
     )
@@ -64,17 +64,17 @@ def test_regressor_is_the_inverse_dynamics(name, values):
 @given(values=numbers)
 def test_split_with_the_actual_velocity_is_the_inverse_dynamics(name, values):
     """Y_s(q, q', q', q'') = Y(q, q', q''), and it is linear in v with slope C."""
-    chosen, x, r, v, p, theta = drawn(values, name)
-    own = x[list(chosen.plant.indices(1))]
+    model, x, r, v, p, theta = drawn(values, name)
+    own = x[list(model.plant.indices(1))]
 
     def force(velocity):
-        y, rest = chosen.split_function(x, velocity, r, p)
+        y, rest = model.split_function(x, velocity, r, p)
         return (y @ theta + rest).full().ravel()
 
-    wanted = chosen.plant.inverse_function(x, r, p).full().ravel()
+    wanted = model.plant.inverse_function(x, r, p).full().ravel()
     scale = 1e-8 * (1 + np.abs(wanted).max())
     np.testing.assert_allclose(force(own), wanted, atol=scale)
-    coriolis = chosen.coriolis_function(x, theta, p).full()
+    coriolis = model.coriolis_function(x, theta, p).full()
     np.testing.assert_allclose(force(own + v) - wanted, coriolis @ v, atol=scale + 1e-8 * np.abs(coriolis).max())
 
 
@@ -83,21 +83,21 @@ def test_split_with_the_actual_velocity_is_the_inverse_dynamics(name, values):
 @given(values=numbers)
 def test_coriolis_matrix_makes_the_change_of_mass_skew(name, values):
     """M' - 2 C + (M' - 2 C)^T = 0, with M' by a central difference along q' (error of order h^2 = 1e-10)."""
-    chosen, x, _, _, p, theta = drawn(values, name)
-    n, h = len(chosen.plant.names), 1e-5
+    model, x, _, _, p, theta = drawn(values, name)
+    n, h = len(model.plant.names), 1e-5
     along = np.concatenate([x[n:], np.zeros(n)])
-    ahead, behind = (chosen.mass_function(x + s * h * along, theta, p).full() for s in (1, -1))
-    skew = (ahead - behind) / (2 * h) - 2 * chosen.coriolis_function(x, theta, p).full()
+    ahead, behind = (model.mass_function(x + s * h * along, theta, p).full() for s in (1, -1))
+    skew = (ahead - behind) / (2 * h) - 2 * model.coriolis_function(x, theta, p).full()
     np.testing.assert_allclose(skew + skew.T, 0, atol=1e-6 * (1 + np.abs(skew).max()))
 
 
 def test_published_regressor_of_the_two_link_arm():
     """Slotine and Li (1991), section 9.2 (from memory): a = (3.34, 0.97, 1.04, 0.6), and their regressor."""
-    chosen = regressor("two_link_arm")
-    theta = chosen.theta_function(chosen.plant.exact).full().ravel()
+    model = regressor("two_link_arm")
+    theta = model.theta_function(model.plant.exact).full().ravel()
     np.testing.assert_allclose(theta[:4], [3.34, 0.97, 1.0392, 0.6], atol=5e-5)
     q, w, v, s = np.random.default_rng(0).standard_normal((4, 2))
-    y, rest = (m.full() for m in chosen.split_function([*q, *w], v, s, chosen.plant.approximate))
+    y, rest = (m.full() for m in model.split_function([*q, *w], v, s, model.plant.approximate))
     cosine, sine = np.cos(q[1]), np.sin(q[1])
     cross = w[1] * v[0] + w[0] * v[1] + w[1] * v[1]
     printed = [
@@ -110,14 +110,14 @@ def test_published_regressor_of_the_two_link_arm():
 
 def test_published_inertia_and_gravity_load_of_the_puma():
     """At the posture (0, 45, 180, 0, 45, 0) deg without load; numbers as P. Corke's toolbox prints them (from memory)."""
-    chosen = regressor("puma560")
-    p = chosen.plant.exact * [n != "load" for n in chosen.plant.parameters]
+    model = regressor("puma560")
+    p = model.plant.exact * [n != "load" for n in model.plant.parameters]
     x = np.zeros(12)
     x[[1, 2, 4]] = np.pi / 4, np.pi, np.pi / 4
-    mass = chosen.mass_function(x, chosen.theta_function(p), p).full()
+    mass = model.mass_function(x, model.theta_function(p), p).full()
     np.testing.assert_allclose(np.diag(mass), [3.6594, 4.4137, 0.9378, 0.1925, 0.1713, 0.1941], atol=6e-5)
     np.testing.assert_allclose([mass[0, 1], mass[0, 2], mass[1, 2]], [-0.4044, 0.1006, 0.3509], atol=6e-5)
-    gravity = chosen.plant.inverse_function(x, np.zeros(6), p).full().ravel()
+    gravity = model.plant.inverse_function(x, np.zeros(6), p).full().ravel()
     np.testing.assert_allclose(gravity, [0, 31.6399, 6.0351, 0, 0.0283, 0], atol=6e-5)
 
 
@@ -129,8 +129,8 @@ def test_more_combinations_than_parameters():
         "weight": fp.Combination(lambda p: p.m * p.l, "kg m"),
         "square": fp.Combination(lambda p: p.m**2, "kg^2"),
     }
-    found = fp.Regressor(plant, ("inertia", "weight"), combinations)
-    y, rest = (m.full() for m in found.function([0.3, 0.7], [2.0], plant.approximate))
+    result = fp.Regressor(plant, ("inertia", "weight"), combinations)
+    y, rest = (m.full() for m in result.function([0.3, 0.7], [2.0], plant.approximate))
     np.testing.assert_allclose(y, [[2.0, 9.81 * np.sin(0.3)]], atol=1e-9)
     np.testing.assert_allclose(rest, [[0.07]], atol=1e-9)
     with pytest.raises(InvalidValue, match="'square' does not enter"):
@@ -142,8 +142,8 @@ def test_more_combinations_than_parameters():
 def test_linear_parameters_are_found():
     """Linear jointly with all others; a Stribeck level is one only where its velocity is not learned."""
     assert fp.linear_parameters(pendulum()) == ()
-    found = fp.linear_parameters(fp.load_problem("planar_arm").problem.plant)
-    assert found == ("J1", "k1", "m2", "I2", "load", "b1", "b2", "c1", "c2")
+    result = fp.linear_parameters(fp.load_problem("planar_arm").problem.plant)
+    assert result == ("J1", "k1", "m2", "I2", "load", "b1", "b2", "c1", "c2")
     assert fp.linear_parameters(fp.load_problem("two_link_arm").problem.plant) == ("I1", "Ie", "b")
 
 
@@ -165,9 +165,9 @@ def test_plants_without_a_regressor_are_refused():
     """Fewer inputs than coordinates; an inverse that only a root finder has."""
     with pytest.raises(NotSupported, match="fully actuated"):
         fp.Regressor(fp.load_problem("cart_pole").problem.plant, ("m",))
-    bent = fp.Plant(
+    nonlinear = fp.Plant(
         {"y": "m"}, {"u": "N"}, {"m": fp.Parameter(1, 1, "kg")}, lambda q, v, u, p: {"y": ca.sinh(u.u) / p.m}
     )
     with pytest.raises(NotSupported, match="root finder"):
-        fp.Regressor(bent, ("m",))
+        fp.Regressor(nonlinear, ("m",))
     assert fp.linear_parameters(chain(1)) == ("m",)

@@ -112,19 +112,19 @@ def test_predicted_band_is_drawn_around_the_distance_from_the_models_run():
         "adaptive": fp.ComputedTorque(track, fp.Sigmoid(gain=-1.5, scale=5.0)),
     }
     task = Task("case", Path("case.py"), "case", "", problem, controllers, headline=("plain", "adaptive"))
-    found = compare(task, seed=0, compiled=False)
-    data = chart_data(found, ["#000000"])
+    comparison_value = compare(task, seed=0, compiled=False)
+    data = chart_data(comparison_value, ["#000000"])
     [chart] = [c for c in data["charts"] if "band" in c]
     distance, upper, lower = ([v for v in s["values"] if v is not None] for s in chart["series"])
-    entry: Any = found["adaptive"]
+    entry: Any = comparison_value["adaptive"]
     assert chart["only"] == "adaptive"
     apart = entry.run["state.y"] - entry.prediction.nominal.states[:, 0]
     assert max(distance) == pytest.approx(apart.max(), rel=1e-4)
     assert max(upper) == pytest.approx(entry.prediction.half_width["y"], rel=1e-4)
     assert min(lower) == -max(upper)
     assert max(np.abs(distance)) < 1.1 * max(upper)
-    assert "was predicted before the run" in render(found)
-    assert found["plain"].prediction is None
+    assert "was predicted before the run" in render(comparison_value)
+    assert comparison_value["plain"].prediction is None
 
 
 def test_run_that_ended_early_is_told_in_words(comparison):

@@ -32,13 +32,13 @@ def mass(**settings) -> fp.Problem:
         parameters={"m": fp.Parameter(1.5, 1.0, "kg"), "k": fp.Parameter(6.0, 10.0, "N/m")},
         response=lambda q, v, u, p: {"q": (u.u - p.k * q.q) / p.m},
     )
-    given: dict[str, Any] = {
+    settings_in_use: dict[str, Any] = {
         "reference": fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(3 * t)}),
         "start": {"q": 0.0},
         "period": PERIOD,
         "duration": 4.0,
     }
-    return fp.Problem(plant=plant, **(given | settings))
+    return fp.Problem(plant=plant, **(settings_in_use | settings))
 
 
 def torque(gain: float = -0.5, rate: float = 6.0, scale: float = 20.0) -> fp.ComputedTorque:
@@ -47,13 +47,13 @@ def torque(gain: float = -0.5, rate: float = 6.0, scale: float = 20.0) -> fp.Com
 
 def answers(problem: fp.Problem, controller=None, mismatch: float = 0.0) -> dict[str, fp.Answer]:
     """All answers by question."""
-    chosen = {"it": torque() if controller is None else controller}
-    return {a.question: a for a in fp.review(problem, chosen, mismatch=mismatch, seed=0).answers}
+    controllers = {"it": torque() if controller is None else controller}
+    return {a.question: a for a in fp.review(problem, controllers, mismatch=mismatch, seed=0).answers}
 
 
-def about(found: dict[str, fp.Answer], words: str) -> fp.Answer:
-    [question] = [q for q in found if words in q]
-    return found[question]
+def about(result: dict[str, fp.Answer], words: str) -> fp.Answer:
+    [question] = [q for q in result if words in q]
+    return result[question]
 
 
 def predicted(seeds: range) -> tuple[int, int, int]:
@@ -153,20 +153,20 @@ def test_feedback_of_a_plan_is_that_of_the_riccati_equation():
 
     assert problem.horizon is not None
     assert problem.cost is not None
-    [found] = plan_gains(problem, problem.horizon, problem.cost, [0.0], problem.plant.approximate)
+    [result] = plan_gains(problem, problem.horizon, problem.cost, [0.0], problem.plant.approximate)
     m, k = problem.plant.approximate
     whole = scipy.linalg.expm(np.array([[0, 1, 0], [-k / m, 0, 1 / m], [0, 0, 0]]) * 1e-2)
     stationary, *_ = control.dlqr(whole[:2, :2], whole[:2, 2:], np.diag([1e3, 1.0]), np.array([[1e-2]]))
-    assert found.state == pytest.approx(-stationary, rel=1e-3)
-    assert not found.before.any()
+    assert result.state == pytest.approx(-stationary, rel=1e-3)
+    assert not result.before.any()
 
 
 def test_a_good_problem_is_ready():
     """Every answer about a mild mismatch is yes, in the form that the problem wants; the plain one is ready too, with advice."""
     problem, plain = mass(limits=fp.Limits(inputs={"u": (-20.0, 20.0)})), torque()
-    found = answers(problem, replace(plain, deformation=fp.ModelReferenced(plain.deformation)))
-    assert {a.verdict for a in found.values()} == {"yes"}
-    assert all(not a.change for a in found.values())
+    answers_by_question = answers(problem, replace(plain, deformation=fp.ModelReferenced(plain.deformation)))
+    assert {a.verdict for a in answers_by_question.values()} == {"yes"}
+    assert all(not a.change for a in answers_by_question.values())
     others = {q: a for q, a in answers(problem, plain).items() if a.verdict != "yes"}
     assert set(others) == {"Is it the form of the iteration that the problem wants?"}
     assert "ModelReferenced" in about(others, "form of the iteration").change
@@ -195,9 +195,9 @@ def test_what_is_wrong_is_answered_no(words, controller, settings):
 
 def test_wrong_sign_is_found_before_the_run():
     """A gain of the wrong sign, which a run refuses."""
-    found = answers(mass(), torque(gain=0.5))
-    assert about(found, "Does the deformation converge").verdict == "no"
-    gain = about(found, "gain admissible")
+    answers_by_question = answers(mass(), torque(gain=0.5))
+    assert about(answers_by_question, "Does the deformation converge").verdict == "no"
+    gain = about(answers_by_question, "gain admissible")
     assert gain.verdict == "no"
     assert gain.numbers["recommended"] == pytest.approx(-1 / 0.396737 / 1.25, rel=0.01)  # J from 1 to 1.5 over the box
 
@@ -248,9 +248,9 @@ def test_prediction_is_the_review_s_verdict():
     """The verdict does not depend on the questions that are asked beside it."""
     for seed in (0, 9, 20):
         case = random_case(seed)
-        found = answers(case.problem, case.controller)
+        answers_by_question = answers(case.problem, case.controller)
         one = predict(case.problem, case.controller)
-        assert about(found, "Does the deformation converge").verdict == one.verdict
+        assert about(answers_by_question, "Does the deformation converge").verdict == one.verdict
 
 
 def test_a_map_that_changes_on_line_is_not_judged():
@@ -265,10 +265,10 @@ def test_a_plan_that_is_too_stiff_for_its_map_is_found():
     """The case that two_mass shows failing: the start asks for more than 0.81 S per cycle."""
     task = fp.load_problem("two_mass")
     name = "RHC+FPI, stiff, small S"
-    found = fp.review(task.problem, {name: task.controllers[name]}, mismatch=0.0, seed=0)
-    slew = about({a.question: a for a in found.answers}, "fast enough")
+    answers_by_question = fp.review(task.problem, {name: task.controllers[name]}, mismatch=0.0, seed=0)
+    slew = about({a.question: a for a in answers_by_question.answers}, "fast enough")
     assert slew.verdict == "no"
-    assert not found.ready
+    assert not answers_by_question.ready
 
 
 def test_values_that_make_no_sense_are_refused():
@@ -284,9 +284,9 @@ def test_every_shipped_problem_can_be_reviewed(name, capsys):
     task = fp.load_problem(name)
     few = list(task.controllers)[1:2]  # the adaptive one of the headline pair
     code = main(["review", name, "--controllers", *few, "--json"])
-    found = json.loads(capsys.readouterr().out)
-    assert set(found["controllers"]) == set(few)
-    every = [*found["answers"], *(a for group in found["controllers"].values() for a in group)]
+    document = json.loads(capsys.readouterr().out)
+    assert set(document["controllers"]) == set(few)
+    every = [*document["answers"], *(a for group in document["controllers"].values() for a in group)]
     assert all(a["evidence"] and a["question"].endswith("?") for a in every)
     assert all(a["change"] for a in every if a["verdict"] == "no")
     assert code == int(any(a["verdict"] == "no" for a in every))
@@ -303,18 +303,18 @@ def test_journey_with_text(capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["no_such_problem"], "unknown"),
         (["two_mass", "--controllers", "RCH"], "Did you mean"),
         (["two_mass", "--mismatch", "250"], "mismatch 250"),
     ],
 )
-def test_bad_input_ends_with_2(words, said, capsys):
+def test_bad_input_ends_with_2(words, message, capsys):
     """Names and values are named; nothing is printed on standard output."""
     assert main(["review", *words]) == 2
     printed = capsys.readouterr()
-    assert said in printed.err
+    assert message in printed.err
     assert not printed.out
 
 
@@ -322,8 +322,8 @@ def test_slots_are_judged_by_their_schedule():
     """Crane: the published radius; a controller that does not fit is a no with its reason."""
     task = fp.load_problem("crane_slots")
     controller: Any = task.controllers["slots+FPI"]
-    found = answers(task.problem, controller)
-    assert about(found, "schedule").numbers["floquet_radius"] == pytest.approx(0.0485, abs=1e-3)
+    answers_by_question = answers(task.problem, controller)
+    assert about(answers_by_question, "schedule").numbers["floquet_radius"] == pytest.approx(0.0485, abs=1e-3)
     wrong = replace(controller, slots=(replace(controller.slots[0], order=3), controller.slots[1]))
     assert about(answers(task.problem, wrong), "fit the problem").verdict == "no"
 
@@ -331,7 +331,7 @@ def test_slots_are_judged_by_their_schedule():
 def test_estimators_and_filters_are_part_of_the_loop():
     """The motor's derivatives come from a window: told of its delay a deformation converges, not told it does not."""
     task = fp.load_problem("noisy_motor")
-    told, untold = (
+    diagnostics, untold = (
         predict(task.problem, task.controllers[n]) for n in ("RHC+FPI, filtered error", "RHC+FPI, delay not told")
     )
-    assert (told.verdict, untold.verdict) == ("yes", "no")
+    assert (diagnostics.verdict, untold.verdict) == ("yes", "no")

@@ -31,26 +31,26 @@ def moving(eigenvalue: float = 1.5, **settings) -> fp.Problem:
 def answer(problem: fp.Problem, deformation: Deformation, words: str) -> Any:
     """The answer to the question with these words, None where it is not asked."""
     controller = fp.ComputedTorque(fp.Exponential(rate=RATE), deformation)
-    found = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).controllers["it"]
-    return next((a for a in found if words in a.question), None)
+    answers_by_question = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).controllers["it"]
+    return next((a for a in answers_by_question if words in a.question), None)
 
 
 @pytest.mark.parametrize(("ratio", "verdict"), [(0.9, "no"), (2.0, "unknown"), (4.0, "yes")])
 def test_slow_iterations_are_told(ratio, verdict):
     """Below what the plain form needs: no; less than three times: unknown. The increment form is not asked."""
     slow = fp.Affine(gain=-2 * ratio * least_product(3, RATE, PERIOD) / 1.5)
-    found = answer(moving(), slow, "keep up with its tracking law")
-    assert found.verdict == verdict
-    assert found.numbers["ratio"] == pytest.approx(ratio, rel=1e-6)
+    one_answer = answer(moving(), slow, "keep up with its tracking law")
+    assert one_answer.verdict == verdict
+    assert one_answer.numbers["ratio"] == pytest.approx(ratio, rel=1e-6)
     assert answer(moving(), fp.Increment(slow, cycles=0), "keep up with its tracking law") is None
     assert answer(moving(), fp.Filtered(slow, pole=0.1), "keep up with its tracking law") is not None
 
 
 def test_lag_that_is_said_to_be_borne_is_borne():
     """At the longest lag the loop is stable, at twice the limit not; a large gain bears less than three cycles."""
-    found = answer(moving(1.0), fp.Affine(gain=-0.2), "small lag")
-    assert found.verdict == "yes"
-    for tau, stable in ((found.numbers["lag"], True), (2 * found.numbers["limit"], False)):
+    one_answer = answer(moving(1.0), fp.Affine(gain=-0.2), "small lag")
+    assert one_answer.verdict == "yes"
+    for tau, stable in ((one_answer.numbers["lag"], True), (2 * one_answer.numbers["limit"], False)):
         radius = np.abs(poles(lag(tau), 2, RATE, PERIOD, 0.1, plain=False)).max()
         assert (radius < 1) == stable
     assert answer(moving(1.0), fp.Affine(gain=-2.0), "small lag").verdict == "unknown"
@@ -62,33 +62,35 @@ def test_two_cycle_that_is_said_to_exist_is_there():
     problem = chain(2, 1.5)
     limit = answer(problem, sigmoid, "two-cycles").numbers["limit"]
     for share, verdict in ((0.99, "yes"), (1.01, "no")):
-        chosen = sigmoid.with_effective_gain(share * limit * sigmoid.effective_gain() / sigmoid.secant_gain())
-        found = answer(problem, chosen, "two-cycles")
-        assert found.verdict == verdict
+        deformation = sigmoid.with_effective_gain(share * limit * sigmoid.effective_gain() / sigmoid.secant_gain())
+        one_answer = answer(problem, deformation, "two-cycles")
+        assert one_answer.verdict == verdict
         requests = np.random.default_rng(0).uniform(-10, 10, size=(12, 1))
-        errors = errors_after_request(problem, fp.ComputedTorque(fp.Exponential(rate=RATE), chosen), requests, 4000)
+        errors = errors_after_request(
+            problem, fp.ComputedTorque(fp.Exponential(rate=RATE), deformation), requests, 4000
+        )
         sizes = np.abs(errors[-50:, 0]).max(axis=0)
         if verdict == "yes":
             assert sizes.max() < 1e-6
         else:
-            assert sizes.max() == pytest.approx(found.numbers["amplitude"], rel=1e-6)
+            assert sizes.max() == pytest.approx(one_answer.numbers["amplitude"], rel=1e-6)
 
 
 def test_benefit_is_told_from_harm():
     """A wrong inertia: yes. A right one, which the plain form disturbs: no. A slightly wrong one: not sure."""
     verdicts = {1.5: "yes", 1.0: "no", 1.005: "unknown"}
     for eigenvalue, verdict in verdicts.items():
-        found = answer(moving(eigenvalue), fp.Affine(gain=-1.0), "lower the response error")
-        assert found.verdict == verdict
-        assert found.numbers["with"] == pytest.approx(found.numbers["null"], rel=1.0)
+        one_answer = answer(moving(eigenvalue), fp.Affine(gain=-1.0), "lower the response error")
+        assert one_answer.verdict == verdict
+        assert one_answer.numbers["with"] == pytest.approx(one_answer.numbers["null"], rel=1.0)
 
 
 def test_benefit_is_not_known_under_dead_time():
     """The recursion pairs a response with the last request."""
     late = moving(dead_time=fp.DeadTime(inputs={"u": PERIOD}))
-    found = answer(late, fp.Paired(fp.Affine(gain=-0.5), cycles=1), "lower the response error")
-    assert found.verdict == "unknown"
-    assert "dead time" in found.evidence
+    one_answer = answer(late, fp.Paired(fp.Affine(gain=-0.5), cycles=1), "lower the response error")
+    assert one_answer.verdict == "unknown"
+    assert "dead time" in one_answer.evidence
     assert answer(late, fp.Paired(fp.Affine(gain=-0.5), cycles=1), "two-cycles") is None
     assert answer(late, fp.Paired(fp.Affine(gain=-0.5), cycles=1), "small lag") is None
 

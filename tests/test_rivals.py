@@ -73,8 +73,8 @@ def test_pid_on_a_double_integrator_has_the_computed_poles():
     run = simulate(resting(chain(2), period=1e-3), controller)
     states = np.column_stack([run["integral"][:-1], run["state"][1:]])  # the integral is logged after its update
     matrix = np.linalg.lstsq(states[:-1], states[1:], rcond=None)[0].T
-    found = np.log(np.linalg.eigvals(matrix).astype(complex)) / 1e-3
-    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(wanted), rtol=0.01)
+    result = np.log(np.linalg.eigvals(matrix).astype(complex)) / 1e-3
+    np.testing.assert_allclose(np.sort_complex(result), np.sort_complex(wanted), rtol=0.01)
 
 
 def test_pid_starts_without_a_jump_and_its_integral_waits_for_the_actuator():
@@ -190,14 +190,14 @@ def test_force_mrac_believes_in_the_reference_model():
     )
     moving = fp.Trajectory(lambda t: {"q": ca.sin(2 * t)})
     problem = fp.Problem(plant, moving, {"q": 0.0}, 1e-3, 10.0, measure_from=3.0)
-    found = []
+    collected = []
     for deformation in (fp.Identity(), SIGMOID):
         run = simulate(problem, fp.ForceMRAC(fp.Exponential(3.7), deformation))
         late = slice(3000, run.cycles)
         desired, before = run["force_desired"][late], run["force_desired"][2999:-1]
         errors = (run["error"][late], run["force_recalculated"][late] - before, run["command"][late] - desired)
-        found.append((np.abs(errors[0]).max(), rms(errors[1]), rms(errors[2])))
-    (plain, unequal, _), (adaptive, equal, illusion) = found
+        collected.append((np.abs(errors[0]).max(), rms(errors[1]), rms(errors[2])))
+    (plain, unequal, _), (adaptive, equal, illusion) = collected
     assert 20 * equal < illusion
     np.testing.assert_allclose([plain, unequal], [0.172, 8.1], rtol=0.2)
     np.testing.assert_allclose([adaptive, equal, illusion], [0.0030, 0.13, 9.1], rtol=0.2)
@@ -275,18 +275,18 @@ def test_adaptation_has_the_computed_limit(share, grows):
     """At rest only the bias is adapted, |phi| = 1: stable below gamma |B| period / 2 = rate."""
     law = fp.LyapunovMRAC(RATE, adaptation=share * 2 * RATE / 1e-2)
     load = {"y": fp.Pulse(at=0.1, duration=0.1, size=1e-6)}
-    moved = np.abs(simulate(resting(chain(2), 0.0, disturbances=load), law)["state.y'"])
-    assert (moved[200:].max() > moved[:60].max()) == grows
+    speeds = np.abs(simulate(resting(chain(2), 0.0, disturbances=load), law)["state.y'"])
+    assert (speeds[200:].max() > speeds[:60].max()) == grows
 
 
 def test_leakage_binds_the_gains_to_the_model():
     """Under a load that the gains cannot match they stay nearer to where they began."""
     problem = swing(disturbances={"torque": fp.Sine(amplitude=2.0, frequency=1.5)}, duration=6.0)
-    moved = []
+    shifted = []
     for leakage in (0.0, 5.0):
         gains = simulate(problem, fp.LyapunovMRAC(RATE, adaptation=20.0, leakage=leakage))["gains"]
-        moved.append(np.abs(gains - gains[0]).max())
-    assert moved[1] < 0.7 * moved[0]
+        shifted.append(np.abs(gains - gains[0]).max())
+    assert shifted[1] < 0.7 * shifted[0]
 
 
 def test_lyapunov_mrac_on_a_coupled_plant():
@@ -338,12 +338,12 @@ def test_view_is_shown_where_there_is_one():
     """As a note and in the report; a law without an exponential surface has none."""
     problem = swing(duration=0.3, measure_from=0.1)
     task = Task("case", Path("case.py"), "title", "", problem, {"CTC": VIEWED[0], "PID": RIVALS[0]})
-    found = compare(task, seed=0, compiled=False)
-    view = found["CTC"].lyapunov
+    comparison = compare(task, seed=0, compiled=False)
+    view = comparison["CTC"].lyapunov
     assert view is not None
-    assert found["CTC"].notes[-1] == view.text
-    assert found["PID"].lyapunov is None
-    assert "Lyapunov's view" in render(found)
+    assert comparison["CTC"].notes[-1] == view.text
+    assert comparison["PID"].lyapunov is None
+    assert "Lyapunov's view" in render(comparison)
 
 
 # What fits, and what does not
@@ -379,9 +379,9 @@ def test_what_does_not_fit_is_skipped_in_a_comparison():
     """The others run, and the report's table has a row with the reason."""
     problem = swing(duration=0.2, measure_from=0.0)
     controllers = {"CTC": VIEWED[0], "odd": fp.BacksteppingMRAC(RATE, (1.0,), SIGMOID)}
-    found = compare(Task("case", Path("case.py"), "title", "", problem, controllers), seed=0, compiled=False)
-    assert [e.name for e in found.entries] == ["CTC"]
-    assert "not run: BacksteppingMRAC" in render(found)
+    comparison = compare(Task("case", Path("case.py"), "title", "", problem, controllers), seed=0, compiled=False)
+    assert [e.name for e in comparison.entries] == ["CTC"]
+    assert "not run: BacksteppingMRAC" in render(comparison)
 
 
 @pytest.mark.parametrize(

@@ -149,15 +149,15 @@ def test_a_prepared_loop_runs_what_a_fresh_one_runs(dead_time, task):
     problem = replace(task.problem, dead_time=dead_time)
     bench = Bench(replace(task, problem=problem), Conditions(5, COMPARING, 20.0, compiled=False))
     for name, number in (("CTC+FPI", 0), ("CTC exact", 2), ("CTC+FPI", 1), ("CTC exact", 1)):
-        found = bench.record(number, name)
+        result = bench.record(number, name)
         scenario = draw(problem.plant, seed=5, use=COMPARING, number=number, percent=20.0)
         variant = with_exact(problem, scenario.exact)
         run = fp.simulate(variant, task.controllers[name], seed=scenario.seed, compiled=False)
         fresh = fp.measure(variant, run).values
-        for metric, numbers in found["metrics"].items():
+        for metric, numbers in result["metrics"].items():
             assert numbers == {e: v if math.isfinite(v) else None for e, v in fresh[metric].items()}
         # Contraction needs the symbols along the run; a scenario does not compute them.
-        assert set(fresh) - set(found["metrics"]) <= {"contraction.predicted", "contraction.measured"}
+        assert set(fresh) - set(result["metrics"]) <= {"contraction.predicted", "contraction.measured"}
 
 
 # --- Statistics -------------------------------------------------------------------------------------------------------
@@ -206,8 +206,8 @@ def test_differences_are_taken_within_scenarios():
     assert one.difference.high < 0
     assert one.worst == pytest.approx(0.099)
     assert one.worst_scenario == 40
-    told = verdict([summarise("A", plain, None, seed=0), one], {})
-    assert told[0].startswith("B has a smaller error than A")
+    sentences = verdict([summarise("A", plain, None, seed=0), one], {})
+    assert sentences[0].startswith("B has a smaller error than A")
 
 
 def test_failures_are_counted_and_are_worse_than_any_error():
@@ -220,10 +220,10 @@ def test_failures_are_counted_and_are_worse_than_any_error():
     assert one.better == 2
     assert one.difference is not None
     assert one.difference.median == 0  # two gains, one tie, two losses
-    told = " ".join(verdict([summarise("A", plain, None, seed=0), one], {"C": "no horizon"}))
-    assert "B and A show no clear difference" in told
-    assert "B fails in 3 of 5 scenarios (3 ended early)" in told
-    assert "Not run: C (no horizon)" in told
+    sentences = " ".join(verdict([summarise("A", plain, None, seed=0), one], {"C": "no horizon"}))
+    assert "B and A show no clear difference" in sentences
+    assert "B fails in 3 of 5 scenarios (3 ended early)" in sentences
+    assert "Not run: C (no horizon)" in sentences
 
 
 def test_an_error_as_large_as_the_motion_has_diverged(task):
@@ -310,8 +310,8 @@ def test_killed_workers_are_replaced(tmp_path):
 def test_a_job_that_kills_every_worker_is_given_up(tmp_path):
     """The job is named; nothing waits for ever."""
     opening = {"folder": str(tmp_path), "deadly": []}
-    told = rf"{DEATHS} processes died one after the other at the job -1"
-    with pytest.raises(WorkerDied, match=told), Workers("mortal_worker", opening, opening, 2) as workers:
+    message = rf"{DEATHS} processes died one after the other at the job -1"
+    with pytest.raises(WorkerDied, match=message), Workers("mortal_worker", opening, opening, 2) as workers:
         list(workers.answers([1, -1, 2]))
 
 
@@ -343,8 +343,8 @@ def test_results_do_not_depend_on_processes_order_or_company(task, tmp_path):
 
 def test_adaptation_is_judged_against_the_baseline(task, tmp_path):
     """FPI is better than the wrong model in every scenario, and the informed controller is a bound."""
-    found = fp.compare_scenarios(task, count=8, folder=tmp_path, baseline="CTC", **SETTINGS)
-    plain, adaptive, informed = (found[n] for n in ("CTC", "CTC+FPI", "CTC exact"))
+    study = fp.compare_scenarios(task, count=8, folder=tmp_path, baseline="CTC", **SETTINGS)
+    plain, adaptive, informed = (study[n] for n in ("CTC", "CTC+FPI", "CTC exact"))
     assert plain.difference is None
     assert adaptive.better == informed.better == 8
     assert adaptive.difference is not None
@@ -369,9 +369,9 @@ def test_a_controller_that_does_not_fit_is_skipped_with_its_reason(task, tmp_pat
     """The others are compared as ever; only its reason stands in the table."""
     planner = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3))
     wider = replace(task, controllers={**task.controllers, "RHC": planner})
-    found = fp.compare_scenarios(wider, count=2, folder=tmp_path, **SETTINGS)
-    assert "needs Problem(horizon=...)" in found.skipped["RHC"]
-    assert [s.name for s in found.summaries] == ["CTC", "CTC+FPI", "CTC exact"]
+    study = fp.compare_scenarios(wider, count=2, folder=tmp_path, **SETTINGS)
+    assert "needs Problem(horizon=...)" in study.skipped["RHC"]
+    assert [s.name for s in study.summaries] == ["CTC", "CTC+FPI", "CTC exact"]
 
 
 ARGUMENTS = ["compare", "line.py", "--scenarios", "4", "--mismatch", "20", "--no-compile"]
@@ -380,9 +380,9 @@ ARGUMENTS = ["compare", "line.py", "--scenarios", "4", "--mismatch", "20", "--no
 def test_command_line_journey(task, capsys):
     """A report with the chart, a picture, a ledger and JSON; then more seeds, and a changed file that is refused."""
     assert main([*ARGUMENTS, "--json", "--out", "out"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["controllers"]["CTC+FPI"]["difference"]["high"] < 0
-    assert len(found["controllers"]["CTC"]["errors"]) == 4
+    document = json.loads(capsys.readouterr().out)
+    assert document["controllers"]["CTC+FPI"]["difference"]["high"] < 0
+    assert len(document["controllers"]["CTC"]["errors"]) == 4
     page = Path("out/report.html").read_text()
     assert "Error against mismatch" in page
     assert "CTC+FPI has a smaller error than CTC" in page
@@ -488,12 +488,12 @@ def test_thirty_random_kills(task, tmp_path):
 
 
 def _children(parent: int) -> list[int]:
-    found = []
+    collected = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
             fields = stat.read_text().rpartition(")")[2].split()
         except OSError:
             continue
         if int(fields[1]) == parent:
-            found.append(int(stat.parent.name))
-    return found
+            collected.append(int(stat.parent.name))
+    return collected

@@ -62,8 +62,8 @@ def run(problem, controller=ADAPTIVE, seed=0, compiled=False):
 def test_noise_gain_of_the_closed_loop(gain):
     """Var r = a/(2 - a) sigma^2 and lag-1 correlation -a/2 of the seen error: bounds are four standard deviations."""
     problem = resting(linear(1.0, 1.0), duration=20.0, sensing=fp.Sensing({"y''": NOISE}))
-    found = run(problem, fp.ComputedTorque(GENTLE, fp.Affine(gain=-2 * gain)))
-    requests, error = found["deformed.y"][100:], (found["realised.y"] - found["desired.y"])[100:]
+    result = run(problem, fp.ComputedTorque(GENTLE, fp.Affine(gain=-2 * gain)))
+    requests, error = result["deformed.y"][100:], (result["realised.y"] - result["desired.y"])[100:]
     memory = 1 - gain
     spread = 4 * math.sqrt(2 / requests.size * (1 + memory**2) / (1 - memory**2))
     assert np.var(requests) == pytest.approx(gain / (2 - gain), rel=spread)
@@ -89,8 +89,8 @@ def test_motor_turns_as_wanted():
     problem, rpm = replace(task.problem, duration=12.0), 2 * math.pi / 60
     speeds = {}
     for name in ("RHC", "RHC+FPI", "RHC+FPI (eq 3)"):
-        found = fp.simulate(problem, task.controllers[name], seed=0)
-        speeds[name] = found["plant_state.speed"][found.time >= problem.measure_from] / rpm
+        result = fp.simulate(problem, task.controllers[name], seed=0)
+        speeds[name] = result["plant_state.speed"][result.time >= problem.measure_from] / rpm
     for name in ("RHC+FPI", "RHC+FPI (eq 3)"):
         assert speeds[name].mean() == pytest.approx(60, abs=0.1)
         assert speeds[name].std() < speeds["RHC"].std() / 3
@@ -100,10 +100,10 @@ def test_coloured_noise_has_its_deviation_and_memory():
     """Standard deviation and correlation exp(-T / correlation time), within four standard deviations."""
     times = 1e-3 * np.arange(200_000)
     values = fp.ColouredNoise(deviation=2.0, correlation_time=5e-3).values(times, np.random.default_rng(0))
-    kept = math.exp(-0.2)
-    spread = 4 * math.sqrt(2 / times.size * (1 + kept**2) / (1 - kept**2))
+    decay = math.exp(-0.2)
+    spread = 4 * math.sqrt(2 / times.size * (1 + decay**2) / (1 - decay**2))
     assert np.var(values) == pytest.approx(4.0, rel=spread)
-    assert np.corrcoef(values[1:], values[:-1])[0, 1] == pytest.approx(kept, abs=4 / math.sqrt(times.size))
+    assert np.corrcoef(values[1:], values[:-1])[0, 1] == pytest.approx(decay, abs=4 / math.sqrt(times.size))
 
 
 # --- sensors in the loop ---
@@ -121,17 +121,17 @@ def test_nothing_and_zero_noise_are_the_ideal_loop():
 
 def test_quantised_values_are_multiples_of_the_quantum():
     """And the nearest ones."""
-    found = run(swinging(sensing=fp.Sensing({"y": fp.Sensor(quantum=1 / 1024)})))
-    counts = found["state.y"] * 1024
+    result = run(swinging(sensing=fp.Sensing({"y": fp.Sensor(quantum=1 / 1024)})))
+    counts = result["state.y"] * 1024
     np.testing.assert_array_equal(counts, np.round(counts))
-    assert np.abs(found["state.y"] - found["plant_state.y"]).max() <= 0.5 / 1024
+    assert np.abs(result["state.y"] - result["plant_state.y"]).max() <= 0.5 / 1024
     assert np.unique(counts).size > 10
 
 
 def test_lost_samples_repeat_the_last():
     """As often as asked for, the first one being the start."""
-    found = run(swinging(sensing=fp.Sensing({"y'": fp.Sensor(dropout=0.3)}), duration=2.0))
-    seen, true = found["state.y'"], found["plant_state.y'"]
+    result = run(swinging(sensing=fp.Sensing({"y'": fp.Sensor(dropout=0.3)}), duration=2.0))
+    seen, true = result["state.y'"], result["plant_state.y'"]
     lost = seen != true
     assert np.array_equal(seen[1:][lost[1:]], seen[:-1][lost[1:]])
     assert lost.mean() == pytest.approx(0.3, abs=4 * math.sqrt(0.3 * 0.7 / lost.size))
@@ -166,20 +166,20 @@ def test_compiled_loop_is_the_same():
 def test_order_of_sensor_dead_time_and_controller():
     """The controller is given what the sensor showed three cycles ago; the run is judged by the true error."""
     problem = swinging(sensing=fp.Sensing({"y": NOISE}), dead_time=fp.DeadTime(measurement=3e-3))
-    found = run(problem)
-    assert np.array_equal(found["state.y"][3:], found["measured.y"][:-3])
-    assert found["true_error.y"] == pytest.approx(found["reference.y"] - found["plant_state.y"])
-    assert fp.measure(problem, found).max_error["y"] == np.abs(found["true_error.y"]).max()
+    result = run(problem)
+    assert np.array_equal(result["state.y"][3:], result["measured.y"][:-3])
+    assert result["true_error.y"] == pytest.approx(result["reference.y"] - result["plant_state.y"])
+    assert fp.measure(problem, result).max_error["y"] == np.abs(result["true_error.y"]).max()
 
 
 def test_stepper_replays_a_noisy_run():
     """A controller stepped by hand with what it was given computes the same commands, the wait at the start included."""
     problem = swinging(sensing=fp.Sensing({"y": fp.Sensor(quantum=1e-6)}, fp.PositionDifference()))
-    found, stepper = run(problem), fp.Stepper(problem, ADAPTIVE, compiled=False)
+    result, stepper = run(problem), fp.Stepper(problem, ADAPTIVE, compiled=False)
     memory = stepper.start()
     for k in range(20):
-        command, memory = stepper.step(found.time[k], found["state"][k], found["realised"][k], memory)
-        assert command == pytest.approx(found["command"][k])
+        command, memory = stepper.step(result.time[k], result["state"][k], result["realised"][k], memory)
+        assert command == pytest.approx(result["command"][k])
 
 
 # --- estimators ---
@@ -194,10 +194,10 @@ def test_response_is_the_stated_average_of_requests(estimator, order):
     weights = estimator.weights(order, period)
     assert weights.sum() == pytest.approx(1.0)
     assert (weights * np.arange(weights.size)).sum() == pytest.approx(estimator.delay(order, period), abs=1e-6)
-    found = estimated(estimator, plant, period, trajectory(plant, period, requests))[1]
+    result = estimated(estimator, plant, period, trajectory(plant, period, requests))[1]
     expected = np.convolve(requests, weights)[: requests.size]
     first = weights.size if isinstance(estimator, fp.LowPassDifference) else estimator.fills(order)
-    np.testing.assert_allclose(found[first:], expected[first - 1 : -1], atol=1e-6)
+    np.testing.assert_allclose(result[first:], expected[first - 1 : -1], atol=1e-6)
 
 
 def trajectory(plant, period, requests):
@@ -214,11 +214,11 @@ def estimated(estimator, plant, period, states):
     measures = estimator.measures(plant)
     block = estimator.block(plant, period, states[0], Signal("seen", measures))
     memory = [s.start_vector() for s in block.memory.signals]
-    places, found = [plant.state.elements.index(m) for m in measures], []
+    places, collected = [plant.state.elements.index(m) for m in measures], []
     for row in states:
         state, response, *memory = block.function.call([row[places], *memory])
-        found.append((state.full().ravel(), float(response)))
-    return np.array([s for s, _ in found]), np.array([r for _, r in found])
+        collected.append((state.full().ravel(), float(response)))
+    return np.array([s for s, _ in collected]), np.array([r for _, r in collected])
 
 
 @pytest.mark.parametrize(
@@ -258,12 +258,12 @@ def test_deformation_waits_for_the_window(estimator):
     """Until the window holds samples of the run alone the request is the desired response; estimates are finite from the first."""
     problem = swinging(sensing=fp.Sensing(estimator=estimator), duration=0.05)
     controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Affine(gain=-0.05))
-    found, blind = run(problem, controller), problem.warm_up_cycles
+    result, blind = run(problem, controller), problem.warm_up_cycles
     assert blind == estimator.fills(2)
-    assert np.array_equal(found["deformed"][:blind], found["desired"][:blind])
-    assert (found["deformed"][blind:] != found["desired"][blind:]).all()
+    assert np.array_equal(result["deformed"][:blind], result["desired"][:blind])
+    assert (result["deformed"][blind:] != result["desired"][blind:]).all()
     # The start's velocity of 1 m/s is known from the first cycle on.
-    assert found["state.y'"][0] == pytest.approx(1.0)
+    assert result["state.y'"][0] == pytest.approx(1.0)
 
 
 # --- stability ---
@@ -289,10 +289,10 @@ def test_second_difference_of_position(gain):
     problem = resting(
         linear(1.0, 1.0), period=1e-4, duration=1e-2, sensing=fp.Sensing(estimator=fp.PositionDifference())
     )
-    found = modes(problem, fp.ComputedTorque(GENTLE, fp.Affine(gain=-2 * gain)))
+    mode_values = modes(problem, fp.ComputedTorque(GENTLE, fp.Affine(gain=-2 * gain)))
     expected = np.roots([1, -(1 - gain / 2), gain / 2])
     for root in expected:
-        assert np.abs(found - root).min() < 5e-3
+        assert np.abs(mode_values - root).min() < 5e-3
     if gain == FASTEST:
         assert np.abs(expected).max() == pytest.approx(0.414, abs=1e-3)
         radii = [np.abs(np.roots([1, -(1 - a / 2), a / 2])).max() for a in np.linspace(0.05, 1.5, 30)]
@@ -308,10 +308,10 @@ def test_filtered_error(pole, share):
     gain = share * limit
     problem = resting(linear(1.0, 1.0), period=1e-4, duration=1e-2)
     controller = fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Filtered(fp.Affine(gain=-2 * gain), pole))
-    found = modes(problem, controller)
+    mode_values = modes(problem, controller)
     for root in np.roots([1, -(1 + pole - gain * (1 - pole)), pole]):
-        assert np.abs(found - root).min() < 2e-3
-    assert (np.abs(found).max() > 1 + 1e-4) == (share > 1)
+        assert np.abs(mode_values - root).min() < 2e-3
+    assert (np.abs(mode_values).max() > 1 + 1e-4) == (share > 1)
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS[2:], ids=str)
@@ -367,8 +367,8 @@ def test_delay_that_makes_the_loop_unstable_is_refused():
     smaller = fp.Affine(gain=-2 * 0.9 * limit)
     paired = fp.Paired(fp.Affine(gain=-2 * gain), cycles=problem.response_delay)
     shorter = replace(problem, sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window=5, degree=2)))
-    chosen = ((problem, smaller), (problem, paired), (shorter, fp.Affine(gain=-2 * gain)))
-    for accepted, deformation in chosen:
+    selection = ((problem, smaller), (problem, paired), (shorter, fp.Affine(gain=-2 * gain)))
+    for accepted, deformation in selection:
         assert run(accepted, fp.ComputedTorque(tracking, deformation)).stop is None
 
 
@@ -442,6 +442,6 @@ def test_state_variable_filter_sees_constant_motions_as_they_are():
         duration=0.5,
         sensing=fp.Sensing({}, fp.StateVariableFilter(bandwidth=100.0)),
     )
-    found = run(problem, fp.ExactModel(fp.ComputedTorque(fp.Exponential(rate=5.0))))
-    assert found["realised"][450, 0] == pytest.approx(found["plant_realised"][450, 0], rel=1e-2)
-    assert found["state"][450, 1] == pytest.approx(found["plant_state"][430, 1], rel=1e-2)
+    result = run(problem, fp.ExactModel(fp.ComputedTorque(fp.Exponential(rate=5.0))))
+    assert result["realised"][450, 0] == pytest.approx(result["plant_realised"][450, 0], rel=1e-2)
+    assert result["state"][450, 1] == pytest.approx(result["plant_state"][430, 1], rel=1e-2)

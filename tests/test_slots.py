@@ -29,8 +29,8 @@ POLE: Any = fp.load_problem("cart_pole_slots")
 
 def crane(start: dict[str, float], **changes: Any) -> fp.Problem:
     """The crane from another start, measured from the first cycle."""
-    given = {e: start.get(e, 0.0) for e in CRANE.problem.plant.state.elements}
-    return replace(CRANE.problem, start=given, measure_from=0.0, **changes)
+    values = {e: start.get(e, 0.0) for e in CRANE.problem.plant.state.elements}
+    return replace(CRANE.problem, start=values, measure_from=0.0, **changes)
 
 
 def run(problem: fp.Problem, controller: Controller) -> fp.Run:
@@ -38,9 +38,9 @@ def run(problem: fp.Problem, controller: Controller) -> fp.Run:
     return fp.simulate(problem, controller, seed=0, compiled=False)
 
 
-def switches(found: fp.Run) -> np.ndarray:
+def switches(run_: fp.Run) -> np.ndarray:
     """First cycles of all slots but the first."""
-    return np.flatnonzero(np.diff(found["slot"][:, 0])) + 1
+    return np.flatnonzero(np.diff(run_["slot"][:, 0])) + 1
 
 
 # Stability of a schedule
@@ -49,10 +49,10 @@ def switches(found: fp.Run) -> np.ndarray:
 def test_crane_schedule_is_stable_although_no_slot_is():
     """The pendulum swings undamped in a cart slot, the cart rolls on in an angle slot; one period shrinks both."""
     slots = CRANE.controllers["slots"]
-    found = fp.floquet_radius(CRANE.problem, slots.slots, slots.schedule, blend=slots.blend)
-    assert found.radius == pytest.approx(0.0485, abs=5e-4)
-    assert found.period == pytest.approx(5.3)
-    for values in found.eigenvalues.values():
+    floquet = fp.floquet_radius(CRANE.problem, slots.slots, slots.schedule, blend=slots.blend)
+    assert floquet.radius == pytest.approx(0.0485, abs=5e-4)
+    assert floquet.period == pytest.approx(5.3)
+    for values in floquet.eigenvalues.values():
         assert values.real.max() == pytest.approx(0.0, abs=1e-6)
 
 
@@ -65,9 +65,9 @@ def period_map(problem: fp.Problem, controller: Controller, period: float) -> np
     size, cycles, names = 1e-4, round(period / problem.period), problem.plant.state.elements
     before, after = [], []
     for name in names:
-        found = run(replace(problem, start={e: size * (e == name) for e in names}), controller)
-        at = np.arange(cycles, found.cycles, cycles)
-        ends = np.hstack([found["state"][at], found["command"][at - 1]]) / size
+        result = run(replace(problem, start={e: size * (e == name) for e in names}), controller)
+        at = np.arange(cycles, result.cycles, cycles)
+        ends = np.hstack([result["state"][at], result["command"][at - 1]]) / size
         before.append(ends[:-1])
         after.append(ends[1:])
     return np.linalg.lstsq(np.vstack(before), np.vstack(after), rcond=1e-9)[0].T
@@ -80,8 +80,8 @@ def test_nonlinear_run_shrinks_by_the_floquet_radius():
     away = []
     for period in (5e-3, 1e-3):
         problem = crane({}, period=period, duration=10.6 + 2 * period, limits=fp.Limits())
-        found = np.abs(np.linalg.eigvals(period_map(problem, slots, 5.3))).max()
-        away.append(abs(found / radius - 1))
+        result = np.abs(np.linalg.eigvals(period_map(problem, slots, 5.3))).max()
+        away.append(abs(result / radius - 1))
     assert away[0] < 0.03
     assert away[1] < 0.01
 
@@ -114,23 +114,23 @@ def test_one_slot_alone_has_the_radius_of_its_eigenvalues():
     """Without a switch one period is e^(A T), whose radius is e^(largest real part T)."""
     for integral in (False, True):
         slot = fp.Slot("q2", fp.Exponential(rate=4.0, integral=integral))
-        found = fp.floquet_radius(MASSES.problem, [slot], fp.Periodic({"q2": 1.5}), blend=0.1)
-        assert found.eigenvalues["q2"].size == 4 + integral
-        assert found.eigenvalues["q2"].real.max() == pytest.approx(-0.1, abs=1e-3)
-        assert found.radius == pytest.approx(np.exp(1.5 * found.eigenvalues["q2"].real.max()), rel=1e-9)
+        floquet = fp.floquet_radius(MASSES.problem, [slot], fp.Periodic({"q2": 1.5}), blend=0.1)
+        assert floquet.eigenvalues["q2"].size == 4 + integral
+        assert floquet.eigenvalues["q2"].real.max() == pytest.approx(-0.1, abs=1e-3)
+        assert floquet.radius == pytest.approx(np.exp(1.5 * floquet.eigenvalues["q2"].real.max()), rel=1e-9)
 
 
 def test_no_radius_without_a_set_point_or_a_period():
     """The reason is said."""
     slots = CRANE.controllers["slots"]
-    chosen = fp.ByError({"cart": 1.0, "angle": 1.0}, dwell=0.5)
-    found = fp.floquet_radius(CRANE.problem, slots.slots, chosen)
-    assert found.radius is None
-    assert found.reason == "the schedule is not periodic"
+    selection = fp.ByError({"cart": 1.0, "angle": 1.0}, dwell=0.5)
+    floquet = fp.floquet_radius(CRANE.problem, slots.slots, selection)
+    assert floquet.radius is None
+    assert floquet.reason == "the schedule is not periodic"
     moving = replace(CRANE.problem, reference=fp.Trajectory(lambda t: {"cart": 0.1 * t, "angle": 0 * t}))
-    found = fp.floquet_radius(moving, slots.slots, slots.schedule)
-    assert found.radius is None
-    assert "still moves" in found.reason
+    floquet = fp.floquet_radius(moving, slots.slots, slots.schedule)
+    assert floquet.radius is None
+    assert "still moves" in floquet.reason
 
 
 # Relative orders
@@ -203,25 +203,25 @@ def chosen(schedule: Schedule, **changes: Any) -> fp.Run:
 def test_by_error_keeps_dwell_and_hysteresis():
     """A slot ends when it has lasted the dwell and another weighted error is clearly larger; then and not otherwise."""
     weights, dwell, hysteresis = np.array([1.0, 5.0]), 0.7, 0.2
-    found = chosen(fp.ByError({"cart": 1.0, "angle": 5.0}, dwell=dwell, hysteresis=hysteresis))
-    slot, scores = found["slot"][:, 0].astype(int), weights * np.abs(found["error"])
-    assert len(switches(found)) > 10
-    assert min(b - a for a, b, _ in found.spans()[:-1]) == pytest.approx(dwell)
+    result = chosen(fp.ByError({"cart": 1.0, "angle": 5.0}, dwell=dwell, hysteresis=hysteresis))
+    slot, scores = result["slot"][:, 0].astype(int), weights * np.abs(result["error"])
+    assert len(switches(result)) > 10
+    assert min(b - a for a, b, _ in result.spans()[:-1]) == pytest.approx(dwell)
     assert slot[0] == np.argmax(scores[0])
-    for start, end, active in found.spans():
-        first, last = round(start / found.period), round(end / found.period)
-        free = np.arange(first + round(dwell / found.period), min(last + 1, found.cycles))
+    for start, end, active in result.spans():
+        first, last = round(start / result.period), round(end / result.period)
+        free = np.arange(first + round(dwell / result.period), min(last + 1, result.cycles))
         clear = scores[free, 1 - active] > (1 + hysteresis) * scores[free, active]
         assert not clear[:-1].any()
-        assert not clear.size or clear[-1] == (last < found.cycles)
+        assert not clear.size or clear[-1] == (last < result.cycles)
 
 
 def test_by_look_ahead_keeps_the_dwell():
     """No slot is shorter; and with a hysteresis that no prediction exceeds the first slot stays for ever."""
     weights = {"cart": 1.0, "angle": 1.0}
-    found = chosen(fp.ByLookAhead(weights, dwell=1.0, hysteresis=0.2))
-    assert len(switches(found)) > 10
-    assert min(b - a for a, b, _ in found.spans()[:-1]) >= 1.0 - 1e-9
+    result = chosen(fp.ByLookAhead(weights, dwell=1.0, hysteresis=0.2))
+    assert len(switches(result)) > 10
+    assert min(b - a for a, b, _ in result.spans()[:-1]) >= 1.0 - 1e-9
     assert len(chosen(fp.ByLookAhead(weights, dwell=1.0, hysteresis=1e9)).spans()) == 1
 
 
@@ -248,16 +248,16 @@ def test_a_slot_without_gain_is_not_chosen():
     """The angle has the larger error; but tilted by 0.2 rad the force's effect on it is below 99 % of that at the start."""
     schedule = fp.ByError({"cart": 1e-6, "angle": 1.0}, dwell=0.01)
     slots = replace(CRANE.controllers["slots exact model"].controller, schedule=schedule, smallest_gain=0.99)
-    found = run(crane({"cart": 0.1}, duration=2.0), fp.ExactModel(slots))
-    gain = angle_gain(found["state.angle"])
+    result = run(crane({"cart": 0.1}, duration=2.0), fp.ExactModel(slots))
+    gain = angle_gain(result["state.angle"])
     assert gain.min() > 0.99 * gain[0]
-    found = run(crane({"cart": 0.1, "angle'": 0.9}, duration=2.0), fp.ExactModel(slots))
-    gain = angle_gain(found["state.angle"])
+    result = run(crane({"cart": 0.1, "angle'": 0.9}, duration=2.0), fp.ExactModel(slots))
+    gain = angle_gain(result["state.angle"])
     low = gain < 0.99 * gain[0]
     # In the dwell of two cycles an active slot may still lose its gain.
-    assert (found["slot"][2:, 0][low[2:] & low[1:-1] & low[:-2]] == 0).all()
+    assert (result["slot"][2:, 0][low[2:] & low[1:-1] & low[:-2]] == 0).all()
     assert low.sum() > 20
-    assert (found["slot"][:, 0] == 1).any()
+    assert (result["slot"][:, 0] == 1).any()
 
 
 def angle_gain(angle: np.ndarray) -> np.ndarray:
@@ -299,8 +299,8 @@ def test_command_is_continuous_at_switches(name):
     """A slot begins with the last command, and its steps in the next 0.1 s vanish with the period; a jump would not."""
     largest = []
     for period in (5e-3, 2.5e-3):
-        found = run(crane({"cart": -1.0}, period=period, duration=10.6), CRANE.controllers[name])
-        steps, at = np.abs(np.diff(found["command"][:, 0])), switches(found)
+        result = run(crane({"cart": -1.0}, period=period, duration=10.6), CRANE.controllers[name])
+        steps, at = np.abs(np.diff(result["command"][:, 0])), switches(result)
         assert len(at) == 3
         assert steps[at - 1].max() < 1e-12
         largest.append(max(steps[k - 1 : k + round(0.1 / period)].max() for k in at))
@@ -313,30 +313,30 @@ def test_without_blend_the_command_jumps():
     largest = []
     for period in (5e-3, 2.5e-3):
         slots = replace(CRANE.controllers["slots"], blend=0.0)
-        found = run(crane({"cart": -1.0}, period=period, duration=10.6), slots)
-        steps = np.abs(np.diff(found["command"][:, 0]))
-        largest.append(steps[switches(found)].max())
+        result = run(crane({"cart": -1.0}, period=period, duration=10.6), slots)
+        steps = np.abs(np.diff(result["command"][:, 0]))
+        largest.append(steps[switches(result)].max())
     assert largest[1] > 0.9 * largest[0] > 0.5
 
 
-def own_law(found: fp.Run, name: str, rate: float) -> np.ndarray:
+def own_law(run_: fp.Run, name: str, rate: float) -> np.ndarray:
     """y''^Des = 2 rate e' + rate^2 e towards rest."""
-    return -(2 * rate * found[f"state.{name}'"] + rate**2 * found[f"state.{name}"])
+    return -(2 * rate * run_[f"state.{name}'"] + rate**2 * run_[f"state.{name}"])
 
 
 @pytest.mark.parametrize("name", ["slots", "slots+FPI"])
 @pytest.mark.parametrize("blend", [0.1, 0.3])
 def test_offset_decays_with_the_blend(name, blend):
     """What the desired response is away from the law falls as e^(-t / blend) and begins at what the plant does."""
-    found = run(crane({"cart": -1.0}, duration=5.3), replace(CRANE.controllers[name], blend=blend))
-    (at,) = switches(found)
-    offset = found["desired.angle"] - own_law(found, "angle", 3.0)
-    expected = offset[at] * np.exp(-(found.time[at:] - found.time[at]) / blend)
+    result = run(crane({"cart": -1.0}, duration=5.3), replace(CRANE.controllers[name], blend=blend))
+    (at,) = switches(result)
+    offset = result["desired.angle"] - own_law(result, "angle", 3.0)
+    expected = offset[at] * np.exp(-(result.time[at:] - result.time[at]) / blend)
     assert abs(offset[at]) > 0.1
     np.testing.assert_allclose(offset[at:], expected, atol=1e-9)
-    np.testing.assert_allclose((found["desired.cart"] - own_law(found, "cart", 1.0))[:at], 0, atol=1e-12)
-    begins = found["realised.angle"] if name == "slots+FPI" else found["deformed.angle"]
-    assert found["desired.angle"][at] == pytest.approx(begins[at], rel=1e-9)
+    np.testing.assert_allclose((result["desired.cart"] - own_law(result, "cart", 1.0))[:at], 0, atol=1e-12)
+    begins = result["realised.angle"] if name == "slots+FPI" else result["deformed.angle"]
+    assert result["desired.angle"][at] == pytest.approx(begins[at], rel=1e-9)
 
 
 def test_a_deformation_starts_afresh_with_every_slot():
@@ -345,11 +345,11 @@ def test_a_deformation_starts_afresh_with_every_slot():
     tuned = fp.Tuned(sigmoid, largest_gain=3 * sigmoid.effective_gain())
     slots = CRANE.controllers["slots+FPI"]
     slots = replace(slots, slots=[replace(s, deformation=tuned) for s in slots.slots])
-    found = run(crane({"cart": -1.0}, duration=10.6), slots)
-    assert len(found.spans()) == 4
-    for start, end, slot in found.spans():
-        first, last = round(start / found.period), round(end / found.period) - 1
-        active, other = (found[f"gain_factor_{('cart', 'angle')[k]}"][:, 0] for k in (slot, 1 - slot))
+    result = run(crane({"cart": -1.0}, duration=10.6), slots)
+    assert len(result.spans()) == 4
+    for start, end, slot in result.spans():
+        first, last = round(start / result.period), round(end / result.period) - 1
+        active, other = (result[f"gain_factor_{('cart', 'angle')[k]}"][:, 0] for k in (slot, 1 - slot))
         assert active[first] == 1
         assert active[last] > 1.5
         assert (other[first : last + 1] == 1).all()
@@ -358,22 +358,22 @@ def test_a_deformation_starts_afresh_with_every_slot():
 def test_an_integral_starts_afresh_with_every_slot():
     """Bumpless: it begins where it cancels the feedback of error and rate, whatever it was at the end of the slot before."""
     slots, problem = TANKS.controllers["slots"], replace(TANKS.problem, duration=480.0, measure_from=0.0)
-    found = run(problem, replace(slots, blend=0.0))
+    result = run(problem, replace(slots, blend=0.0))
     chain = output_chain(problem.plant, "h2")
     of_integral, of_error, of_rate = fp.Exponential(rate=0.1).gains(2)
 
     def feedback(cycle: int) -> float:
-        rate = float(chain.states(found["state"][cycle], problem.plant.approximate)[1])
-        return of_error * found["error.h2"][cycle] - of_rate * rate
+        rate = float(chain.states(result["state"][cycle], problem.plant.approximate)[1])
+        return of_error * result["error.h2"][cycle] - of_rate * rate
 
-    lower = [(round(a / found.period), round(b / found.period)) for a, b, slot in found.spans() if slot == 0]
+    lower = [(round(a / result.period), round(b / result.period)) for a, b, slot in result.spans() if slot == 0]
     assert len(lower) == 4
     for (_, ended), (first, _) in pairwise(lower):
         begun = -feedback(first) / of_integral
         # With blend = 0 the law is joined in the second cycle; by then one cycle's error was added.
-        used = (found["desired.h2"][first + 1] - feedback(first + 1)) / of_integral
-        assert used == pytest.approx(begun + found.period * found["error.h2"][first], rel=1e-9)
-        before = (found["desired.h2"][ended - 1] - feedback(ended - 1)) / of_integral
+        used = (result["desired.h2"][first + 1] - feedback(first + 1)) / of_integral
+        assert used == pytest.approx(begun + result.period * result["error.h2"][first], rel=1e-9)
+        before = (result["desired.h2"][ended - 1] - feedback(ended - 1)) / of_integral
         assert abs(before - begun) > 0.1 * abs(begun)
 
 
@@ -381,10 +381,10 @@ def test_blanked_cycles_keep_the_distance():
     """In the first cycles of a slot the request keeps its distance from the desired response; without blank it does not."""
     for blank in (0, 4):
         slots = replace(CRANE.controllers["slots+FPI"], blank=blank)
-        found = run(crane({"cart": -1.0}, duration=10.6), slots)
-        away = found["deformed"] - found["desired"]
-        for k in switches(found):
-            distance = away[k : k + 6, int(found["slot"][k, 0])]
+        result = run(crane({"cart": -1.0}, duration=10.6), slots)
+        away = result["deformed"] - result["desired"]
+        for k in switches(result):
+            distance = away[k : k + 6, int(result["slot"][k, 0])]
             assert np.ptp(distance[:4]) < 1e-9 if blank else np.ptp(distance[:4]) > 1e-3
             assert abs(distance[4] - distance[3]) > 1e-5
 
@@ -392,15 +392,15 @@ def test_blanked_cycles_keep_the_distance():
 def test_too_little_gain_holds_the_command():
     """Held in exactly the cycles in which the active slot's gain is below its share, and the status says so."""
     slots = replace(CRANE.controllers["slots exact model"].controller, smallest_gain=0.995)
-    found = run(crane({"cart": -1.0}, duration=10.6), fp.ExactModel(slots))
-    gain = angle_gain(found["state.angle"])
-    cart_gain = gain / np.cos(found["state.angle"])
-    share = np.where(found["slot"][:, 0] == 1, gain / gain[0], cart_gain / cart_gain[0])
-    held = found["slot_held"][:, 0] > 0.5
-    assert 20 < held.sum() < found.cycles / 2
+    result = run(crane({"cart": -1.0}, duration=10.6), fp.ExactModel(slots))
+    gain = angle_gain(result["state.angle"])
+    cart_gain = gain / np.cos(result["state.angle"])
+    share = np.where(result["slot"][:, 0] == 1, gain / gain[0], cart_gain / cart_gain[0])
+    held = result["slot_held"][:, 0] > 0.5
+    assert 20 < held.sum() < result.cycles / 2
     np.testing.assert_array_equal(held, share < 0.995)
-    np.testing.assert_array_equal(found["status"][:, 0], np.where(held, Status.HELD, Status.OK))
-    steps = np.diff(found["command"][:, 0])
+    np.testing.assert_array_equal(result["status"][:, 0], np.where(held, Status.HELD, Status.OK))
+    steps = np.diff(result["command"][:, 0])
     assert np.abs(steps[held[1:]]).max() == 0
     assert np.abs(steps[~held[1:]]).max() > 1e-3
 
@@ -424,14 +424,14 @@ def test_inputs_of_other_slots_keep_their_command():
     law = fp.Exponential(rate=2.0)
     deformation = fp.Sigmoid(gain=-1.0, shift=0.3, scale=5.0)
     pair = (fp.Slot("a", law, deformation, input="Fa"), fp.Slot("b", law, deformation, input="Fb"))
-    found = run(problem, fp.Slotted(pair, fp.Periodic({"a": 0.5, "b": 0.5}), blend=0.05))
-    moved, slot = np.abs(np.diff(found["command"], axis=0)) > 0, found["slot"][1:, 0].astype(int)
-    assert not moved[slot == 0, 1].any()
-    assert not moved[slot == 1, 0].any()
-    assert moved[slot == 0, 0].sum() > 90
-    assert moved[slot == 1, 1].sum() > 90
+    result = run(problem, fp.Slotted(pair, fp.Periodic({"a": 0.5, "b": 0.5}), blend=0.05))
+    shifted, slot = np.abs(np.diff(result["command"], axis=0)) > 0, result["slot"][1:, 0].astype(int)
+    assert not shifted[slot == 0, 1].any()
+    assert not shifted[slot == 1, 0].any()
+    assert shifted[slot == 0, 0].sum() > 90
+    assert shifted[slot == 1, 1].sum() > 90
     # What the commands mean by the model, of mass 1, is the stored request of both, whether active or not.
-    np.testing.assert_allclose(found["deformed"], found["command"] - found["state"][:, :2], atol=1e-12)
+    np.testing.assert_allclose(result["deformed"], result["command"] - result["state"][:, :2], atol=1e-12)
     assert "needs the name of its input. Valid: Fa, Fb." in refused(
         problem, fp.Slotted((fp.Slot("a", law),), fp.Periodic({"a": 0.5}), blend=0.05)
     )
@@ -664,23 +664,23 @@ MEASURED = {
 }
 
 
-def rms(problem: fp.Problem, found: fp.Run) -> np.ndarray:
+def rms(problem: fp.Problem, run_: fp.Run) -> np.ndarray:
     """Of every judged error, from `measure_from` on."""
-    assert found.stop is None
-    return np.sqrt(np.mean(found["error"][round(problem.measure_from / found.period) :] ** 2, axis=0))
+    assert run_.stop is None
+    return np.sqrt(np.mean(run_["error"][round(problem.measure_from / run_.period) :] ** 2, axis=0))
 
 
 @pytest.mark.parametrize("name", MEASURED)
 def test_shipped_problems_measure_what_they_say(name):
     """Adaptation improves slots by a wrong model everywhere, on masses and tanks beyond RHC without it."""
     task = fp.load_problem(name)
-    found = {}
+    collected = {}
     for controller, expected in MEASURED[name].items():
-        found[controller] = rms(task.problem, run(task.problem, task.controllers[controller]))
-        assert found[controller] == pytest.approx(expected, rel=0.06), controller
-    assert (found["slots+FPI"] < 0.5 * found["slots"]).all()
+        collected[controller] = rms(task.problem, run(task.problem, task.controllers[controller]))
+        assert collected[controller] == pytest.approx(expected, rel=0.06), controller
+    assert (collected["slots+FPI"] < 0.5 * collected["slots"]).all()
     if name in ("mass_spring_slots", "two_tanks_slots"):
-        assert (found["slots+FPI"] < 0.01 * found["RHC"]).all()
+        assert (collected["slots+FPI"] < 0.01 * collected["RHC"]).all()
 
 
 def test_slots_of_the_cart_pole_are_the_wrong_plan():
@@ -697,11 +697,11 @@ def test_slots_of_the_cart_pole_are_the_wrong_plan():
 
 def test_a_saved_run_keeps_its_slots(tmp_path):
     """The signal, and with it the spans, survive saving; other controllers have none."""
-    found = run(crane({"cart": -1.0}, duration=6.0), CRANE.controllers["slots+FPI"])
-    found.save(tmp_path / "run.npz")
+    result = run(crane({"cart": -1.0}, duration=6.0), CRANE.controllers["slots+FPI"])
+    result.save(tmp_path / "run.npz")
     loaded = fp.load_run(tmp_path / "run.npz")
-    np.testing.assert_array_equal(loaded["slot"], found["slot"])
-    assert loaded.spans() == found.spans()
+    np.testing.assert_array_equal(loaded["slot"], result["slot"])
+    assert loaded.spans() == result.spans()
     assert np.array(loaded.spans()) == pytest.approx(np.array([(0, 1.4, 0), (1.4, 5.3, 1), (5.3, 6.0, 0)]))
     brief = replace(pendulum_problem(), duration=0.02)
     assert run(brief, fp.ComputedTorque(fp.Exponential(rate=8.0))).spans() == []

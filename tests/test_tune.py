@@ -141,17 +141,17 @@ def records(folder: Path) -> list[dict[str, Any]]:
 
 def test_every_controller_gets_the_same_budget_and_none_gets_worse(task, tmp_path):
     """As many trials each, besides the settings of the file; a gain of -0.1 is too timid and is found to be."""
-    found = fp.tune(task, trials=8, seed=1, folder=tmp_path / "t")
+    tuned = fp.tune(task, trials=8, seed=1, folder=tmp_path / "t")
     tried = records(tmp_path / "t")
     assert {n: [r["trial"] for r in tried if r["controller"] == n] for n in ("CTC", "CTC+FPI")} == {
         n: list(range(-1, 8)) for n in ("CTC", "CTC+FPI")
     }
-    assert all(e.cost <= e.cost_before for e in found.entries)
-    adaptive = found.entries[1]
+    assert all(e.cost <= e.cost_before for e in tuned.entries)
+    adaptive = tuned.entries[1]
     assert adaptive.cost < 0.5 * adaptive.cost_before
-    assert found.untouched == ("CTC exact",)
+    assert tuned.untouched == ("CTC exact",)
     # The cost is what a comparison would report, of the settings as they were written down.
-    changed = with_tuned(task, {e.name: e.settings for e in found.entries})
+    changed = with_tuned(task, {e.name: e.settings for e in tuned.entries})
     run = fp.simulate(task.problem, changed.controllers["CTC+FPI"], seed=0, compiled=False)
     error = fp.measure(task.problem, run).rms_error["y"]
     # Over 1.5 s the reference sin(2 t) moves between 0 and 1, so the relative error is the error itself.
@@ -165,13 +165,13 @@ def test_any_metric_with_a_direction_may_be_tuned_by(task, tmp_path):
     )
     own = replace(task, metrics=(*task.metrics, largest))
     for name, sign in (("max_error.y", 1), ("share_inside", -1)):
-        found = fp.tune(own, trials=4, seed=0, folder=tmp_path / name, controllers=["CTC+FPI"], metric=name)
-        changed = with_tuned(task, {e.name: e.settings for e in found.entries}).controllers["CTC+FPI"]
+        tuned = fp.tune(own, trials=4, seed=0, folder=tmp_path / name, controllers=["CTC+FPI"], metric=name)
+        changed = with_tuned(task, {e.name: e.settings for e in tuned.entries}).controllers["CTC+FPI"]
         metrics = fp.measure(own.problem, fp.simulate(own.problem, changed, seed=0, compiled=False), own.metrics)
         metric, _, element = name.partition(".")
-        assert found.entries[0].cost == pytest.approx(sign * metrics[metric][element])
-        assert found.entries[0].cost < found.entries[0].cost_before
-        assert found.facts()["metric"] == name
+        assert tuned.entries[0].cost == pytest.approx(sign * metrics[metric][element])
+        assert tuned.entries[0].cost < tuned.entries[0].cost_before
+        assert tuned.facts()["metric"] == name
     with pytest.raises(OutputError, match="metric was"):
         fp.tune(own, trials=4, seed=0, folder=tmp_path / "max_error.y", controllers=["CTC+FPI"], metric="share_inside")
 
@@ -205,15 +205,15 @@ def test_failing_trials_cost_a_finite_penalty(task, tmp_path):
     wild = replace(
         task, tuning={"CTC+FPI": {"deformation.gain": fp.Span(-1e4, -1e3), "deformation.scale": fp.Span(1e5, 1e6)}}
     )
-    found = fp.tune(wild, trials=4, seed=0, folder=tmp_path / "t")
+    tuned = fp.tune(wild, trials=4, seed=0, folder=tmp_path / "t")
     costs = [r["cost"] for r in records(tmp_path / "t")]
     assert all(0 < c <= 2 * PENALTY for c in costs)
-    assert found.entries[0].failed == 4
-    assert found.entries[0].settings == {"deformation.gain": -0.1, "deformation.scale": 20.0}
+    assert tuned.entries[0].failed == 4
+    assert tuned.entries[0].settings == {"deformation.gain": -0.1, "deformation.scale": 20.0}
     refused = replace(task, tuning={"CTC+FPI": {"deformation.scale": fp.Span(-2.0, -1.0)}})
-    found = fp.tune(refused, trials=1, seed=0, folder=tmp_path / "refused")
+    tuned = fp.tune(refused, trials=1, seed=0, folder=tmp_path / "refused")
     assert records(tmp_path / "refused")[1]["cost"] == 2 * PENALTY
-    assert found.entries[0].settings == {"deformation.scale": 20.0}
+    assert tuned.entries[0].settings == {"deformation.scale": 20.0}
 
 
 def test_a_disturbed_study_finds_what_a_calm_one_finds(task, tmp_path):

@@ -60,8 +60,8 @@ def test_tuner_settles_at_its_target_in_noise(start, target):
     tuned = fp.Tuned(fp.Affine(gain=-2 * start), largest_gain=1.9, target=target)
     layout = tuned.memory(("q",))
     r, n, m = ca.SX.sym("r"), ca.SX.sym("n"), ca.SX.sym("m", layout.size)
-    request, following = tuned.step(r, r + n, ca.SX(0), layout.split(m))
-    step = ca.Function("s", [ca.vertcat(r, m), n], [ca.vertcat(request, layout.join(following))])
+    request, next_memory = tuned.step(r, r + n, ca.SX(0), layout.split(m))
+    step = ca.Function("s", [ca.vertcat(r, m), n], [ca.vertcat(request, layout.join(next_memory))])
     noise = np.random.default_rng(1).standard_normal((1, 40_000))
     log = step.mapaccum("run", noise.size)(np.append(0.0, layout.start()), noise).full()
     gain = start * log[1 + layout.slice("tuner_factor").start, 10_000:]
@@ -138,8 +138,8 @@ def test_tuner_leaves_a_saturated_two_cycle():
     tuned = fp.Tuned(sigmoid, largest_gain=1.5)
     layout = tuned.memory(("q",))
     r, d, m = ca.SX.sym("r"), ca.SX.sym("d"), ca.SX.sym("m", layout.size)
-    request, following = tuned.step(r, 4 * r, d, layout.split(m))
-    step = ca.Function("s", [r, d, m], [request, layout.join(following)])
+    request, next_memory = tuned.step(r, 4 * r, d, layout.split(m))
+    step = ca.Function("s", [r, d, m], [request, layout.join(next_memory)])
     memory, value = layout.start(), 30.0
     for _ in range(400):
         value, memory = step(value, 1.0, memory)

@@ -115,13 +115,13 @@ def test_real_plant_under_adaptation_moves_like_the_model(comparison):
 
 def test_cases_that_do_not_work_are_explained(comparison):
     """Absolute effort, and a scale below the slew of the desired response: the verdict gives the reason."""
-    said = {s.split(" ")[0] + s: s for s in comparison.verdict}
+    sentences = {s.split(" ")[0] + s: s for s in comparison.verdict}
     effort = next(s for s in comparison.verdict if s.startswith("RHC+FPI, absolute effort"))
     assert "absolute effort" in effort
     assert "feedforward" in effort
     slew = next(s for s in comparison.verdict if s.startswith("RHC+FPI, stiff, small S"))
     assert "raise its scale S" in slew
-    assert said
+    assert sentences
 
 
 def test_headline_is_about_the_named_pair(comparison):

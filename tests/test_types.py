@@ -45,8 +45,8 @@ def uses_of_any(source: str) -> list[int]:
 
 
 def _annotations(node: ast.AST) -> list[ast.expr]:
-    found = [getattr(node, "annotation", None), getattr(node, "returns", None)]
-    return [a for a in found if isinstance(a, ast.expr)]
+    result = [getattr(node, "annotation", None), getattr(node, "returns", None)]
+    return [a for a in result if isinstance(a, ast.expr)]
 
 
 @pytest.mark.parametrize("package", CORE)

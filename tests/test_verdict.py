@@ -39,29 +39,29 @@ def judged(deformation, gain=1.6, **changes):
 
 def test_help_is_stated_with_numbers():
     """Which error, from what to what, by which factor, at which price."""
-    found = judged(fp.Sigmoid(gain=-0.5, scale=10.0))
-    assert found["adaptive"].pair == "plain"
-    assert found.verdict[0].startswith("adaptive lowers the rms error of y from")
-    assert "times less" in found.verdict[0]
+    sentences = judged(fp.Sigmoid(gain=-0.5, scale=10.0))
+    assert sentences["adaptive"].pair == "plain"
+    assert sentences.verdict[0].startswith("adaptive lowers the rms error of y from")
+    assert "times less" in sentences.verdict[0]
 
 
 def test_too_small_a_scale_is_recognised():
     """The desired response outruns the map's step limit: the verdict names S and by how much to raise it."""
-    found = judged(fp.Sigmoid(gain=-0.5, scale=1e-3))
-    assert "raise its scale S" in found.verdict[0]
+    sentences = judged(fp.Sigmoid(gain=-0.5, scale=1e-3))
+    assert "raise its scale S" in sentences.verdict[0]
 
 
 def test_too_large_a_gain_is_recognised():
     """Beyond the linear limit the iteration is no contraction; the verdict says so and gives admissible gains."""
-    found = judged(fp.Rotation(fraction=1.4, radius=1e4))
-    assert "is too large" in found.verdict[0]
-    assert found["adaptive"].contraction.predicted > 1
+    sentences = judged(fp.Rotation(fraction=1.4, radius=1e4))
+    assert "is too large" in sentences.verdict[0]
+    assert sentences["adaptive"].contraction.predicted > 1
 
 
 def test_no_difference_is_said():
     """With an exact model there is nothing to gain."""
-    found = judged(fp.Sigmoid(gain=-0.5, scale=10.0), gain=1.0)
-    assert "no clear difference" in found.verdict[0] or "does not help" in found.verdict[0]
+    sentences = judged(fp.Sigmoid(gain=-0.5, scale=10.0), gain=1.0)
+    assert "no clear difference" in sentences.verdict[0] or "does not help" in sentences.verdict[0]
 
 
 def test_controller_that_cannot_serve_is_skipped_with_its_reason():
@@ -77,10 +77,10 @@ def test_controller_that_cannot_serve_is_skipped_with_its_reason():
         "CTC": fp.ComputedTorque(TRACK),
         "RHC": fp.RecedingHorizon(fp.ReducedGradient(iterations=5, tolerance=1e-6)),
     }
-    found = compare(Task("case", Path("case.py"), "", "", problem, controllers), seed=0, compiled=False)
-    assert "needs Problem(horizon=...)" in found.skipped["RHC"]
-    assert found.verdict[-1].startswith("Not run: RHC")
-    assert found.outcome is Outcome.NOT_COMPARABLE
+    comparison = compare(Task("case", Path("case.py"), "", "", problem, controllers), seed=0, compiled=False)
+    assert "needs Problem(horizon=...)" in comparison.skipped["RHC"]
+    assert comparison.verdict[-1].startswith("Not run: RHC")
+    assert comparison.outcome is Outcome.NOT_COMPARABLE
 
 
 def test_unknown_entry_offers_the_nearest():
@@ -179,11 +179,11 @@ def _with_second_error(run):
 def test_how_much_to_raise_the_scale_is_a_quarter_more_than_is_needed():
     """The largest change of the desired response in a cycle over the map's largest step, and a quarter; then it is silent."""
     deformation = fp.Sigmoid(gain=-0.5, scale=1e-3)
-    found = judged(deformation)
-    largest = np.abs(np.diff(found["plain"].run["desired.y"])).max()
+    sentences = judged(deformation)
+    largest = np.abs(np.diff(sentences["plain"].run["desired.y"])).max()
     needed = largest / deformation.largest_step()
-    assert f"changes by up to {largest:.3g} in one cycle" in found.verdict[0]
-    assert f"raise its scale S at least {1.25 * needed:.2g} times" in found.verdict[0]
+    assert f"changes by up to {largest:.3g} in one cycle" in sentences.verdict[0]
+    assert f"raise its scale S at least {1.25 * needed:.2g} times" in sentences.verdict[0]
     assert "raise its scale" not in judged(replace(deformation, scale=1.25 * needed * 1e-3)).verdict[0]
 
 

@@ -99,10 +99,10 @@ def test_parameters_are_not_compiled_in():
     loops = [close_loop(replace(problem, plant=p), controller) for p in (problem.plant, heavier)]
     assert loops[0].function.n_instructions() == loops[1].function.n_instructions()
     memories = [loop.memory.start() for loop in loops]
-    given = [loops[0].function(m)[0].full() for m in memories]
+    values = [loops[0].function(m)[0].full() for m in memories]
     other = loops[1].function(memories[1])[0].full()
-    assert not np.array_equal(given[0], given[1])
-    np.testing.assert_array_equal(given[1], other)
+    assert not np.array_equal(values[0], values[1])
+    np.testing.assert_array_equal(values[1], other)
 
 
 LONG = """

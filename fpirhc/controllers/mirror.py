@@ -2,8 +2,8 @@
 
     commands -> believed dead time -> believed actuator lag -> model -> [sensors' quanta -> late samples -> estimator] -> modelled
 
-Where the response itself is measured it is that of this instant, f^(x_k, u_{k-1}), u_{k-1} what acted by the beliefs. Where it is
-estimated from samples, a twin of the plant makes them (`twin`).
+Where the response itself is measured, the model's response is that of this instant, f^(x_k, u_{k-1}), with u_{k-1} the input that
+acted according to the beliefs. Where the response is estimated from samples, a twin of the plant produces them (`twin`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,12 @@ __all__ = ["MEASURED", "measured_state", "mirror_blocks", "with_measured_state"]
 
 
 def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
-    """Return the block that writes '_modelled', with what it remembers; none where the map is given its own last request."""
+    """Return the block that writes '_modelled', with what it remembers; none where the deformation is not model-referenced.
+
+    Args:
+        problem: the problem.
+        deformation: of the controller.
+    """
     mirror = deformation.mirror
     if mirror is None:
         return [], []
@@ -38,7 +43,12 @@ def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Bloc
 
 
 def with_measured_state(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
-    """Return the blocks, before them one that names the state as the measured one where some block reads that."""
+    """Return the blocks, and before them one that writes the measured state where a block reads it.
+
+    Args:
+        plant: the plant.
+        blocks: of the controller.
+    """
     if not any(MEASURED in block.reads for block in blocks):
         return list(blocks)
     target = measured_state(plant)

@@ -16,11 +16,11 @@ from fpirhc.symbolic.layout import Expression, Signal, scalar
 from fpirhc.task.problem import Problem
 
 MEASURED = "_measured_state"  # the state that the response belongs to, where a controller may act on a predicted one
-NONE = 1e-9  # a fraction of a cycle below this is none
+NONE = 1e-9  # a fraction of a cycle below this counts as zero
 
 
 def measured_state(plant: Plant) -> Signal:
-    """The signal of the measured state."""
+    """Return the signal of the measured state."""
     return Signal(MEASURED, plant.state.elements, plant.state.units)
 
 
@@ -28,8 +28,12 @@ def measured_state(plant: Plant) -> Signal:
 class Path:
     """The believed way from the commands to the model.
 
-    `counts`: whether the first cycles differ from the others. The whole cycles of the measurement's dead time are put before the
-    model: the twin lives in the time of the samples.
+    The whole cycles of the measurement's dead time come before the model: the twin runs in the time of the samples.
+
+    Args:
+        problem: the problem.
+        mirror: the beliefs.
+        counts: whether the first cycles differ from the others.
     """
 
     problem: Problem
@@ -43,7 +47,7 @@ class Path:
 
     @property
     def fraction(self) -> float:
-        """What is left of it, in cycles."""
+        """The rest of the measurement's dead time, in cycles."""
         rest = self.mirror.measurement - self.late
         return rest if rest > NONE else 0.0
 
@@ -55,14 +59,14 @@ class Path:
 
     @property
     def queue(self) -> Queue:
-        """Of the commands; the newest one is that of the last cycle."""
+        """Queue of the commands; the newest one is that of the last cycle."""
         if isinstance(self.mirror.cycles, tuple):
             return Queue(tuple(c + self.late for c in self.mirror.cycles))
         return Queue(self.mirror.cycles + self.late)
 
     @property
     def memory(self) -> tuple[Signal, ...]:
-        """Commands on their way, what lagging actuators do, and the cycles so far."""
+        """Commands on their way, positions of lagging actuators, and the number of cycles so far."""
         plant, length = self.problem.plant, self.queue.length
         start = tuple(self.problem.dead_time.commands_before(plant))
         names = tuple(f"{e}@{k}" for k in range(1, length) for e in plant.input.elements)
@@ -73,13 +77,13 @@ class Path:
 
     @property
     def reads(self) -> tuple[Signal, ...]:
-        """What every mirror reads."""
+        """Signals that every mirror reads."""
         plant = self.problem.plant
         before = Signal("_command_before", plant.input.elements, plant.input.units)
         return measured_state(plant), before, plant.parameter
 
     def acted(self, s: Signals) -> tuple[Expression, Expression, dict[str, Expression]]:
-        """What acted in the last cycle: at its end, in the mean, and what is remembered."""
+        """Return the input that acted in the last cycle, at its end and in the mean, and what is remembered."""
         size, newest = self.problem.plant.input.size, s._command_before
         remembered: dict[str, Expression] = {}
         if self.counts:

@@ -31,6 +31,7 @@ from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.optimisers.fixed_point import FixedPoint
+from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
@@ -124,13 +125,6 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     memory = _first_memory(problem, optimiser, ocp, data_of)
     solve = optimiser.step(ocp)
     feedforward_of = _feedforward(problem)
-    reads = (
-        plant.time,
-        like(plant.state, "_plan_state"),
-        plant.parameter,
-        like(plant.input, "_command_shift_last"),
-        like(plant.input, "_command_before"),
-    )
     logged = tuple(scalar(name) for name in optimiser.logged)
     writes = (like(plant.input, "planned"), Signal("solve", _SOLVE), scalar("_solve_status"), *logged)
 
@@ -158,7 +152,13 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         }
 
     own = memory + Layout((scalar("plan_begun"),))
-    return Block("plan", Layout(reads), Layout(writes), step, own, opaque=True)
+    return Block("plan", _plan_reads(plant), Layout(writes), step, own, opaque=True)
+
+
+def _plan_reads(plant: Plant) -> Layout:
+    """Time, state from which the plan starts, parameters, and the command shift and command of the last cycle."""
+    last = like(plant.input, "_command_shift_last"), like(plant.input, "_command_before")
+    return Layout((plant.time, like(plant.state, "_plan_state"), plant.parameter, *last))
 
 
 def _first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> Layout:

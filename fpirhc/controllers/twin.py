@@ -1,12 +1,12 @@
-"""A twin of the plant: what the estimator would show if the plant were the model.
+"""A twin of the plant: the estimator's output if the plant were the model.
 
-The twin is the model with the deformation taken off, f^(x, u) - delta, which is what the plant is believed to do, integrated over
-the cycle; its samples pass the estimator that the plant's pass. What the estimator makes of delta is added again. With an exact
-model delta is zero and both estimates are the same number, late, rounded and smoothed as they are.
+The twin is the model without the deformation, f^(x, u) - delta, which is the believed response of the plant. It is integrated over
+the cycle, and its samples pass the same estimator as the plant's. The estimate of delta is then added again. With an exact model
+delta is zero, and both estimates are the same number, equally late, rounded and smoothed.
 
-A twin would drift away from the plant. So after each cycle it is put where its own estimate of the state is the controller's, and
-what the estimator remembers of it is moved along the same path, a polynomial below the plant's order, which no estimate of the
-response sees: the twin's response is always the model's, and never that of the move.
+A twin would drift away from the plant. After each cycle it is therefore moved to where its own estimate of the state is the
+controller's. The estimator's memory of the twin is moved along the same path, a polynomial below the plant's order, which does not
+change an estimate of the response: the twin's response remains the model's.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def twin_block(path: Path) -> Block:
 
 
 class _Deformations:
-    """Deformations of earlier cycles: the one that acts, and what the estimator shows of them."""
+    """Deformations of earlier cycles: the one that acts, and their share in the estimated response."""
 
     def __init__(self, path: Path) -> None:
         plant = path.problem.plant
@@ -87,7 +87,7 @@ class _Deformations:
         return Signal("mirror_deformations", tuple(f"{e}@{k}" for k in range(1, self._length + 1) for e in self._names))
 
     def seen(self, s: Signals) -> tuple[Expression, Expression, dict[str, Expression]]:
-        """The forcing of every coordinate that stands for the acting deformation, its estimated response, what is remembered."""
+        """Return the forcing that stands for the acting deformation, its estimated response, and what is remembered."""
         size = len(self._names)
         column = ca.vertcat(getattr(s, BEFORE), s.mirror_deformations)
         late = [self._acting.delayed(column[size * j :], size) for j in range(max(w.size for w in self._weights))]

@@ -7,7 +7,8 @@ with the diagonal weights W and gradients w that the limits add,
                v = -Q_uu^-1 (l_u + w_u + B'p'),       P <- Q + A'P'A + (S + B'P'A)'K,     p <- l_s + A'p' + (S + B'P'A)'v,
     forward    du = v + K dx,   dx+ = A dx + B du + c,   lambda = P' dx + p + w,
 
-so that (dx, du, lambda) is Newton's step of all first-order conditions at once. It says whether every Q_uu is positive definite.
+so that (dx, du, lambda) is Newton's step of all first-order conditions at once. A flag shows whether every Q_uu is positive
+definite.
 
 References: D. Q. Mayne, Int. J. Control 3(1), 1966; H. G. Bock, K. J. Plitt, IFAC World Congress 1984, for the gaps.
 """
@@ -51,7 +52,7 @@ def expansion_shapes(ocp: OptimalControl) -> tuple[tuple[int, int], ...]:
 def expand(ocp: OptimalControl) -> ca.Function:
     """Function (U, X, K (nu, ns N), rolled, s0, data, lower, upper) -> the parts of `Expansion`.
 
-    At the plan's own nodes after s_0; or, rolled, at the states that follow with u = clip(U + K (x - X)).
+    The plan is expanded at its own nodes after s_0; where `rolled`, at the states of a rollout with u = clip(U + K (x - X)).
     """
     n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
     node, _, theta = stage_symbols(ocp)
@@ -80,7 +81,11 @@ def sweep(
 ) -> ca.Function:
     """Function (expansion, W, w, costates (ns, N), mu, data) -> (v, K, dx (ns, N + 1), du, costates, ok).
 
-    `places` are the limited states: rows of W and w after those of the inputs. `scales` (nu,), (ns,) are weighed by mu.
+    Args:
+        ocp: the problem.
+        hessian: second derivatives of the quadratic model.
+        places: the limited states: rows of W and w after those of the inputs.
+        scales: of the inputs (nu,) and of the states (ns,), multiplied by mu.
     """
     n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
     p = Expansion(

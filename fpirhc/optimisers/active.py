@@ -14,7 +14,13 @@ _RANK = 1e-9  # relative singular value below which active limits depend on each
 
 @dataclass(frozen=True, eq=False)
 class Active:
-    """rows: J (count, N nu). distances: of the states beyond their limits, positive where violated (count,)."""
+    """Active limits of states.
+
+    Args:
+        rows: J, shape (count, N nu).
+        distances: of the states beyond their limits, positive where violated, shape (count,).
+        complementarity: largest product of a multiplier and the distance of its limit.
+    """
 
     rows: np.ndarray
     distances: np.ndarray
@@ -22,7 +28,7 @@ class Active:
 
     @property
     def count(self) -> int:
-        """How many limits are active."""
+        """Number of active limits."""
         return self.rows.shape[0]
 
 

@@ -4,7 +4,7 @@ With F = T(x) - x, type II takes the weights gamma that make |F_k - dF gamma| sm
 
     x+ = T(x_k) - dT gamma.
 
-Where |F| then grows beyond twice its last value, the iteration goes back to the plain T and forgets its memory. Every call is
+Where |F| then grows beyond twice its last value, the iteration goes back to the plain T and forgets its memory. Every call does
 the same work.
 
 References: D. G. Anderson, J. ACM 12(4), 1965; H. F. Walker, P. Ni, SIAM J. Numer. Anal. 49(4), 2011.
@@ -26,7 +26,10 @@ _GROWTH = 2.0  # growth of |F| after which the memory is dropped
 
 @dataclass(frozen=True)
 class Anderson:
-    """Acceleration with the last `memory` changes; 3 to 10 are usual.
+    """Acceleration with the last changes of an iteration.
+
+    Args:
+        memory: number of changes; 3 to 10 are usual.
 
     Raises:
         InvalidValue: fewer than one.
@@ -42,7 +45,15 @@ class Anderson:
 def iterated(
     function: ca.Function, start: ca.MX, arguments: list[ca.MX], iterations: int, acceleration: Anderson | None
 ) -> ca.MX:
-    """Return x after `iterations` of x <- function(x, *given), a column."""
+    """Return the column x after a number of steps x <- function(x, *arguments).
+
+    Args:
+        function: of a column and of `arguments`.
+        start: first x.
+        arguments: further arguments, constant.
+        iterations: number of steps.
+        acceleration: None: plain steps.
+    """
     x = ca.vec(start)
     if acceleration is None:
         for _ in range(iterations):
@@ -57,7 +68,7 @@ def iterated(
 
 
 def _advance(function: ca.Function, memory: int) -> ca.Function:
-    """Function (state, *given) -> state, with state = (x, T before, F before, dF, dT, number of changes known)."""
+    """Function (state, *arguments) -> state, with state = (x, T before, F before, dF, dT, number of changes known)."""
     size = function.numel_in(0)
     state = ca.MX.sym("state", 3 * size + 2 * size * memory + 1)
     arguments = [ca.MX.sym(function.name_in(k), *function.size_in(k)) for k in range(1, function.n_in())]

@@ -1,10 +1,10 @@
 """The contract of optimisers, and how every plan is judged.
 
-A plan's stationarity is measured by our own adjoint gradient g, never by a solver's word:
+A plan's stationarity is measured by an adjoint gradient g of this package, and not by a solver's status:
 
     stationarity = max |U - clip(U - g / (step c), lower, upper)|,
 
-how far, in the units of the inputs, a scaled projected gradient step would move some input. c is the curvature of the cost
+the largest move of an input, in its unit, by a scaled projected gradient step. c is the curvature of the cost
 rate along each input (`OptimalControl.curvature`), so that the number does not depend on the units of the cost. It is zero
 exactly at points that satisfy the first-order conditions, bounds active or not. A multiplier of a state bound counts only where
 the state is at that bound and with the sign of that bound. Feasibility is the largest violation of a state bound by the rolled
@@ -27,7 +27,7 @@ from fpirhc.symbolic.expression import FINITE, Matrix, is_finite
 from fpirhc.symbolic.layout import Layout
 
 FEASIBLE = 1e-4  # largest violation of a state bound that still counts as kept
-UNKNOWN_ITERATIONS = -1.0  # solver call-outs do not tell their iterations inside a graph
+UNKNOWN_ITERATIONS = -1.0  # a solver that is called inside a graph does not report its iterations
 
 
 class Optimiser(ABC):
@@ -44,26 +44,35 @@ class Optimiser(ABC):
         return {}
 
     def check(self, ocp: OptimalControl) -> None:  # noqa: B027 -- most optimisers serve every problem
-        """Raise NotSupported when the problem has something this optimiser cannot keep."""
+        """Raise if the optimiser cannot serve the problem.
+
+        Raises:
+            NotSupported: the problem has something that this optimiser cannot keep.
+        """
 
     @abstractmethod
     def memory(self, ocp: OptimalControl) -> Layout:
-        """What is kept for the next call: at least the plan, in `plan_inputs`."""
+        """Return the layout of what is remembered for the next call: at least the plan, in `plan_inputs`."""
 
     @abstractmethod
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
-        """The memory for a horizon that starts one stage later."""
+        """Return the memory for a horizon that starts one stage later.
+
+        Args:
+            ocp: the problem.
+            memory: a column in the layout of `memory`.
+        """
 
     @abstractmethod
     def step(self, ocp: OptimalControl) -> ca.Function:
         """Function (s0, data, lower, upper, memory) -> (U (nu, N), diagnostics, memory for the next call).
 
-        diagnostics: cost, stationarity, feasibility, iterations, status. A plan that is not finite is never returned: the
-        remembered one is, with status NON_FINITE.
+        The diagnostics are cost, stationarity, feasibility, iterations and status. A plan that is not finite is never returned;
+        the remembered plan is returned in its place, with the status NON_FINITE.
         """
 
     def converging(self, ocp: OptimalControl) -> ca.Function:
-        """Like `step`, but may stop as soon as the plan is converged, and may work longer: for open-loop solves."""
+        """Function like `step`, for open-loop solves: it may stop where the plan is converged, and it may work longer."""
         return self.step(ocp)
 
     def rescue(self, ocp: OptimalControl) -> ca.Function | None:  # noqa: ARG002
@@ -71,12 +80,23 @@ class Optimiser(ABC):
         return None
 
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:  # noqa: ARG002
-        """Memory to begin a run with, for a first horizon that is known beforehand; nothing unless an optimiser says otherwise."""
+        """Return the memory with which a run begins; the memory's start unless an optimiser overrides it.
+
+        Args:
+            ocp: the problem.
+            state: the first state of the first horizon, shape (ns,).
+            data: of the first horizon, shape (ntheta, N + 1).
+        """
         return self.memory(ocp).start()
 
 
 def require_settings(owner: str, iterations: int, tolerance: float) -> None:
-    """Check what every iterative optimiser is given.
+    """Check the settings of an iterative optimiser.
+
+    Args:
+        owner: name of the optimiser, for the message.
+        iterations: per call.
+        tolerance: of the stationarity.
 
     Raises:
         InvalidValue: fewer than one iteration, or a tolerance that is not positive.
@@ -88,18 +108,18 @@ def require_settings(owner: str, iterations: int, tolerance: float) -> None:
 
 
 def shift(columns: ca.MX) -> ca.MX:
-    """Drop the first stage and repeat the last: the warm start of the next call."""
+    """Return the columns without the first stage and with the last one twice: the warm start of the next call."""
     return columns if columns.shape[1] == 1 else ca.horzcat(columns[:, 1:], columns[:, -1])
 
 
 def clip(columns: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
-    """Clip every stage's input to its box."""
+    """Return every stage's input clipped to its box."""
     stages = columns.shape[1]
     return ca.fmin(ca.fmax(columns, ca.repmat(lower, 1, stages)), ca.repmat(upper, 1, stages))
 
 
 def largest(value: ca.MX) -> ca.MX:
-    """Largest absolute entry."""
+    """Return the largest absolute entry."""
     return ca.norm_inf(ca.vec(value))
 
 
@@ -110,7 +130,7 @@ def stationarity(ocp: OptimalControl, inputs: ca.MX, gradient: ca.MX, lower: ca.
 
 
 def state_violation(ocp: OptimalControl, states: ca.MX) -> ca.MX:
-    """Largest violation of a hard state bound by s_1 ... s_N; zero without bounds."""
+    """Return the largest violation of a hard state bound by s_1 ... s_N; zero without bounds."""
     worst: ca.MX = ca.MX(0)
     for k in np.flatnonzero(ocp.hard).tolist():
         row = states[k, 1:]
@@ -122,7 +142,7 @@ def state_violation(ocp: OptimalControl, states: ca.MX) -> ca.MX:
 
 
 def judge(ocp: OptimalControl) -> ca.Function:
-    """Function (U, s0, data, lower, upper, M) -> (cost, stationarity, feasibility), by our own sweeps.
+    """Function (U, s0, data, lower, upper, M) -> (cost, stationarity, feasibility), by one rollout and one adjoint sweep.
 
     M (ns, N) are the multipliers of the state bounds; zero without them.
     """
@@ -138,7 +158,7 @@ def judge(ocp: OptimalControl) -> ca.Function:
 
 
 def _valid_multipliers(ocp: OptimalControl, states: ca.MX, multipliers: ca.MX) -> ca.MX:
-    """Keep what can be a multiplier: positive at the upper bound, negative at the lower one, zero elsewhere."""
+    """The part that can be a multiplier: positive at the upper bound, negative at the lower one, zero elsewhere."""
     rows = []
     for k in range(ocp.state.size):
         row, values = states[k, 1:], multipliers[k, :]
@@ -151,19 +171,26 @@ def _valid_multipliers(ocp: OptimalControl, states: ca.MX, multipliers: ca.MX) -
 
 
 def sane(s0: ca.MX, data: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
-    """1 when a problem can be posed: finite first state and data, and a box that is not empty; 0 otherwise (NaN included)."""
+    """Return 1 where the first state and the data are finite and the box is not empty, else 0."""
     ordered = ca.logic_and(ca.mmin(lower <= upper), ca.logic_and(ca.mmin(lower <= FINITE), ca.mmin(upper >= -FINITE)))
     return ca.logic_and(is_finite(ca.vertcat(s0, ca.vec(data))), ordered)
 
 
 def remembered_plan(column: ca.MX, size: int, lower: ca.MX, upper: ca.MX) -> ca.MX:
-    """The remembered plan (size, N) inside its box; a poisoned memory is forgotten, for zero inputs."""
+    """Return the remembered plan (size, N) inside its box; in place of a plan that is not finite, zero inputs inside it."""
     usable = ca.if_else(is_finite(column), column, 0)
     return clip(ca.reshape(usable, size, column.numel() // size), lower, upper)
 
 
 def status_of(finite: Matrix, residual: Matrix, violation: Matrix | float, tolerance: float) -> Matrix:
-    """Return the status number of a plan."""
+    """Return the status number of a plan.
+
+    Args:
+        finite: whether the plan and its numbers are finite.
+        residual: its stationarity.
+        violation: the largest violation of a state bound.
+        tolerance: of the stationarity.
+    """
     converged = ca.if_else(residual <= tolerance, int(Status.OK), int(Status.NOT_CONVERGED))
     feasible = ca.if_else(violation <= FEASIBLE, converged, int(Status.INFEASIBLE))
     return ca.if_else(finite, feasible, int(Status.NON_FINITE))

@@ -4,7 +4,7 @@ Entry r of stage i is input r, or a limited state one stage later. Matrices of l
 all stages, then upper ones. With sign 1 for lower, -1 for upper ones, d = sign (w - limit) is a distance, and a multiplier z >= 0
 adds -sign z to the gradient. A multiplier of a state is at most rho: beyond it the limit gives way (exact L1 penalty).
 
-pure        the limits with gamma z > d are equalities with the weight kappa = 1e8 / gamma, the others are not there:
+pure        the limits with gamma z > d are equalities with the weight kappa = 1e8 / gamma, and the others are left out:
             gradient -sign (z - kappa d), and afterwards z <- z - kappa (sign dw + d).
 interior    w - limit - t + e = 0, t z = mu, e (rho - z) = mu: weight kappa = 1 / (t / z + e / (rho - z)) and gradient
             -sign (z - kappa b) with b = d - mu / z + mu / (rho - z).
@@ -25,9 +25,9 @@ from fpirhc.horizon.sweep import Expansion
 from fpirhc.optimisers.scales import Scales
 from fpirhc.symbolic.expression import FINITE
 
-ENOUGH = 0.99  # share of it from which a limit counts as given up
+ENOUGH = 0.99  # share of the largest multiplier from which a limit counts as given up
 STIFF = 1e8  # weight of an equality, in units of 1 / gamma
-BOUNDARY = 0.99  # share of the way to the boundary that a step may go
+BOUNDARY = 0.99  # largest share of the distance to the boundary in one step
 CLOSED = 1e-6  # scaled gap below which a plan counts as a trajectory
 _NONE = 10 * FINITE
 
@@ -41,7 +41,14 @@ class Interior(NamedTuple):
 
 
 class Limited:
-    """The limits of one call; `lower`, `upper` (nu,) are those of the inputs."""
+    """The limits of one call.
+
+    Args:
+        ocp: the problem.
+        scales: its units.
+        lower: lower limits of the inputs, shape (nu,).
+        upper: upper limits of the inputs, shape (nu,).
+    """
 
     def __init__(self, ocp: OptimalControl, scales: Scales, lower: ca.MX, upper: ca.MX) -> None:
         n, nu, places = ocp.stages, ocp.input.size, list(scales.bounded)
@@ -63,16 +70,16 @@ class Limited:
         self._at = ca.if_else(self.present, at, 0)
 
     def entries(self, inputs: ca.MX, states: ca.MX) -> ca.MX:
-        """What is limited, (rows, 2 N), from (nu, N) and (ns, N + 1)."""
+        """Return the entries that can be limited, (rows, 2 N), from inputs (nu, N) and states (ns, N + 1)."""
         once = ca.vertcat(inputs, states[self.places, 1:]) if self.places else inputs
         return ca.horzcat(once, once)
 
     def inputs(self) -> tuple[ca.MX, ca.MX]:
-        """Lower and upper limits of the inputs, (nu,) each."""
+        """Return lower and upper limits of the inputs, (nu,) each."""
         return self._inputs
 
     def on_states(self, rows: ca.MX) -> ca.MX:
-        """Spread the rows of limited states (rows, N) over all states, (ns, N)."""
+        """Return the rows of limited states (rows, N) at their places among all states, (ns, N)."""
         return ca.mtimes(self._spread, rows[self._nu :, :])
 
     def distance(self, p: Expansion) -> ca.MX:
@@ -80,12 +87,12 @@ class Limited:
         return ca.if_else(self.present, self.sign * (self.entries(p.inputs, p.states) - self._at), 1)
 
     def both(self, values: ca.MX) -> ca.MX:
-        """Add up the lower and the upper side, (rows, N), where there is a limit."""
+        """Return the sum of the lower and the upper side, (rows, N), where there is a limit."""
         present_values = ca.if_else(self.present, values, 0)
         return present_values[:, : self._n] + present_values[:, self._n :]
 
     def pushes(self, z: ca.MX, counted: ca.MX | float) -> ca.MX:
-        """Multipliers of states as they enter the gradient, (rows, N), where `counted`."""
+        """Return the multipliers of states as they enter the gradient, (rows, N), where `counted`."""
         return self.both(-self.sign * self.of_states * counted * ca.fmin(ca.fmax(z, 0), self.rho))
 
     def pure(self, p: Expansion, z: ca.MX, slope: ca.MX, gap: ca.MX) -> tuple[ca.MX, ...]:
@@ -93,7 +100,7 @@ class Limited:
         d = self.distance(p)
         slopes = self.entries(slope, ca.MX.zeros(p.states.shape))
         held = ca.logic_and(ca.logic_and(self.of_states == 0, gap < CLOSED), ca.logic_and(z == 0, d == 0))
-        # An input on its limit that the cost holds there has a multiplier.
+        # The cost holds an input on its limit where the gradient is a multiplier of it.
         z = ca.if_else(held, ca.fmax(self.sign * slopes, 0), z)
         capped, active = self._chosen(d, z)
         weight = ca.if_else(active, STIFF / self.reach, 0)
@@ -101,7 +108,7 @@ class Limited:
         return self.both(weight), self.both(lean), z
 
     def pure_multipliers(self, p: Expansion, z: ca.MX, du: ca.MX, dx: ca.MX) -> ca.MX:
-        """Multipliers after a pure step."""
+        """Return the multipliers after a pure step."""
         d = self.distance(p)
         capped, active = self._chosen(d, z)
         next_z = z - STIFF / self.reach * (self.sign * self.entries(du, dx) + d)

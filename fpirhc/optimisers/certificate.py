@@ -1,4 +1,4 @@
-"""What can be said about a plan beyond its residual: how fast the iteration contracts there, and how far the optimum is.
+"""What is known about a plan beyond its residual: how fast the iteration contracts there, and how far the optimum is.
 
 At a plan U with free inputs (not held by an active bound) let H be the exact Hessian of V and M the Hessian of the quadratic
 model, both on the free inputs. One step of the preconditioned iteration multiplies a small error by I - a M^-1 H, which is
@@ -11,8 +11,8 @@ With K < 1, Banach's a-posteriori bound and strong convexity relative to M give,
     |U - U*|_M <= a |h|_M / (1 - K),        V(U) - V(U*) <= g'h / (2 (1 - K_1)),   K_1 = |I - M^-1 H|_M.
 
 Both hold where H varies little between U and U* and the same bounds stay active. H is therefore computed at U and one step further:
-K is the larger of both plus their difference, and where the sets of free inputs differ nothing is said. The ratio of the last two
-steps is not such a bound and is not offered as one.
+K is the larger of both plus their difference. Where the sets of free inputs differ, no bound is given. The ratio of the last two
+steps is not such a bound and is not used as one.
 
 Active limits of states, those with a multiplier, are equations J U = const to first order. H is then the Hessian of the Lagrangian,
 and H, M and g are restricted to the directions Z with J Z = 0; the shortest move back onto the limits is added to the error.
@@ -41,12 +41,18 @@ _AT_BOUND = 1e-9  # relative distance within which an input counts as at its bou
 class Certificate:
     """What is known about a plan.
 
-    stationarity, feasibility: as of the plan, recomputed. factor: K, infinite where nothing can be said.
-    error: bound of the distance to the optimum in the M-norm (square root of cost), NaN where K >= 1. input_error: bound of the
-    error of any input, in its unit. suboptimality: bound of V(U) - V(U*). free: number of free directions. curvature: least
-    eigenvalue of M^-1 H; a plan where it is not positive is no strict minimum. active: number of limits of states with a
-    multiplier. complementarity: largest product of a multiplier and the distance of its limit, in units of the cost. broken: the
-    worst violations of limits in words.
+    Args:
+        stationarity: of the plan, recomputed.
+        feasibility: of the plan, recomputed.
+        factor: K, infinite where it is not known.
+        error: bound of the distance to the optimum in the M-norm (square root of cost), NaN where K >= 1.
+        input_error: bound of the error of any input, in its unit.
+        suboptimality: bound of V(U) - V(U*).
+        free: number of free directions.
+        curvature: least eigenvalue of M^-1 H; a plan where it is not positive is no strict minimum.
+        active: number of limits of states with a multiplier.
+        complementarity: largest product of a multiplier and the distance of its limit, in units of the cost.
+        broken: the worst violations of limits in words.
     """
 
     stationarity: float
@@ -91,7 +97,12 @@ class Certificate:
 
 
 def certify(plan: Plan, *, gain: float = 1.0) -> Certificate:
-    """Return what is known about a plan for an iteration of effective gain `gain` (1: full Gauss-Newton steps)."""
+    """Return what is known about a plan.
+
+    Args:
+        plan: a solved horizon.
+        gain: effective gain of the iteration; 1: full Gauss-Newton steps.
+    """
     _, stationarity, feasibility = plan.verify()
     slope, hessian = _second_order(plan, plan.inputs)
     free, held = _free(plan, plan.inputs, slope), active_limits(plan)

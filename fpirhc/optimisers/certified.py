@@ -21,17 +21,17 @@ from fpirhc.symbolic.expression import FINITE, is_finite
 
 
 class Certified(NamedTuple):
-    """g (nu, N); stationarity, violation, violation of limits that are not given up, and E."""
+    """How far a plan is from the first-order conditions."""
 
-    slope: ca.MX
-    left: ca.MX
+    slope: ca.MX  # g (nu, N)
+    left: ca.MX  # stationarity
     violation: ca.MX
-    broken: ca.MX
-    error: ca.MX
+    broken: ca.MX  # violation of limits that are not given up
+    error: ca.MX  # E
 
 
 def certified(ocp: OptimalControl, limits: Limited, scales: Scales, p: Expansion, z: ca.MX) -> Certified:
-    """Return what is known about an expanded plan with multipliers z (rows, 2 N)."""
+    """Return how far an expanded plan with multipliers z (rows, 2 N) is from the first-order conditions."""
     n = ocp.stages
     slope = certify(ocp, limits, p, z)
     units = [

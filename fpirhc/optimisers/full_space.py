@@ -5,8 +5,8 @@
 
 H is indefinite, so an iteration on g itself would violate the eigenvalue condition; h has the Jacobian H'H at a solution, which
 satisfies it for 0 < gain < 2 / sigma_max(H)^2. The price is the condition number squared: the rate is
-(kappa^2 - 1)/(kappa^2 + 1), with kappa = cond H between 10^3 and 10^6 on ordinary horizons, and the plan is not feasible before it
-is converged. It is kept as the baseline that `GradientFixedPoint` and `FixedPoint` are measured against. Limits are not served.
+(kappa^2 - 1)/(kappa^2 + 1), with kappa = cond H between 10^3 and 10^6 on ordinary horizons, and the plan is feasible only once
+it is converged. It is the baseline to which `GradientFixedPoint` and `FixedPoint` are compared. It does not serve limits.
 
 References: H. Khan, J. K. Tar, I. J. Rudas, on fixed-point iteration in place of the reduced gradient (2017-2018), the exact
 formula reconstructed.
@@ -40,8 +40,9 @@ _BALANCING = 20  # passes of Ruiz's equilibration
 class FullSpaceFixedPoint(Optimiser):
     """The faithful baseline: map (6) on z = (S, U, mu) with h = H'g.
 
-    Parameters:
-        iterations: per call; expect 10^4 and more. tolerance: of the stationarity (in the unit of the inputs).
+    Args:
+        iterations: per call; 10^4 and more are usual.
+        tolerance: of the stationarity, in the unit of the inputs.
         map: the deformation; None chooses the affine map with 0.95 of the gain 1/sigma_max(H)^2 along the reference.
         scaled: iterate on variables that make the rows of H of the same size (Ruiz), which helps by orders of magnitude.
         acceleration: Anderson(m), or None.
@@ -63,7 +64,8 @@ class FullSpaceFixedPoint(Optimiser):
         """Raise if anything is bounded, or the map's gain cannot contract.
 
         Raises:
-            NotSupported: some input or state has limits. NotContractive: a gain outside (0, 2 / sigma_max(H)^2).
+            NotSupported: some input or state has limits.
+            NotContractive: a gain outside (0, 2 / sigma_max(H)^2).
         """
         if ocp.bounds_states or np.isfinite(ocp.input_lower).any() or np.isfinite(ocp.input_upper).any():
             raise NotSupported(
@@ -93,7 +95,7 @@ class FullSpaceFixedPoint(Optimiser):
         return self.memory(ocp).join({k: ca.vec(shift(ca.reshape(v, rows[k], ocp.stages))) for k, v in parts.items()})
 
     def step(self, ocp: OptimalControl) -> ca.Function:
-        """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
+        """Every call does the same `iterations`."""
         nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
         s0, data = ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
         lower, upper, memory = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu), ca.MX.sym("memory", n * (2 * ns + nu))

@@ -37,8 +37,9 @@ _SAFE = 0.95  # share of the largest gain, for the map that is chosen automatica
 class GradientFixedPoint(Optimiser):
     """Fixed-point iteration with the scaled reduced gradient as its response error.
 
-    Parameters:
-        iterations: per call. tolerance: of the stationarity (in the unit of the inputs).
+    Args:
+        iterations: per call.
+        tolerance: of the stationarity, in the unit of the inputs.
         map: the deformation; None chooses the affine map with 0.95 of the gain 1/L, L the largest curvature along the reference.
         acceleration: Anderson(m), or None.
 
@@ -58,7 +59,8 @@ class GradientFixedPoint(Optimiser):
         """Raise if states are bounded, or the map's gain cannot contract.
 
         Raises:
-            NotSupported: projection keeps bounds of inputs only. NotContractive: a gain outside (0, 2 / L).
+            NotSupported: projection keeps bounds of inputs only.
+            NotContractive: a gain outside (0, 2 / L).
         """
         if ocp.bounds_states:
             raise NotSupported("GradientFixedPoint keeps input limits only; for state limits use FixedPoint()")
@@ -83,7 +85,7 @@ class GradientFixedPoint(Optimiser):
         return ca.vec(shift(ca.reshape(memory, ocp.input.size, ocp.stages)))
 
     def step(self, ocp: OptimalControl) -> ca.Function:
-        """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
+        """Every call does the same `iterations`."""
         nu, n = ocp.input.size, ocp.stages
         s0, data = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size, n + 1)
         lower, upper, memory = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu), ca.MX.sym("memory", nu * n)

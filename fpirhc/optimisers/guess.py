@@ -1,4 +1,4 @@
-"""What a horizon's data say about a first plan: the reference and the feedforward."""
+"""A first plan from a horizon's data: the reference and the feedforward."""
 
 from __future__ import annotations
 

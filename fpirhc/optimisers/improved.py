@@ -22,9 +22,18 @@ def improved(
     *,
     calls: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Return (plan (nu, N), diagnostics with the iterations of all calls, memory, calls).
+    """Improve a plan until its status is OK; with a violated limit of a state, as long as the violation shrinks.
 
-    A plan that violates a limit of a state is improved further as long as the violation shrinks.
+    Args:
+        optimiser: the optimiser.
+        ocp: the problem.
+        state: the first state, shape (ns,).
+        data: shape (ntheta, N + 1).
+        memory: from which the first call begins.
+        calls: most calls.
+
+    Returns:
+        Plan (nu, N), diagnostics with the iterations of all calls, memory, and the number of calls.
     """
     step, bounds, rescue = optimiser.converging(ocp), (ocp.input_lower, ocp.input_upper), None
     status, count, iterations, violation, stuck = Status.NOT_CONVERGED, 0, 0.0, np.inf, 0
@@ -33,7 +42,7 @@ def improved(
         arguments = (state, data, *bounds, memory)
         results = step(*arguments)
         if int(results[1][4]) != Status.OK:
-            # Built only here: most horizons never need it.
+            # Built only here, because most horizons do not need it.
             rescue = rescue or optimiser.rescue(ocp)
             results = rescue(*arguments, *results) if rescue else results
         inputs, diagnostics, memory = (np.asarray(v.full()) for v in results)

@@ -1,8 +1,8 @@
-"""Two optimisers in a row: the second is asked when the first ends without a usable plan.
+"""Two optimisers in a row: the second one is called where the first one ends without a usable plan.
 
-A plan is usable when its status is OK or NOT_CONVERGED. Both start from the last plan that was used, whoever found it: when the
-second is asked, the first begins its next call from that plan's inputs alone. How often the second was asked is logged by a run as
-`second_plans` and told by its metrics.
+A plan is usable when its status is OK or NOT_CONVERGED. Both start from the last plan that was used. After a plan of the second
+optimiser, the first one begins its next call from that plan's inputs alone. A run logs the number of plans of the second optimiser
+as `second_plans`, and its metrics show it.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from fpirhc.status import Status
 from fpirhc.symbolic.expression import FINITE
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 
-_PLAN, _ASKED = "plan_inputs", "plan_second_plans"
+_PLAN, _COUNT = "plan_inputs", "plan_second_plans"
 
 
 @dataclass(frozen=True)
 class Ladder(Optimiser):
     """The first optimiser, and a second one for horizons that the first leaves without a usable plan.
 
-    Parameters:
-        first: asked in every call. second: asked in the same call when the first's status is INFEASIBLE or NON_FINITE. A horizon
-        that no optimiser can keep is asked of both; of two plans without use the one that is finite is returned, else the first's.
+    Args:
+        first: called in every cycle.
+        second: called in the same cycle where the status of the first is INFEASIBLE or NON_FINITE. Of two plans that are not
+            usable the finite one is returned, else that of the first.
     """
 
     first: Optimiser
@@ -36,25 +37,25 @@ class Ladder(Optimiser):
 
     @property
     def exportable(self) -> bool:
-        """Whether both are."""
+        """Whether both are exportable."""
         return self.first.exportable and self.second.exportable
 
     @property
     def logged(self) -> Mapping[str, str]:
-        """How many plans the second has found since the run began."""
-        return {"second_plans": _ASKED}
+        """Number of plans of the second optimiser since the run began."""
+        return {"second_plans": _COUNT}
 
     def check(self, ocp: OptimalControl) -> None:
-        """Raise what either raises: a second optimiser that cannot serve the problem is no help."""
+        """Raise what either optimiser raises; both must serve the problem."""
         self.first.check(ocp)
         self.second.check(ocp)
 
     def memory(self, ocp: OptimalControl) -> Layout:
-        """The plan, what each remembers beside it, and how often the second was asked."""
+        """The plan, the rest of both memories, and the number of plans of the second optimiser."""
         first, second = self.first.memory(ocp), self.second.memory(ocp)
         own = [Signal(f"first_{s.name}", s.elements, s.units, s.start) for s in first.signals if s.name != _PLAN]
         other = [Signal(f"second_{s.name}", s.elements, s.units, s.start) for s in second.signals if s.name != _PLAN]
-        return Layout((first[_PLAN], *own, *other, scalar(_ASKED)))
+        return Layout((first[_PLAN], *own, *other, scalar(_COUNT)))
 
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         """Both memories one stage later."""
@@ -62,10 +63,10 @@ class Ladder(Optimiser):
         one = self.first.shifted(ocp, self._part(ocp, self.first, "first", parts))
         other = self.second.shifted(ocp, self._part(ocp, self.second, "second", parts))
         plan = self.first.memory(ocp).split(one)[_PLAN]
-        return self._joined(ocp, plan, one, other, parts[_ASKED])
+        return self._joined(ocp, plan, one, other, parts[_COUNT])
 
     def step(self, ocp: OptimalControl) -> ca.Function:
-        """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
+        """One step of the first, and one of the second where it is needed."""
         return self._laddered(ocp, self.first.step(ocp), self.second.step(ocp))
 
     def converging(self, ocp: OptimalControl) -> ca.Function:
@@ -89,28 +90,28 @@ class Ladder(Optimiser):
         work = ca.Function("fpirhc_second", [*arguments, *results], self._second(ocp, second, arguments, results))
         before = self._part(ocp, self.second, "second", parts)
         plan = ca.vec(results[0])
-        after = self._joined(ocp, plan, results[2], before, parts[_ASKED])
+        after = self._joined(ocp, plan, results[2], before, parts[_COUNT])
         rest = ca.Function("fpirhc_no_second", [*arguments, *results], [*results[:2], after])
         choice = ca.Function.if_else("fpirhc_second_if_needed", work, rest)
         better = choice(begun[1][4] > int(Status.NOT_CONVERGED) + 0.5, *arguments, *begun)
         inner = ca.Function("fpirhc_ladder_step", arguments, list(better))
-        # What is poisoned in the memory of the one that is not asked would stay for ever.
+        # A memory that is not finite would stay so where its optimiser is not called.
         usable = ca.if_else(ca.fabs(arguments[4]) <= FINITE, arguments[4], 0)
         return ca.Function("fpirhc_ladder", arguments, list(inner(*symbols, usable)))
 
     def _second(
         self, ocp: OptimalControl, second: ca.Function, arguments: list[ca.MX], results: list[ca.MX]
     ) -> list[ca.MX]:
-        """The better one of both answers."""
+        """The better one of both results."""
         parts = self.memory(ocp).split(arguments[4])
         inputs, diagnostics, after = second(*arguments[:4], self._part(ocp, self.second, "second", parts))
         usable = diagnostics[4] < int(Status.INFEASIBLE) - 0.5
         only = ca.logic_and(results[1][4] == int(Status.NON_FINITE), diagnostics[4] < int(Status.NON_FINITE) - 0.5)
         better = ca.logic_or(usable, only)
         plan = ca.if_else(better, inputs, results[0])
-        # The first has nothing to go on from but the inputs that will be used.
+        # The next call of the first begins from the inputs alone.
         forgotten = ca.if_else(better, ca.MX(self.first.memory(ocp).start()), results[2])
-        memory = self._joined(ocp, ca.vec(plan), forgotten, after, parts[_ASKED] + better)
+        memory = self._joined(ocp, ca.vec(plan), forgotten, after, parts[_COUNT] + better)
         return [plan, ca.if_else(better, diagnostics, results[1]), memory]
 
     def _part(self, ocp: OptimalControl, optimiser: Optimiser, name: str, parts: Mapping[str, ca.MX]) -> ca.MX:
@@ -118,7 +119,7 @@ class Ladder(Optimiser):
         return layout.join({n: parts[n if n == _PLAN else f"{name}_{n}"] for n in layout.names})
 
     def _joined(self, ocp: OptimalControl, plan: ca.MX, one: ca.MX, other: ca.MX, count: ca.MX) -> ca.MX:
-        joined: dict[str, ca.MX] = {_PLAN: plan, _ASKED: count}
+        joined: dict[str, ca.MX] = {_PLAN: plan, _COUNT: count}
         for name, optimiser, memory in (("first", self.first, one), ("second", self.second, other)):
             split = optimiser.memory(ocp).split(memory)
             joined |= {f"{name}_{n}": value for n, value in split.items() if n != _PLAN}

@@ -4,7 +4,7 @@ Two settings of one Riccati sweep (`fpirhc.horizon.sweep`). The pure step is the
 equalities of the sweep, rolled out with its feedback. The interior step keeps all limits by a barrier, on a plan whose states are
 free (multiple shooting), with limits of states that give way at a price (exact L1 penalty); it runs only where pure steps do not
 contract, and ends as soon as they do. A plan is OK by its own first-order conditions once it is rolled out, never by the barrier's
-residual; where the limits cannot be kept it is the plan of least violation near by, INFEASIBLE.
+residual. Where the limits cannot be kept, the result is a plan of least violation nearby, with the status INFEASIBLE.
 
 With `realtime` a call does a fixed number of iterations without a search: interior steps by the fraction to the boundary, with a
 barrier that follows how well they go, and pure steps near a solution.
@@ -42,7 +42,7 @@ def limited_step(ocp: OptimalControl, settings: LimitedSettings) -> ca.Function:
 
 
 def shifted_limited(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
-    """The memory one stage later; the last stage, which is repeated, has no feedback."""
+    """Return the memory one stage later; the last stage, which is repeated, has no feedback."""
     layout, n, nu, ns = limited_memory(ocp), ocp.stages, ocp.input.size, ocp.state.size
     parts = layout.split(memory)
     rows = layout["plan_multipliers"].size // (2 * n)

@@ -1,4 +1,4 @@
-"""What the iteration with limits remembers."""
+"""Memory of the iteration with limits."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 
 def limited_memory(ocp: OptimalControl) -> Layout:
-    """The plan, the states and costates of s_1 ... s_N, its feedback, the multipliers of its limits, and how far the search was.
+    """Return the layout of the plan, its states and costates s_1 ... s_N, its feedback, its multipliers, mu and the damping.
 
-    `plan_barrier` is zero where there is nothing to remember.
+    `plan_barrier` is zero where no plan is remembered.
     """
     n, states, inputs = range(ocp.stages), ocp.state.elements, ocp.input.elements
     rows = (*inputs, *(states[k] for k in scales(ocp).bounded))

@@ -1,4 +1,4 @@
-"""Numbers of the iteration with limits, for the loops in C and for the composed graph: chosen once, not per problem."""
+"""Numbers of the iteration with limits, for the loops in C and for the composed graph: the same for all problems."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fpirhc.optimisers.scales import Scales
 NEAR = 1e-3  # scaled error below which a remembered plan is improved by pure steps at once
 SEVERAL = 3  # iterations per call from which on pure steps are tried first in any case
 PATIENCE = 3  # pure steps in a row that may fail to halve the error: the active limits are changing
-HOPELESS = 1e2  # scaled error from which on they are not waited for: multipliers are at their largest value
+HOPELESS = 1e2  # scaled error from which on there is no patience: multipliers are at their largest value
 PURE_STEPS = 10
 MU_WARM, MU_MOST = (
     1e-4,
@@ -26,7 +26,17 @@ ROLLED, REFERENCE = 1, 2  # first plans after the state held: the inputs rolled 
 
 @dataclass(frozen=True)
 class LimitedSettings:
-    """tolerance of the stationarity, feasible violation, map of pure steps, hessian, damping; iterations; realtime: no search."""
+    """Settings of one Function.
+
+    Args:
+        tolerance: of the stationarity, in the unit of the inputs.
+        feasible: violation of a state bound, in its unit, below which a plan counts as converged.
+        map: the deformation of pure steps.
+        hessian: second derivatives of the quadratic model; None: exact.
+        damping: added to the curvature of the inputs, in units of it.
+        iterations: most iterations of one call.
+        realtime: a fixed number of iterations without a search.
+    """
 
     tolerance: float
     feasible: float
@@ -37,5 +47,5 @@ class LimitedSettings:
     realtime: bool
 
     def scaled_tolerance(self, scales: Scales) -> float:
-        """The tolerance in units of the inputs' half ranges."""
+        """Return the tolerance in units of the inputs' half ranges."""
         return float(max(self.tolerance / scales.inputs.min(), 1e-12))

@@ -19,7 +19,15 @@ _AT_BOUND = 1e-6  # relative distance within which an input counts as at its bou
 def fit_multipliers(
     ocp: OptimalControl, inputs: np.ndarray, state: np.ndarray, data: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
-    """Return M (ns, N) with the sign of the bound it belongs to; zero where no state is at a bound."""
+    """Return M (ns, N), each entry with the sign of its bound; zero where no state is at a bound.
+
+    Args:
+        ocp: the problem.
+        inputs: U, shape (nu, N).
+        state: s_0, shape (ns,).
+        data: shape (ntheta, N + 1).
+        bounds: lower and upper limits of the inputs, shape (nu,) each.
+    """
     none = np.zeros((ocp.state.size, ocp.stages))
     if not ocp.bounds_states:
         return none

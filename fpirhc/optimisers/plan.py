@@ -17,17 +17,25 @@ from fpirhc.optimisers.multipliers import fit_multipliers
 from fpirhc.status import Status
 from fpirhc.summary import line, number, table
 
-_WORST = 5  # violations told
+_WORST = 5  # violations in a text
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
     """A solved horizon.
 
-    inputs (nu, N), states (ns, N + 1). cost, stationarity, feasibility as defined in `fpirhc.optimisers.base`; None where the
-    status is NON_FINITE, because what was tried has no such numbers. iterations as far as the optimiser tells (-1: it does not);
-    calls of its step; status. problem, data (ntheta, N + 1), bounds of the inputs:
-    what was solved.
+    Args:
+        inputs: U, shape (nu, N).
+        states: X, shape (ns, N + 1).
+        cost: V; None where the status is NON_FINITE, because what was tried has no such number.
+        stationarity: as defined in `fpirhc.optimisers.base`; None like the cost.
+        feasibility: as defined there; None like the cost.
+        iterations: of the optimiser; -1: not known.
+        calls: of the optimiser's step.
+        status: of the plan.
+        problem: the problem that was solved.
+        data: its data, shape (ntheta, N + 1).
+        bounds: lower and upper limits of the inputs, shape (nu,) each.
     """
 
     inputs: np.ndarray
@@ -46,12 +54,12 @@ class Plan:
         return line(self, self.status.name, *(f"{name} {value}" for name, value in self._facts()))
 
     def _repr_html_(self) -> str:
-        """What was found and what is wrong with it, for notebooks."""
+        """The numbers of the plan and its faults as a table, for notebooks."""
         notes = [self.status.remedy, *self.violations(), self.overflow()]
         return table(f"Plan: {self.status.name}", ("", "value"), self._facts(), notes)
 
     def _facts(self) -> list[tuple[str, str]]:
-        """What sums up the plan, by name."""
+        """The numbers that sum up the plan, by name."""
         steps = f"{self.iterations:g}" if self.iterations >= 0 else "unknown"
         return [
             ("cost", _shown(self.cost, lambda v: f"{v:.7g}")),
@@ -63,11 +71,11 @@ class Plan:
 
     @cached_property
     def state_multipliers(self) -> np.ndarray:
-        """Multipliers of the state bounds, shape (ns, N), fitted to the plan itself: the optimiser is not asked."""
+        """Multipliers of the state bounds, shape (ns, N), fitted to the plan alone, without its optimiser."""
         return fit_multipliers(self.problem, self.inputs, self.states[:, 0], self.data, self.bounds)
 
     def violations(self) -> tuple[str, ...]:
-        """The five worst violations of state bounds in words, the first state before all others; empty when there are none."""
+        """Return the five worst violations of state bounds in words, the first state first; empty when there are none."""
         ocp, violations = self.problem, []
         for k, (name, unit) in enumerate(zip(ocp.state.elements, ocp.state.units, strict=True)):
             low, high = ocp.state_lower[k], ocp.state_upper[k]
@@ -82,7 +90,7 @@ class Plan:
         return tuple(text for _, _, text in sorted(violations)[:_WORST])
 
     def overflow(self) -> str:
-        """Where the plan stops being finite: the state, input or cost term and its stage, in words; empty when nowhere."""
+        """Return where the plan stops being finite: the state, input or cost term and its stage, in words; empty when nowhere."""
         ocp = self.problem
         for stage in range(ocp.stages + 1):
             for names, values in ((ocp.state.elements, self.states), (ocp.input.elements, self.inputs)):
@@ -100,7 +108,7 @@ class Plan:
         return "" if np.isfinite(final) else f"the terminal cost is {final} at stage {ocp.stages}"
 
     def slacks(self) -> dict[str, float]:
-        """Cost of every soft limit and price of every priced one over the horizon by name, zero where it is kept."""
+        """Return the cost of every soft limit and the price of every priced one over the horizon by name, zero where it is kept."""
         _, _, terms = rollout(self.problem)(self.states[:, 0], self.inputs, self.data)
         values = zip(self.problem.terms, np.asarray(terms.full()).ravel(), strict=True)
         prices = {name.removeprefix("soft "): float(v) for name, v in values if name.startswith("soft ")}
@@ -112,7 +120,7 @@ class Plan:
         return prices
 
     def verify(self) -> tuple[float, float, float]:
-        """Recompute (cost, stationarity, feasibility) from the problem's own functions."""
+        """Return (cost, stationarity, feasibility), recomputed from the problem's own functions."""
         ocp = self.problem
         numbers = judge(ocp)(self.inputs, self.states[:, 0], self.data, *self.bounds, self.state_multipliers)
         cost, stationarity, feasibility = (float(v) for v in numbers)
@@ -132,7 +140,13 @@ def solve(
 
     A plan that violates a state bound is improved further as long as the violation shrinks.
 
-    Parameters: `state` s_0 (ns,), `data` (ntheta, N + 1), `start` a first plan (nu, N), zero when not given.
+    Args:
+        ocp: the problem.
+        optimiser: the optimiser.
+        state: s_0, shape (ns,).
+        data: shape (ntheta, N + 1).
+        calls: most calls of the optimiser's step.
+        start: first inputs, shape (nu, N); None: zero.
 
     Raises:
         NotSupported: the optimiser cannot serve the problem.

@@ -1,11 +1,10 @@
-"""The reduced-gradient method: what the fixed-point optimisers replace.
+"""The reduced-gradient method, which the fixed-point optimisers replace.
 
 Lagrange's reduced gradient, found by one adjoint sweep, with projection on the input box and a line search. The step length is
 the spectral one of Barzilai and Borwein, the line search non-monotone over the last values (Birgin, Martinez and Raydan's
 spectral projected gradient): U+ = clip(U - gamma D g) if it decreases enough, else gamma is divided by four and the next
 iteration tries again from the same plan. D = 1 / (step c) scales by the curvature c along each input
-(`OptimalControl.curvature`), so that gamma is a number near 1 and neither the units of the inputs nor the size of the weights
-matter.
+(`OptimalControl.curvature`), so that gamma is a number near 1, whatever the units of the inputs and the size of the weights.
 
 Every call does the same amount of work: one gradient per iteration.
 
@@ -38,8 +37,9 @@ _TINY = 1e-300
 class ReducedGradient(Optimiser):
     """Projected spectral gradient with a fixed number of iterations per call.
 
-    Parameters:
-        iterations: per call. tolerance: of the stationarity (in the unit of the inputs), below which a plan is converged.
+    Args:
+        iterations: per call.
+        tolerance: of the stationarity, in the unit of the inputs, below which a plan is converged.
 
     Raises:
         InvalidValue: fewer than one iteration, or a tolerance that is not positive.
@@ -74,7 +74,7 @@ class ReducedGradient(Optimiser):
         return ca.vertcat(ca.vec(shift(plan)), memory[-1])
 
     def step(self, ocp: OptimalControl) -> ca.Function:
-        """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
+        """Every call does the same `iterations`."""
         nu, n = ocp.input.size, ocp.stages
         s0, data = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size, n + 1)
         lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)

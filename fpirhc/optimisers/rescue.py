@@ -1,7 +1,8 @@
 """Interior steps where the plain iteration without limits of states gives up.
 
 The plain iteration is fast where it contracts. Where it does not, its plan is the first guess of the iteration with limits
-(`fpirhc.optimisers.limited`) if a plan was remembered, else that one begins on its own. The better plan of both is kept.
+(`fpirhc.optimisers.limited`) if a plan was remembered. Otherwise that iteration begins from its own first guess. The better plan of
+both is returned.
 """
 
 from __future__ import annotations
@@ -17,7 +18,14 @@ from fpirhc.symbolic.layout import Layout
 
 
 def rescue(ocp: OptimalControl, plain: ca.Function, layout: Layout, limited: ca.Function) -> ca.Function:
-    """Function (arguments of `plain`, its results) -> the results that are better, with the memory of `plain`."""
+    """Function (arguments of `plain`, its results) -> the better results, with the memory of `plain`.
+
+    Args:
+        ocp: the problem.
+        plain: the converging step of the plain iteration.
+        layout: its memory.
+        limited: the converging step of the iteration with limits.
+    """
     arguments = [ca.MX.sym(plain.name_in(k), *plain.size_in(k)) for k in range(plain.n_in())]
     results = [ca.MX.sym(f"r{k}", *plain.size_out(k)) for k in range(3)]
     work = ca.Function("fpirhc_rescue", [*arguments, *results], _better(ocp, layout, limited, arguments, results))

@@ -24,9 +24,15 @@ _NARROW = 1e-6  # limits closer together than this share of the reference's spre
 
 @dataclass(frozen=True, eq=False)
 class Scales:
-    """inputs (nu,), states (ns,), cost: a number in units of the cost; bounded: places of the states that have a limit.
+    """Units of a problem.
 
-    capacity: largest multipliers of the bounded states, in cost per unit. hard: whether their limits have no price.
+    Args:
+        inputs: shape (nu,).
+        states: shape (ns,).
+        cost: C.
+        bounded: places of the states that have a limit.
+        capacity: largest multipliers of the bounded states, in cost per unit.
+        hard: whether the limits of the bounded states have no price.
     """
 
     inputs: np.ndarray

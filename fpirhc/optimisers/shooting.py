@@ -21,36 +21,36 @@ def program_values(ocp: OptimalControl) -> ca.Function:
 
 
 def sizes(ocp: OptimalControl) -> tuple[int, int]:
-    """Numbers of variables and of constraints."""
+    """Return the numbers of variables and of constraints."""
     return ocp.stages * (ocp.state.size + ocp.input.size) + ocp.state.size, ocp.stages * ocp.state.size
 
 
 def interleave(states: ca.MX, inputs: ca.MX) -> ca.MX:
-    """(ns, N + 1), (nu, N) -> column (s_0, u_0, s_1, ..., s_N)."""
+    """Return states (ns, N + 1) and inputs (nu, N) as a column (s_0, u_0, s_1, ..., s_N)."""
     n = inputs.shape[1]
     return ca.vertcat(ca.vec(ca.vertcat(states[:, :n], inputs)), states[:, n])
 
 
 def separate(ocp: OptimalControl, column: ca.MX) -> tuple[ca.MX, ca.MX]:
-    """Inverse of `interleave`."""
+    """Return states (ns, N + 1) and inputs (nu, N) of a column: the inverse of `interleave`."""
     ns, nu, n = ocp.state.size, ocp.input.size, ocp.stages
     stages = ca.reshape(column[: n * (ns + nu)], ns + nu, n)
     return ca.horzcat(stages[:ns, :], column[n * (ns + nu) :]), stages[ns:, :]
 
 
 def stage_bounds(ocp: OptimalControl, s0: ca.MX, bound: np.ndarray) -> ca.MX:
-    """Bounds of s_0 ... s_N: the first state is given."""
+    """Return the bounds of s_0 ... s_N; the first state is fixed."""
     return ca.horzcat(s0, ca.repmat(ca.DM(bound), 1, ocp.stages))
 
 
 def shift_variables(ocp: OptimalControl, column: ca.MX) -> ca.MX:
-    """Variables, or their multipliers, one stage later."""
+    """Return variables, or their multipliers, one stage later."""
     states, inputs = separate(ocp, column)
     return interleave(shift(states), shift(inputs))
 
 
 def shift_dynamics(ocp: OptimalControl, column: ca.MX) -> ca.MX:
-    """Multipliers of the dynamics one stage later."""
+    """Return multipliers of the dynamics one stage later."""
     stages: ca.MX = ca.reshape(column, ocp.state.size, ocp.stages)
     return ca.vec(shift(stages))
 
@@ -68,7 +68,7 @@ def program(ocp: OptimalControl) -> dict[str, ca.MX]:
 
 
 def gauss_newton_hessian(ocp: OptimalControl) -> ca.Function:
-    """Function (x, p, lam_f, lam_g) -> Hessian of the cost alone, block by block (both triangles, as SQP wants it)."""
+    """Function (x, p, lam_f, lam_g) -> Hessian of the cost alone, block by block, with both triangles."""
     nlp = program(ocp)
     hessian, _ = ca.hessian(nlp["f"], nlp["x"])
     weight, multipliers = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", sizes(ocp)[1])
