@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Named
@@ -59,7 +60,7 @@ class Linearisation:
     step: float
 
 
-class Terminal(ABC):
+class Terminal(Checked, ABC):
     """Contract: a quadratic terminal cost that is computed from the problem."""
 
     @abstractmethod
@@ -67,7 +68,7 @@ class Terminal(ABC):
         """Return the symmetric weight P of (x - x^N)' P (x - x^N), shape (nx, nx)."""
 
 
-class Cost(ABC):
+class Cost(Checked, ABC):
     """Contract: named stage terms and a terminal cost, as CasADi expressions."""
 
     @property

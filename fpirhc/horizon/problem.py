@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, Mistakes, NotSupported
+from fpirhc.fields.checked import Checked
 from fpirhc.horizon.constraint_states import (
     ConstraintState,
     ends,
@@ -38,7 +39,7 @@ from fpirhc.task.reference import Reference
 
 
 @dataclass(frozen=True)
-class Horizon:
+class Horizon(Checked):
     """Length and stages of a controller's prediction.
 
     Args:

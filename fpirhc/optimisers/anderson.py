@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.checked import Checked
 from fpirhc.horizon.riccati import solve_free
 from fpirhc.optimisers.base import FINITE
 
@@ -25,7 +26,7 @@ _GROWTH = 2.0  # growth of |F| after which the memory is dropped
 
 
 @dataclass(frozen=True)
-class Anderson:
+class Anderson(Checked):
     """Acceleration with the last `memory` changes; 3 to 10 are usual.
 
     Raises:

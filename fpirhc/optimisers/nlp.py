@@ -18,6 +18,7 @@ from typing import TypeAlias
 import casadi as ca
 
 from fpirhc.errors import InvalidValue, NotSupported, nearest
+from fpirhc.fields.checked import Checked
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.base import (
@@ -52,7 +53,7 @@ _LARGEST_MULTIPLIER = 1e12
 
 
 @dataclass(frozen=True)
-class QuadraticSolver(ABC):
+class QuadraticSolver(Checked, ABC):
     """Contract: a solver of the quadratic programs inside SequentialQuadratic."""
 
     @property

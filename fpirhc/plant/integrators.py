@@ -13,11 +13,12 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression
 
 
-class Integrator(ABC):
+class Integrator(Checked, ABC):
     """Contract: one cycle of the plant as a Function."""
 
     @property

@@ -7,10 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from fpirhc.errors import Mistakes
+from fpirhc.fields.checked import Checked
 
 
 @dataclass(frozen=True)
-class Parameter:
+class Parameter(Checked):
     """One parameter of a plant.
 
     Args:

@@ -20,6 +20,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import Mistakes, NotInvertible
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.inverse import inverse_by_newton, inverse_by_user, inverse_of_affine
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_response
@@ -30,7 +31,7 @@ __all__ = ["Parameter", "Plant", "derivative_unit", "structural_order"]
 
 
 @dataclass(frozen=True, eq=False)
-class Plant:
+class Plant(Checked):
     """A system q^(r) = f(q, q', ..., u, p); a controller has its approximate parameters only.
 
     Args:

@@ -16,10 +16,11 @@ import numpy as np
 from scipy.signal import lfilter
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.checked import Checked
 from fpirhc.symbolic.layout import Expression
 
 
-class Disturbance(ABC):
+class Disturbance(Checked, ABC):
     """Contract: values at given times, and the size and speed of their changes where these are known."""
 
     @property

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fpirhc.errors import Mistakes
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Value
 
@@ -16,7 +17,7 @@ Interval = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class PathConstraint:
+class PathConstraint(Checked):
     """A limit on any expression of a stage.
 
     Args:
@@ -33,7 +34,7 @@ class PathConstraint:
 
 
 @dataclass(frozen=True, eq=False)
-class Limits:
+class Limits(Checked):
     """Limits of a problem.
 
     The plant's actuator clips the inputs to their limits. All other limits bind an optimiser's plan.

@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
+from fpirhc.fields.checked import Checked
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.problem import Horizon
 from fpirhc.plant.integrators import Integrator, RungeKutta4
@@ -23,7 +24,7 @@ from fpirhc.task.reference import Reference
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class Problem(Checked):
     """One control task.
 
     Args:

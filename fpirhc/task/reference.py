@@ -14,12 +14,13 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Expression
 
 
-class Reference(ABC):
+class Reference(Checked, ABC):
     """Contract: the nominal motion of every coordinate."""
 
     @property
