@@ -112,6 +112,11 @@ class Mistakes:
         """Add one mistake."""
         self._mistakes.append(mistake)
 
+    @property
+    def none(self) -> bool:
+        """Whether there is no mistake so far."""
+        return not self._mistakes
+
     def unknown(self, what: str, names: Iterable[str], valid: Iterable[str]) -> None:
         """Add a mistake, with the nearest valid name, for each of `names` that is not in `valid`."""
         allowed = list(valid)

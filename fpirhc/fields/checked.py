@@ -15,7 +15,7 @@ from functools import cache
 from typing import ClassVar, get_origin
 
 from fpirhc.errors import InvalidField, nearest
-from fpirhc.fields.expected import Anything, Expected, accepts, expected_by, mistakes_in
+from fpirhc.fields.expected import Anything, Expected, Number, accepts, expected_by, mistakes_in
 from fpirhc.fields.given import call_of, described
 from fpirhc.fields.place import users_place
 
@@ -36,6 +36,12 @@ class Checked(metaclass=_CheckedWhenCalled):
     Raises:
         InvalidField: all wrong arguments together: unknown or missing names, wrong types, numbers out of the range of their kind.
     """
+
+
+def expects_whole_number(owner: type, name: str) -> bool:
+    """Whether a field of a class is declared as a whole number, with or without a range."""
+    one = _arguments_of(owner).expected.get(name)
+    return isinstance(one, Number) and one.whole
 
 
 @dataclass(frozen=True)

@@ -248,7 +248,11 @@ def expected_by(annotation: object) -> Expected:  # noqa: PLR0911 -- one line pe
         return Number(whole=annotation is int)
     if annotation is None:
         return Instance(type(None))
-    if not isinstance(annotation, type) or annotation is object or getattr(annotation, "_is_protocol", False):
+    if (
+        not isinstance(annotation, type)
+        or annotation in (object, typing.Any)
+        or getattr(annotation, "_is_protocol", False)
+    ):
         return Anything()
     return Instance(annotation)
 

@@ -39,5 +39,6 @@ Duration: TypeAlias = Annotated[float, Range("a number of seconds from 1e-12 to 
 Accuracy: TypeAlias = Annotated[
     float, Range("a number above 0 and below 1", low=0.0, high=1.0, open_low=True, open_high=True)
 ]
-Count: TypeAlias = Annotated[int, Range("a whole number of at least 1", low=1)]
+Count: TypeAlias = Annotated[int, Range("a whole number from 1 to 1000000", low=1, high=1e6)]
+Few: TypeAlias = Annotated[int, Range("a whole number from 1 to 1000", low=1, high=1000)]
 CountOrZero: TypeAlias = Annotated[int, Range("a whole number of at least 0", low=0)]

@@ -17,6 +17,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.user_code import called
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Named
@@ -269,7 +270,7 @@ class CustomCost(Cost):
 
     def stage(self, view: View) -> Mapping[str, Expression]:
         """Return the user's terms."""
-        return self.terms(view)
+        return called("cost", self.terms, view)
 
     def terminal_cost(
         self,
@@ -279,7 +280,7 @@ class CustomCost(Cost):
         step: float,  # noqa: ARG002
     ) -> Expression:
         """Return the user's terminal cost, or zero."""
-        return ca.SX(0) if self.terminal is None else self.terminal(view)
+        return ca.SX(0) if self.terminal is None else called("cost: terminal", self.terminal, view)
 
 
 def _squares(weights: Mapping[str, float], value: Named, target: Named) -> Expression:

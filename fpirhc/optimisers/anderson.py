@@ -18,6 +18,7 @@ import casadi as ca
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import Few
 from fpirhc.horizon.riccati import solve_free
 from fpirhc.optimisers.base import FINITE
 
@@ -33,7 +34,7 @@ class Anderson(Checked):
         InvalidValue: fewer than one.
     """
 
-    memory: int
+    memory: Few
 
     def __post_init__(self) -> None:
         if self.memory < 1:

@@ -19,6 +19,7 @@ import casadi as ca
 
 from fpirhc.errors import InvalidValue, NotSupported, nearest
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import Accuracy, Count
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.base import (
@@ -70,7 +71,7 @@ class QuadraticSolver(Checked, ABC):
 class Qrqp(QuadraticSolver):
     """CasADi's own active-set solver on a sparse QR factorisation."""
 
-    iterations: int = 200
+    iterations: Count = 200
 
     @property
     def plugin(self) -> str:
@@ -87,7 +88,7 @@ class Qrqp(QuadraticSolver):
 class Osqp(QuadraticSolver):
     """OSQP, an operator-splitting method."""
 
-    accuracy: float = 1e-8
+    accuracy: Accuracy = 1e-8
 
     @property
     def plugin(self) -> str:
@@ -261,8 +262,8 @@ class Ipopt(_MultipleShooting):
     Parameters: tolerance of our stationarity, in the unit of the inputs; accuracy that IPOPT is asked for; iterations it may use.
     """
 
-    accuracy: float = 1e-8
-    iterations: int = 200
+    accuracy: Accuracy = 1e-8
+    iterations: Count = 200
 
     @property
     def plugin(self) -> str:
@@ -288,8 +289,8 @@ class Ipopt(_MultipleShooting):
 class Fatrop(_MultipleShooting):
     """fatrop: an interior-point method that exploits the stages of the horizon."""
 
-    accuracy: float = 1e-8
-    iterations: int = 200
+    accuracy: Accuracy = 1e-8
+    iterations: Count = 200
 
     @property
     def plugin(self) -> str:
@@ -314,7 +315,7 @@ class SequentialQuadratic(_MultipleShooting):
     """
 
     quadratic: QuadraticSolver = field(default_factory=Qrqp)
-    iterations: int = 20
+    iterations: Count = 20
 
     @property
     def plugin(self) -> str:

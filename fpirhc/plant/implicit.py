@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import Few
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression
@@ -36,8 +37,8 @@ class ImplicitMidpoint(Integrator):
         InvalidValue: fewer than one of either.
     """
 
-    substeps: int = 1
-    newton: int = 3
+    substeps: Few = 1
+    newton: Few = 3
 
     def __post_init__(self) -> None:
         _check("ImplicitMidpoint", self.substeps, self.newton)
@@ -57,8 +58,8 @@ class RadauIIA(Integrator):
         InvalidValue: fewer than one of either.
     """
 
-    substeps: int = 1
-    newton: int = 3
+    substeps: Few = 1
+    newton: Few = 3
 
     def __post_init__(self) -> None:
         _check("RadauIIA", self.substeps, self.newton)

@@ -21,6 +21,7 @@ import numpy as np
 
 from fpirhc.errors import Mistakes, NotInvertible
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.user_code import called
 from fpirhc.plant.inverse import inverse_by_newton, inverse_by_user, inverse_of_affine
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_response
@@ -166,7 +167,8 @@ class Plant(Checked):
     def response_function(self) -> ca.Function:
         """Function (state, input, parameters) -> highest derivative of every coordinate (n)."""
         x, u, p = self._symbols()
-        responses = self.response(*self._derivatives(x), Named(self.input.elements, u, "input"), self._parameters(p))
+        views = (*self._derivatives(x), Named(self.input.elements, u, "input"), self._parameters(p))
+        responses = called("response", self.response, *views)
         column = ca.vertcat(*(ca.SX(responses[c]) for c in self.names))
         return ca.Function("fpirhc_response", [x, u, p], [ca.densify(column)], ["x", "u", "p"], ["r"])
 
