@@ -40,12 +40,15 @@ def called(what: str, function: Callable[..., Result], *arguments: object) -> Re
         raise InvalidProblem(f"{what}{_at(error)}: {explained(error)}") from None
 
 
-def scalar_expression(what: str, value: object, *, finite: bool = True) -> Expression:
+def scalar_expression(
+    what: str, value: object, *, of: Callable[..., object] | None = None, finite: bool = True
+) -> Expression:
     """Return a result of a user's function as one scalar expression.
 
     Args:
         what: the name of the result.
         value: the result.
+        of: the user's function, whose source is searched for the cause of NaN.
         finite: whether NaN is refused. CasADi makes NaN of math.sin(symbol), and says nothing.
 
     Raises:
@@ -57,9 +60,7 @@ def scalar_expression(what: str, value: object, *, finite: bool = True) -> Expre
     if made.numel() != 1:
         raise InvalidProblem(f"{what} must be one scalar, got shape {made.shape}")
     if finite and _holds_nan(made):
-        raise InvalidProblem(
-            f"{what} holds NaN: a function of `math` and float(...) make NaN of a symbol; {_OF_CASADI}"
-        )
+        raise InvalidProblem(f"{what} holds NaN{_cause_of_nan(of)}")
     return made
 
 
@@ -105,6 +106,24 @@ def place_of(function: Callable[..., object]) -> str:
     """Return "file.py, line 12" of a function's definition; empty where it has none."""
     code = getattr(inspect.unwrap(function), "__code__", None)
     return "" if code is None else f"{Path(code.co_filename).name}, line {code.co_firstlineno}"
+
+
+def _cause_of_nan(function: Callable[..., object] | None) -> str:
+    """The first call in a function's source that makes NaN of a symbol."""
+    general = f": float(...) and the functions of `math` make NaN of a symbol; {_OF_CASADI}"
+    if function is None:
+        return general
+    own = inspect.unwrap(function)
+    try:
+        lines, first = inspect.getsourcelines(own)
+    except (OSError, TypeError):
+        return general
+    calls = [(n, c) for n, line in enumerate(lines, first) if (c := re.search(r"\bmath\.(\w+)\(", line)) is not None]
+    if not calls:
+        return general
+    number, call = calls[0]
+    file = Path(inspect.getsourcefile(own) or "").name
+    return f" ({file}, line {number}): {call.group(0)}...) of a symbol is NaN; {_instead(call.group(1))}"
 
 
 def _at(error: BaseException) -> str:

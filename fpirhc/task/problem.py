@@ -75,7 +75,9 @@ class Problem(Checked):
         plant = self.plant
         mistakes.unknown("judged: coordinate", self.judged or (), plant.coordinates)
         mistakes.unknown("disturbances: input or coordinate", self.disturbances, [*plant.inputs, *plant.coordinates])
+        instants, random = np.array([0.0, self.period]), np.random.default_rng(0)
         checks = (
+            *((lambda one=one: one.values(instants, random)) for one in self.disturbances.values()),
             lambda: self.limits.check(plant),
             lambda: self.reference.function(plant),
             lambda: self.dead_time.check(plant, self.period),
