@@ -127,7 +127,7 @@ def _cause_of_nan(function: Callable[..., object] | None) -> str:
 
 
 def _at(error: BaseException) -> str:
-    place = place_in_users_code(error)
+    place = place_in_users_code(error).partition(": ")[0]
     return f" ({place})" if place else ""
 
 
