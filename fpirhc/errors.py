@@ -93,7 +93,7 @@ class WorkerDied(FpirhcError, RuntimeError):
 
 def nearest(name: str, valid: Iterable[str]) -> str:
     """Return ' Did you mean ...? Valid: ...', the end of a message about an unknown `name`."""
-    names = list(valid)
+    names = [str(one) for one in valid]
     if not names:
         return " No names are valid here."
     close = get_close_matches(name, names, n=1, cutoff=0.5)

@@ -8,7 +8,7 @@ import math
 import re
 import traceback
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -41,7 +41,12 @@ def called(what: str, function: Callable[..., Result], *arguments: object) -> Re
 
 
 def scalar_expression(
-    what: str, value: object, *, of: Callable[..., object] | None = None, finite: bool = True
+    what: str,
+    value: object,
+    *,
+    of: Callable[..., object] | None = None,
+    symbols: Sequence[Expression] = (),
+    finite: bool = True,
 ) -> Expression:
     """Return a result of a user's function as one scalar expression.
 
@@ -49,16 +54,22 @@ def scalar_expression(
         what: the name of the result.
         value: the result.
         of: the user's function, whose source is searched for the cause of NaN.
+        symbols: those that the result may hold; without them any.
         finite: whether NaN is refused. CasADi makes NaN of math.sin(symbol), and says nothing.
 
     Raises:
-        InvalidProblem: it is none, or it holds NaN.
+        InvalidProblem: it is none, it holds NaN, or it holds a symbol of the user's own, which has no value.
     """
     if not isinstance(value, ca.SX | ca.MX | ca.DM | int | float | np.number):
         raise InvalidProblem(f"{what} must be one scalar expression, got {described(value)}")
     made = expression(value if isinstance(value, ca.SX | ca.MX | ca.DM) else ca.DM(float(value)))
     if made.numel() != 1:
         raise InvalidProblem(f"{what} must be one scalar, got shape {made.shape}")
+    strange = _strangers(made, symbols)
+    if strange:
+        raise InvalidProblem(
+            f"{what} holds the symbol {strange}, which has no value; use the arguments of the function, or a Parameter"
+        )
     if finite and _holds_nan(made):
         raise InvalidProblem(f"{what} holds NaN{_cause_of_nan(of)}")
     return made
@@ -140,6 +151,17 @@ def _instead(name: str) -> str:
     """What CasADi has for a function of numpy or math."""
     ours = _EQUIVALENTS.get(name, name)
     return f"use ca.{ours}" if hasattr(ca, ours.partition("(")[0]) else _OF_CASADI
+
+
+def _strangers(made: Expression, symbols: Sequence[Expression]) -> str:
+    """Names of symbols in an expression that are not among those that it may hold."""
+    if not symbols or made.is_constant():
+        return ""
+    known = ca.symvar(ca.vertcat(*symbols))
+    if not isinstance(made, type(known[0])):
+        return ", ".join(one.name() for one in ca.symvar(made))
+    function = ca.Function("fpirhc_result", known, [made], {"allow_free": True})
+    return ", ".join(function.get_free())
 
 
 def _holds_nan(made: Expression) -> bool:

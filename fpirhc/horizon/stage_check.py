@@ -5,6 +5,7 @@ from __future__ import annotations
 import casadi as ca
 
 from fpirhc.errors import FpirhcError, Mistakes
+from fpirhc.fields.user_code import named_results, scalar_expression
 from fpirhc.horizon.cost import Cost, View
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Named
@@ -14,15 +15,18 @@ from fpirhc.task.limits import Limits
 def check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mistakes) -> None:
     """Add every mistake in the cost's names and weights, and in the user's functions of a stage."""
     view = _view_of_symbols(plant)
+    parts = (view.state, view.reference, view.input, view.input_before, view.feedforward, view.parameters)
+    symbols = (*(part.vector for part in parts), view.time)
     if cost is not None:
         try:
             cost.check(plant)
-            cost.stage(view)
+            for name, term in named_results("cost", cost.stage(view)).items():
+                scalar_expression(f"cost: term '{name}'", term, symbols=symbols, finite=False)
         except FpirhcError as error:
             mistakes.add(str(error))
     for name, path in limits.paths.items():
         try:
-            path.value(name, view)
+            path.value(name, view, symbols)
         except FpirhcError as error:
             mistakes.add(str(error))
 

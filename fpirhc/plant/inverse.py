@@ -35,7 +35,10 @@ def inverse_by_user(plant: Plant, inverse: Callable[..., Mapping[str, Expression
         if name not in commands:
             mistakes.add(f"it does not give input '{name}'; return it too")
     mistakes.raise_if_any()
-    column = ca.vertcat(*(scalar_expression(f"inverse: input '{i}'", commands[i], of=inverse) for i in plant.inputs))
+    entries = [
+        scalar_expression(f"inverse: input '{i}'", commands[i], of=inverse, symbols=(x, r, p)) for i in plant.inputs
+    ]
+    column = ca.vertcat(*entries)
     return ca.Function("fpirhc_inverse", [x, r, p], [ca.densify(column)], ["x", "r", "p"], ["u"])
 
 

@@ -64,7 +64,7 @@ def check_response(plant: Plant, mistakes: Mistakes) -> None:
             mistakes.add(f"response does not give the derivative {c}{chr(39) * r} of coordinate '{c}'; return it too")
             continue
         try:
-            scalar_expression(f"response of '{c}'", response[c], of=plant.response)
+            scalar_expression(f"response of '{c}'", response[c], of=plant.response, symbols=(x, u, p))
         except FpirhcError as error:
             mistakes.add(str(error))
     if mistakes.none:

@@ -184,7 +184,9 @@ class Formula(Disturbance):
             InvalidValue: a value is not finite.
         """
         t = ca.SX.sym("t")
-        expression = scalar_expression("disturbance", called("disturbance", self.expression, t), of=self.expression)
+        expression = scalar_expression(
+            "disturbance", called("disturbance", self.expression, t), of=self.expression, symbols=(t,)
+        )
         function = ca.Function("fpirhc_disturbance", [t], [expression])
         samples = np.asarray(function.map(times.size)(times[None, :]).full()).ravel()
         if not np.all(np.isfinite(samples)):

@@ -38,14 +38,19 @@ class PathConstraint(Checked):
         if not takes(self.expression, 1):
             raise InvalidValue("PathConstraint.expression: expected a function of 1 argument, the view of a stage")
 
-    def value(self, name: str, view: object) -> Expression:
-        """Return the limited expression of a stage; `name` is the constraint's.
+    def value(self, name: str, view: object, symbols: Sequence[Expression] = ()) -> Expression:
+        """Return the limited expression of a stage.
+
+        Args:
+            name: of the constraint.
+            view: of the stage.
+            symbols: those that the view is made of; without them any.
 
         Raises:
             InvalidProblem: the function fails, or does not give one scalar.
         """
         what = f"limits: paths['{name}']"
-        return scalar_expression(what, called(what, self.expression, view), finite=False)
+        return scalar_expression(what, called(what, self.expression, view), symbols=symbols, finite=False)
 
 
 @dataclass(frozen=True, eq=False)

@@ -70,7 +70,7 @@ class Trajectory(Reference):
     def coordinates(self, t: Expression) -> Mapping[str, Expression]:
         """Return {coordinate: expression of t}."""
         return {
-            str(name): scalar_expression(f"reference: coordinate '{name}'", value, of=self.motion)
+            str(name): scalar_expression(f"reference: coordinate '{name}'", value, of=self.motion, symbols=(t,))
             for name, value in named_results("reference", called("reference", self.motion, t)).items()
         }
 
