@@ -38,6 +38,11 @@ class Checked(metaclass=_CheckedWhenCalled):
     """
 
 
+def field_names(owner: type) -> tuple[str, ...]:
+    """Names of the arguments of a class."""
+    return tuple(_arguments_of(owner).expected)
+
+
 def expects_whole_number(owner: type, name: str) -> bool:
     """Whether a field of a class is declared as a whole number, with or without a range."""
     one = _arguments_of(owner).expected.get(name)
