@@ -48,7 +48,11 @@ def page() -> str:
 def _section(verb: Verb) -> list[str]:
     examples = [f"    {line}  # {remark}" for line, remark in verb.examples]
     options = [f"| `{_call(a)}` | {_text(a)} |" for a in _actions(verb)]
-    codes = [f"- {code:d}: {meaning}" for code, meaning in verb.exit_codes.items() if code != ExitCode.CRASHED]
+    codes = [
+        f"- {code:d}: {meaning}"
+        for code, meaning in verb.exit_codes.items()
+        if code not in (ExitCode.CRASHED, ExitCode.OUTPUT_CLOSED)
+    ]
     notes = ["```text", verb.notes.strip(), "```", ""] if verb.notes else []
     table = ["| argument | meaning |", "|---|---|", *options, ""] if options else []
     title = [f"## {verb.name}", "", f"{verb.summary[0].upper()}{verb.summary[1:]}.", ""]

@@ -6,7 +6,7 @@ so that a user sees them together.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
 
@@ -31,6 +31,32 @@ class InvalidShape(FpirhcError, ValueError):
 
 class InvalidProblem(FpirhcError, ValueError):
     """One or more mistakes in a plant, a problem or a controller, listed together."""
+
+
+class InvalidField(InvalidValue, InvalidProblem, TypeError):
+    """One or more arguments of a value that are unknown, missing, of a wrong type or out of range.
+
+    Args:
+        mistakes: each as one sentence.
+        place: file and line of the user's call; empty where it is not known.
+    """
+
+    def __init__(self, mistakes: Sequence[str], place: str = "") -> None:
+        super().__init__(tuple(mistakes), place)
+        self.mistakes, self.place = tuple(mistakes), place
+
+    @property
+    def text(self) -> str:
+        """The mistakes without their place."""
+        if len(self.mistakes) == 1:
+            return self.mistakes[0]
+        return "\n".join(f"  {k}. {m}" for k, m in enumerate(self.mistakes, 1))
+
+    def __str__(self) -> str:
+        if not self.place:
+            return self.text
+        lead = f"{len(self.mistakes)} mistakes\n" if len(self.mistakes) > 1 else ""
+        return f"{self.place}: {lead}{self.text}"
 
 
 class ProblemFileError(FpirhcError):
@@ -67,7 +93,7 @@ class WorkerDied(FpirhcError, RuntimeError):
 
 def nearest(name: str, valid: Iterable[str]) -> str:
     """Return ' Did you mean ...? Valid: ...', the end of a message about an unknown `name`."""
-    names = list(valid)
+    names = [str(one) for one in valid]
     if not names:
         return " No names are valid here."
     close = get_close_matches(name, names, n=1, cutoff=0.5)
@@ -85,6 +111,11 @@ class Mistakes:
     def add(self, mistake: str) -> None:
         """Add one mistake."""
         self._mistakes.append(mistake)
+
+    @property
+    def none(self) -> bool:
+        """Whether there is no mistake so far."""
+        return not self._mistakes
 
     def unknown(self, what: str, names: Iterable[str], valid: Iterable[str]) -> None:
         """Add a mistake, with the nearest valid name, for each of `names` that is not in `valid`."""

@@ -256,7 +256,7 @@ def test_compiled_equals_virtual_machine():
     [
         (fp.DeadTime(inputs={"Q3": 0.1}), "input 'Q3'.*Did you mean"),
         (fp.DeadTime(inputs={"Q1": -0.1}), "'Q1' must be a number of at least 0, in s"),
-        (fp.DeadTime(measurement=float("nan")), "'measurement' must be a number of at least 0, in s"),
+        (fp.DeadTime(measurement=float("inf")), "'measurement' must be a number of at least 0, in s"),
         (fp.DeadTime(inputs={"Q1": 2.0}), "'Q1' is 2 s, more than 1000 control cycles of 0.001 s"),
     ],
 )

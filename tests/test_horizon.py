@@ -148,7 +148,7 @@ BAD_COSTS = {
         fp.CustomCost(terms=lambda v: v.input.torque**2),  # type: ignore[arg-type, return-value]
         "must be {name: expression}",
     ),
-    "many": (fp.Quadratic(states={"angel": 1.0, "angle": -1.0}, effort={"torqe": np.nan}), "4 mistakes"),
+    "many": (fp.Quadratic(states={"angel": 1.0, "angle": -1.0}, effort={"torqe": np.inf}), "4 mistakes"),
 }
 
 

@@ -152,11 +152,6 @@ def test_limits_in_a_closed_loop(case):
         (fp.Limits(rates={"torqe": (-1.0, 1.0)}), (), "torque"),
         (fp.Limits(rates={"torque": (1.0, -1.0)}), (), "swap them"),
         (fp.Limits(paths={"angle": fp.PathConstraint(lambda v: v.state.angle)}), (), "already the name"),
-        (
-            fp.Limits(paths={"mix": 3.0}),  # type: ignore[dict-item]  # a number is refused
-            (),
-            "must be a Path",
-        ),
         (fp.Limits(paths={"mix": fp.PathConstraint(lambda v: v.state.angel, upper=1.0)}), (), "angle"),
         (fp.Limits(paths={"mix": fp.PathConstraint(lambda v: v.state.vector, upper=1.0)}), (), "one scalar"),
         (fp.Limits(soft={"angle": 1.0}), (), "soft: limit of"),

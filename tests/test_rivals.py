@@ -362,7 +362,7 @@ MISFITS = {
     "too many gains": (swing, fp.PID({"angle": 1.0}, {}, {"angle": (1.0, 1.0)}), "at most 1 gains of e'"),
     "wrong order": (swing, fp.BacksteppingMRAC(RATE, (1.0, 1.0, 1.0), SIGMOID), "relative order 2, but rates has 3"),
     "unknown parameter": (swing, fp.ForceMRAC(TRACK, SIGMOID, {"mass": 1.0}), "parameter 'mass' is unknown"),
-    "no number": (swing, fp.ForceMRAC(TRACK, SIGMOID, {"m": float("nan")}), "'m' must be a finite number"),
+    "no number": (swing, fp.ForceMRAC(TRACK, SIGMOID, {"m": float("inf")}), "'m' must be a finite number"),
     "chattering": (swing, fp.SlidingMode(RATE, 500.0, 0.2), "chatters with any model"),
 }
 

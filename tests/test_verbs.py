@@ -311,7 +311,7 @@ def test_exit_codes_are_those_of_the_help(verb, folder, monkeypatch, capsys):
             before()
         assert outcome([verb.name, *shlex.split(words)]) == code, (words, capsys.readouterr().err)
         met.add(code)
-    assert met == set(verb.exit_codes) - {ExitCode.CRASHED, ExitCode.INTERRUPTED}
+    assert met == set(verb.exit_codes) - {ExitCode.CRASHED, ExitCode.INTERRUPTED, ExitCode.OUTPUT_CLOSED}
 
 
 def outcome(words: list[str]) -> int:
@@ -327,7 +327,7 @@ def outcome(words: list[str]) -> int:
     [(KeyboardInterrupt(), ExitCode.INTERRUPTED), (ZeroDivisionError("in a model"), ExitCode.CRASHED)],
 )
 def test_interrupts_and_crashes_have_codes_of_their_own(error, code, monkeypatch, capsys):
-    """A crash must not end with 1, which is an answer of the review; its traceback is printed."""
+    """A crash must not end with 1, which is an answer of the review; it is one line, and --debug prints its traceback."""
 
     def run(options):
         raise error
@@ -336,7 +336,21 @@ def test_interrupts_and_crashes_have_codes_of_their_own(error, code, monkeypatch
     monkeypatch.setattr(discovery, "shipped", lambda: commands)
     assert main(["list"]) == code
     printed = capsys.readouterr().err
-    assert ("ZeroDivisionError: in a model" in printed) == (code == ExitCode.CRASHED)
+    assert ("ZeroDivisionError" in printed) == (code == ExitCode.CRASHED)
+    assert len(printed.splitlines()) == 1
+    assert main(["list", "--debug"]) == code
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_reader_that_closes_the_output_ends_it_in_silence():
+    """`fpirhc list | head -1`: no traceback, and not Python's exit code 1, which is an answer."""
+    words = [sys.executable, "-m", "fpirhc", "list"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait() == ExitCode.OUTPUT_CLOSED
 
 
 # --- Earlier names ----------------------------------------------------------------------------------------------------

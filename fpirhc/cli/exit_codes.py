@@ -20,8 +20,9 @@ class ExitCode(IntEnum):
     CHANGED = 5, "a metric changed"
     NO_BASELINE = 6, "a baseline is missing, stale, damaged, edited by hand, or of a newer format"
     FAULTY_INSTALLATION = 7, "a check of the installation failed"
-    CRASHED = 70, "an error inside fpirhc or a problem file's own code; the traceback is on standard error"
+    CRASHED = 70, "an error inside fpirhc; --debug prints the traceback"
     INTERRUPTED = 130, "interrupted from the keyboard; finished results are kept"
+    OUTPUT_CLOSED = 141, "the reader of the output closed it before the end, as head does"
 
     def __new__(cls, value: int, meaning: str) -> ExitCode:
         """Make a member of a number and its meaning."""
@@ -35,7 +36,9 @@ def _meanings(*codes: ExitCode) -> Mapping[ExitCode, str]:
     return MappingProxyType({code: code.meaning for code in codes})
 
 
-OF_EVERY_VERB = _meanings(ExitCode.FINISHED, ExitCode.BAD_INPUT, ExitCode.CRASHED, ExitCode.INTERRUPTED)
+OF_EVERY_VERB = _meanings(
+    ExitCode.FINISHED, ExitCode.BAD_INPUT, ExitCode.CRASHED, ExitCode.INTERRUPTED, ExitCode.OUTPUT_CLOSED
+)
 
 
 def table(meanings: Mapping[ExitCode, str]) -> str:

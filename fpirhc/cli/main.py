@@ -3,32 +3,50 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import sys
 from collections.abc import Mapping, Sequence
 
+from fpirhc.cli.crash import closed_by_reader, crash, interrupted, silence_output
 from fpirhc.cli.discovery import Known, former_names, known, shipped
 from fpirhc.cli.exit_codes import ExitCode, table
-from fpirhc.cli.verb import aligned
+from fpirhc.cli.verb import DEBUG, aligned
 from fpirhc.summary import printable
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code; wrong options end with SystemExit(2), as argparse does."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        code = int(_run([word for word in words if word != DEBUG]))
+        sys.stdout.flush()  # a reader that has gone shows here, and not at the end of the program
+        return code
+    except BaseException as error:
+        if isinstance(error, SystemExit) and not closed_by_reader(error):
+            raise
+        if DEBUG in words:
+            import traceback
+
+            traceback.print_exc()
+        return _ended_by(error)
+
+
+def _ended_by(error: BaseException) -> int:
+    """Say in one line what ended the command, and return its exit code."""
     from fpirhc.errors import FpirhcError, OutputError
 
-    try:
-        return int(_run(list(sys.argv[1:] if arguments is None else arguments)))
-    except OutputError as error:
+    if closed_by_reader(error):
+        silence_output()
+        return int(ExitCode.OUTPUT_CLOSED)
+    if isinstance(error, OutputError):
         return _complain(error, ExitCode.NOT_WRITABLE)
-    except FpirhcError as error:
+    if isinstance(error, FpirhcError):
         return _complain(error, ExitCode.BAD_INPUT)
-    except KeyboardInterrupt:
+    if interrupted(error):
         return _complain("interrupted", ExitCode.INTERRUPTED)
-    except Exception:  # noqa: BLE001 -- without this, Python's own exit code 1 would read as the answer no
-        import traceback
-
-        traceback.print_exc()
-        return _complain("this is an error inside fpirhc, or in a problem file's own code", ExitCode.CRASHED)
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return _complain(f"the disk is full ({error.filename or 'output'}): {error.strerror}", ExitCode.NOT_WRITABLE)
+    return _complain(*crash(error))
 
 
 def _run(words: list[str]) -> ExitCode:

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from fpirhc.cli.crash import interrupted
+
 
 def results_folder(wanted: str | None, *default: str) -> Path:
     """Return the folder for results, created before anything runs.
@@ -46,6 +48,8 @@ def resumable(ledger: Path) -> Iterator[None]:
     """Print, after an interruption from the keyboard, where the finished results are."""
     try:
         yield
-    except KeyboardInterrupt:
+    except BaseException as error:
+        if not interrupted(error):
+            raise
         print(f"fpirhc: finished results are kept in {ledger}; the same command continues from them", file=sys.stderr)
         raise

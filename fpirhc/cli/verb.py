@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 
 from fpirhc.cli.exit_codes import OF_EVERY_VERB, ExitCode, table
 
+DEBUG = "--debug"  # an option of every command; `main` reads it before the command does
+
 
 @dataclass(frozen=True)
 class Verb:
@@ -49,6 +51,7 @@ class Verb:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         self.add(parser)
+        parser.add_argument(DEBUG, action="store_true", help="print the traceback of an error")
         return parser
 
 

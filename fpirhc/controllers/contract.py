@@ -22,6 +22,7 @@ from fpirhc.deformation.base import Deformation, Demand, Mirror, with_inner
 from fpirhc.deformation.identity import Identity
 from fpirhc.describe import replaced
 from fpirhc.errors import NotSupported
+from fpirhc.fields.checked import Checked
 from fpirhc.horizon.cost import Cost
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.plant.plant import Plant
@@ -74,7 +75,7 @@ class Planner:
         return replace(costed, horizon=replace(costed.horizon, margins=self.margins))
 
 
-class Controller(ABC):
+class Controller(Checked, ABC):
     """Contract: a frozen value that becomes blocks for a given problem.
 
     Concrete controllers are frozen dataclasses. `fpirhc.conformance.check_controller` tests that a controller keeps this contract.

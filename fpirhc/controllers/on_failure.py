@@ -11,11 +11,12 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from fpirhc.fields.checked import Checked
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Expression
 
 
-class OnFailure(ABC):
+class OnFailure(Checked, ABC):
     """Contract: the input to apply when the solve failed, and the status to report."""
 
     @abstractmethod

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import like
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.integrators import runge_kutta_4
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
@@ -31,7 +32,7 @@ from fpirhc.tracking.base import Tracking
 Parts = tuple[list[Block], list[Block], list[Block], list[Delay]]
 
 
-class Replanning(ABC):
+class Replanning(Checked, ABC):
     """Contract: blocks before the plan (-> _plan_state), after it (-> nominal, desired), after the command; delays."""
 
     @property

@@ -18,6 +18,7 @@ import casadi as ca
 
 from fpirhc.describe import replaced
 from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.fields.checked import Checked
 from fpirhc.symbolic.layout import Expression, Layout
 
 Wrapping = TypeVar("Wrapping")
@@ -81,7 +82,7 @@ class Demand:
     recovery: float = 0.0
 
 
-class Deformation(ABC):
+class Deformation(Checked, ABC):
     """Contract: a map from (request, response, desired) to the next request, and facts about it.
 
     Concrete maps are frozen dataclasses. A map around another one has the facts of the inner map unless it overrides them.

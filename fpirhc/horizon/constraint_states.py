@@ -57,7 +57,7 @@ def rates(limits: Limits, plant: Plant, view: View, step: float) -> list[Constra
 def paths(limits: Limits, view: View) -> list[ConstraintState]:
     """Limited expressions of state and input of stages 0 ... N-1."""
     return [
-        ConstraintState(name, path.unit, expression(path.expression(view)), path.lower, path.upper)
+        ConstraintState(name, path.unit, path.value(name, view), path.lower, path.upper)
         for name, path in limits.paths.items()
     ]
 

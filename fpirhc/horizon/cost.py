@@ -16,6 +16,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.user_code import called
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Named
@@ -59,7 +61,7 @@ class Linearisation:
     step: float
 
 
-class Terminal(ABC):
+class Terminal(Checked, ABC):
     """Contract: a quadratic terminal cost that is computed from the problem."""
 
     @abstractmethod
@@ -67,7 +69,7 @@ class Terminal(ABC):
         """Return the symmetric weight P of (x - x^N)' P (x - x^N), shape (nx, nx)."""
 
 
-class Cost(ABC):
+class Cost(Checked, ABC):
     """Contract: named stage terms and a terminal cost, as CasADi expressions."""
 
     @property
@@ -280,7 +282,7 @@ class CustomCost(Cost):
 
     def stage(self, view: View) -> Mapping[str, Expression]:
         """Return the user's terms."""
-        return self.terms(view)
+        return called("cost", self.terms, view)
 
     def terminal_cost(
         self,
@@ -290,7 +292,7 @@ class CustomCost(Cost):
         step: float,  # noqa: ARG002
     ) -> Expression:
         """Return the user's terminal cost, or zero."""
-        return ca.SX(0) if self.terminal is None else self.terminal(view)
+        return ca.SX(0) if self.terminal is None else called("cost: terminal", self.terminal, view)
 
 
 def _squares(weights: Mapping[str, float], value: Named, target: Named) -> Expression:

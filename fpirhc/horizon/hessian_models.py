@@ -13,10 +13,11 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from fpirhc.fields.checked import Checked
 from fpirhc.horizon.problem import OptimalControl
 
 
-class HessianModel(ABC):
+class HessianModel(Checked, ABC):
     """Contract: a model of a stage's second derivatives."""
 
     @abstractmethod

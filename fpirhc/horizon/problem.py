@@ -16,6 +16,9 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, Mistakes, NotSupported
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import Count, Duration
+from fpirhc.fields.user_code import scalar_expression
 from fpirhc.horizon.constraint_states import (
     ConstraintState,
     ends,
@@ -39,7 +42,7 @@ from fpirhc.task.reference import Reference
 
 
 @dataclass(frozen=True)
-class Horizon:
+class Horizon(Checked):
     """Length and stages of a controller's prediction.
 
     Args:
@@ -59,8 +62,8 @@ class Horizon:
         NotSupported: an integrator that is not made of plain expressions.
     """
 
-    stages: int
-    step: float
+    stages: Count
+    step: Duration
     discretisation: Integrator = field(default_factory=RungeKutta4)
     terminal: tuple[str, ...] = ()
     blocks: tuple[int, ...] = ()
@@ -393,10 +396,12 @@ def _scalar_terms(expressions: Mapping[str, Expression]) -> dict[str, Expression
     if not isinstance(expressions, Mapping) or not expressions:
         mistakes.add(f"the terms must be {{name: expression}} with at least one entry, got {expressions!r}")
         mistakes.raise_if_any()
-    terms = {str(name): ca.SX(value) for name, value in expressions.items()}
-    for name, value in terms.items():
-        if value.numel() != 1:
-            mistakes.add(f"term '{name}' must be one scalar, got shape {value.shape}; sum its entries with ca.sum1")
+    terms = {}
+    for name, value in expressions.items():
+        try:
+            terms[str(name)] = scalar_expression(f"term '{name}'", value, finite=False)
+        except InvalidProblem as error:
+            mistakes.add(f"{error}{'; sum its entries with ca.sum1' if 'shape' in str(error) else ''}")
     mistakes.raise_if_any()
     return terms
 

@@ -17,6 +17,8 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import Few
 from fpirhc.horizon.riccati import solve_free
 from fpirhc.symbolic.expression import is_finite
 
@@ -25,7 +27,7 @@ _GROWTH = 2.0  # growth of |F| after which the memory is dropped
 
 
 @dataclass(frozen=True)
-class Anderson:
+class Anderson(Checked):
     """Acceleration with the last changes of an iteration.
 
     Args:
@@ -35,7 +37,7 @@ class Anderson:
         InvalidValue: fewer than one.
     """
 
-    memory: int
+    memory: Few
 
     def __post_init__(self) -> None:
         if self.memory < 1:

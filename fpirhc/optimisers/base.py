@@ -20,6 +20,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.checked import Checked
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient, rollout
 from fpirhc.status import Status
@@ -30,7 +31,7 @@ FEASIBLE = 1e-4  # largest violation of a state bound that still counts as kept
 UNKNOWN_ITERATIONS = -1.0  # a solver that is called inside a graph does not report its iterations
 
 
-class Optimiser(ABC):
+class Optimiser(Checked, ABC):
     """Contract: one improvement of a warm-started plan as a Function, with a fixed amount of work where possible."""
 
     @property
@@ -43,7 +44,7 @@ class Optimiser(ABC):
         """Scalars of the memory that a run logs: signal -> name in the memory."""
         return {}
 
-    def check(self, ocp: OptimalControl) -> None:  # noqa: B027 -- most optimisers serve every problem
+    def check(self, ocp: OptimalControl) -> None:
         """Raise if the optimiser cannot serve the problem.
 
         Raises:

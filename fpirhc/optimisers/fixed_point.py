@@ -44,6 +44,7 @@ from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import require_own_requests
 from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.fields.kinds import Count
 from fpirhc.horizon.hessian_models import GaussNewton, HessianModel
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.base import Optimiser, require_settings
@@ -78,7 +79,7 @@ class FixedPoint(Optimiser):
         InvalidValue: fewer than one iteration, a tolerance that is not positive, or a negative damping.
     """
 
-    iterations: int
+    iterations: Count
     tolerance: float
     map: Deformation = field(default_factory=lambda: Affine(gain=-2.0))
     hessian: HessianModel | None = None

@@ -23,6 +23,7 @@ from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import require_own_requests
 from fpirhc.errors import NotContractive, NotSupported
+from fpirhc.fields.kinds import Count
 from fpirhc.horizon.auxiliary import auxiliary_gradient, auxiliary_hessian
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
@@ -51,7 +52,7 @@ class FullSpaceFixedPoint(Optimiser):
         InvalidValue: fewer than one iteration, or a tolerance that is not positive.
     """
 
-    iterations: int
+    iterations: Count
     tolerance: float
     map: Deformation | None = None
     scaled: bool = False

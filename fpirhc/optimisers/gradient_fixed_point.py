@@ -21,6 +21,7 @@ from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import require_own_requests
 from fpirhc.errors import NotContractive, NotSupported
+from fpirhc.fields.kinds import Count
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.reference_expansion import steepest_curvature
 from fpirhc.horizon.rollout import reduced_gradient
@@ -47,7 +48,7 @@ class GradientFixedPoint(Optimiser):
         InvalidValue: fewer than one iteration, or a tolerance that is not positive.
     """
 
-    iterations: int
+    iterations: Count
     tolerance: float
     map: Deformation | None = None
     acceleration: Anderson | None = None

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from fpirhc.fields.kinds import Accuracy, Count
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.multiple_shooting import MultipleShooting
 from fpirhc.optimisers.quadratic_solvers import Options, Osqp, Qrqp, QuadraticSolver
@@ -30,8 +31,8 @@ class Ipopt(MultipleShooting):
         iterations: most iterations of IPOPT in one call.
     """
 
-    accuracy: float = 1e-8
-    iterations: int = 200
+    accuracy: Accuracy = 1e-8
+    iterations: Count = 200
 
     @property
     def plugin(self) -> str:
@@ -63,8 +64,8 @@ class Fatrop(MultipleShooting):
         iterations: most iterations of fatrop in one call.
     """
 
-    accuracy: float = 1e-8
-    iterations: int = 200
+    accuracy: Accuracy = 1e-8
+    iterations: Count = 200
 
     @property
     def plugin(self) -> str:
@@ -92,7 +93,7 @@ class SequentialQuadratic(MultipleShooting):
     """
 
     quadratic: QuadraticSolver = field(default_factory=Qrqp)
-    iterations: int = 20
+    iterations: Count = 20
 
     @property
     def plugin(self) -> str:

@@ -10,13 +10,15 @@ from typing import TypeAlias
 import casadi as ca
 
 from fpirhc.errors import InvalidValue, NotSupported, nearest
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import Accuracy, Count
 
 Setting: TypeAlias = "bool | int | float | str | Sequence[bool] | ca.Function | Mapping[str, Setting]"
 Options: TypeAlias = Mapping[str, Setting]
 
 
 @dataclass(frozen=True)
-class QuadraticSolver(ABC):
+class QuadraticSolver(Checked, ABC):
     """Contract: a solver of the quadratic programs inside `SequentialQuadratic`."""
 
     @property
@@ -37,7 +39,7 @@ class Qrqp(QuadraticSolver):
         iterations: most iterations of one program.
     """
 
-    iterations: int = 200
+    iterations: Count = 200
 
     @property
     def plugin(self) -> str:
@@ -58,7 +60,7 @@ class Osqp(QuadraticSolver):
         accuracy: of both residuals.
     """
 
-    accuracy: float = 1e-8
+    accuracy: Accuracy = 1e-8
 
     @property
     def plugin(self) -> str:

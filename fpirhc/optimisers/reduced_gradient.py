@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.errors import NotSupported
+from fpirhc.fields.kinds import Count
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.base import Optimiser, clip, judge, remembered_plan, require_settings, sane, shift, status_of
@@ -45,7 +46,7 @@ class ReducedGradient(Optimiser):
         InvalidValue: fewer than one iteration, or a tolerance that is not positive.
     """
 
-    iterations: int
+    iterations: Count
     tolerance: float
 
     def __post_init__(self) -> None:

@@ -21,6 +21,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import Few
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression
@@ -32,8 +33,8 @@ _Coefficients: TypeAlias = tuple[np.ndarray, np.ndarray]  # a (stages, stages) a
 class _Implicit(Integrator):
     """Sub-steps of one implicit method, each with a fixed number of Newton steps."""
 
-    substeps: int = 1
-    newton: int = 3
+    substeps: Few = 1
+    newton: Few = 3
 
     def __post_init__(self) -> None:
         for what, value in (("sub-step", self.substeps), ("Newton step", self.newton)):

@@ -13,11 +13,13 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import Accuracy, Few
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression
 
 
-class Integrator(ABC):
+class Integrator(Checked, ABC):
     """Contract: one cycle of the plant as a Function."""
 
     @property
@@ -45,7 +47,7 @@ class RungeKutta4(Integrator):
         InvalidValue: fewer than one sub-step.
     """
 
-    substeps: int = 1
+    substeps: Few = 1
 
     def __post_init__(self) -> None:
         if self.substeps < 1:
@@ -77,7 +79,7 @@ class Euler(Integrator):
         InvalidValue: fewer than one sub-step.
     """
 
-    substeps: int = 1
+    substeps: Few = 1
 
     def __post_init__(self) -> None:
         if self.substeps < 1:
@@ -101,7 +103,7 @@ class Cvodes(Integrator):
         tolerance: relative and absolute.
     """
 
-    tolerance: float = 1e-10
+    tolerance: Accuracy = 1e-10
 
     @property
     def opaque(self) -> bool:

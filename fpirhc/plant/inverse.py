@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 
+from fpirhc.errors import Mistakes
+from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.symbolic.layout import Expression, Named
 
 if TYPE_CHECKING:
@@ -24,8 +26,19 @@ def inverse_by_user(plant: Plant, inverse: Callable[..., Mapping[str, Expression
     """Function (state, response, parameters) -> input, made of the user's `inverse`."""
     x, _, p = plant.symbols()
     r = ca.SX.sym("r", len(plant.controlled_names))
-    commands = inverse(*plant._derivatives(x), Named(plant.controlled_names, r, "coordinate"), plant._parameters(p))
-    column = ca.vertcat(*(ca.SX(commands[i]) for i in plant.inputs))
+    wanted = Named(plant.controlled_names, r, "coordinate")
+    commands = named_results(
+        "inverse", called("inverse", inverse, *plant._derivatives(x), wanted, plant._parameters(p))
+    )
+    mistakes = Mistakes("inverse")
+    for name in plant.inputs:
+        if name not in commands:
+            mistakes.add(f"it does not give input '{name}'; return it too")
+    mistakes.raise_if_any()
+    entries = [
+        scalar_expression(f"inverse: input '{i}'", commands[i], of=inverse, symbols=(x, r, p)) for i in plant.inputs
+    ]
+    column = ca.vertcat(*entries)
     return ca.Function("fpirhc_inverse", [x, r, p], [ca.densify(column)], ["x", "r", "p"], ["u"])
 
 

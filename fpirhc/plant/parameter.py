@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from fpirhc.errors import Mistakes
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.spread import Spread
 
 
 @dataclass(frozen=True)
-class Parameter:
+class Parameter(Checked):
     """One parameter of a plant.
 
     Args:

@@ -23,6 +23,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import Mistakes, NotInvertible
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.user_code import called
 from fpirhc.plant.inverse import inverse_by_newton, inverse_by_user, inverse_of_affine
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_response
@@ -33,7 +35,7 @@ __all__ = ["Parameter", "Plant", "derivative_unit", "structural_order"]
 
 
 @dataclass(frozen=True, eq=False)
-class Plant:
+class Plant(Checked):
     """A system q^(r) = f(q, q', ..., u, p); a controller has its approximate parameters only.
 
     Args:
@@ -183,7 +185,8 @@ class Plant:
     def response_function(self) -> ca.Function:
         """Function (state, input, parameters) -> highest derivative of every coordinate (n)."""
         x, u, p = self.symbols()
-        responses = self.response(*self._derivatives(x), Named(self.input.elements, u, "input"), self._parameters(p))
+        views = (*self._derivatives(x), Named(self.input.elements, u, "input"), self._parameters(p))
+        responses = called("response", self.response, *views)
         column = ca.vertcat(*(ca.SX(responses[c]) for c in self.names))
         return ca.Function("fpirhc_response", [x, u, p], [ca.densify(column)], ["x", "u", "p"], ["r"])
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
-import casadi as ca
-
 from fpirhc.errors import FpirhcError, Mistakes
+from fpirhc.fields.expected import takes
+from fpirhc.fields.user_code import called, named_results, scalar_expression
+from fpirhc.plant.inverse import inverse_by_user
 from fpirhc.plant.structural_order import structural_order
-from fpirhc.symbolic.layout import Named
+from fpirhc.symbolic.layout import Expression, Named
 
 if TYPE_CHECKING:
     from fpirhc.plant.plant import Plant
@@ -46,8 +47,8 @@ def check_names(plant: Plant, mistakes: Mistakes) -> None:
 def check_response(plant: Plant, mistakes: Mistakes) -> None:
     """Add every mistake of the response and of the orders to `mistakes`."""
     expected = max(plant.orders) + 2
-    arguments = len(inspect.signature(plant.response).parameters)
-    if arguments != expected:
+    if not takes(plant.response, expected):
+        arguments = len(inspect.signature(plant.response).parameters)
         lower = ["q", "v", "a"] + [f"d{k}" for k in range(3, 12)]
         mistakes.add(
             f"response takes {arguments} argument(s); with order {max(plant.orders)} it is called as "
@@ -55,22 +56,25 @@ def check_response(plant: Plant, mistakes: Mistakes) -> None:
         )
         return
     x, u, p = plant.symbols()
+    arguments_of_step = (*plant._derivatives(x), Named(plant.input.elements, u, "input"), plant._parameters(p))
     try:
-        response = plant.response(*plant._derivatives(x), Named(plant.input.elements, u, "input"), plant._parameters(p))
+        response = named_results("response", called("response", plant.response, *arguments_of_step))
     except FpirhcError as error:
-        mistakes.add(f"response: {error}")
-        return
-    if not isinstance(response, Mapping):
-        mistakes.add(f"response must return {{coordinate: expression}}, got {type(response).__name__}")
+        mistakes.add(str(error))
         return
     mistakes.unknown("response: coordinate", response, plant.coordinates)
     for c, r in zip(plant.names, plant.orders, strict=True):
         if c not in response:
             mistakes.add(f"response does not give the derivative {c}{chr(39) * r} of coordinate '{c}'; return it too")
-        elif ca.SX(response[c]).numel() != 1:
-            mistakes.add(f"response of '{c}' must be one scalar, got shape {ca.SX(response[c]).shape}")
-    if all(c in response and ca.SX(response[c]).numel() == 1 for c in plant.names):
+            continue
+        try:
+            scalar_expression(f"response of '{c}'", response[c], of=plant.response, symbols=(x, u, p))
+        except FpirhcError as error:
+            mistakes.add(str(error))
+    if mistakes.none:
         _check_orders(plant, mistakes)
+    if mistakes.none and plant.inverse is not None:
+        _check_inverse(plant, plant.inverse, mistakes)
 
 
 def _check_order_numbers(plant: Plant, mistakes: Mistakes) -> None:
@@ -83,6 +87,19 @@ def _check_order_numbers(plant: Plant, mistakes: Mistakes) -> None:
     for order in orders:
         if not isinstance(order, int) or isinstance(order, bool) or order < 1:
             mistakes.add(f"order must be a whole number of at least 1, got {order!r}")
+
+
+def _check_inverse(plant: Plant, inverse: Callable[..., Mapping[str, Expression]], mistakes: Mistakes) -> None:
+    arguments = max(plant.orders) + 2
+    if not takes(inverse, arguments):
+        mistakes.add(
+            f"inverse is called with {arguments} arguments: the derivatives below the order, responses, parameters"
+        )
+        return
+    try:
+        inverse_by_user(plant, inverse)
+    except FpirhcError as error:
+        mistakes.add(str(error))
 
 
 def _check_orders(plant: Plant, mistakes: Mistakes) -> None:

@@ -25,6 +25,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidValue, NotSupported, nearest
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.symbolic.layout import Expression, Named, Signal, vector
 
@@ -34,7 +35,7 @@ _SPREAD = 0.3  # relative range of random parameters
 
 
 @dataclass(frozen=True, eq=False)
-class Combination:
+class Combination(Checked):
     """An expression of parameters that enters linearly as a whole: Combination(lambda p: p.m * p.l**2, "kg m^2").
 
     Args:

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.checked import Checked
 
 TAILS = 2.0  # standard deviations at which normal distributions are cut off; 95 % of the uncut one lie inside
 _NORMAL = NormalDist()
 _LEAST = _NORMAL.cdf(-TAILS)
 
 
-class Spread(ABC):
+class Spread(Checked, ABC):
     """Contract: the distribution of an exact parameter around its value, for a share of the full spread."""
 
     @abstractmethod

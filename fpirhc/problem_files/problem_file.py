@@ -11,9 +11,6 @@ It may also define
 from __future__ import annotations
 
 import ast
-import importlib.util
-import sys
-import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,6 +18,9 @@ from types import ModuleType
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, Mistakes, ProblemFileError, nearest
+from fpirhc.fields.given import call_of, described
+from fpirhc.problem_files.importing import imported
+from fpirhc.problem_files.importing import line_of as _at
 from fpirhc.problem_files.tuning_spans import TuningSpans, check_tuning
 from fpirhc.simulation.metrics import Metric, known_metrics, with_own_metrics
 from fpirhc.simulation.pictures.base import Picture
@@ -114,33 +114,71 @@ def load_problem(name_or_path: str) -> Task:
         ProblemFileError: the file raises an error on import (the message shows the line), or a definition is missing or wrong.
     """
     path = find_problem(name_or_path)
-    module = _import(path)
+    module = imported(path)
     mistakes = Mistakes(f"problem file '{path.name}'")
-    problem, controllers = getattr(module, "problem", None), getattr(module, "controllers", None)
-    if not isinstance(problem, Problem):
-        mistakes.add("it must define problem = fpirhc.Problem(...)")
-    if not isinstance(controllers, Mapping) or not controllers:
-        mistakes.add("it must define controllers = {'name': fpirhc.ComputedTorque(...), ...}")
-        controllers = {}
-    for name, controller in controllers.items():
-        if not isinstance(controller, Controller):
-            mistakes.add(f"controllers['{name}'] must be a controller, got {type(controller).__name__}")
-    headline = getattr(module, "headline", None)
-    mistakes.unknown("headline: controller", headline or (), controllers)
+    problem, controllers = _problem(module, mistakes), _controllers(module, mistakes)
+    headline = _headline(module, controllers, mistakes)
     tuning, own = getattr(module, "tuning", {}), getattr(module, "metrics", ())
     if not isinstance(own, Sequence) or not all(isinstance(metric, Metric) for metric in own):
-        mistakes.add("metrics must be a sequence of fpirhc.Metric, metrics = (fpirhc.Metric(...),)")
-    pictures = tuple(getattr(module, "pictures", ()))
-    _check_pictures(pictures, controllers, mistakes)
+        mistakes.add(f"{_at(module, 'metrics')}expected a sequence of fpirhc.Metric, metrics = (fpirhc.Metric(...),)")
+    pictures = getattr(module, "pictures", ())
+    if not isinstance(pictures, Sequence):
+        mistakes.add(f"{_at(module, 'pictures')}expected a sequence of pictures, got {described(pictures)}")
+        pictures = ()
+    _check_pictures(tuple(pictures), controllers, mistakes)
+    if not isinstance(tuning, Mapping):
+        mistakes.add(f"{_at(module, 'tuning')}expected {{controller: {{setting: Span(...)}}}}, got {described(tuning)}")
     try:
         mistakes.raise_if_any()
         check_tuning(tuning, controllers)
         metrics = with_own_metrics(own)
     except FpirhcError as error:
         raise ProblemFileError(str(error)) from None
-    assert isinstance(problem, Problem)
+    assert problem is not None
     title, _, description = (module.__doc__ or path.stem).strip().partition("\n")
-    return Task(path.stem, path, title, description.strip(), problem, controllers, headline, tuning, metrics, pictures)
+    return Task(
+        path.stem, path, title, description.strip(), problem, controllers, headline, tuning, metrics, tuple(pictures)
+    )
+
+
+def _problem(module: ModuleType, mistakes: Mistakes) -> Problem | None:
+    problem = getattr(module, "problem", None)
+    if isinstance(problem, Problem):
+        return problem
+    others = [name for name, value in vars(module).items() if isinstance(value, Problem)]
+    named = f"; '{others[0]}' is one, so call it 'problem'" if others else ""
+    got = f", got {described(problem)}" if hasattr(module, "problem") else ""
+    mistakes.add(f"{_at(module, 'problem')}it must define problem = fpirhc.Problem(...){got}{named}")
+    return None
+
+
+def _controllers(module: ModuleType, mistakes: Mistakes) -> Mapping[str, Controller]:
+    controllers = getattr(module, "controllers", None)
+    where = _at(module, "controllers")
+    if not isinstance(controllers, Mapping) or not controllers:
+        got = f", got {described(controllers)}" if hasattr(module, "controllers") else ""
+        mistakes.add(f"{where}it must define controllers = {{'name': fpirhc.ComputedTorque(...), ...}}{got}")
+        return {}
+    for name, controller in controllers.items():
+        if not isinstance(name, str) or not name:
+            mistakes.add(f"{where}the name of a controller must be a text, got {described(name)}")
+        if not isinstance(controller, Controller):
+            mend = f"; write {call_of(controller)}" if isinstance(controller, type) else ""
+            mistakes.add(f"{where}controllers['{name}'] must be a controller, got {described(controller)}{mend}")
+    return controllers
+
+
+def _headline(module: ModuleType, controllers: Mapping[str, Controller], mistakes: Mistakes) -> tuple[str, str] | None:
+    headline = getattr(module, "headline", None)
+    if headline is None:
+        return None
+    if not isinstance(headline, Sequence) or isinstance(headline, str) or len(headline) != 2:
+        mistakes.add(
+            f"{_at(module, 'headline')}headline must be a pair of names (without adaptation, with), got {described(headline)}"
+        )
+        return None
+    mistakes.unknown(f"{_at(module, 'headline')}headline: controller", headline, controllers)
+    return headline[0], headline[1]
 
 
 def _check_pictures(pictures: tuple[object, ...], controllers: Mapping[str, object], mistakes: Mistakes) -> None:
@@ -149,28 +187,3 @@ def _check_pictures(pictures: tuple[object, ...], controllers: Mapping[str, obje
             mistakes.add(f"pictures must hold pictures such as Portrait(...), got {picture!r}")
         else:
             mistakes.unknown(f"picture '{picture.title}': controller", picture.controllers, controllers)
-
-
-def _import(path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"fpirhc_problem_{path.stem}", path)
-    if spec is None or spec.loader is None:
-        raise ProblemFileError(f"'{path}' is not a Python file")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    try:
-        spec.loader.exec_module(module)
-    except SyntaxError as error:
-        raise ProblemFileError(
-            f"{path.name}, line {error.lineno}: {error.msg}\n    {(error.text or '').strip()}"
-        ) from None
-    except Exception as error:  # noqa: BLE001 -- every error of a user's file is shown with its line
-        raise ProblemFileError(f"{_own_line(path, error)}\n    {type(error).__name__}: {error}") from None
-    return module
-
-
-def _own_line(path: Path, error: BaseException) -> str:
-    """The last line of the user's file in the traceback."""
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).resolve() == path.resolve()]
-    if not frames:
-        return path.name
-    return f"{path.name}, line {frames[-1].lineno}: {frames[-1].line}"

@@ -8,6 +8,7 @@ from typing import Any
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import InvalidName, InvalidValue, nearest
+from fpirhc.fields.checked import expects_whole_number
 
 Values = Mapping[str, float]
 
@@ -64,7 +65,7 @@ def is_whole(controller: Controller, path: str) -> bool:
     owner: Any = controller
     for parent in parents:
         owner = _entry(owner, parent)
-    return is_dataclass(owner) and any(f.name == name and f.type in (int, "int") for f in fields(owner))
+    return is_dataclass(owner) and expects_whole_number(type(owner), name)
 
 
 def _names(value: Any) -> list[str]:

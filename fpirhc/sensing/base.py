@@ -23,6 +23,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.layout import Expression, Signal
@@ -30,7 +31,7 @@ from fpirhc.symbolic.layout import Expression, Signal
 Array: TypeAlias = np.ndarray
 
 
-class DerivativeEstimator(ABC):
+class DerivativeEstimator(Checked, ABC):
     """Contract: a block from the measured quantities to the controller's 'state' and 'realised'."""
 
     @property
@@ -70,7 +71,7 @@ class DerivativeEstimator(ABC):
     def fills(self, order: int) -> int:
         """Number of the first cycle (from 0) whose response depends on this run's samples alone."""
 
-    def check(self, plant: Plant) -> None:  # noqa: B027 -- most estimators serve every plant
+    def check(self, plant: Plant) -> None:
         """Raise if the estimator cannot serve the plant.
 
         Raises:

@@ -21,6 +21,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, response_names
 from fpirhc.sensing.measured import Measured
@@ -34,7 +35,7 @@ _STREAM = 1  # separates the sensors' random series from the series of disturban
 
 
 @dataclass(frozen=True, eq=False)
-class Sensing:
+class Sensing(Checked):
     """Sensors and estimator between plant and controller; ideal by default.
 
     Args:

@@ -9,11 +9,12 @@ import math
 from dataclasses import dataclass
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.checked import Checked
 from fpirhc.task.disturbance import Disturbance
 
 
 @dataclass(frozen=True, eq=False)
-class Sensor:
+class Sensor(Checked):
     """Noise, quantisation and lost samples of one measured quantity.
 
     Args:

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
-from zipfile import BadZipFile
 
 import numpy as np
 
-from fpirhc.errors import InvalidName, OutputError, nearest
-from fpirhc.simulation.common_columns import with_common_columns
+from fpirhc.errors import InvalidName, nearest
 from fpirhc.summary import line, number, table
-from fpirhc.symbolic.layout import Layout, Signal
+from fpirhc.symbolic.layout import Layout
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
-
-FORMAT = 1  # of saved runs
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,53 +114,11 @@ class Run:
         return run_figure(self)
 
     def save(self, path: str | Path) -> None:
-        """Write the run to a .npz file (no pickle).
+        """Write the run to a .npz file (no pickle), at once or not at all.
 
         Raises:
-            OutputError: the file cannot be written.
+            OutputError: the file cannot be written, or its place is a symbolic link.
         """
-        facts = {
-            "format": FORMAT,
-            "problem": self.problem,
-            "controller": self.controller,
-            "seed": self.seed,
-            "period": self.period,
-            "stop": self.stop,
-            "compiled": self.compiled,
-            "settings": self.settings,
-            "signals": [[s.name, list(s.elements), list(s.units)] for s in self.layout.signals],
-        }
-        try:
-            with Path(path).open("wb") as file:
-                np.savez_compressed(file, log=self.log, facts=np.array(json.dumps(facts)))
-        except OSError as error:
-            raise OutputError(f"cannot write the run to '{path}': {error.strerror}") from None
+        from fpirhc.simulation.run_file import save_run
 
-
-def load_run(path: str | Path) -> Run:
-    """Read a run that `Run.save` wrote.
-
-    Raises:
-        OutputError: the file is missing, damaged, or of another format.
-    """
-    try:
-        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            facts, log = json.loads(str(stored["facts"])), stored["log"]
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-        raise OutputError(f"cannot read a run from '{path}': {error}") from None
-    if facts.get("format") != FORMAT:
-        raise OutputError(f"'{path}' has format {facts.get('format')}, this version reads {FORMAT}")
-    # A file of an older version lacks columns; they follow from the others.
-    layout, log = with_common_columns(Layout(tuple(Signal(n, tuple(e), tuple(u)) for n, e, u in facts["signals"])), log)
-    log.setflags(write=False)
-    return Run(
-        facts["problem"],
-        facts["controller"],
-        facts["seed"],
-        facts["period"],
-        layout,
-        log,
-        facts["stop"],
-        facts["compiled"],
-        facts["settings"],
-    )
+        save_run(self, Path(path))

@@ -20,7 +20,7 @@ from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.run_signals import judgements
 from fpirhc.symbolic.block import Composite
-from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.evaluate import Evaluator, unwrapped
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native
 from fpirhc.task.problem import Problem
@@ -184,7 +184,10 @@ def _run_chunks(
         for argument, table in zip(evaluator.arguments[1:], tables, strict=True):
             argument.reshape(CHUNK, -1)[:] = table[at : at + CHUNK]
         evaluator.redirect(1, log[at : at + CHUNK])
-        evaluator.evaluate()
+        try:
+            evaluator.evaluate()
+        except SystemError as error:
+            raise unwrapped(error) from None
         rows = log[at : min(at + CHUNK, cycles)]
         bad = _first_bad(rows)
         if bad is not None:

@@ -81,7 +81,10 @@ class Evaluator:
         checked = [self._checked(k, value) for k, value in enumerate(values)]
         for array, value in zip(self.arguments, checked, strict=True):
             array[...] = value
-        self.evaluate()
+        try:
+            self.evaluate()
+        except SystemError as error:
+            raise unwrapped(error) from None
         if self.failed:
             raise InvalidValue(f"'{self.function.name()}' fails for these arguments: {values}")
         return tuple(result.copy() for result in self.results)
@@ -112,6 +115,15 @@ class Evaluator:
                 f"argument '{name}' has {array.size} entries (shape {array.shape}{hint}), got shape {entries.shape}"
             )
         return entries.reshape(array.shape)
+
+
+def unwrapped(error: SystemError) -> BaseException:
+    """Return the interruption from the keyboard that CasADi wrapped, or else the error itself.
+
+    A solver that Ctrl-C reaches returns with the interruption set, which Python reports as a SystemError.
+    """
+    cause = error.__cause__ or error.__context__
+    return cause if isinstance(cause, KeyboardInterrupt) else error
 
 
 def _array(size: tuple[int, int]) -> np.ndarray:

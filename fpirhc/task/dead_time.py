@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 import casadi as ca
 
 from fpirhc.errors import Mistakes
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
@@ -26,7 +27,7 @@ MOST = 1000  # cycles of dead time
 
 
 @dataclass(frozen=True, eq=False)
-class DeadTime:
+class DeadTime(Checked):
     """Dead time in seconds.
 
     Args:

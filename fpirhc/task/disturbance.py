@@ -16,10 +16,12 @@ import numpy as np
 from scipy.signal import lfilter
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.symbolic.layout import Expression
 
 
-class Disturbance(ABC):
+class Disturbance(Checked, ABC):
     """Contract: values at given times, and the size and speed of their changes where these are known."""
 
     @property
@@ -182,7 +184,10 @@ class Formula(Disturbance):
             InvalidValue: a value is not finite.
         """
         t = ca.SX.sym("t")
-        function = ca.Function("fpirhc_disturbance", [t], [self.expression(t)])
+        expression = scalar_expression(
+            "disturbance", called("disturbance", self.expression, t), of=self.expression, symbols=(t,)
+        )
+        function = ca.Function("fpirhc_disturbance", [t], [expression])
         samples = np.asarray(function.map(times.size)(times[None, :]).full()).ravel()
         if not np.all(np.isfinite(samples)):
             where = times[np.argmin(np.isfinite(samples))]

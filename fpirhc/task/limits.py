@@ -8,15 +8,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fpirhc.errors import Mistakes
+from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.expected import takes
+from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.expression import Value
+from fpirhc.symbolic.expression import Expression, Value
 
 Interval = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class PathConstraint:
+class PathConstraint(Checked):
     """A limit on any expression of a stage.
 
     Args:
@@ -31,9 +34,27 @@ class PathConstraint:
     upper: float = math.inf
     unit: str = ""
 
+    def __post_init__(self) -> None:
+        if not takes(self.expression, 1):
+            raise InvalidValue("PathConstraint.expression: expected a function of 1 argument, the view of a stage")
+
+    def value(self, name: str, view: object, symbols: Sequence[Expression] = ()) -> Expression:
+        """Return the limited expression of a stage.
+
+        Args:
+            name: of the constraint.
+            view: of the stage.
+            symbols: those that the view is made of; without them any.
+
+        Raises:
+            InvalidProblem: the function fails, or does not give one scalar.
+        """
+        what = f"limits: paths['{name}']"
+        return scalar_expression(what, called(what, self.expression, view), symbols=symbols, finite=False)
+
 
 @dataclass(frozen=True, eq=False)
-class Limits:
+class Limits(Checked):
     """Limits of a problem.
 
     The plant's actuator clips the inputs to their limits. All other limits bind an optimiser's plan.
@@ -100,8 +121,12 @@ class Limits:
 def _check_interval(name: str, interval: object, mistakes: Mistakes) -> None:
     if not isinstance(interval, Sequence) or len(interval) != 2:
         mistakes.add(f"'{name}' needs two numbers (lower, upper), got {interval!r}")
-    elif any(math.isnan(v) for v in interval) or interval[0] > interval[1]:
+    elif interval[0] > interval[1]:
         mistakes.add(f"'{name}' has lower {interval[0]} above upper {interval[1]}; swap them")
+    elif interval[0] == math.inf or interval[1] == -math.inf:
+        mistakes.add(
+            f"'{name}' has limits {tuple(interval)!r} that no number meets; a free side is -inf below, inf above"
+        )
 
 
 def _bounds(intervals: Mapping[str, Interval], names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:

@@ -11,8 +11,11 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import Duration
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.problem import Horizon
+from fpirhc.horizon.stage_check import check_stage
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
@@ -21,9 +24,11 @@ from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.limits import Limits
 from fpirhc.task.reference import Reference
 
+MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
+
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class Problem(Checked):
     """One control task.
 
     Args:
@@ -50,8 +55,8 @@ class Problem:
     plant: Plant
     reference: Reference
     start: Mapping[str, float]
-    period: float
-    duration: float
+    period: Duration
+    duration: Duration
     limits: Limits = field(default_factory=Limits)
     disturbances: Mapping[str, Disturbance] = field(default_factory=dict)
     dead_time: DeadTime = field(default_factory=DeadTime)
@@ -70,7 +75,9 @@ class Problem:
         plant = self.plant
         mistakes.unknown("judged: coordinate", self.judged or (), plant.coordinates)
         mistakes.unknown("disturbances: input or coordinate", self.disturbances, [*plant.inputs, *plant.coordinates])
+        instants, random = np.array([0.0, self.period]), np.random.default_rng(0)
         checks = (
+            *((lambda one=one: one.values(instants, random)) for one in self.disturbances.values()),
             lambda: self.limits.check(plant),
             lambda: self.reference.function(plant),
             lambda: self.dead_time.check(plant, self.period),
@@ -82,6 +89,7 @@ class Problem:
             except FpirhcError as error:
                 mistakes.add(str(error))
         mistakes.raise_if_any()
+        check_stage(plant, self.cost, self.limits, mistakes)
         _check_inverse(self, mistakes)
         mistakes.raise_if_any()
 
@@ -137,6 +145,10 @@ def _check_times(problem: Problem, mistakes: Mistakes) -> None:
         if not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
             mistakes.add(f"{name} must be a positive number, in {unit}, got {value!r}")
             return
+    if problem.duration > MOST_CYCLES * problem.period:
+        mistakes.add(
+            f"a run of {problem.duration:g} s has more than {MOST_CYCLES:.0e} cycles of {problem.period:g} s; shorten it"
+        )
     if problem.duration < problem.period:
         mistakes.add(f"duration {problem.duration} {unit} is shorter than one period of {problem.period} {unit}")
     if not 0 <= problem.measure_from < problem.duration:

@@ -14,12 +14,14 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Expression
 
 
-class Reference(ABC):
+class Reference(Checked, ABC):
     """Contract: the nominal motion of every coordinate."""
 
     @property
@@ -67,7 +69,10 @@ class Trajectory(Reference):
 
     def coordinates(self, t: Expression) -> Mapping[str, Expression]:
         """Return {coordinate: expression of t}."""
-        return self.motion(t)
+        return {
+            str(name): scalar_expression(f"reference: coordinate '{name}'", value, of=self.motion, symbols=(t,))
+            for name, value in named_results("reference", called("reference", self.motion, t)).items()
+        }
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 
@@ -26,7 +27,7 @@ class Feedback:
     rate: float | None = None
 
 
-class Tracking(ABC):
+class Tracking(Checked, ABC):
     """Contract: q^Des from the nominal motion and the measured state.
 
     A law is two blocks with its memory between them, because the memory may depend on the command, which comes later in the cycle

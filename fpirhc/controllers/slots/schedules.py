@@ -17,6 +17,7 @@ import casadi as ca
 
 from fpirhc.controllers.slots.slot import Channel
 from fpirhc.errors import Mistakes
+from fpirhc.fields.checked import Checked
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, scalar
@@ -25,7 +26,7 @@ from fpirhc.task.problem import Problem
 SlotSpans = tuple[tuple[str, float], ...]
 
 
-class Schedule(ABC):
+class Schedule(Checked, ABC):
     """Contract: which slot is active, cycle by cycle."""
 
     @abstractmethod

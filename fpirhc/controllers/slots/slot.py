@@ -17,6 +17,7 @@ from fpirhc.deformation.base import Deformation, Mirror
 from fpirhc.deformation.identity import Identity
 from fpirhc.deformation.model_referenced import form_inside
 from fpirhc.errors import InvalidProblem, NotInvertible, NotSupported
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.relative_order import OutputChain, output_chain
 from fpirhc.symbolic.block import Block, Delay
@@ -29,7 +30,7 @@ First = Callable[[Signals], Mapping[str, Expression]]
 
 
 @dataclass(frozen=True)
-class Slot:
+class Slot(Checked):
     """The coordinate that is controlled while the slot lasts, and how.
 
     Args:

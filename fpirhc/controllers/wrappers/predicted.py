@@ -29,6 +29,7 @@ from fpirhc.controllers.base import Controller, compose_controller, embedded, li
 from fpirhc.controllers.mirror import MEASURED
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.fields.checked import Checked
 from fpirhc.members import Example
 from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Plant
@@ -39,7 +40,7 @@ from fpirhc.task.dead_time import MOST, DeadTime
 from fpirhc.task.problem import Problem
 
 
-class Predictor(ABC):
+class Predictor(Checked, ABC):
     """Contract: the signal that is queued while it is on its way, and the motion of the state under it over one cycle."""
 
     @property

@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression, Layout
 from fpirhc.task.problem import Problem
@@ -37,7 +38,7 @@ class Seen:
 Correct = Callable[[Seen, Mapping[str, Expression]], tuple[Expression, dict[str, Expression]]]
 
 
-class Estimator(ABC):
+class Estimator(Checked, ABC):
     """Contract: a frozen value that becomes a step for a given problem."""
 
     def model(self, plant: Plant) -> Plant:

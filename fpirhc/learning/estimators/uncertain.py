@@ -16,13 +16,14 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression
 from fpirhc.task.problem import Problem
 
 
 @dataclass(frozen=True)
-class Uncertain:
+class Uncertain(Checked):
     """Prior of a learned parameter.
 
     Args:

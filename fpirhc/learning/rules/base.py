@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from fpirhc.fields.checked import Checked
 from fpirhc.symbolic.layout import Expression
 
 Pair = tuple[Expression, Expression]
@@ -27,7 +28,7 @@ class Evidence:
     clipped: Expression
 
 
-class Rule(ABC):
+class Rule(Checked, ABC):
     """Contract: a frozen value that changes the estimate."""
 
     @property

@@ -9,6 +9,7 @@ from numbers import Integral, Real
 from typing import Literal, get_args
 
 from fpirhc.errors import InvalidName, InvalidValue, nearest
+from fpirhc.fields.checked import Checked
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
 
@@ -30,7 +31,7 @@ def percent(value: float) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Metric:
+class Metric(Checked):
     """A number that sums up a run, or one number for every coordinate, input or term.
 
         overshoot = Metric("overshoot", function, by="coordinate", unit=lambda problem, name: problem.plant.coordinates[name])

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fpirhc.fields.checked import Checked
 from fpirhc.simulation import drawing
 from fpirhc.simulation.run import Run
 
@@ -39,7 +40,7 @@ class Quantity:
     values: Callable[[Run], np.ndarray]
 
 
-class Picture(ABC):
+class Picture(Checked, ABC):
     """Contract of a picture.
 
     Every picture has the attributes `title`, `caption` and `controllers`, the names of the controllers that it shows (empty: all).

@@ -12,6 +12,8 @@ from typing import Any
 
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import CountOrZero
 from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.metrics import measure
@@ -57,6 +59,20 @@ def fingerprint(task: Task, conditions: Conditions) -> dict[str, Any]:
 
 def _hash(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
+
+
+@dataclass(frozen=True)
+class RecordFields(Checked):
+    """The fields of a record of one controller in one scenario, as `Bench.record` makes it."""
+
+    scenario: CountOrZero
+    controller: str
+    mismatch: float
+    outcome: str
+    error: float | None
+    metrics: Mapping[str, object]
+    lasted: float
+    stop: str | None
 
 
 class Bench:

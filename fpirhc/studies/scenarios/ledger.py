@@ -15,7 +15,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, Self
 
-from fpirhc.errors import OutputError
+from fpirhc.errors import InvalidField, OutputError
+from fpirhc.fields.checked import Checked, field_names
 
 
 class Ledger:
@@ -24,16 +25,19 @@ class Ledger:
     Args:
         path: path of the file.
         header: conditions of the results.
+        record: class whose fields every record has; None: records are not checked.
 
     Raises:
         OutputError: the file cannot be written, is damaged, is in use, or holds results under other conditions.
     """
 
-    def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
-        self._path = path
+    def __init__(self, path: Path, header: Mapping[str, Any], record: type[Checked] | None = None) -> None:
+        self._path, self._record = path, record
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("a+b")
+            self._file = path.open(
+                "a+b", buffering=0
+            )  # a disk that is full shows in the write itself, and never when the file is closed
         except OSError as error:
             raise OutputError(f"cannot write to '{path}': {error.strerror}; choose another folder with --out") from None
         try:
@@ -65,11 +69,15 @@ class Ledger:
     def _write(self, value: Mapping[str, Any]) -> None:
         line = json.dumps(value, allow_nan=False, separators=(",", ":")).encode() + b"\n"
         try:
-            self._file.write(line)
-            self._file.flush()
+            written = self._file.write(line)
+            while written < len(line):
+                written += self._file.write(line[written:])
             os.fsync(self._file.fileno())
         except OSError as error:
-            raise OutputError(f"cannot write to '{self._path}': {error.strerror}") from None
+            raise OutputError(
+                f"cannot write to '{self._path}': {error.strerror}; finished results are kept, and the same command "
+                "continues from them"
+            ) from None
 
     def _read(self, header: dict[str, Any]) -> list[dict[str, Any]]:
         self._file.seek(0)
@@ -84,7 +92,21 @@ class Ledger:
             return []
         if lines[0] != header:
             raise OutputError(_refusal(self._path, lines[0], header))
+        for number, line in enumerate(lines[1:], 2):
+            self._check(number, line)
         return lines[1:]
+
+    def _check(self, number: int, line: Mapping[str, Any]) -> None:
+        """Refuse a record that lacks a field, or has one of a wrong type; other fields may stand beside them."""
+        if self._record is None:
+            return
+        names = field_names(self._record)
+        try:
+            self._record(**{name: value for name, value in line.items() if name in names})
+        except InvalidField as error:
+            raise OutputError(
+                f"'{self._path}', line {number} is damaged: {error.text}; remove the line, and its result is computed again"
+            ) from None
 
     def _parsed(self, content: bytes) -> Iterator[dict[str, Any]]:
         for number, line in enumerate(content.splitlines(), 1):

@@ -16,7 +16,7 @@ from fpirhc.problem_files.settings import Values
 from fpirhc.simulation.metrics import Metric
 from fpirhc.simulation.metrics.columns import Column
 from fpirhc.studies.comparison.compare import check_gains, select, versions
-from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint
+from fpirhc.studies.scenarios.bench import Bench, Conditions, RecordFields, fingerprint
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.scenarios.paired import Record, Summary, summarise, verdict
@@ -126,7 +126,7 @@ def compare_scenarios(
     bench, header = Bench(task, conditions), fingerprint(task, conditions)
     opening = {"path": str(task.path.resolve()), "tuned": tuned or {}, "conditions": asdict(conditions)}
     workers = Workers(__package__ + ".worker", opening, header, processes)
-    with Ledger(folder / LEDGER, header) as ledger:
+    with Ledger(folder / LEDGER, header, RecordFields) as ledger:
         records, skipped = _completed(ledger, bench, workers if processes > 1 else None, count, names, progress)
     summaries = _summaries(records, seed, task.metrics)
     return ScenarioComparison(

@@ -35,7 +35,7 @@ def main() -> None:
         number, name = json.loads(line)
         try:
             _answer(answers, bench.record(number, name))
-        except FpirhcError as error:
+        except Exception as error:  # noqa: BLE001 -- a process that dies of it would be started again and again
             _answer(answers, {"error": f"scenario {number}, controller '{name}': {error}"})
 
 

@@ -22,6 +22,8 @@ from typing import Any
 import numpy as np
 
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import CountOrZero
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import current_setting, is_whole, with_settings
 from fpirhc.problem_files.tuning_spans import TuningSpans
@@ -151,11 +153,23 @@ def tune(
     conditions = Conditions(seed, TUNING, float(percent), compiled)
     aim = objective(metric, task.metrics)
     header = {**fingerprint(task, conditions), "scenarios": count, "optuna": optuna.__version__, "metric": aim.name}
-    with Ledger(folder / LEDGER, header) as ledger:
+    with Ledger(folder / LEDGER, header, TrialFields) as ledger:
         entries = tuple(_tuned(optuna, task, n, conditions, count, trials, aim, ledger, progress) for n in names)
     words = f"{count} scenario{'s' if count > 1 else ''} within {percent:g} %"
     untouched = tuple(n for n in task.controllers if n not in names)
     return Tuning(task.name, trials, seed, words, aim.name, entries, untouched)
+
+
+@dataclass(frozen=True)
+class TrialFields(Checked):
+    """The fields of a record of one trial."""
+
+    controller: str
+    trial: int
+    shares: Mapping[str, float]
+    settings: Mapping[str, float]
+    cost: float
+    failures: CountOrZero
 
 
 def _optuna() -> ModuleType:

@@ -1,0 +1,1 @@
+"""Fields of values are checked where they are given: types, ranges, names."""

@@ -1,0 +1,143 @@
+"""Full disks, damaged ledgers and Ctrl-C: one line, a code of its own, and what is finished is kept."""
+
+from __future__ import annotations
+
+import json
+import resource
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from test_scenarios import LINE
+
+import fpirhc as fp
+from fpirhc.cli.exit_codes import ExitCode
+from fpirhc.cli.main import main
+from fpirhc.symbolic.evaluate import unwrapped
+
+COMMAND = [
+    "compare",
+    "line.py",
+    "--scenarios",
+    "3",
+    "--mismatch",
+    "20",
+    "--no-compile",
+    "--controllers",
+    "CTC",
+    "CTC+FPI",
+]
+PLANNED = """measure_from=0.5,
+    horizon=fp.Horizon(stages=30, step=5e-3),
+    cost=fp.Quadratic(states={'y': 1.0}),"""
+LONG = LINE.replace("measure_from=0.5,", PLANNED).replace(
+    "controllers = {", "controllers = {\n    'RHC': fp.RecedingHorizon(fp.Ipopt()),"
+)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """An empty working folder with a problem."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "line.py").write_text(LINE)
+    return tmp_path
+
+
+@contextmanager
+def room(size: int) -> Iterator[None]:
+    """Files may grow to `size` bytes; the system cuts a longer write off and refuses the next, as a full disk does."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@contextmanager
+def interrupted_after(seconds: float) -> Iterator[None]:
+    """A signal that is answered as Ctrl-C is, wherever the program is then."""
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_a_full_disk_is_one_line_and_the_same_command_continues_to_the_same_results(folder, capsys):
+    ledger = Path("out/scenarios.jsonl")
+    assert main([*COMMAND, "--out", "whole"]) == ExitCode.FINISHED
+    whole = Path("whole/scenarios.jsonl").read_bytes()
+    capsys.readouterr()
+    ends = [k for k, byte in enumerate(whole) if byte == ord("\n")]
+    with room(ends[2] + 40):  # the header, two records and a torn third
+        assert main([*COMMAND, "--out", "out"]) == ExitCode.NOT_WRITABLE
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    assert "cannot write to 'out/scenarios.jsonl'" in said[0]
+    assert "the same command continues from them" in said[0]
+    assert len(ledger.read_bytes()) == ends[2] + 40
+    assert main([*COMMAND, "--out", "out"]) == ExitCode.FINISHED
+    assert ledger.read_bytes() == whole
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda r: {k: v for k, v in r.items() if k != "scenario"}, "needs scenario"),
+        (lambda r: {k: v for k, v in r.items() if k != "metrics"}, "needs metrics"),
+        (lambda r: {**r, "scenario": "1"}, "scenario: expected a whole number of at least 0, got the text '1'"),
+        (lambda r: {**r, "error": [1]}, "error: expected a number or None"),
+    ],
+)
+def test_a_record_that_lacks_a_field_is_refused_by_name(change, message, folder, capsys):
+    assert main([*COMMAND, "--out", "out"]) == ExitCode.FINISHED
+    capsys.readouterr()
+    ledger = Path("out/scenarios.jsonl")
+    lines = ledger.read_text().splitlines()
+    lines[2] = json.dumps(change(json.loads(lines[2])))
+    ledger.write_text("\n".join(lines) + "\n")
+    assert main([*COMMAND, "--out", "out"]) == ExitCode.NOT_WRITABLE
+    said = " ".join(capsys.readouterr().err.split())
+    assert "scenarios.jsonl', line 3 is damaged" in said
+    assert message in said
+    assert "Traceback" not in said
+
+
+def test_an_interruption_inside_a_solver_is_an_interruption(folder):
+    """CasADi reports it as a SystemError, which would be taken for a fault of the program."""
+    (folder / "long.py").write_text(LONG)
+    task = fp.load_problem("long.py")
+    long = replace(task.problem, duration=500.0)
+    with interrupted_after(2.0), pytest.raises(KeyboardInterrupt):
+        fp.simulate(long, task.controllers["RHC"], seed=0, compiled=False)
+
+
+def test_what_is_no_interruption_stays_what_it_is():
+    fault = SystemError("a fault")
+    assert unwrapped(fault) is fault
+    fault.__cause__ = KeyboardInterrupt()
+    assert isinstance(unwrapped(fault), KeyboardInterrupt)
+
+
+def test_ctrl_c_in_scenarios_keeps_what_is_finished(folder, capfd):
+    (folder / "long.py").write_text(LONG)
+    words = ["compare", "long.py", "--scenarios", "1000", "--mismatch", "20", "--no-compile", "--out", "out"]
+    with interrupted_after(6.0):
+        assert main([*words, "--controllers", "CTC", "RHC"]) == ExitCode.INTERRUPTED
+    said = capfd.readouterr().err
+    assert "finished results are kept in out/scenarios.jsonl" in said
+    assert "Traceback" not in said
+    finished = Path("out/scenarios.jsonl").read_text().splitlines()
+    assert all(json.loads(line)["controller"] in ("CTC", "RHC") for line in finished[1:])
+    assert main([*words[:3], "1", *words[4:], "--controllers", "CTC"]) == ExitCode.FINISHED
+    assert Path("out/scenarios.jsonl").read_text().splitlines()[: len(finished)] == finished

@@ -1,0 +1,416 @@
+"""Typical mistakes in problem files: each is refused with its file and line, its cause and how to mend it, and without a traceback.
+
+Each case changes one place of a correct file. What stands in a message is what a user needs: the line of the change, what is wrong
+there, and what to write instead.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import subprocess
+import sys
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from mutated_problems import SOURCE, mutated
+
+import fpirhc as fp
+from fpirhc.cli.exit_codes import ExitCode
+from fpirhc.cli.main import main
+from fpirhc.controllers.contract import checked
+from fpirhc.deformation.base import Deformation
+from fpirhc.errors import FpirhcError, InvalidField, ProblemFileError
+from fpirhc.fields.checked import Checked, expects_whole_number
+from fpirhc.problem_files import importing
+from fpirhc.symbolic.number import SymbolicNumber
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """A change of the correct file: `old` becomes `new`; the message has the line of `new`, the cause and the mend."""
+
+    old: str
+    new: str
+    cause: str
+    mend: str = ""
+
+
+MISTAKES = {
+    "class without parentheses": Mistake(
+        "fp.Paired(fp.Sigmoid(gain=-0.2, scale=10.0), cycles=1)",
+        "fp.Sigmoid",
+        "ComputedTorque.deformation: expected a Deformation, got the class Sigmoid",
+        "write Sigmoid(gain=...)",
+    ),
+    "optimiser by name": Mistake(
+        "fp.RecedingHorizon(optimiser),",
+        'fp.RecedingHorizon(optimiser="ipopt"),',
+        "expected an Optimiser, got the text 'ipopt'",
+        "write fp.Ipopt()",
+    ),
+    "optimiser by a name of the command line": Mistake(
+        "fp.RecedingHorizon(optimiser),",
+        'fp.RecedingHorizon(optimiser="fixed-point"),',
+        "expected an Optimiser",
+        "write fp.FixedPoint(iterations=..., tolerance=...)",
+    ),
+    "path of two arguments": Mistake(
+        "lambda view: view.state.y + view.state.z", "lambda x, u: x.y", "expected a function of 1 argument"
+    ),
+    "path with its text and function swapped": Mistake(
+        'fp.PathConstraint(lambda view: view.state.y + view.state.z, upper=3.0, unit="m")',
+        'fp.PathConstraint("m", lambda view: view.state.y)',
+        "PathConstraint.expression: expected a function, got the text 'm'",
+    ),
+    "reference that returns a number": Mistake(
+        'lambda t: {"y": ca.sin(t), "z": 0.1 * ca.cos(t)}',
+        "lambda t: 0.5",
+        "reference must return {name: expression}, got 0.5",
+    ),
+    "reference that is a function": Mistake(
+        'fp.Trajectory(lambda t: {"y": ca.sin(t), "z": 0.1 * ca.cos(t)})',
+        'lambda t: {"y": t, "z": t}',
+        "Problem.reference: expected a Reference, got the function",
+    ),
+    "reference without a coordinate": Mistake(
+        '"z": 0.1 * ca.cos(t)', "", "coordinate 'z' has no nominal motion", "add 'z' to the reference"
+    ),
+    "predicted with a mapping": Mistake(
+        "fp.Predicted(fp.ComputedTorque(tracking), inputs=0.01)",
+        'fp.Predicted(fp.ComputedTorque(tracking), {"u": 0.3})',
+        "Predicted.inputs: expected a number, got {'u': 0.3}",
+    ),
+    "negative weight": Mistake(
+        '"z": 10.0, "y\'": 0.1}', '"z": -10.0}', "the weight of 'z' must be a finite number of at least 0, got -10.0"
+    ),
+    "misspelt weight": Mistake('"z": 10.0, "y\'": 0.1}', '"zz": 10.0}', "states: 'zz' is unknown", "Did you mean 'z'?"),
+    "list of controllers": Mistake(
+        'headline = ("CTC", "CTC+FPI")',
+        "controllers = list(controllers.values())",
+        "it must define controllers = {'name': fpirhc.ComputedTorque(...), ...}, got [",
+    ),
+    "limits that no number meets": Mistake(
+        '"force": (-20.0, 20.0)',
+        '"force": (float("inf"), float("inf"))',
+        "'force' has limits (inf, inf) that no number meets",
+        "a free side is -inf below, inf above",
+    ),
+    "limits by one number": Mistake(
+        '"force": (-20.0, 20.0)', '"force": 20.0', "Limits.inputs['force']: expected (a number, a number)"
+    ),
+    "limits the wrong way round": Mistake(
+        '"force": (-20.0, 20.0)', '"force": (20.0, -20.0)', "lower 20.0 above upper -20.0", "swap them"
+    ),
+    "vanishing period": Mistake(
+        "period=1e-2", "period=1e-300", "Problem.period: expected a number of seconds from 1e-12 to 1e12"
+    ),
+    "endless duration": Mistake(
+        "duration=0.1", "duration=1e300", "Problem.duration: expected a number of seconds from 1e-12 to 1e12"
+    ),
+    "too many cycles": Mistake("duration=0.1", "duration=1e9", "more than 1e+09 cycles", "shorten it"),
+    "number as a text": Mistake(
+        "period=1e-2", 'period="1e-2"', "expected a number of seconds", "write 1e-2 without quotes"
+    ),
+    "comma behind a number": Mistake(
+        "gain=-0.2, scale", "gain=(-0.2,), scale", "Sigmoid.gain: expected a number", "remove the comma"
+    ),
+    "negative iterations": Mistake(
+        "iterations=1", "iterations=-3", "FixedPoint.iterations: expected a whole number from 1"
+    ),
+    "stages with a point": Mistake("stages=4", "stages=4.0", "Horizon.stages: expected a whole number", "write 4"),
+    "zero accuracy": Mistake(
+        "fp.FixedPoint(iterations=1, tolerance=1e-2)",
+        "fp.Ipopt(accuracy=0)",
+        "Ipopt.accuracy: expected a number above 0",
+    ),
+    "misspelt field": Mistake(
+        "measure_from=0.02",
+        "measured_from=0.02",
+        "Problem has no field 'measured_from'",
+        "Did you mean 'measure_from'?",
+    ),
+    "missing field": Mistake(
+        "fp.Exponential(rate=6.0)", "fp.Exponential()", "Exponential needs rate", "write Exponential(rate=...)"
+    ),
+    "misspelt class": Mistake(
+        "fp.Exponential(", "fp.Exponental(", "fpirhc has no name 'Exponental'", "Did you mean 'Exponential'?"
+    ),
+    "if on a symbol": Mistake(
+        "u.lift / p.mass - 9.81",
+        "u.lift / p.mass if q.z > 0 else 0",
+        "a symbol is neither true nor false",
+        "use ca.if_else",
+    ),
+    "max of a symbol": Mistake(
+        "u.lift / p.mass - 9.81", "u.lift / p.mass - max(q.z, 0)", "max() and min() cannot act on it", "ca.fmax"
+    ),
+    "math on a symbol": Mistake("ca.sin(t), ", "math.sin(t), ", "math.sin(...) of a symbol is NaN", "use ca.sin"),
+    "numpy array of symbols": Mistake(
+        "u.lift / p.mass - 9.81",
+        "np.array([u.lift, q.z])",
+        "must be one scalar expression, got a value of the class ndarray",
+    ),
+    "symbol as a setting": Mistake(
+        "gain=-0.3",
+        'gain=ca.SX.sym("g")',
+        "Affine.gain: expected a number, got a CasADi symbol",
+        "a setting is a number",
+    ),
+    "response of too few arguments": Mistake(
+        "def response(q, v, u, p):",
+        "def response(q, u, p, v=0, *, w):",
+        "response takes 5 argument(s)",
+        "response(q, v, u, p)",
+    ),
+    "response that returns nothing": Mistake(
+        'return {"y"', '_ = {"y"', "response must return {name: expression}, got None", "return"
+    ),
+    "misspelt parameter": Mistake(
+        "p.friction", "p.fricton", "parameter 'fricton' is unknown", "Did you mean 'friction'?"
+    ),
+    "problem under another name": Mistake(
+        "problem = fp.Problem(", "task = fp.Problem(", "it must define problem", "call it 'problem'"
+    ),
+    "headline of one name": Mistake('("CTC", "CTC+FPI")', '"CTC"', "headline must be a pair of names"),
+    "program ended by the file": Mistake(
+        'headline = ("CTC", "CTC+FPI")', "raise SystemExit(0)", "the file ends the program", "leave the exit out"
+    ),
+    "forgotten import": Mistake("import casadi as ca", "import casadi", "name 'ca' is not defined"),
+}
+SOURCES = SOURCE.replace("import casadi as ca\n", "import math\nimport numpy as np\nimport casadi as ca\n")
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_typical_mistake_is_explained_in_place(name, tmp_path, monkeypatch, capsys):
+    mistake = MISTAKES[name]
+    assert SOURCES.count(mistake.old) >= 1
+    text = SOURCES.replace(mistake.old, mistake.new, 1)
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(text, encoding="utf-8")
+    assert main(["compare", "mine.py"]) == ExitCode.BAD_INPUT
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    said = " ".join(printed.err.split())
+    assert said.startswith("fpirhc: ")
+    assert "mine.py" in said
+    assert mistake.cause in said
+    assert mistake.mend in said
+    assert "Traceback" not in said
+    # A definition that is missing has no line; everything else has the line of its statement or of the change itself.
+    lines = {int(number) for number in re.findall(r"line (\d+)", said)}
+    assert lines & _possible_lines(text, SOURCES.index(mistake.old)) or "it must define problem" in said
+
+
+def _possible_lines(text: str, place: int) -> set[int]:
+    """Lines from the beginning of the changed statement to the change; for a definition, also the statements that use it."""
+    at = text[:place].count("\n") + 1
+    lines = text.splitlines()
+    starts = [k for k, line in enumerate(lines, 1) if line and not line[0].isspace() and line[0] not in ")}"]
+    first = max(k for k in starts if k <= at)
+    users = [k for k in starts if k > at] if lines[first - 1].startswith(("def", "import")) else []
+    return {*range(first, at + 1), *users}
+
+
+def test_all_mistakes_of_a_value_are_said_together():
+    wrong: dict[str, Any] = {"gain": "a", "shift": None, "scal": 1.0}
+    with pytest.raises(InvalidField, match=r"(?s)3 mistakes.*no field 'scal'.*Sigmoid.gain.*Sigmoid.shift") as caught:
+        fp.Sigmoid(**wrong)
+    assert "test_mistakes.py, line" in str(caught.value)
+
+
+# --- The mechanism ----------------------------------------------------------------------------------------------------
+
+
+class Live(SymbolicNumber):
+    """A number that stands for a symbol."""
+
+
+def test_a_number_that_stands_for_a_symbol_is_a_number_and_a_bare_symbol_is_none():
+    live: Any = Live()
+    assert fp.Parameter(approximate=live, exact=1.0, unit="kg").approximate is live
+    for symbol in (ca.SX.sym("a"), ca.MX.sym("a")):
+        bare: Any = symbol
+        with pytest.raises(InvalidField, match="a CasADi symbol"):
+            fp.Parameter(approximate=bare, exact=1.0, unit="kg")
+
+
+@dataclass(frozen=True)
+class Foreign(Deformation):
+    """A map of another distribution, which has no line for checks."""
+
+    gain: float
+    inner: Deformation | None = None
+    spans: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+    def step(self, request, response, desired, memory):
+        """Pass the desired response on."""
+        del request, response
+        return desired, memory
+
+    def effective_gain(self):
+        """None."""
+        return 0.0
+
+    def secant_gain(self):
+        """None."""
+        return 0.0
+
+    def largest_step(self):
+        """No bound."""
+        return math.inf
+
+    def with_effective_gain(self, gain):
+        """The same."""
+        del gain
+        return self
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"gain": "a"}, "Foreign.gain: expected a number, got the text 'a'"),
+        (
+            {"gain": 1.0, "inner": fp.Sigmoid},
+            "Foreign.inner: expected a Deformation or None, got the class Sigmoid; write Sig",
+        ),
+        ({"gain": 1.0, "spans": {"a": (1.0, "b")}}, r"Foreign.spans\['a'\]\[1\]: expected a number, got the text 'b'"),
+        ({"gain": 1.0, "spans": {1: (1.0, 2.0)}}, "Foreign.spans: name 1: expected a text, got 1"),
+        ({"gain": True}, "expected a number, got True"),
+        ({"gain": float("nan")}, "expected a number, got nan"),
+        ({}, r"Foreign needs gain; write Foreign\(gain=\.\.\.\)"),
+    ],
+)
+def test_a_class_of_another_distribution_is_checked_without_a_line_of_its_own(settings, message):
+    with pytest.raises(InvalidField, match=message):
+        Foreign(**settings)
+    whole: Any = np.int64(2)
+    assert Foreign(np.float64(1.0), Foreign(2), {"a": (1, whole)}).gain == 1.0
+
+
+def test_what_an_annotation_does_not_say_is_not_checked():
+    class Open(Checked):
+        def __init__(self, one, *more: int, two: NotThere = 3, **rest: int) -> None:  # type: ignore[name-defined]  # noqa: F821
+            self.all = (one, more, two, rest)
+
+    text: Any = "3"
+    opened: Any = Open(1, 2, text, two=4, other=5)
+    assert opened.all == (1, (2, "3"), 4, {"other": 5})
+
+
+def test_a_contract_is_no_value():
+    class Contract(Checked, ABC):
+        @abstractmethod
+        def act(self) -> None: ...
+
+    with pytest.raises(InvalidField, match="Contract is a contract"):
+        Contract()  # type: ignore[abstract]
+
+
+def test_the_tuner_knows_whole_numbers_with_a_range():
+    assert expects_whole_number(fp.Ipopt, "iterations")
+    assert not expects_whole_number(fp.Ipopt, "accuracy")
+    assert not expects_whole_number(fp.Ipopt, "nothing")
+
+
+# --- The command line -------------------------------------------------------------------------------------------------
+
+
+def test_an_error_inside_is_one_line_with_a_code_of_its_own(tmp_path, monkeypatch, capsys):
+    """Exit code 1 is the answer no of a review."""
+    monkeypatch.setattr("fpirhc.problem_files.problem_file.load_problem", lambda name: [][1])
+    assert main(["review", "two_mass"]) == ExitCode.CRASHED
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    assert "IndexError in test_mistakes.py" in said
+    assert "report" in said
+    assert main(["--debug", "review", "two_mass"]) == ExitCode.CRASHED
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_an_error_in_a_files_own_code_during_a_run_is_bad_input(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    metric = 'metrics = (fp.Metric("mine", lambda problem, run: {}["there"]),)\n'
+    Path("mine.py").write_text(SOURCE + metric, encoding="utf-8")
+    assert main(["compare", "mine.py", "--no-compile", "--controllers", "CTC"]) == ExitCode.BAD_INPUT
+    said = capsys.readouterr().err
+    assert "mine.py, line" in said
+    assert "KeyError: 'there'" in said
+    assert "Traceback" not in said
+
+
+# --- Random mistakes --------------------------------------------------------------------------------------------------
+
+
+_CAUSE = importing._cause
+
+
+def raw_error(path: Path, seed: int, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The Python error that a random mistake raises inside the library; empty where it is refused by name, or accepted."""
+    inside: list[BaseException] = []
+    cause = _CAUSE
+
+    def seen(error: Exception) -> str:
+        inside.append(error)
+        return cause(error)
+
+    monkeypatch.setattr(importing, "_cause", seen)
+    path.write_text(mutated(seed), encoding="utf-8")
+    try:
+        task = fp.load_problem(str(path))
+        for controller in task.controllers.values():
+            try:
+                checked(task.problem, controller)
+            except FpirhcError:
+                continue
+    except ProblemFileError:
+        # An error of the file itself, such as a misspelt name, is shown as Python has it; one from our own lines is not.
+        wrapped = [e for e in inside if not isinstance(e, FpirhcError) and not _from_file(e, path)]
+        return f"seed {seed}: {wrapped[0]!r}" if wrapped else ""
+    except Exception as error:  # noqa: BLE001 -- what is looked for
+        return f"seed {seed}: {error!r}"
+    return ""
+
+
+def _from_file(error: BaseException, path: Path) -> bool:
+    """Whether the innermost line of the file or of the package is the file's."""
+    place, own = error.__traceback__, False
+    while place is not None:
+        name = place.tb_frame.f_code.co_filename
+        own = name == str(path) if name == str(path) or "/fpirhc/" in name else own
+        place = place.tb_next
+    return own or isinstance(error, SyntaxError)
+
+
+def test_the_file_without_mistakes_is_accepted(tmp_path):
+    (tmp_path / "mine.py").write_text(SOURCE, encoding="utf-8")
+    task = fp.load_problem(str(tmp_path / "mine.py"))
+    assert [type(checked(task.problem, one)).__name__ for one in task.controllers.values()]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_random_mistakes_never_end_in_a_raw_error(tmp_path, monkeypatch):
+    raw = [raw_error(tmp_path / "mine.py", seed, monkeypatch) for seed in range(300)]
+    assert [one for one in raw if one] == []
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_ten_thousand_random_mistakes_never_end_in_a_raw_error(tmp_path, monkeypatch):
+    raw = [raw_error(tmp_path / "mine.py", seed, monkeypatch) for seed in range(1000, 11_000)]
+    assert [one for one in raw if one] == []
+
+
+def test_no_traceback_reaches_the_terminal(tmp_path):
+    """The program itself, in a process of its own."""
+    (tmp_path / "mine.py").write_text(SOURCE.replace("gain=-0.3", "gain='a'"), encoding="utf-8")
+    words = [sys.executable, "-m", "fpirhc", "run", str(tmp_path / "mine.py"), "CTC"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == ExitCode.BAD_INPUT
+    assert "Affine.gain: expected a number, got the text 'a'" in done.stderr
+    assert "Traceback" not in done.stderr

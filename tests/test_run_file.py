@@ -1,0 +1,169 @@
+"""Saved runs: written at once or not at all, and read with a schema whatever the file holds."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pickle
+import random
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_loop import swing
+
+import fpirhc as fp
+from fpirhc.errors import OutputError
+from fpirhc.simulation import run_file
+
+
+@pytest.fixture(scope="module")
+def run() -> fp.Run:
+    """A short run."""
+    problem = swing(duration=0.05, measure_from=0.0)
+    return fp.simulate(problem, fp.ComputedTorque(fp.Exponential(rate=6.0)), seed=0, compiled=False)
+
+
+def npy(array: Any) -> bytes:
+    """An array as numpy stores it."""
+    content = io.BytesIO()
+    np.lib.format.write_array(content, np.asarray(array), allow_pickle=True)
+    return content.getvalue()
+
+
+def write(path: Path, **parts: bytes) -> None:
+    """A zip of named parts."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, content in parts.items():
+            file.writestr(f"{name}.npy", content)
+
+
+def facts_of(path: Path) -> dict[str, Any]:
+    """The facts of a file."""
+    with np.load(path) as stored:
+        facts: dict[str, Any] = json.loads(str(stored["facts"]))
+    return facts
+
+
+DEEP = "[" * 100_000
+HOSTILE = {
+    "no zip": lambda log, facts: b"PK\x03\x04 nothing",
+    "empty": lambda log, facts: b"",
+    "format": lambda log, facts: {**facts, "format": 9},
+    "no mapping": lambda log, facts: [1],
+    "no facts": lambda log, facts: {},
+    "no period": lambda log, facts: {k: v for k, v in facts.items() if k != "period"},
+    "negative period": lambda log, facts: {**facts, "period": -1.0},
+    "period of text": lambda log, facts: {**facts, "period": "1"},
+    "seed of text": lambda log, facts: {**facts, "seed": "1"},
+    "settings of a list": lambda log, facts: {**facts, "settings": [1]},
+    "unknown field": lambda log, facts: {**facts, "more": 1},
+    "signals of text": lambda log, facts: {**facts, "signals": "text"},
+    "signal without units": lambda log, facts: {**facts, "signals": [["time", []]]},
+    "signals of another size": lambda log, facts: {**facts, "signals": facts["signals"][:-1]},
+    "same signal twice": lambda log, facts: {**facts, "signals": [*facts["signals"][:-1], facts["signals"][0]]},
+    "no time": lambda log, facts: {**facts, "signals": [["tome", *s[1:]] if s[0] == "time" else s for s in facts["signals"]]},
+    "numbers for names": lambda log, facts: {**facts, "signals": [[1, [], []]] * len(facts["signals"])},
+    "flat log": lambda log, facts: log.ravel(),
+    "log of whole numbers": lambda log, facts: log.astype(int),
+    "log of objects": lambda log, facts: np.array([[os.getcwd]], dtype=object),
+    "log of texts": lambda log, facts: log.astype(str),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_a_hostile_file_is_refused_in_one_way(case, run, tmp_path):
+    good, bad = tmp_path / "good.npz", tmp_path / "bad.npz"
+    run.save(good)
+    change = HOSTILE[case](run.log, facts_of(good))
+    if isinstance(change, bytes):
+        bad.write_bytes(change)
+    elif isinstance(change, np.ndarray):
+        write(bad, log=npy(change), facts=npy(json.dumps(facts_of(good))))
+    else:
+        write(bad, log=npy(run.log), facts=npy(json.dumps(change)))
+    with pytest.raises(OutputError, match="cannot read a run from"):
+        fp.load_run(bad)
+
+
+@pytest.mark.parametrize("facts", ["{", DEEP, '{"format": NaN}', "\x00", "1e999"])
+def test_facts_that_are_no_facts_are_refused(facts, run, tmp_path):
+    write(tmp_path / "bad.npz", log=npy(run.log), facts=npy(facts))
+    with pytest.raises(OutputError, match="cannot read a run from"):
+        fp.load_run(tmp_path / "bad.npz")
+
+
+def test_a_file_runs_no_code(tmp_path, run):
+    """Pickles are refused, wherever they stand."""
+
+    class Trap:
+        def __reduce__(self):
+            return (os.mkdir, (str(tmp_path / "ran"),))
+
+    (tmp_path / "bad.npz").write_bytes(pickle.dumps(Trap()))
+    write(tmp_path / "worse.npz", log=npy(np.array([Trap()], dtype=object)), facts=npy("{}"))
+    for name in ("bad.npz", "worse.npz"):
+        with pytest.raises(OutputError):
+            fp.load_run(tmp_path / name)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_four_hundred_flipped_bits_give_the_run_or_one_error(run, tmp_path):
+    """The sums of the zip find every change of the log and the facts; the rest of the file does not matter."""
+    run.save(tmp_path / "run.npz")
+    content, numbers = (tmp_path / "run.npz").read_bytes(), random.Random(0)
+    refused = 0
+    for _ in range(400):
+        bit = numbers.randrange(8 * len(content))
+        flipped = bytearray(content)
+        flipped[bit // 8] ^= 1 << bit % 8
+        (tmp_path / "bad.npz").write_bytes(flipped)
+        try:
+            again = fp.load_run(tmp_path / "bad.npz")
+        except OutputError:
+            refused += 1
+        else:
+            assert np.array_equal(again.log, run.log)
+            assert (again.problem, again.seed, again.period) == (run.problem, run.seed, run.period)
+    assert refused > 300
+
+
+def test_a_file_that_unpacks_to_too_much_is_refused(run, tmp_path, monkeypatch):
+    run.save(tmp_path / "run.npz")
+    monkeypatch.setattr(run_file, "MOST", run.log.nbytes // 2)
+    with pytest.raises(OutputError, match="unpacks to"):
+        fp.load_run(tmp_path / "run.npz")
+
+
+def test_pipes_folders_and_missing_files_are_refused(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", tmp_path, tmp_path / "none.npz"):
+        with pytest.raises(OutputError, match="cannot read a run from"):
+            fp.load_run(path)
+
+
+def test_a_run_is_never_written_through_a_link_or_over_a_device(run, tmp_path):
+    """A link planted under the name of the file must not let somebody choose which file is overwritten."""
+    (tmp_path / "precious").write_text("precious")
+    (tmp_path / "run.npz").symlink_to(tmp_path / "precious")
+    for path in (tmp_path / "run.npz", tmp_path, Path(os.devnull)):
+        with pytest.raises(OutputError, match="link or no ordinary file"):
+            run.save(path)
+    assert (tmp_path / "precious").read_text() == "precious"
+
+
+def test_a_write_that_fails_leaves_the_earlier_file(run, tmp_path, monkeypatch):
+    run.save(tmp_path / "run.npz")
+    before = (tmp_path / "run.npz").read_bytes()
+
+    def full(handle: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OutputError, match=r"cannot write the run to .*No space left on device"):
+        run.save(tmp_path / "run.npz")
+    assert (tmp_path / "run.npz").read_bytes() == before
+    assert os.listdir(tmp_path) == ["run.npz"]
