@@ -160,7 +160,8 @@ class Comparison:
             for e in self.entries
         ]
         head = ("controller", *(c.heading for c in shown), "cycle [us]", "worst status")
-        return table(self.title, head, rows, self.verdict)
+        notes = self.verdict if self.null is None else (*self.verdict, self.null.text)
+        return table(self.title, head, rows, notes)
 
     def __getitem__(self, name: str) -> Entry:
         for entry in self.entries:
