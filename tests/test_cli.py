@@ -172,14 +172,14 @@ def test_ctrl_c_keeps_what_is_finished(folder, capsys, monkeypatch):
     """The finished controller is reported, the other is named as interrupted; exit code 130."""
     from fpirhc.studies.comparison import compare as study
 
-    ordinary = vars(study)["simulate"]
+    ordinary = vars(study)["judged_run"]
 
-    def interrupted(problem, controller, **settings):
+    def interrupted(loop, **settings):
         if settings["name"] == "CTC+FPI":
             raise KeyboardInterrupt
-        return ordinary(problem, controller, **settings)
+        return ordinary(loop, **settings)
 
-    monkeypatch.setattr(study, "simulate", interrupted)
+    monkeypatch.setattr(study, "judged_run", interrupted)
     assert main(["compare", "line.py", "--no-compile"]) == 130
     assert (folder / "results" / "line" / "report.html").exists()
     assert "interrupted before it finished" in capsys.readouterr().out.replace("\n", " ")

@@ -126,7 +126,8 @@ def test_cases_that_do_not_work_are_explained(comparison):
 
 def test_headline_is_about_the_named_pair(comparison):
     """The first sentence compares RHC with RHC+FPI."""
-    assert comparison.verdict[0].startswith("RHC+FPI lowers the rms error of q1 from")
+    assert comparison.findings[0].pair == ("RHC", "RHC+FPI")
+    assert comparison.verdict[0].startswith("RHC+FPI lowers the rms error of q2 from 0.0422 to")
 
 
 def test_predicted_and_measured_contraction_agree(comparison):

@@ -29,7 +29,7 @@ def cstr() -> Comparison:
 
 
 def test_reactor_whose_only_weighted_output_is_lost(cstr):
-    """C_b, the only weighted output, goes from 7e-6 to 0.44 mol/l: that is worse, though the unweighed jacket's error is smaller."""
+    """C_b, the only weighted output, goes from 7e-6 to 0.44 mol/l: that is worse, though the jacket's error is smaller."""
     first = cstr.findings[0]
     assert cstr["RHC"].metrics.rms_error["C_b"] < 1e-5
     assert cstr["RHC+FPI"].metrics.rms_error["C_b"] == pytest.approx(0.44, rel=0.1)
@@ -42,7 +42,7 @@ def test_reactor_whose_only_weighted_output_is_lost(cstr):
 
 
 def test_reactor_fails_the_null_test(cstr):
-    """Its model is exact, so the null test is the run itself; at a tenth of the period the error of FPI's own is 14 times smaller."""
+    """Its model is exact, so the null test is the run itself."""
     assert cstr.null is not None
     assert cstr.null.harmful
     assert not cstr.null.passed
@@ -65,7 +65,7 @@ def test_what_does_not_help_is_never_green(cstr):
 
 
 def test_tanks_get_better_in_both_levels_worst_first():
-    """h1 four times better, h2 forty times; the page's first number is the smaller gain. Own errors are small beside the model's."""
+    """h1 four times better, h2 forty times; the smaller gain comes first. Own errors are small beside the model's."""
     tanks = compared("quadruple_tank", "RHC", "RHC+FPI", "RHC exact model")
     first = tanks.findings[0]
     assert first.outcome is Outcome.BETTER
@@ -99,7 +99,7 @@ def test_infusion_is_better():
 
 
 def test_own_map_in_the_wrong_form_is_worse_and_the_right_form_is_named():
-    """Paired, the plan's own feedback diverges through the dead time; as an increment the same map halves the error, and is named."""
+    """Paired, the loop diverges through the dead time; as an increment the same map halves the error, and is named."""
     cart = compared("own_map", "RHC", "RHC+FPI", "RHC+FPI, increment")
     outcomes = {f.pair[1]: f.outcome for f in cart.findings if f.pair}
     assert outcomes == {"RHC+FPI": Outcome.WORSE, "RHC+FPI, increment": Outcome.BETTER}
@@ -118,7 +118,7 @@ def test_an_exact_model_that_is_beaten_is_no_bound():
 
 
 def test_at_the_same_rate_and_with_the_same_information_it_is_parity():
-    """Van der Pol-Duffing: at ten corrections per plan RHC+FPI has less than half the error of offset-free control; at one it has 0.9.
+    """Van der Pol-Duffing: ten corrections per plan give RHC+FPI half the error of offset-free control; one gives it 0.9.
 
     Both correct the response that the model expected by the one that was measured, so that only the rate differs.
     """

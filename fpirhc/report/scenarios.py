@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fpirhc.report.outcomes import css_class
 from fpirhc.report.page import page, picture, text, wide_table, write_page
 from fpirhc.simulation.drawing import PALETTE
 from fpirhc.simulation.metrics.columns import Column as Metric
@@ -72,12 +73,13 @@ def write_scenarios(comparison: ScenarioComparison, path: Path) -> None:
 def render_scenarios(comparison: ScenarioComparison) -> str:
     """Return the page's text."""
     first, *others = comparison.verdict
+    outcome = next((s.outcome for s in comparison.summaries[1:]), None)  # the first sentence is about the first rival
     rest = "".join(f"<li>{text(s)}</li>" for s in others)
     about = f"<p class='about'>{text(comparison.description)}</p>" if comparison.description else ""
     chart = picture(mismatch_figure(comparison), "Error against mismatch", _CAPTION) if comparison.summaries else ""
     parts = [
         f"<header><h1>{text(comparison.title)}</h1></header>",
-        f"<section id='verdict'><p class='headline'>{text(first)}</p><ul>{rest}</ul>{about}</section>",
+        f"<section id='verdict'><p class='headline {css_class(outcome)}'>{text(first)}</p><ul>{rest}</ul>{about}</section>",
         _table(comparison),
         f"<section><h2>Error against mismatch</h2>{chart}</section>",
         _tuning(comparison),

@@ -58,19 +58,26 @@ class Simulator:
         return any(f.class_name() == "OsqpInterface" for f in self.loop.function.find_functions())
 
     def run(
-        self, *, seed: int, name: str = "", variant: Problem | None = None, progress: Progress | None = None
+        self,
+        *,
+        seed: int,
+        name: str = "",
+        variant: Problem | None = None,
+        disturbed: bool = True,
+        progress: Progress | None = None,
     ) -> Run:
         """Run the loop once and return its signals.
 
         Args:
             seed: of the noise of disturbances and sensors.
             name: of the controller in the results; '': the name of its class.
-            variant: the simulator's problem with other exact parameters; None: the problem itself.
+            variant: the simulator's problem with other exact parameters or another duration; None: the problem itself.
+            disturbed: whether disturbances act; the sensors' noise always does.
             progress: called with (cycles done, cycles in all).
         """
         problem = variant or self.problem
         start = start_memory(self.loop, problem, self.controller)
-        logged, stop = _run_chunks(problem, start, self.loop.trace, self.evaluator, seed, progress)
+        logged, stop = _run_chunks(problem, start, self.loop.trace, self.evaluator, seed, disturbed, progress)
         layout, log = with_common_columns(self.loop.trace, logged)
         log.setflags(write=False)
         step_limit = self.controller.deformation.largest_step()
@@ -172,11 +179,17 @@ def sensing_table(problem: Problem, seed: int, cycles: int) -> np.ndarray:
 
 
 def _run_chunks(
-    problem: Problem, start: np.ndarray, trace: Layout, evaluator: Evaluator, seed: int, progress: Progress | None
+    problem: Problem,
+    start: np.ndarray,
+    trace: Layout,
+    evaluator: Evaluator,
+    seed: int,
+    disturbed: bool,
+    progress: Progress | None,
 ) -> tuple[np.ndarray, str | None]:
     cycles = problem.cycles
     padded = -(-cycles // CHUNK) * CHUNK
-    all_tables = disturbance_table(problem, seed, padded), sensing_table(problem, seed, padded)
+    all_tables = float(disturbed) * disturbance_table(problem, seed, padded), sensing_table(problem, seed, padded)
     tables = [table for table in all_tables if table.shape[1]]
     log = np.empty((padded, trace.size))
     evaluator.arguments[0][:] = start

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
@@ -24,12 +24,12 @@ from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, judged_run, simulator
 from fpirhc.studies.comparison.changes import scales
-from fpirhc.studies.comparison.entry_facts import has_exact_model, no_bound_because, plan_every, weighed
-from fpirhc.studies.comparison.null_test import NullTest, null_test
+from fpirhc.studies.comparison.entry_facts import has_exact_model, plan_every, weighed
+from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import Optimality, measure_optimality
-from fpirhc.studies.comparison.other_rows import beaten_by
 from fpirhc.studies.comparison.outcome import Finding, Outcome
-from fpirhc.studies.comparison.timing import CycleTime, Price, measure_cycle, measure_price
+from fpirhc.studies.comparison.side_by_side import beside_each_other, null_of_pair
+from fpirhc.studies.comparison.timing import CycleTime, Price, measure_cycle
 from fpirhc.studies.comparison.verdict import findings
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
@@ -162,7 +162,8 @@ class Comparison:
             for e in self.entries
         ]
         head = ("controller", *(c.heading for c in shown), "cycle [us]", "worst status")
-        return table(self.title, head, rows, self.verdict)
+        notes = self.verdict if self.null is None else (*self.verdict, self.null.text)
+        return table(self.title, head, rows, notes)
 
     def __getitem__(self, name: str) -> Entry:
         for entry in self.entries:
@@ -217,7 +218,7 @@ def compare(
     loops: dict[str, Simulator] = {}
     ran, skipped = _entries(task, selected, seed, compiled, progress, loops)
     sizes = scales(task.problem)
-    entries = [_beside(task.problem, one, ran, loops, sizes, compiled) for one in ran]
+    entries = beside_each_other(task.problem, ran, loops, sizes, compiled=compiled)
     judged = findings(entries, skipped, task.headline, sizes)
     return Comparison(
         problem=task.name,
@@ -233,7 +234,7 @@ def compare(
         settings=describe(task.problem),
         elapsed=time.perf_counter() - begin,
         pictures=task.pictures,
-        null=_null(task.problem, judged[0], entries, loops, sizes, seed),
+        null=null_of_pair(task.problem, judged[0].pair, entries, loops, sizes, seed=seed),
         time_unit=task.problem.time_unit,
     )
 
@@ -322,42 +323,6 @@ def _entry(
         learns=ready.learns,
         plan_every=plan_every(problem, ready),
     )
-
-
-def _beside(
-    problem: Problem,
-    entry: Entry,
-    entries: Sequence[Entry],
-    loops: Mapping[str, Simulator],
-    sizes: Mapping[str, float],
-    compiled: bool,
-) -> Entry:
-    """The entry with what only shows beside the others: its price, and why its exact model is no bound."""
-    controller, by_name = loops[entry.name].controller, {e.name: e for e in entries}
-    if entry.exact and beaten_by(entry, entries, sizes):
-        return replace(entry, no_bound=no_bound_because(problem, controller, entry.metrics, entry.optimality))
-    plain = by_name.get(entry.pair or "")
-    if plain is None:
-        return entry
-    both = (loops[plain.name].controller, plain.run), (controller, entry.run)
-    return replace(entry, price=measure_price(problem, *both, compiled=compiled))
-
-
-def _null(
-    problem: Problem,
-    first: Finding,
-    entries: Sequence[Entry],
-    loops: Mapping[str, Simulator],
-    sizes: Mapping[str, float],
-    seed: int,
-) -> NullTest | None:
-    """The null test of the pair of the first sentence."""
-    if first.pair is None:
-        return None
-    both = loops[first.pair[0]], loops[first.pair[1]]
-    plain, adaptive = (next(e for e in entries if e.name == name) for name in first.pair)
-    cured = plain.metrics.rms_error
-    return null_test(problem, both, first.pair, sizes, adaptive.weighed, cured=cured, seed=seed)
 
 
 def _predicted(problem: Problem, controller: Controller, compiled: bool) -> Prediction | None:

@@ -23,7 +23,6 @@ from fpirhc.simulation.metrics.window import by_name
 from fpirhc.simulation.simulate import Simulator
 from fpirhc.studies.comparison.changes import ROUNDING, Change, major, outcome_of
 from fpirhc.studies.comparison.outcome import Outcome
-from fpirhc.task.disturbance import Step
 from fpirhc.task.problem import Problem
 
 CYCLES = 2000  # measured cycles of a run at most
@@ -94,16 +93,13 @@ def null_test(
 def _null_problem(problem: Problem) -> Problem:
     longest = problem.measure_from + CYCLES * problem.period
     return replace(
-        problem,
-        plant=problem.plant.with_exact(problem.plant.approximate),
-        duration=min(problem.duration, longest),
-        disturbances={name: Step(at=0.0, size=0.0) for name in problem.disturbances},
+        problem, plant=problem.plant.with_exact(problem.plant.approximate), duration=min(problem.duration, longest)
     )
 
 
 def _errors(loop: Simulator, null: Problem, seed: int) -> dict[str, float]:
     """Rms error of the plant's own state over the measured cycles."""
-    run = loop.run(seed=seed, variant=null)
+    run = loop.run(seed=seed, variant=null, disturbed=False)
     states = run["plant_state"] if "plant_state" in run.layout else run["state"]
     names = null.judged_names
     measured = run.time >= null.measure_from - 0.5 * null.period
@@ -112,7 +108,9 @@ def _errors(loop: Simulator, null: Problem, seed: int) -> dict[str, float]:
     places = [null.plant.state.elements.index(name) for name in names]
     nominal = null.reference.function(null.plant).map(int(measured.sum()))(run.time[measured][None, :])[0]
     errors = np.asarray(nominal.full()).T[:, places] - states[measured][:, places]
-    return by_name(names, np.sqrt(np.mean(errors**2, axis=0)))
+    with np.errstate(over="ignore"):
+        sizes = np.sqrt(np.mean(errors**2, axis=0))
+    return by_name(names, np.where(np.isfinite(sizes), sizes, np.nan))  # squares overflow where a run has diverged
 
 
 def _outcome(changes: Mapping[str, Change]) -> Outcome:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from fpirhc.simulation.metrics import Metric, known_metrics
+from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.studies.scenarios.bootstrap import ConfidenceInterval, median_interval, middle
 
 Record = Mapping[str, Any]
@@ -52,6 +53,14 @@ class Summary:
     def rms_error(self) -> Mapping[str, float]:
         """Median rms error by coordinate."""
         return self.metrics["rms_error"]
+
+    @property
+    def outcome(self) -> Outcome | None:
+        """What it is beside the baseline, where the interval of the difference leaves no doubt; None for the baseline itself."""
+        if self.difference is None:
+            return None
+        low, high = self.difference.low, self.difference.high
+        return Outcome.BETTER if high < 0 else Outcome.WORSE if low > 0 else Outcome.NO_DIFFERENCE
 
     @property
     def failures(self) -> int:
@@ -152,9 +161,9 @@ def _sentence(baseline: Summary, one: Summary) -> str:
         f"median difference of the error {signed(difference.median)}, "
         f"95 % interval {signed(difference.low)} to {signed(difference.high)}; smaller in {one.better} of {count} scenarios"
     )
-    if difference.high < 0:
+    if one.outcome is Outcome.BETTER:
         return f"{one.name} has a smaller error than {baseline.name} ({numbers}; {one.ratio:.3g} times its error)."
-    if difference.low > 0:
+    if one.outcome is Outcome.WORSE:
         return f"{one.name} has a larger error than {baseline.name} ({numbers}; {one.ratio:.3g} times its error)."
     return f"{one.name} and {baseline.name} show no clear difference ({numbers})."
 

@@ -1,0 +1,94 @@
+"""What needs several finished loops of a comparison: prices, why an exact model is no bound, and the null test.
+
+Ctrl-C leaves out what is missing here; the finished runs are kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from fpirhc.simulation.simulate import Simulator
+from fpirhc.studies.comparison.entry_facts import no_bound_because
+from fpirhc.studies.comparison.null_test import NullTest, null_test
+from fpirhc.studies.comparison.other_rows import beaten_by
+from fpirhc.studies.comparison.timing import measure_price
+from fpirhc.task.problem import Problem
+
+if TYPE_CHECKING:
+    from fpirhc.studies.comparison.compare import Entry
+
+
+def beside_each_other(
+    problem: Problem,
+    entries: Sequence[Entry],
+    loops: Mapping[str, Simulator],
+    scales: Mapping[str, float],
+    *,
+    compiled: bool,
+) -> list[Entry]:
+    """Return the entries with what only shows beside the others.
+
+    Args:
+        problem: of the comparison.
+        entries: the controllers that ran.
+        loops: their loops, by name.
+        scales: by which errors are judged, by coordinate.
+        compiled: whether controllers are timed in C.
+    """
+    shown: list[Entry] = []
+    try:
+        for entry in entries:
+            shown.append(_beside(problem, entry, entries, loops, scales, compiled))
+    except KeyboardInterrupt:
+        return [*shown, *entries[len(shown) :]]
+    return shown
+
+
+def null_of_pair(
+    problem: Problem,
+    pair: tuple[str, str] | None,
+    entries: Sequence[Entry],
+    loops: Mapping[str, Simulator],
+    scales: Mapping[str, float],
+    *,
+    seed: int,
+) -> NullTest | None:
+    """Return the null test of a pair (without adaptation, with it); None without one.
+
+    Args:
+        problem: of the comparison.
+        pair: names of the controllers.
+        entries: the controllers that ran.
+        loops: their loops, by name.
+        scales: by which errors are judged, by coordinate.
+        seed: of the sensors' noise.
+    """
+    if pair is None:
+        return None
+    plain, adaptive = (next(e for e in entries if e.name == name) for name in pair)
+    both, cured = (loops[plain.name], loops[adaptive.name]), plain.metrics.rms_error
+    try:
+        return null_test(problem, both, pair, scales, adaptive.weighed, cured=cured, seed=seed)
+    except KeyboardInterrupt:
+        return None
+
+
+def _beside(
+    problem: Problem,
+    entry: Entry,
+    entries: Sequence[Entry],
+    loops: Mapping[str, Simulator],
+    scales: Mapping[str, float],
+    compiled: bool,
+) -> Entry:
+    """The entry with its price, or with why its exact model is no bound."""
+    controller, by_name = loops[entry.name].controller, {e.name: e for e in entries}
+    if entry.exact and beaten_by(entry, entries, scales):
+        return replace(entry, no_bound=no_bound_because(problem, controller, entry.metrics, entry.optimality))
+    plain = by_name.get(entry.pair or "")
+    if plain is None:
+        return entry
+    both = (loops[plain.name].controller, plain.run), (controller, entry.run)
+    return replace(entry, price=measure_price(problem, *both, compiled=compiled))

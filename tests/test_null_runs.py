@@ -1,0 +1,111 @@
+"""The null test: with the approximate model as plant there is nothing to adapt."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from plants import linear
+
+import fpirhc as fp
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.simulation.simulate import simulator
+from fpirhc.studies.comparison.compare import compare
+from fpirhc.studies.comparison.null_test import CYCLES, null_test
+from fpirhc.studies.comparison.outcome import Outcome
+
+PLAIN = fp.ComputedTorque(fp.Exponential(rate=6.0))
+ONE = {"y": 1.0}
+
+
+def problem(**changes) -> fp.Problem:
+    """A mass along a sine, 60 % heavier in the model."""
+    settings = {
+        "plant": linear(1.6, 1.0),
+        "reference": fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}),
+        "start": {"y": 0.0, "y'": 3.0},
+        "period": 1e-3,
+        "duration": 3.0,
+        "measure_from": 1.0,
+    }
+    return fp.Problem(**{**settings, **changes})
+
+
+def null_of(adaptive: fp.ComputedTorque, cured: float = 1.0, **changes):
+    """The null test of this controller beside the one without adaptation."""
+    task = problem(**changes)
+    plain, adapting = (simulator(task, c, compiled=False) for c in (PLAIN, adaptive))
+    return null_test(task, (plain, adapting), ("CTC", "CTC+FPI"), ONE, cured={"y": cured}, seed=0)
+
+
+def rms(plant: fp.Plant, controller: fp.ComputedTorque) -> float:
+    """The rms error of a run of its own, on a problem of its own."""
+    task = problem(plant=plant)
+    return fp.measure(task, fp.simulate(task, controller, seed=0, compiled=False)).rms_error["y"]
+
+
+SIGMOID = fp.Sigmoid(gain=-0.5, scale=10.0)
+
+
+def test_it_is_the_run_on_the_approximate_plant():
+    """The same loops with other exact parameters give what a problem with an exact model gives; the disturbance is left out."""
+    null = null_of(fp.ComputedTorque(PLAIN.tracking, SIGMOID), disturbances={"u": fp.Step(at=0.5, size=4.0)})
+    exact = linear(1.0, 1.0)
+    assert null.before["y"] == pytest.approx(rms(exact, PLAIN), rel=1e-9)
+    assert null.after["y"] == pytest.approx(rms(exact, fp.ComputedTorque(PLAIN.tracking, SIGMOID)), rel=1e-9)
+    assert "(the approximate model as plant, no disturbance)" in null.text
+
+
+def test_a_form_that_leaves_an_exact_model_alone_passes():
+    """The model-referenced form compares with the model's own response, and there is no difference to adapt to."""
+    null = null_of(fp.ComputedTorque(PLAIN.tracking, fp.ModelReferenced(SIGMOID)))
+    assert null.outcome is Outcome.NO_DIFFERENCE
+    assert null.passed
+    assert not null.harmful
+    assert "passed, CTC+FPI is not worse than CTC" in null.text
+
+
+def test_an_own_error_is_judged_by_the_error_that_it_removes():
+    """The plain form makes a small error; it is harmless beside 1 m, and harmful beside a tenth of itself."""
+    adaptive = fp.ComputedTorque(PLAIN.tracking, replace(SIGMOID, gain=-0.05))
+    harmless = null_of(adaptive)
+    assert not harmless.passed
+    assert not harmless.harmful
+    assert "makes a small error of its own" in harmless.text
+    harmful = null_of(adaptive, cured=harmless.after["y"] / 10)
+    assert harmful.harmful
+    assert "failed, CTC+FPI is worse than CTC although there is nothing to adapt" in harmful.text
+
+
+def test_what_does_not_finish():
+    """A loop that diverges where the plain one finishes has failed; where the plain one diverges nothing is shown."""
+    wild = fp.ComputedTorque(PLAIN.tracking, fp.Affine(gain=-60.0))
+    good = fp.ComputedTorque(PLAIN.tracking, SIGMOID)
+    task = problem(duration=2.0, measure_from=0.1)
+    loops = [simulator(task, c, compiled=False) for c in (good, wild)]
+    lost = null_test(task, (loops[0], loops[1]), ("CTC", "CTC+FPI"), ONE, cured=ONE, seed=0)
+    assert np.isnan(lost.after["y"])
+    assert lost.harmful
+    assert "failed, CTC+FPI does not finish where CTC does" in lost.text
+    back = null_test(task, (loops[1], loops[0]), ("CTC", "CTC+FPI"), ONE, cured=ONE, seed=0)
+    assert back.outcome is Outcome.NOT_COMPARABLE
+    assert not back.harmful
+
+
+def test_a_long_run_is_cut():
+    """The price of a test does not grow with the length of the run."""
+    null = null_of(fp.ComputedTorque(PLAIN.tracking, SIGMOID), duration=10.0)
+    assert null.cycles == 1000 + CYCLES
+
+
+def test_a_comparison_without_a_pair_has_none():
+    """Nothing adapts, so there is nothing to test; with a pair it is in the result."""
+    controllers = {"CTC": PLAIN, "CTC+FPI": fp.ComputedTorque(PLAIN.tracking, SIGMOID)}
+    task = Task("case", Path("case.py"), "", "", problem(duration=1.5), controllers)
+    assert compare(task, seed=0, controllers=["CTC"], compiled=False).null is None
+    null = compare(task, seed=0, compiled=False).null
+    assert null is not None
+    assert null.pair == ("CTC", "CTC+FPI")
