@@ -33,6 +33,7 @@ class ReviewGrid:
         states: states of the reference, shape (m, nx).
         responses: responses of the controlled coordinates that the reference needs, shape (m, n).
         draws: exact parameters, shape (draws, np); the first row is the plant's own.
+        mismatch: range of the exact parameters and of the dead times, percent.
     """
 
     problem: Problem
@@ -40,6 +41,7 @@ class ReviewGrid:
     states: np.ndarray
     responses: np.ndarray
     draws: np.ndarray
+    mismatch: float = 0.0
 
     @cached_property
     def commands(self) -> np.ndarray:
@@ -82,7 +84,7 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
     lower, upper = (np.array([box[name][k] for name in plant.parameters]) for k in (0, 1))
     draws = _draws(lower, upper, np.random.default_rng(seed))
     rows = np.vstack([plant.exact[None, :], draws])
-    return ReviewGrid(problem, times, states, responses[:, list(plant.controlled_indices)], rows)
+    return ReviewGrid(problem, times, states, responses[:, list(plant.controlled_indices)], rows, mismatch)
 
 
 def parameter_box(problem: Problem, mismatch: float) -> dict[str, tuple[float, float]]:

@@ -115,7 +115,7 @@ def _of_map(case: Case, general: list[Answer]) -> list[Answer]:
         own, boxed = (spectrum_near(grid, believed, draws, near=False) for draws in (grid.draws[:1], grid.draws))
     except InvalidValue as error:
         return [Answer("Do the eigenvalues of the response Jacobian have one sign?", Verdict.UNKNOWN, str(error))]
-    limit = largest_product(grid.problem, deformation)
+    limit = largest_product(grid.problem, deformation, own.eigenvalues)
     suited = [*_speed_and_range(grid, controller, loops), *_doubtful(case)]
     verdict = converges(grid, controller, loops, _doubts([*general, *suited]))
     gains = [one_sign(own, boxed), gain_admissible(deformation, own, boxed, limit)]
