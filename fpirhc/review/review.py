@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from fpirhc.controllers.base import Controller
@@ -77,7 +77,8 @@ def predict(problem: Problem, controller: Controller) -> Answer:
     general = [well_posed(own), inverse_exists(own), commands_inside(own)]
     loops = loops_along(own, ready)
     case = Case(own, ready, loops, NominalRuns(problem))
-    return converges(own, ready, loops, _doubts([*general, *_speed_and_range(own, ready, loops), *_doubtful(case)]))
+    suited = [*_speed_and_range(own, ready, loops), *_doubtful(case), free_of_two_cycles(own, ready, loops)]
+    return converges(own, ready, loops, _doubts([*general, *suited]))
 
 
 def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: NominalRuns) -> tuple[Answer, ...]:
@@ -119,15 +120,12 @@ def _of_map(case: Case, general: list[Answer]) -> list[Answer]:
         own, boxed = (spectrum_near(grid, believed, draws, near=False) for draws in (grid.draws[:1], grid.draws))
     except InvalidValue as error:
         return [Answer("Do the eigenvalues of the response Jacobian have one sign?", Verdict.UNKNOWN, str(error))]
-    limit = largest_product(grid.problem, deformation)
+    limit = largest_product(grid.problem, deformation, own.eigenvalues)
+    two_cycles = free_of_two_cycles(grid, controller, loops)
     suited = [*_speed_and_range(grid, controller, loops), *_doubtful(case)]
-    verdict = converges(grid, controller, loops, _doubts([*general, *suited]))
+    verdict = converges(grid, controller, loops, _doubts([*general, *suited, two_cycles]))
     gains = [one_sign(own, boxed), gain_admissible(deformation, own, boxed, limit)]
-    law = [
-        fast_enough(grid, controller, own),
-        bears_lag(grid, controller, own),
-        free_of_two_cycles(grid, controller, loops),
-    ]
+    law = [fast_enough(grid, controller, own), bears_lag(grid, controller, own), two_cycles]
     known = [a for a in (*law, chatter_small(grid, controller)) if a is not None]
     form = right_form(grid.problem, deformation)
     return [verdict, box_converges(loops), *gains, *suited, *known, form, pays(case)]
@@ -140,5 +138,5 @@ def _speed_and_range(grid: ReviewGrid, controller: Controller, loops: Loops) -> 
     return [a for a in answers if a is not None]
 
 
-def _doubts(answers: list[Answer]) -> list[str]:
-    return [f"'{a.question}' is answered no" for a in answers if a.verdict == Verdict.NO]
+def _doubts(answers: Sequence[Answer | None]) -> list[str]:
+    return [f"'{a.question}' is answered no" for a in answers if a is not None and a.verdict == Verdict.NO]

@@ -67,7 +67,8 @@ def _remedy(case: Case, runs: NullRuns, predicted: float | None) -> tuple[str, d
             sentences.append(f"The {name} form passes: rms error of {runs.worst} {other.adapted[runs.worst]:.3g}.")
             numbers["with_form"] = other.adapted[runs.worst]
             break
-    period = None if predicted is None else _period(case, runs, predicted)
+    grows = bool(case.loops.loops) and case.loops.radii.max() >= 1
+    period = None if predicted is None or grows else _period(case, runs, predicted)
     if period is not None and period < case.problem.period:
         shorter = case.problem.period / period
         text = f"The form in use needs a period about {shorter:.2g} times shorter, {period:.2g}."
