@@ -220,10 +220,7 @@ def test_a_map_is_fast_enough_at_twice_the_speed(ratio, verdict):
 def test_a_map_without_bound_is_fast_enough(grid):
     """The affine map takes a step of any size."""
     one = slew_enough(grid, fp.Affine(-0.5), grid.problem.plant.approximate, None)
-    assert (one.verdict, one.evidence) == (
-        "yes",
-        "the request changes by up to 14 per s; the map's step has no bound",
-    )
+    assert (one.verdict, one.evidence) == ("yes", "the request changes by up to 14 per s; the map's step has no bound")
 
 
 def test_disturbances_ask_for_speed_as_well():

@@ -211,3 +211,22 @@ def test_draws_are_between_the_range_and_the_model():
             deviations = rests / ((1 - shares[:, None]) * problem.plant.exact) - 1
             fits = (np.abs(deviations) <= spread + 1e-2).all(axis=1)
             assert fits.any() or np.array_equal(row, problem.plant.approximate)
+
+
+def test_a_filter_that_works_is_not_refused_for_a_state_that_nobody_reads():
+    """An integral that is not measured leaves the rank condition of the rest alone: the filter removes the offset in a run."""
+    problem = replace(companion(0.0), disturbances={"y": fp.Step(at=1.0, size=0.5)}, measure_from=3.0)
+    free = fp.Estimating(PLAN, fp.DisturbanceKalman(drift={"y": 10.0}, measured={"y": 1e-3}))
+    every = fp.review(problem, {"free": free}, mismatch=0.0, seed=0).answers
+    assert not [a for a in every if "fit the problem" in a.question]
+    errors = [fp.simulate(problem, one, seed=0)["error"][150:] for one in (PLAN, free)]
+    assert np.abs(errors[1]).max() < 0.1 * np.abs(errors[0]).max()
+
+
+@pytest.mark.parametrize(("rate", "settings"), [(0.0, {"judged": ("y", "z")}), (0.2, {})])
+def test_a_filter_is_refused_for_a_state_that_is_judged_or_grows(rate, settings):
+    """What nothing measured depends on must be harmless."""
+    free = fp.Estimating(PLAN, fp.DisturbanceKalman(drift={"y": 10.0}, measured={"y": 1e-3}))
+    every = fp.review(companion(rate, **settings), {"free": free}, mismatch=0.0, seed=0).answers
+    [refused] = [a for a in every if "fit the problem" in a.question]
+    assert refused.verdict == "no"
