@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.controllers.base import Controller
 from fpirhc.review.grid import review_grid
 from fpirhc.review.inner import inner_motion, inner_places
 
@@ -38,7 +39,7 @@ def companion(rate: float, *, weigh: bool = False, **settings: Any) -> fp.Proble
     return fp.Problem(plant=plant, **(usual | settings))
 
 
-def answer(problem: fp.Problem, controller: fp.Controller, words: str) -> fp.Answer:
+def answer(problem: fp.Problem, controller: Controller, words: str) -> fp.Answer:
     every = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).answers
     [one] = [a for a in every if words in a.question]
     return one
@@ -181,7 +182,7 @@ def test_states_that_leave_every_bound_are_left_on_the_reference():
 def test_currents_of_the_nerve_cell_are_those_of_a_run():
     """The gates move with the voltage: the exact model's commands in a run without a pulse, and not those of gates at rest."""
     task = fp.load_problem("problems/gallery/hodgkin_huxley.py")
-    problem = replace(task.problem, disturbances={}, start=task.problem.start | {"V": -65.0})
+    problem = replace(task.problem, disturbances={}, start={**task.problem.start, "V": -65.0})
     run = fp.simulate(problem, fp.ExactModel(fp.ComputedTorque(fp.Exponential(rate=1.0))), seed=0)
     grid = review_grid(problem, 0.0, 0)
     needed = grid.commands[0, 1:-1, 0]
@@ -212,3 +213,22 @@ def test_draws_are_between_the_range_and_the_model():
             deviations = rests / ((1 - shares[:, None]) * problem.plant.exact) - 1
             fits = (np.abs(deviations) <= spread + 1e-2).all(axis=1)
             assert fits.any() or np.array_equal(row, problem.plant.approximate)
+
+
+def test_a_filter_that_works_is_not_refused_for_a_state_that_nobody_reads():
+    """An integral that is not measured leaves the rank condition of the rest alone: the filter removes the offset in a run."""
+    problem = replace(companion(0.0), disturbances={"y": fp.Step(at=1.0, size=0.5)}, measure_from=3.0)
+    free = fp.Estimating(PLAN, fp.DisturbanceKalman(drift={"y": 10.0}, measured={"y": 1e-3}))
+    every = fp.review(problem, {"free": free}, mismatch=0.0, seed=0).answers
+    assert not [a for a in every if "fit the problem" in a.question]
+    errors = [fp.simulate(problem, one, seed=0)["error"][150:] for one in (PLAN, free)]
+    assert np.abs(errors[1]).max() < 0.1 * np.abs(errors[0]).max()
+
+
+@pytest.mark.parametrize(("rate", "settings"), [(0.0, {"judged": ("y", "z")}), (0.2, {})])
+def test_a_filter_is_refused_for_a_state_that_is_judged_or_grows(rate, settings):
+    """What nothing measured depends on must be harmless."""
+    free = fp.Estimating(PLAN, fp.DisturbanceKalman(drift={"y": 10.0}, measured={"y": 1e-3}))
+    every = fp.review(companion(rate, **settings), {"free": free}, mismatch=0.0, seed=0).answers
+    [refused] = [a for a in every if "fit the problem" in a.question]
+    assert refused.verdict == "no"

@@ -22,14 +22,17 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
+from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import Loops
 from fpirhc.review.maps import largest_product
 from fpirhc.review.neighbourhood import eigenvalues_near
 from fpirhc.review.stages import stiff_advice
 from fpirhc.review.stand_in import is_planned
+from fpirhc.review.zero_dynamics import zero_dynamics_modes
 
 QUESTION = "Does the deformation converge?"
 _SURE = math.log(100)
+_NEAR = 0.1  # distance from a mode of the zero dynamics, as a share of its own distance from 1
 
 
 def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: list[str]) -> Answer:
@@ -43,10 +46,13 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
     """
     if not loops.loops:
         return Answer(QUESTION, Verdict.UNKNOWN, f"no linear loop: {loops.reason}", "Run it and look at the factor.")
-    growth = np.log(np.maximum(loops.radii, 1e-300)) * grid.problem.cycles
-    worst = float(loops.radii.max())
+    radii, left_out = _own_radii(grid, loops)
+    growth = np.log(np.maximum(radii, 1e-300)) * grid.problem.cycles
+    worst = float(radii.max())
     text = f"the slowest mode of the linear loop changes by {worst:.6g} per cycle"
-    numbers = {"radius": worst, "smallest_radius": float(loops.radii.min())}
+    if left_out:
+        text += f", beside those of the states that decay by themselves, {float(loops.radii.max()):.6g}"
+    numbers = {"radius": worst, "smallest_radius": float(radii.min())}
     deformation = controller.deformation
     if not deformation.constant or loops.learns:
         what = (
@@ -61,7 +67,7 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
             QUESTION, Verdict.NO, f"{text}: it grows all along the reference", _mend(grid, controller, loops), numbers
         )
     if growth.max() > -_SURE:
-        where = f"between {loops.radii.min():.6g} and {worst:.6g} along the reference"
+        where = f"between {radii.min():.6g} and {worst:.6g} along the reference"
         return Answer(QUESTION, Verdict.UNKNOWN, f"{text} ({where})", _mend(grid, controller, loops), numbers)
     against = [*_steep(grid, controller), *doubts]
     if against:
@@ -92,6 +98,27 @@ def _mend(grid: ReviewGrid, controller: Controller, loops: Loops) -> str:
         outer = "The outer loop does not converge even with the right model"
         return f"{outer}. {stiff}" if stiff else f"{outer}: lower its rate, or predict over the dead time."
     return "Change the gain to the recommended one; under dead time pair the deformation."
+
+
+def _own_radii(grid: ReviewGrid, loops: Loops) -> tuple[np.ndarray, bool]:
+    """Largest |pole| at every point without the decaying modes of the zero dynamics, and whether any has been left out.
+
+    A slow compartment fills at its own rate, however fast the deformation converges.
+    """
+    modes = zero_dynamics_modes(grid, loops.places)
+    radii = np.array([_without(one, rates) for one, rates in zip(loops.loops, modes, strict=True)])
+    return radii, bool((radii < loops.radii).any())
+
+
+def _without(loop: LinearLoop, rates: np.ndarray) -> float:
+    """Largest |pole| where each decaying rate takes away the pole that is nearest to it."""
+    poles = loop.poles[~loop.hidden]
+    for one in rates[rates.real < 0]:
+        exact = np.exp(one * loop.period)
+        nearest = int(np.argmin(np.abs(poles - exact))) if poles.size else 0
+        if poles.size and abs(poles[nearest]) < 1 and abs(poles[nearest] - exact) < _NEAR * abs(1 - exact):
+            poles = np.delete(poles, nearest)
+    return float(np.abs(poles).max(initial=0.0))
 
 
 def _steep(grid: ReviewGrid, controller: Controller) -> list[str]:

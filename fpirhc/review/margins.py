@@ -86,7 +86,7 @@ def margins(loop: LinearLoop, place: int) -> tuple[float, float, float]:
         place: number of the input.
 
     Returns:
-        Gain margin as a factor of at least 1, up or down; phase margin, degrees; delay margin, s.
+        Gain margin as a factor of at least 1, up or down; phase margin, degrees; delay margin, in the unit of time.
     """
     import control  # slow to import, and only margins need it
 

@@ -39,5 +39,5 @@ def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answ
 
 
 def _rate(controller: Controller) -> float | None:
-    """Rate of the tracking law, 1/s, where the controller has such a law."""
+    """Rate of the tracking law, per unit of time, where the controller has such a law."""
     return None if controller.law is None else controller.law.speed

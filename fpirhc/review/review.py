@@ -45,8 +45,8 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
     Args:
         problem: the problem.
         controllers: the controllers by name.
-        mismatch: range of the exact parameters, percent, see `fpirhc.plant.mismatch`; the box spans the approximate
-            values too.
+        mismatch: range of the exact parameters, percent, see `fpirhc.plant.mismatch`; the box spans the plants
+            between this range and the model too.
         seed: of the draws from the box.
 
     Raises:

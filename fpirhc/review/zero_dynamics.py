@@ -6,6 +6,8 @@ that are no derivative of a controlled coordinate move by themselves.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import casadi as ca
 import numpy as np
 
@@ -24,23 +26,32 @@ _STILL = 1e-4  # growth over the run, as a share, below which a mode is neutral
 
 def zero_dynamics_rate(grid: ReviewGrid) -> float | None:
     """Return the largest real part of the zero dynamics along the reference, per unit of time; None where there are none."""
-    plant = grid.problem.plant
-    inside = [k for k, e in enumerate(plant.state.elements) if e.rstrip("'") not in plant.controlled_names]
-    if not inside:
+    if not _inside(grid.problem.plant):
         return None
-    rates, slopes = [], response_slopes(plant)
-    for state, command in zip(grid.states, grid.commands[0], strict=True):
-        if np.isfinite(command).all():
-            rates.append(_rate(plant, slopes(state, command, plant.exact), inside))
-    return max(rates, default=float("nan"))
+    modes = zero_dynamics_modes(grid, [k for k in range(len(grid.times)) if np.isfinite(grid.commands[0, k]).all()])
+    return max((float(one.real.max()) for one in modes), default=float("nan"))
 
 
-def _rate(plant: Plant, slopes: tuple[ca.DM, ca.DM], inside: list[int]) -> float:
+def zero_dynamics_modes(grid: ReviewGrid, places: Sequence[int]) -> list[np.ndarray]:
+    """Return the eigenvalues of the zero dynamics at points of the reference, per unit of time; none where all is controlled."""
+    plant, slopes = grid.problem.plant, response_slopes(grid.problem.plant)
+    inside = _inside(plant)
+    if not inside:
+        return [np.zeros(0)] * len(places)
+    return [_modes(plant, slopes(grid.states[k], grid.commands[0, k], plant.exact), inside) for k in places]
+
+
+def _inside(plant: Plant) -> list[int]:
+    """Places of the states that are no derivative of a controlled coordinate."""
+    return [k for k, e in enumerate(plant.state.elements) if e.rstrip("'") not in plant.controlled_names]
+
+
+def _modes(plant: Plant, slopes: tuple[ca.DM, ca.DM], inside: list[int]) -> np.ndarray:
     rows, gains = (np.asarray(m.full()) for m in slopes)
     controlled = list(plant.controlled_indices)
     a, b = state_matrices(plant, rows, gains)
     internal = (a - b @ np.linalg.solve(gains[controlled], rows[controlled]))[np.ix_(inside, inside)]
-    return float(np.linalg.eigvals(internal).real.max())
+    return np.asarray(np.linalg.eigvals(internal))
 
 
 def zero_dynamics(problem: Problem, rate: float | None, planned: bool, loops: Loops) -> Answer:

@@ -17,7 +17,7 @@ Task: x = 50 mm sin 2 t, which reverses twice in pi s; the error counts from 4 s
 
 The exact model's bristles move at 1 000 per second: a stage of 10 ms in one explicit step is unstable, the exact model's plan
 diverges (40 mm), and `fpirhc review` says so. The stages below have 8 sub-steps each, which cures it. Every state is told to
-the controllers; the deflection z, which nobody can measure, serves the filter's rank condition and the exact model.
+the controllers; the deflection z, which nobody can measure, serves the exact model alone: without it the filter is as good.
 
 `fpirhc tune stick_slip --trials 20 --seeds 2 --mismatch 10`, relative errors: CTC+FPI from 1.4e-4 to 2.2e-5 (gain 1.2e-4),
 RHC+FPI from 1.3e-4 to 6.3e-5 (gain -2.9), offset-free stays at 2.49e-4, which is what a filter of one cycle gives. The gains

@@ -46,6 +46,6 @@ VERB = Verb(
     ),
     notes="""
 An answer over the box holds for all exact parameters within PERCENT % of those in the problem file, and for all
-between these and the approximate ones.
+between these and the approximate ones, with one share for all parameters.
 """,
 )

@@ -96,17 +96,21 @@ class DisturbanceKalman(Estimator):
 
         a, noise_input, c = self._matrices(problem)
         model, size = problem.plant, len(self.drift)
+        used = self._used(problem, a, c)
         noise = np.array([self.noise.get(n, 0.0) for n in model.names])
         walk = problem.period * np.array(list(self.drift.values())) ** 2
         q = scipy.linalg.block_diag((noise_input * noise**2) @ noise_input.T, np.diag(walk))
         r = np.diag(np.array(list(self.measured.values())) ** 2)
+        gain = np.zeros((model.state.size + size, len(self.measured)))
+        a, c, q = a[np.ix_(used, used)], c[:, used], q[np.ix_(used, used)]
         try:
             p = scipy.linalg.solve_discrete_are(a.T, c.T, q, r)
-            gain = np.linalg.solve(c @ p @ c.T + r, c @ p).T
+            own = np.linalg.solve(c @ p @ c.T + r, c @ p).T
         except np.linalg.LinAlgError:
-            gain = np.full((model.state.size + size, len(self.measured)), np.nan)
+            own = np.full((len(a), len(self.measured)), np.nan)
+        gain[used] = own
         if not (
-            np.isfinite(gain).all() and np.abs(np.linalg.eigvals((np.eye(len(a)) - gain @ c) @ a)).max() < 1 - _SLOWEST
+            np.isfinite(own).all() and np.abs(np.linalg.eigvals((np.eye(len(a)) - own @ c) @ a)).max() < 1 - _SLOWEST
         ):
             noiseless = [n for n in model.names if n not in self.drift and n not in self.noise]
             hint = (
@@ -170,15 +174,39 @@ class DisturbanceKalman(Estimator):
                 f"{len(self.measured)} measured state(s) ({measured}): measure as many, or estimate fewer"
             )
         a, _, c = self._matrices(problem)
-        stacked = np.vstack([a - np.eye(len(a)), c])
-        rows = np.abs(stacked).max(axis=1) > 0
-        rank = int(np.linalg.matrix_rank(stacked[rows] / np.abs(stacked[rows]).max(axis=1, keepdims=True), tol=1e-9))
-        if rank < len(a):
+        used = self._used(problem, a, c)
+        rank = _rank(a[np.ix_(used, used)], c[:, used])
+        if rank < used.sum():
             raise NotSupported(
                 f"DisturbanceKalman: a constant {disturbances} cannot be determined from {measured}: [A - I, B; C, 0] has rank "
-                f"{rank} and needs {len(a)} (Pannocchia and Rawlings 2003); measure another state, or disturb the response "
+                f"{rank} and needs {used.sum()} (Pannocchia and Rawlings 2003); measure another state, or disturb the response "
                 "of a coordinate that acts on a measured state"
             )
+
+    def _used(self, problem: Problem, a: np.ndarray, c: np.ndarray) -> np.ndarray:
+        """Which states and disturbances the filter corrects, shape (nx + nw,): all, where the measured states determine all.
+
+        Else those on which a measured state depends, if all disturbances are among them. The other states must be neutral or decay,
+        and nobody may judge them: the amount of a drug that has left the body follows from the model.
+        """
+        everything = np.ones(len(a), dtype=bool)
+        if _rank(a, c) == len(a):
+            return everything
+        used, pattern = (c != 0).any(axis=0), a != 0
+        while (grown := used | pattern[used].any(axis=0)).sum() > used.sum():
+            used = grown
+        judged = [problem.plant.state.elements.index(n) for n in problem.judged_names]
+        judged += range(problem.plant.state.size, len(a))
+        rest = a[np.ix_(~used, ~used)]
+        harmless = used[judged].all() and np.abs(np.linalg.eigvals(rest)).max(initial=0.0) < 1 + _SLOWEST
+        return used if harmless else everything
+
+
+def _rank(a: np.ndarray, c: np.ndarray) -> int:
+    """Rank of [A - I; C], with rows of size one."""
+    stacked = np.vstack([a - np.eye(len(a)), c])
+    rows = np.abs(stacked).max(axis=1) > 0
+    return int(np.linalg.matrix_rank(stacked[rows] / np.abs(stacked[rows]).max(axis=1, keepdims=True), tol=1e-9))
 
 
 def _operating_point(problem: Problem) -> tuple[ca.DM, ca.DM, np.ndarray]:

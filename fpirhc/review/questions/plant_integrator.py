@@ -20,8 +20,8 @@ def integrator_follows(grid: ReviewGrid) -> Answer | None:
     if problem.integrator.opaque:
         return None
     usable = [k for k in range(len(grid.times)) if np.isfinite(grid.commands[0, k]).all()]
-    chosen = [usable[k] for k in np.unique(np.linspace(0, len(usable) - 1, _POINTS).astype(int))] if usable else []
-    places = [Place(grid.states[k], grid.commands[0, k], plant.exact) for k in chosen]
+    points = [usable[k] for k in np.unique(np.linspace(0, len(usable) - 1, _POINTS).astype(int))] if usable else []
+    places = [Place(grid.states[k], grid.commands[0, k], plant.exact) for k in points]
     try:
         poles = [step_poles(plant, problem.integrator, problem.period, place) for place in places]
     except (FpirhcError, np.linalg.LinAlgError) as error:

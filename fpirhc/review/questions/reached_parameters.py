@@ -32,8 +32,9 @@ def reaches_parameters(case: Case) -> Answer:
     sizes = {names[k]: _effect(case.grid, case.believed, k) for k in wrong if present[k]}
     numbers = {"wrong": float(len(wrong)), "reached": float(len(reached))}
     numbers |= {f"effect_{name}": size for name, size in sizes.items()}
-    text = "; ".join([*_reached(sizes), *_missed(missed)])
-    if not missed:
+    idle = _without_task(case.grid, missed)
+    text = "; ".join([*_reached(sizes), *_missed(missed, idle)])
+    if reached and not set(missed) - set(idle):
         return Answer(TEXT, Verdict.YES, text, "", numbers)
     change = f"Control a coordinate in whose response {missed[0]} is, or correct {', '.join(missed)} in the model."
     if reached:
@@ -46,8 +47,23 @@ def _reached(sizes: dict[str, float]) -> list[str]:
     return ["the response changes by up to " + ", ".join(f"{v:.3g} ({n})" for n, v in ordered)] if ordered else []
 
 
-def _missed(names: list[str]) -> list[str]:
-    return [f"the response does not depend on {', '.join(names)}"] if names else []
+def _missed(names: list[str], idle: list[str]) -> list[str]:
+    if not names:
+        return []
+    note = f" ({', '.join(idle)}: only in states without a task)" if idle else ""
+    return [f"the response does not depend on {', '.join(names)}{note}"]
+
+
+def _without_task(grid: ReviewGrid, names: list[str]) -> list[str]:
+    """Those of the parameters that are in the responses of simulated states alone, see `fpirhc.review.inner`."""
+    plant = grid.problem.plant
+    pattern = np.asarray(ca.DM(plant.response_function.jac_sparsity(0, 2), 1).full()) != 0
+    inner = {plant.state.elements[k].rstrip("'") for k in grid.inner}
+    of = {
+        name: {c for c, row in zip(plant.names, pattern, strict=True) if row[k]}
+        for k, name in enumerate(plant.parameter.elements)
+    }
+    return [name for name in names if of[name] and of[name] <= inner]
 
 
 def _present(plant: Plant) -> list[bool]:
