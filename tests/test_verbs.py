@@ -292,6 +292,13 @@ JOURNEYS: dict[str, Any] = {
 FAULTY: list[bool] = []
 
 
+def test_doctor_and_readme_say_the_same_about_a_faulty_installation(capsys):
+    """The code of `doctor` in its help, in README's table, and in the program."""
+    code = ExitCode.FAULTY_INSTALLATION
+    assert f"  {code:<4d} {code.meaning}\n" in help_of("doctor", capsys)
+    assert f"| {code:d} | {code.meaning} |\n" in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("verb", VERBS, ids=lambda v: v.name)
 def test_exit_codes_are_those_of_the_help(verb, folder, monkeypatch, capsys):
     """With right and wrong input every code that the help lists is met, and no other one."""

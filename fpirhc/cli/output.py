@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+RESULTS = "results.json"  # what --json prints, beside every report
+
 
 def results_folder(wanted: str | None, *default: str) -> Path:
     """Return the folder for results, created before anything runs.
