@@ -7,8 +7,9 @@ import math
 
 import pytest
 
-from fpirhc.baselines.bands import BANDED, Expected, Metric
+from fpirhc.baselines.bands import Expected, Metric
 from fpirhc.baselines.baseline import Baseline
+from fpirhc.baselines.catalogue import BANDED
 from fpirhc.baselines.judging import BETTER, CHANGED, HOLDS, WORSE, Judgement, Row, ignoring, judge
 from fpirhc.baselines.junit import to_junit
 from fpirhc.baselines.markdown import to_markdown
