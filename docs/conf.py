@@ -21,14 +21,18 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "sphinx.ext.mathjax",
+    "sphinxcontrib.katex",
     "sphinx_gallery.gen_gallery",
     "plain_docstrings",
 ]
 exclude_patterns = ["_build", "gallery_src/README.rst"]
 html_theme = "furo"
 html_title = f"fpirhc {release}"
-# Offline like the reports: formulas are typeset by a script only where there is a network.
+# Offline like the reports: KaTeX's script comes with its extension, its style sheet and fonts stand in _static/katex. Both are of
+# version 0.16.22 of KaTeX; the style sheet names the fonts in the one format that every browser reads.
+html_static_path = ["_static"]
+katex_css_path = "katex/katex.min.css"
+katex_options = "throwOnError: true"
 myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3
 autodoc_member_order = "bysource"
@@ -41,6 +45,7 @@ sphinx_gallery_conf = {
     "filename_pattern": "/plot_",
     "download_all_examples": False,
     "show_memory": False,
+    "write_computation_times": False,  # its page would load scripts from elsewhere
     "abort_on_example_error": True,
     "only_warn_on_example_error": False,
     "plot_gallery": True,

@@ -62,7 +62,7 @@ def test_changes_are_in_percent_of_the_old_value():
     """Also of a negative one, and of one that was zero."""
     rows = [Row("c", "m", old, new, 0.1, CHANGED) for old, new in ((2.0, 3.0), (-2.0, -1.0), (0.0, 1.0), (0.0, 0.0))]
     assert [row.change for row in rows] == [0.5, 0.5, math.inf, 0.0]
-    assert [change(row.change) for row in rows] == ["+50 %", "+50 %", "from zero", "+0 %"]
+    assert [change(row.change) for row in rows] == ["+50 %", "+50 %", "from zero", "0 %"]
     assert Row("c", "outcome", "finished", "ended early", None, CHANGED).change is None
     assert Row("c", "m", True, False, None, CHANGED).change is None
 

@@ -60,9 +60,10 @@ def test_compare_writes_a_report_and_says_what_it_found(folder, capsys):
 
 
 def test_json_is_one_object_on_standard_output(folder, capsys):
-    """Machines read the same numbers that people see."""
+    """Machines read the same numbers that people see; the same object stands beside the report."""
     assert main(["compare", "line.py", "--json", "--seed", "3", "--no-compile"]) == 0
     document = json.loads(capsys.readouterr().out)
+    assert json.loads((folder / "results" / "line" / "results.json").read_text(encoding="utf-8")) == document
     assert document["problem"] == "line"
     assert document["seed"] == 3
     assert set(document["versions"]) >= {"fpirhc", "casadi"}

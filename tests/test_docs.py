@@ -79,3 +79,33 @@ def test_every_public_name_is_on_the_api_page():
     members = {c.__name__ for family in FAMILIES for c in member_classes(family)}
     assert len(shown) == len(set(shown))
     assert set(shown) == set(fp.__all__) | members
+
+
+def test_a_page_that_loads_from_elsewhere_is_found(tmp_path, capsys):
+    """Scripts, pictures, styles and what a style fetches; links to other sites load nothing."""
+    spec = importlib.util.spec_from_file_location("check_offline", DOCS / "check_offline.py")
+    assert spec
+    assert spec.loader
+    check = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(check)
+    here = (
+        "<a href='https://x.org'>x</a><link rel='canonical' href='https://x.org'><script src='_static/a.js'></script>"
+    )
+    assert check.elsewhere(here + "<img src='data:image/png;base64,AA'>") == []
+    there = "<script src='https://x.org/a.js'></script><img src='//x.org/b.png'><link rel='stylesheet' href='http://x.org/c'>"
+    assert check.elsewhere(there) == ["https://x.org/a.js", "//x.org/b.png", "http://x.org/c"]
+    (tmp_path / "index.html").write_text(here)
+    (tmp_path / "own.css").write_text("@font-face { src: url(fonts/a.woff2) }")
+    assert check.main(tmp_path) == 0
+    (tmp_path / "other.css").write_text("@import 'https://x.org/a.css'; a { background: url(\"//x.org/b.png\") }")
+    assert check.main(tmp_path) == 1
+    assert "other.css loads https://x.org/a.css" in capsys.readouterr().err
+
+
+def test_the_site_has_its_formulas_inside():
+    """Every font that the style sheet names stands beside it, and nothing is named that is elsewhere."""
+    folder = DOCS / "_static" / "katex"
+    style = (folder / "katex.min.css").read_text(encoding="utf-8")
+    named = set(re.findall(r"url\(([^)]+)\)", style))
+    assert named == {f"fonts/{path.name}" for path in (folder / "fonts").iterdir()}
+    assert (folder / "LICENSE").read_text(encoding="utf-8").startswith("The MIT License")

@@ -18,6 +18,9 @@ from fpirhc.horizon.problem import stage_data, transcribe
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import render
 from fpirhc.report.terminal import progress_bars, show, show_run
+from fpirhc.review.answer import Answer, Review, Verdict
+from fpirhc.studies.scenarios.paired import percent
+from fpirhc.studies.scenarios.scenario_study import compare_scenarios
 from fpirhc.summary import printable, table
 
 HOSTILE = "<img src=x onerror=alert(1)>[bold red]$\\frac$ \x1b[31m:bomb: `id` $(id) \"'&"
@@ -114,20 +117,63 @@ def shown(comparison: fp.Comparison, plan: fp.Plan) -> dict[str, Any]:
     }
 
 
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory) -> dict[str, Any]:
+    """What a user works with: a task with its problem and plant, a review of it, and scenarios."""
+    folder = tmp_path_factory.mktemp("inputs")
+    tracking = fp.Exponential(rate=6.0)
+    controllers = {
+        MARKED: fp.ComputedTorque(tracking),
+        HOSTILE: fp.ComputedTorque(tracking, fp.Sigmoid(gain=-0.5, scale=50.0)),
+    }
+    task = Task("[bold]<i>", Path(__file__), HOSTILE, HOSTILE, hostile_problem(0.05), controllers, (MARKED, HOSTILE))
+    answer = Answer(f"Is it {HOSTILE}?", Verdict.NO, f"{HOSTILE} is 3 {UNIT}", "change it")
+    study = compare_scenarios(task, count=2, percent=5.0, seed=0, folder=folder, compiled=False)
+    review = Review((answer,), {HOSTILE: (answer, replace(answer, verdict=Verdict.YES, change=""))}, 5.0)
+    plant = task.problem.plant
+    return {"task": task, "problem": task.problem, "plant": plant, "review": review, "scenarios": study}
+
+
+@pytest.mark.parametrize("kind", ["task", "problem", "plant", "review", "scenarios"])
+def test_inputs_show_themselves_as_results_do(kind, inputs):
+    """A line and a table of nothing but text, whatever the names are."""
+    check_shows_itself(inputs[kind])
+
+
+def test_inputs_show_what_they_hold(inputs):
+    """Units, parameters, times, limits, kinds of controllers, answers and medians, each in its table."""
+    found = {kind: read(value._repr_html_()).text for kind, value in inputs.items()}
+    for text in (UNIT, "coordinate, order 2", "1.6", "1/s^2", "Unit of time: s."):
+        assert text in found["plant"]
+    for text in ("10 cycles of 0.005 s, 0.05 s in all", "-30 to 30 N<i>", "4 stages of 0.01 s", "y = 0.5, y' = 0"):
+        assert text in found["problem"]
+    for text in (printable(HOSTILE), "ComputedTorque", "Sigmoid", "with adaptation", "10 cycles"):
+        assert text in found["task"]
+    for text in ("not ready", "change it", "1 yes, 2 no, 0 unknown"):
+        assert text in found["review"]
+    study = inputs["scenarios"]
+    for text in ("baseline", percent(study.summaries[1].median), printable(study.verdict[0])):
+        assert text in found["scenarios"]
+
+
 KINDS = ("comparison", "run", "metrics", "contraction", "plan", "certificate")
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_results_show_themselves(kind, comparison, plan):
     """A line that names the class, and a table of nothing but text."""
-    value = shown(comparison, plan)[kind]
-    other_diagnostics, page = repr(value), read(value._repr_html_())
-    assert other_diagnostics.startswith(f"{type(value).__name__}(")
-    assert "\n" not in other_diagnostics
-    assert len(other_diagnostics) < 1000
-    assert "array(" not in other_diagnostics
-    assert str(value) == other_diagnostics
-    assert "\x1b" not in other_diagnostics + page.text
+    check_shows_itself(shown(comparison, plan)[kind])
+
+
+def check_shows_itself(value: Any) -> None:
+    """A line without new lines and escape codes, and a page without tags that come from a name."""
+    line, page = repr(value), read(value._repr_html_())
+    assert line.startswith(f"{type(value).__name__}(")
+    assert "\n" not in line
+    assert len(line) < 1000
+    assert "array(" not in line
+    assert str(value) == line
+    assert "\x1b" not in line + page.text
     assert page.tags <= {"div", "table", "caption", "tr", "th", "td", "p"}
     assert not page.attributes
 
@@ -181,7 +227,7 @@ def test_report_holds_no_foreign_tags(comparison):
     assert "onerror" not in parsed.attributes
     assert "<b>m[/]" not in page
     assert page.count("<img ") == page.count("<img alt=")
-    assert page.count("</script>") == page.count("<script>") == 2
+    assert page.count("</script>") == page.count("<script>") == 3
     assert MARKED in parsed.text
     assert "skipped <b>[/b]" in parsed.text
 

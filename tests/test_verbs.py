@@ -287,9 +287,17 @@ JOURNEYS: dict[str, Any] = {
         (None, "line.py", 2),
         (None, "line.py --reason first --baselines ../elsewhere", 3),
     ],
+    "completion": [(None, "bash", 0), (None, "pwsh", 2)],
     "doctor": [(None, "--json", 0), (lambda: FAULTY.append(True), "", 7), (None, "--jsonn", 2)],
 }  # fmt: skip
 FAULTY: list[bool] = []
+
+
+def test_doctor_and_readme_say_the_same_about_a_faulty_installation(capsys):
+    """The code of `doctor` in its help, in README's table, and in the program."""
+    code = ExitCode.FAULTY_INSTALLATION
+    assert f"  {code:<4d} {code.meaning}\n" in help_of("doctor", capsys)
+    assert f"| {code:d} | {code.meaning} |\n" in (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("verb", VERBS, ids=lambda v: v.name)
@@ -305,6 +313,8 @@ def test_exit_codes_are_those_of_the_help(verb, folder, monkeypatch, capsys):
         lambda: Diagnosis({}, [Finding("a check", Outcome.FAIL if FAULTY else Outcome.OK, "found")]),
     )
     FAULTY.clear()
+    if verb.name == "completion":
+        pytest.importorskip("shtab")
     met = set()
     for before, words, code in JOURNEYS[verb.name]:
         if before:

@@ -38,6 +38,8 @@ def change(share: float | None) -> str:
     """Return a change in percent of the old value."""
     if share is None:
         return "-"
+    if share == 0:
+        return "0 %"
     return f"{100 * share:+.3g} %" if math.isfinite(share) else "from zero"
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from fpirhc.cli.crash import interrupted
 
+RESULTS = "results.json"  # what --json prints, beside every report
+
 
 def results_folder(wanted: str | None, *default: str) -> Path:
     """Return the folder for results, created before anything runs.

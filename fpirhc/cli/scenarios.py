@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from fpirhc.cli.exit_codes import ExitCode
 from fpirhc.cli.options import add_mismatch, add_processes, add_scenarios
-from fpirhc.cli.output import results_folder, resumable
+from fpirhc.cli.output import RESULTS, results_folder, resumable
 
 if TYPE_CHECKING:
     from fpirhc.problem_files.problem_file import Task
@@ -65,9 +65,10 @@ def check_options(options: argparse.Namespace) -> None:
 
 
 def run(options: argparse.Namespace) -> ExitCode:
-    """Run the scenarios, write report.html, mismatch.png and scenarios.jsonl, and print the comparison."""
+    """Run the scenarios, write report.html, results.json, mismatch.png and scenarios.jsonl, and print the comparison."""
     from fpirhc.problem_files.problem_file import load_problem
     from fpirhc.report.figures import save_figure
+    from fpirhc.report.page import write_page
     from fpirhc.report.scenarios import mismatch_figure, scenarios_json, show_scenarios, write_scenarios
 
     task = load_problem(options.problem)
@@ -77,6 +78,7 @@ def run(options: argparse.Namespace) -> ExitCode:
     comparison = _compared(options, task, folder)
     report = folder / "report.html"
     write_scenarios(comparison, report)
+    write_page(f"{scenarios_json(comparison)}\n", folder / RESULTS)
     if comparison.summaries:
         save_figure(mismatch_figure(comparison), folder / "mismatch.png")
     if options.json:

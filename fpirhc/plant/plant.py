@@ -28,7 +28,9 @@ from fpirhc.fields.user_code import called
 from fpirhc.plant.inverse import inverse_by_newton, inverse_by_user, inverse_of_affine
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_response
+from fpirhc.plant.plant_view import plant_facts, plant_table
 from fpirhc.plant.structural_order import structural_order
+from fpirhc.summary import line
 from fpirhc.symbolic.layout import Expression, Named, Signal, scalar, vector
 
 __all__ = ["Parameter", "Plant", "derivative_unit", "structural_order"]
@@ -72,6 +74,13 @@ class Plant(Checked):
         mistakes.raise_if_any()
         check_response(self, mistakes)
         mistakes.raise_if_any()
+
+    def __repr__(self) -> str:
+        return line(self, *plant_facts(self))
+
+    def _repr_html_(self) -> str:
+        """Coordinates, inputs and parameters as a table, for notebooks."""
+        return plant_table(self)
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -24,7 +24,9 @@ from fpirhc.problem_files.importing import line_of as _at
 from fpirhc.problem_files.tuning_spans import TuningSpans, check_tuning
 from fpirhc.simulation.metrics import Metric, known_metrics, with_own_metrics
 from fpirhc.simulation.pictures.base import Picture
+from fpirhc.summary import line, table
 from fpirhc.task.problem import Problem
+from fpirhc.task.problem_view import problem_facts
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +62,19 @@ class Task:
             object.__setattr__(self, "problem", replace(self.problem, name=self.name))
         named = {name: controller.labelled(name) for name, controller in self.controllers.items()}
         object.__setattr__(self, "controllers", named)
+
+    def __repr__(self) -> str:
+        return line(self, self.name, self.title, f"{len(self.controllers)} controllers")
+
+    def _repr_html_(self) -> str:
+        """The controllers as a table, for notebooks."""
+        pair = dict(zip(self.headline or (), ("without adaptation", "with adaptation"), strict=False))
+        rows = [
+            (name, type(one).__name__, type(one.deformation).__name__, pair.get(name, ""))
+            for name, one in self.controllers.items()
+        ]
+        notes = [*self.description.split("\n\n")[:1], f"Problem: {', '.join(problem_facts(self.problem))}."]
+        return table(f"{self.name}: {self.title}", ("controller", "kind", "deformation", "headline"), rows, notes)
 
 
 def shipped_folders() -> list[Path]:

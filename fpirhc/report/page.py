@@ -68,7 +68,7 @@ def wide_table(head: Sequence[str], rows: str, label: str) -> str:
 
 
 def write_page(content: str, path: Path) -> None:
-    """Write a page, atomically: the file is complete or not there.
+    """Write a page or another text, atomically: the file is complete or not there.
 
     Raises:
         OutputError: the file cannot be written.

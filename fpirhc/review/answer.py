@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from fpirhc.summary import line, table
+
 
 class Verdict(StrEnum):
     """The verdict of an answer; yes is good in every question."""
@@ -47,6 +49,19 @@ class Review:
     problem: tuple[Answer, ...]
     controllers: Mapping[str, tuple[Answer, ...]]
     mismatch: float
+
+    def __repr__(self) -> str:
+        return line(self, "ready" if self.ready else "not ready", self._counts(), f"mismatch {self.mismatch:g} %")
+
+    def _repr_html_(self) -> str:
+        """All answers as a table, for notebooks."""
+        groups = [("problem", self.problem), *self.controllers.items()]
+        rows = [(name, a.question, str(a.verdict), a.found, a.change) for name, group in groups for a in group]
+        title = f"Review: {'ready' if self.ready else 'not ready'}"
+        return table(title, ("about", "question", "answer", "facts", "what to change"), rows, [self._counts()])
+
+    def _counts(self) -> str:
+        return ", ".join(f"{sum(a.verdict == v for a in self.answers)} {v}" for v in Verdict)
 
     @property
     def answers(self) -> tuple[Answer, ...]:

@@ -19,9 +19,11 @@ from fpirhc.horizon.stage_check import check_stage
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
+from fpirhc.summary import line
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.limits import Limits
+from fpirhc.task.problem_view import problem_facts, problem_table
 from fpirhc.task.reference import Reference
 
 MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
@@ -92,6 +94,13 @@ class Problem(Checked):
         check_stage(plant, self.cost, self.limits, mistakes)
         _check_inverse(self, mistakes)
         mistakes.raise_if_any()
+
+    def __repr__(self) -> str:
+        return line(self, *problem_facts(self))
+
+    def _repr_html_(self) -> str:
+        """Times, limits and what disturbs as a table, for notebooks."""
+        return problem_table(self)
 
     @property
     def time_unit(self) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from fpirhc.cli import scenarios
 from fpirhc.cli.exit_codes import ExitCode
 from fpirhc.cli.options import add_controllers, add_json, add_no_compile, add_optimisers, add_out, add_problem, add_seed
-from fpirhc.cli.output import results_folder
+from fpirhc.cli.output import RESULTS, results_folder
 from fpirhc.cli.verb import Verb
 
 if TYPE_CHECKING:
@@ -36,7 +36,9 @@ def _run(options: argparse.Namespace) -> ExitCode:
 
 def _run_once(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
+    from fpirhc.report.as_json import to_json
     from fpirhc.report.html import write_report
+    from fpirhc.report.page import write_page
     from fpirhc.report.terminal import announce_backend, progress_bars, show
     from fpirhc.studies.comparison.compare import compare, select
     from fpirhc.studies.comparison.optimiser_choices import with_optimisers
@@ -62,10 +64,9 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
     comparison = noted(comparison, tuned.notes) if tuned else comparison
     report = folder / "report.html"
     write_report(comparison, report)
+    write_page(f"{to_json(comparison)}\n", folder / RESULTS)
     announce_backend(entry.run for entry in comparison.entries)
     if options.json:
-        from fpirhc.report.as_json import to_json
-
         print(to_json(comparison))
     else:
         show(comparison, report)
@@ -103,7 +104,7 @@ VERB = Verb(
         ExitCode.NOT_WRITABLE: ExitCode.NOT_WRITABLE.meaning,
     },
     examples=(
-        ("fpirhc compare two_mass", "every controller of a problem, with a report"),
+        ("fpirhc compare two_mass", "every controller of a problem; report.html and results.json"),
         ("fpirhc compare my_arm.py --controllers RHC RHC+FPI --out results/arm", "two controllers, another folder"),
         ("fpirhc compare two_mass --json", "one JSON object on standard output"),
         ("fpirhc compare two_mass --optimisers all", "the headline pair with every optimiser"),

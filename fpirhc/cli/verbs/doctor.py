@@ -27,7 +27,7 @@ VERB = Verb(
     summary="examine the installation: versions, solvers, compiler, cache",
     add=_add,
     run=_run,
-    codes={ExitCode.FINISHED: "no check failed", ExitCode.FAULTY_INSTALLATION: "at least one check failed"},
+    codes={ExitCode.FINISHED: "no check failed", ExitCode.FAULTY_INSTALLATION: ExitCode.FAULTY_INSTALLATION.meaning},
     examples=(
         ("fpirhc doctor", "what is installed and whether it works"),
         ("fpirhc doctor --json", "one JSON object, to keep or to send"),

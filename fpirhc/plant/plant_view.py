@@ -1,0 +1,33 @@
+"""A plant on one line, and as a table for a notebook: its quantities with units, orders and both sets of parameters."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from fpirhc.summary import number, table
+
+if TYPE_CHECKING:
+    from fpirhc.plant.plant import Plant
+
+
+def plant_facts(plant: Plant) -> tuple[str, ...]:
+    """Return what sums up a plant: its coordinates with their orders, its inputs, the number of its parameters."""
+    orders = ", ".join(f"{name} of order {order}" for name, order in zip(plant.names, plant.orders, strict=True))
+    return orders, f"inputs {', '.join(plant.inputs)}", f"{len(plant.parameters)} parameters"
+
+
+def plant_table(plant: Plant) -> str:
+    """Return HTML: coordinates, inputs and parameters, one per row."""
+    rows = [
+        (name, f"coordinate, order {order}", unit, "", "")
+        for (name, unit), order in zip(plant.coordinates.items(), plant.orders, strict=True)
+    ]
+    rows += [(name, "input", unit, "", "") for name, unit in plant.inputs.items()]
+    rows += [
+        (name, "parameter", one.unit, number(one.approximate), number(one.exact))
+        for name, one in plant.parameters.items()
+    ]
+    notes = [f"Unit of time: {plant.time_unit}."]
+    if plant.controlled is not None:
+        notes.append(f"Controlled: {', '.join(plant.controlled)}.")
+    return table("Plant", ("name", "is", "unit", "model", "plant"), rows, notes)
