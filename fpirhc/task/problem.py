@@ -69,7 +69,7 @@ class Problem(Checked):
     integrator: Integrator = field(default_factory=RungeKutta4)
     measure_from: float = 0.0
     judged: Sequence[str] | None = None
-    input_before: Mapping[str, float] = field(default_factory=dict, kw_only=True)
+    input_before: Mapping[str, float] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
     name: str = field(default="", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
