@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import Field, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,10 +14,13 @@ Value = TypeVar("Value")
 def describe(value: Any) -> Any:
     """Return `value` as data for JSON; a dataclass becomes {"is": its class, field: ...}, a function its name.
 
-    A dataclass field with the metadata {"setting": False} is left out: it names the value and changes nothing.
+    A dataclass field with the metadata {"setting": False} is left out: it names the value and changes nothing. One with
+    {"setting": "where given"} is left out while it is empty, so that a setting that came later makes no earlier baseline stale.
     """
     if is_dataclass(value) and not isinstance(value, type):
-        facts = {f.name: describe(getattr(value, f.name)) for f in fields(value) if f.metadata.get("setting", True)}
+        facts = {
+            f.name: describe(getattr(value, f.name)) for f in fields(value) if _is_setting(f, getattr(value, f.name))
+        }
         return {"is": type(value).__name__, **facts}
     if isinstance(value, Mapping):
         return {str(k): describe(v) for k, v in value.items()}
@@ -28,6 +31,11 @@ def describe(value: Any) -> Any:
     if value is None or isinstance(value, bool | int | float | str):
         return value
     return getattr(value, "__name__", type(value).__name__)
+
+
+def _is_setting(one: Field[Any], content: object) -> bool:
+    kind = one.metadata.get("setting", True)
+    return bool(content) if kind == "where given" else bool(kind)
 
 
 def replaced(value: Value, field: str, content: object) -> Value | None:

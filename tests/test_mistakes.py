@@ -333,14 +333,15 @@ def test_an_error_inside_is_one_line_with_a_code_of_its_own(tmp_path, monkeypatc
     assert "Traceback" in capsys.readouterr().err
 
 
-def test_an_error_in_a_files_own_code_during_a_run_is_bad_input(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(("code", "cause"), [('{}["there"]', "KeyError: 'there'"), ("exit(0)", "SystemExit: 0")])
+def test_an_error_in_a_files_own_code_during_a_run_is_bad_input(code, cause, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    metric = 'metrics = (fp.Metric("mine", lambda problem, run: {}["there"]),)\n'
+    metric = f'metrics = (fp.Metric("mine", lambda problem, run: {code}),)\n'
     Path("mine.py").write_text(SOURCE + metric, encoding="utf-8")
     assert main(["compare", "mine.py", "--no-compile", "--controllers", "CTC"]) == ExitCode.BAD_INPUT
     said = capsys.readouterr().err
     assert "mine.py, line" in said
-    assert "KeyError: 'there'" in said
+    assert cause in said
     assert "Traceback" not in said
 
 

@@ -18,7 +18,7 @@ def crash(error: BaseException) -> tuple[str, ExitCode]:
     """
     from fpirhc.fields.user_code import explained, place_in_users_code
 
-    if _of_a_problem_file(error):
+    if of_a_problem_file(error):
         return f"{place_in_users_code(error)}: {explained(error)}", ExitCode.BAD_INPUT
     if isinstance(error, MemoryError):
         return "the memory does not suffice; use fewer cycles, stages or processes", ExitCode.CRASHED
@@ -26,6 +26,18 @@ def crash(error: BaseException) -> tuple[str, ExitCode]:
     name = f"{type(error).__name__} in {os.path.basename(place.filename)}, line {place.lineno}"
     text = " ".join(str(error).split())
     return f"an error inside fpirhc: {name}: {text[:_LONGEST]}; {REPORT}", ExitCode.CRASHED
+
+
+def of_a_problem_file(error: BaseException) -> bool:
+    """Whether the error arose in code of a problem file, or in a library that this code called."""
+    problem = False
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        name = frame.f_globals.get("__name__", "")
+        if name.startswith("fpirhc_problem_"):
+            problem = True
+        elif name.partition(".")[0] == "fpirhc":
+            problem = False
+    return problem
 
 
 def interrupted(error: BaseException) -> bool:
@@ -49,18 +61,6 @@ def silence_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (OSError, ValueError):  # an output without a file, such as that of a test
         return
-
-
-def _of_a_problem_file(error: BaseException) -> bool:
-    """Whether the error arose in code of a problem file, or in a library that this code called."""
-    problem = False
-    for frame, _ in traceback.walk_tb(error.__traceback__):
-        name = frame.f_globals.get("__name__", "")
-        if name.startswith("fpirhc_problem_"):
-            problem = True
-        elif name.partition(".")[0] == "fpirhc":
-            problem = False
-    return problem
 
 
 _LONGEST = 300  # characters of an error's own text

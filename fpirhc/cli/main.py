@@ -7,7 +7,7 @@ import errno
 import sys
 from collections.abc import Mapping, Sequence
 
-from fpirhc.cli.crash import closed_by_reader, crash, interrupted, silence_output
+from fpirhc.cli.crash import closed_by_reader, crash, interrupted, of_a_problem_file, silence_output
 from fpirhc.cli.discovery import Known, former_names, known, shipped
 from fpirhc.cli.exit_codes import ExitCode, table
 from fpirhc.cli.verb import DEBUG, aligned
@@ -22,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()  # a reader that has gone shows here, and not at the end of the program
         return code
     except BaseException as error:
-        if isinstance(error, SystemExit) and not closed_by_reader(error):
+        if isinstance(error, SystemExit) and not (closed_by_reader(error) or of_a_problem_file(error)):
             raise
         if DEBUG in words:
             import traceback

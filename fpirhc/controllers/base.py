@@ -126,7 +126,7 @@ def commanding_blocks(problem: Problem, judged: Sequence[Signal] = ()) -> tuple[
     The controller also writes 'desired', and '_deformed_unclipped': the response that its model expects of this command.
     `judged` are solver statuses.
     """
-    delays = [Delay(scalar("warm_up"), "_warm_up_now"), Delay(like(problem.plant.input, "_command_before"), "command")]
+    delays = [Delay(scalar("warm_up"), "_warm_up_now"), Delay(command_before(problem), "command")]
     return [_limit_block(problem), _judge_block(judged), _warm_up_block(problem.warm_up_cycles)], delays
 
 
@@ -243,6 +243,12 @@ def _judge_block(judged: Sequence[Signal]) -> Block:
         return {"status": worst}
 
     return Block("judge", reads, Layout((scalar("status"),)), step)
+
+
+def command_before(problem: Problem) -> Signal:
+    """Return the signal of the last command; in the first cycle it is the input before it."""
+    plant = problem.plant
+    return Signal("_command_before", plant.input.elements, plant.input.units, tuple(map(float, problem.inputs_before)))
 
 
 def like(signal: Signal, name: str) -> Signal:

@@ -68,7 +68,7 @@ class Path:
     def memory(self) -> tuple[Signal, ...]:
         """Commands on their way, positions of lagging actuators, and the number of cycles so far."""
         plant, length = self.problem.plant, self.queue.length
-        start = tuple(self.problem.dead_time.commands_before(plant))
+        start = tuple(map(float, self.problem.inputs_before))
         names = tuple(f"{e}@{k}" for k in range(1, length) for e in plant.input.elements)
         queued = (Signal("mirror_commands", names, start=start * (length - 1)),) if length > 1 else ()
         lagging = (Signal("mirror_actuators", plant.input.elements, plant.input.units, start),) if self.decays else ()
@@ -87,7 +87,7 @@ class Path:
         size, newest = self.problem.plant.input.size, s._command_before
         remembered: dict[str, Expression] = {}
         if self.counts:
-            first = ca.DM(self.problem.dead_time.commands_before(self.problem.plant))
+            first = ca.DM(self.problem.inputs_before)
             newest = ca.if_else(s.mirror_cycles < 0.5, first, newest)
             remembered["mirror_cycles_next"] = ca.fmin(s.mirror_cycles + 1, self.late + 1)
         column = newest

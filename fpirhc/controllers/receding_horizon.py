@@ -163,7 +163,7 @@ def _plan_reads(plant: Plant) -> Layout:
 
 def _first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> Layout:
     """The optimiser's memory; it begins with the plan for the first horizon at the problem's start."""
-    first = np.asarray(ocp.start(problem.start_state, np.zeros(ocp.input.size)).full()).ravel()
+    first = np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel()
     data = np.asarray(data_of(0.0, problem.plant.approximate).full())
     return optimiser.memory(ocp).starting_at(optimiser.first_memory(ocp, first, data))
 

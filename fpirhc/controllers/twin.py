@@ -36,7 +36,7 @@ def twin_block(path: Path) -> Block:
     own = tuple(Signal(f"mirror_{m.name}", m.elements, m.units, m.start) for m in estimate.memory.signals)
     twin = Signal("mirror_state", plant.state.elements, plant.state.units, tuple(map(float, start)))
     seen, calm = _seen(problem, names), np.zeros(len(plant.names))
-    resting = np.asarray(seen(start, np.zeros(plant.input.size), plant.approximate, calm).full()).ravel()
+    resting = np.asarray(seen(start, problem.inputs_before, plant.approximate, calm).full()).ravel()
     late = (Signal("mirror_sample", names, start=tuple(map(float, resting))),) if path.fraction else ()
     advance, moves, past = (
         problem.integrator.step(plant, problem.period),

@@ -87,6 +87,11 @@ class Number(Expected):
 
     def fits(self, value: object) -> bool:
         """Whether it is such a number; truth values are none."""
+        if type(value) in _OFTEN and (
+            type(value) is int or not self.whole
+        ):  # without the slow tests of abstract classes
+            number = typing.cast(float, value)
+            return number == number and (self.within is None or self.within.holds(number))  # noqa: PLR0124 -- NaN
         if isinstance(value, SymbolicNumber):
             return True
         kind = numbers.Integral if self.whole else numbers.Real
@@ -274,4 +279,5 @@ def _container(origin: type, arguments: tuple[typing.Any, ...]) -> Expected:
     return Instance(origin)
 
 
+_OFTEN = (float, int)
 _WORDS = {str: "a text", bool: "True or False", type(None): "None", dict: "a dict", ca.SX: "an expression"}

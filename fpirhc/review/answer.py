@@ -56,7 +56,7 @@ class Review:
     def _repr_html_(self) -> str:
         """All answers as a table, for notebooks."""
         groups = [("problem", self.problem), *self.controllers.items()]
-        rows = [(name, a.question, str(a.verdict), a.found, a.change) for name, group in groups for a in group]
+        rows = [(name, a.question, str(a.verdict), a.evidence, a.change) for name, group in groups for a in group]
         title = f"Review: {'ready' if self.ready else 'not ready'}"
         return table(title, ("about", "question", "answer", "facts", "what to change"), rows, [self._counts()])
 

@@ -67,7 +67,7 @@ def _plant_delays(problem: Problem, controller: Controller) -> list[Delay]:
     start = tuple(float(v) for v in problem.start_state)
     approximate = tuple(float(v) for v in controller.parameters(plant))
     exact = tuple(float(v) for v in plant.exact)
-    acting = problem.dead_time.commands_before(plant)
+    acting = tuple(map(float, problem.inputs_before))
     return [
         Delay(Signal("_state_before", plant.state.elements, plant.state.units, start), "_state_after"),
         Delay(Signal("_acting_before", plant.input.elements, plant.input.units, acting), "_acting"),
@@ -105,9 +105,10 @@ def _sense_blocks(problem: Problem, other: Response | None, *, predicts: bool) -
     ]
     if not problem.sensing.ideal:
         signals = true_state, true_response
-        return [*true, *problem.sensing.blocks(plant, problem.period, problem.start_state, behind, signals)]
+        first, before = problem.start_state, problem.inputs_before
+        return [*true, *problem.sensing.blocks(plant, problem.period, first, behind, signals, before)]
     start, calm = tuple(float(v) for v in problem.start_state), np.zeros(len(plant.names))
-    resting = response.function(start, np.zeros(plant.input.size), plant.exact, calm).full().ravel()
+    resting = response.function(start, problem.inputs_before, plant.exact, calm).full().ravel()
     delayed = Signal("realised", true_response.elements, true_response.units, tuple(map(float, resting)))
     return [
         *true,
@@ -162,7 +163,7 @@ def _actuate(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:
     if not any(cycles):
         return [_advance_block(problem, disturbed, problem.plant.input)]
     plant = problem.plant
-    arriving = Signal("arriving", plant.input.elements, plant.input.units, problem.dead_time.commands_before(plant))
+    arriving = Signal("arriving", plant.input.elements, plant.input.units, tuple(map(float, problem.inputs_before)))
     return [
         delay_block("send_command", problem.plant.input, arriving, cycles),
         _advance_block(problem, disturbed, arriving),

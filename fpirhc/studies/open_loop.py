@@ -55,7 +55,7 @@ def solve_first(task: Task, names: Sequence[str], tolerance: float) -> list[Solv
     data = np.asarray(
         stage_data(plant, problem.reference, problem.horizon, problem.cost)(0.0, plant.approximate).full()
     )
-    first = np.asarray(ocp.start(problem.start_state, np.zeros(plant.input.size)).full()).ravel()
+    first = np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel()
     solved = []
     for name in choices if "all" in names else dict.fromkeys(names):
         label, build = choices[name]

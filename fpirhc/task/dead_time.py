@@ -33,16 +33,13 @@ class DeadTime(Checked):
     Args:
         inputs: dead time by input; zero where not named.
         measurement: dead time of the state and the response. At first the queue holds the start.
-        before: commands that are on their way at the start, by input; zero where not named.
+        before: commands that are on their way at the start, by input. `Problem(input_before=...)` says the
+            same, and also serves problems without dead time.
     """
 
     inputs: Mapping[str, float] = field(default_factory=dict)
     measurement: float = 0.0
     before: Mapping[str, float] = field(default_factory=dict)
-
-    def commands_before(self, plant: Plant) -> tuple[float, ...]:
-        """The commands on their way at the start, one per input."""
-        return tuple(float(self.before.get(name, 0.0)) for name in plant.inputs)
 
     def check(self, plant: Plant, period: float) -> None:
         """Raise if a name is unknown, or a dead time is negative, not finite, or too long.

@@ -46,6 +46,9 @@ class Problem(Checked):
         horizon: stages over which a receding-horizon controller plans.
         cost: of such a plan.
         integrator: of the simulated plant.
+        input_before: inputs before the first cycle, by name. The first rate and the first weight of a rate are counted from them,
+            and they act until the first command arrives. An input that is not named has the value of `DeadTime(before=...)`, or
+            else zero, moved into its limits.
         measure_from: time from which metrics count; the transient before it is left out.
         judged: coordinates whose errors are logged and measured; None: the controlled ones.
         name: of the problem in results; the problem of a file has the name of the file.
@@ -68,6 +71,7 @@ class Problem(Checked):
     integrator: Integrator = field(default_factory=RungeKutta4)
     measure_from: float = 0.0
     judged: Sequence[str] | None = None
+    input_before: Mapping[str, float] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
     name: str = field(default="", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
@@ -75,6 +79,7 @@ class Problem(Checked):
         _check_times(self, mistakes)
         _check_start(self, mistakes)
         plant = self.plant
+        _check_input_before(self, mistakes)
         mistakes.unknown("judged: coordinate", self.judged or (), plant.coordinates)
         mistakes.unknown("disturbances: input or coordinate", self.disturbances, [*plant.inputs, *plant.coordinates])
         instants, random = np.array([0.0, self.period]), np.random.default_rng(0)
@@ -131,6 +136,15 @@ class Problem(Checked):
     def start_state(self) -> np.ndarray:
         """First state, shape (nx,)."""
         return np.array([float(self.start.get(e, 0.0)) for e in self.plant.state.elements])
+
+    @cached_property
+    def inputs_before(self) -> np.ndarray:
+        """Inputs before the first cycle, shape (nu,)."""
+        lower, upper = self.limits.input_bounds(self.plant)
+        resting = np.clip(np.zeros(len(self.plant.inputs)), lower, upper)
+        stated = {**self.dead_time.before, **self.input_before}
+        values = [stated.get(name, rest) for name, rest in zip(self.plant.inputs, resting, strict=True)]
+        return np.array(values, dtype=float)
 
     @property
     def response_delay(self) -> float:
@@ -196,6 +210,17 @@ def _check_start(problem: Problem, mistakes: Mistakes) -> None:
             mistakes.add(f"start: '{name}' must be a finite number, got {value!r}")
 
 
+def _check_input_before(problem: Problem, mistakes: Mistakes) -> None:
+    mistakes.unknown("input_before: input", problem.input_before, problem.plant.inputs)
+    for name, value in problem.input_before.items():
+        lower, upper = problem.limits.inputs.get(name, (-math.inf, math.inf))
+        if not math.isfinite(value) or not lower <= value <= upper:
+            mistakes.add(f"input_before: '{name}' must be a finite number within its limits, got {value!r}")
+        if problem.dead_time.before.get(name, value) != value:
+            other = problem.dead_time.before[name]
+            mistakes.add(f"input_before: '{name}' is {value!r}, but dead_time has before={other!r}; state it once")
+
+
 def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
     """Add a mistake where the response is not finite at the start, or cannot be solved for the inputs there."""
     plant = problem.plant
@@ -206,7 +231,7 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
     gain_of = ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response])
     state = ", ".join(f"{e} = {v:g}" for e, v in zip(plant.state.elements, problem.start_state, strict=True))
     for which, values in (("approximate", plant.approximate), ("exact", plant.exact)):
-        gain, free = (np.asarray(m.full()) for m in gain_of(problem.start_state, np.zeros(len(plant.inputs)), values))
+        gain, free = (np.asarray(m.full()) for m in gain_of(problem.start_state, problem.inputs_before, values))
         if not np.all(np.isfinite(free)):
             name = plant.controlled_names[int(np.argmin(np.isfinite(free).ravel()))]
             mistakes.add(f"the response of '{name}' ({which} parameters) is not finite at the start ({state})")

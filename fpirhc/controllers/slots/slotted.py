@@ -29,7 +29,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.contraction import Spectrum, assess_gain
-from fpirhc.controllers.base import Controller, Response, deform_block, like
+from fpirhc.controllers.base import Controller, Response, command_before, deform_block
 from fpirhc.controllers.slots.floquet import Floquet, radius_of
 from fpirhc.controllers.slots.schedules import Schedule
 from fpirhc.controllers.slots.slot import Channel, Slot, channel, delays_for_channel, for_channel
@@ -197,7 +197,7 @@ class Slotted(Controller):
         remembered = {"warm_up": "_warm_up_now", "_slot_before": "slot", "_age_before": "_age"}
         remembered |= {"_offset_before": "_offset", "_distance_before": "_distance"}
         delays += [Delay(scalar(now), source) for now, source in remembered.items()]
-        delays.append(Delay(like(problem.plant.input, "_command_before"), "command"))
+        delays.append(Delay(command_before(problem), "command"))
         delays.append(Delay(by_slot(channels, "_deformed_before"), "deformed"))
         return blocks, delays
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, compose_controller, embedded, like
+from fpirhc.controllers.base import Controller, command_before, compose_controller, embedded, like
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotSupported
 from fpirhc.learning.estimators.base import Estimator, Seen
@@ -94,7 +94,7 @@ class Estimating(Controller):
         modelled = self.inner_problem(problem)
         inner = compose_controller(modelled, self.controller)
         believed = Signal(_BELIEVED, modelled.plant.parameter.elements, modelled.plant.parameter.units)
-        acted = like(problem.plant.input, "_acted")
+        acted = replace(command_before(problem), name="_acted")
         blocks = [
             _estimate_block(problem, modelled, self.estimator, believed, acted),
             embedded("controller", inner, {"parameters": believed}),

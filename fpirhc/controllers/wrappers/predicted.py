@@ -98,7 +98,7 @@ class ByModel(Predictor):
 
     def sent_at_start(self, problem: Problem) -> tuple[float, ...]:
         """Return the commands of the problem before the run."""
-        return problem.dead_time.commands_before(problem.plant)
+        return tuple(map(float, problem.inputs_before))
 
     def advance(self, plant: Plant, period: float) -> ca.Function:
         """Return one Runge-Kutta step of the model as a Function."""
