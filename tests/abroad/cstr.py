@@ -46,6 +46,7 @@ def reactor(alpha, beta, controlled=("C_b", "T_K")):
         inputs={"F": "1/h", "Q": "kJ/h"},
         controlled=controlled,
         order=1,
+        time_unit="h",
         response=response,
         parameters={
             "alpha": fp.Parameter(approximate=alpha, exact=1.0, unit="1", spread=fp.Uniform(absolute=0.05)),

@@ -49,6 +49,7 @@ plant = fp.Plant(
     inputs={"u": "mg/min"},
     controlled=("C1",),
     order=1,
+    time_unit="min",
     response=response,
     parameters={
         name: fp.Parameter(
