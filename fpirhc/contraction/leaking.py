@@ -31,6 +31,7 @@ def leaking_limit(
     pole: float = 0.0,
     eigenvalue: complex = 1.0,
     referenced: bool = False,
+    width: int = 0,
 ) -> float:
     """Return the effective gain up to which every gain converges; 0 when none does, infinite when all below 20 / |lambda| do.
 
@@ -41,12 +42,13 @@ def leaking_limit(
         pole: f of the filter of the error.
         eigenvalue: lambda of the response Jacobian; give -lambda for the limit of a negative gain.
         referenced: whether the form is the model-referenced one.
+        width: half width of a triangular mean of the paired values, whole cycles (`Paired(uncertainty=...)`).
     """
     if complex(eigenvalue).real <= 0:
         return 0.0
 
     def stable(gain: float) -> bool:
-        return _stable(loop_polynomial(weights, gain, cycles, leak, pole, eigenvalue, referenced))
+        return _stable(loop_polynomial(weights, gain, cycles, leak, pole, eigenvalue, referenced, width))
 
     gains = np.geomspace(*_RANGE, _STEPS) / abs(eigenvalue)
     wrong = next((k for k, gain in enumerate(gains) if not stable(float(gain))), None)
@@ -60,13 +62,22 @@ def leaking_limit(
 
 
 def loop_polynomial(
-    weights: Array, gain: float, cycles: float, leak: float, pole: float, eigenvalue: complex, referenced: bool
+    weights: Array,
+    gain: float,
+    cycles: float,
+    leak: float,
+    pole: float,
+    eigenvalue: complex,
+    referenced: bool,
+    width: int = 0,
 ) -> Array:
     """Return the coefficients in 1 / z of (1 - f / z) times (left side minus right side); arguments as in `leaking_limit`."""
     whole = math.floor(cycles + 1e-9)
     share = max(cycles - whole, 0.0)
-    own = np.zeros(max(whole + 3, len(weights) + 1), dtype=complex)
+    own = np.zeros(max(whole + 3 + width, len(weights) + 1), dtype=complex)
     own[whole + 1], own[whole + 2] = 1 - share, share
+    triangle = (1 - np.abs(np.arange(-width, width + 1)) / (width + 1)) / (width + 1)
+    own = np.convolve(own, triangle)[width : width + own.size]
     delayed = np.zeros_like(own)
     delayed[1 : len(weights) + 1] = weights
     smooth = np.array([1.0, -pole])

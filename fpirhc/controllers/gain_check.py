@@ -102,8 +102,10 @@ class _Form:
     def limit(self, weights: np.ndarray, eigenvalue: complex, pairing: float) -> float:
         """Largest effective gain for a response with these weights."""
         if self.referenced or self.leak:
-            settings = {"cycles": pairing, "leak": self.leak, "pole": self.pole}
-            return leaking_limit(weights, **settings, eigenvalue=eigenvalue, referenced=self.referenced)
+            leak, pole = self.leak, self.pole
+            return leaking_limit(
+                weights, cycles=pairing, leak=leak, pole=pole, eigenvalue=eigenvalue, referenced=self.referenced
+            )
         return delayed_limit(weights, pairing=pairing, pole=self.pole, eigenvalue=eigenvalue)
 
 

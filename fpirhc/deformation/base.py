@@ -61,10 +61,12 @@ class Pairing:
     Args:
         cycles: the longest of several dead times; None where the map estimates it on line.
         uncertainty: half width of the mean over the requests around it, cycles.
+        channels: the dead time of every controlled coordinate where there are several; else empty.
     """
 
     cycles: float | None
     uncertainty: int = 0
+    channels: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

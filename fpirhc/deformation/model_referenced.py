@@ -29,7 +29,7 @@ import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Mirror, Pairing
 from fpirhc.deformation.leaky import check_pole, chosen_pole
-from fpirhc.deformation.queue import Cycles, Queue, check_cycles, check_uncertainty, every
+from fpirhc.deformation.queue import Cycles, Queue, check_cycles, check_uncertainty, every, several
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -94,7 +94,7 @@ class ModelReferenced(Wrapper):
     def pairing(self) -> Pairing | None:
         """The longest dead time, that of the measurement included; None without dead time."""
         longest = max(every(self._delays))
-        return Pairing(longest) if longest else None
+        return Pairing(longest, channels=several(self._delays)) if longest else None
 
     @property
     def channels(self) -> int | None:

@@ -68,6 +68,11 @@ def every(cycles: Cycles) -> tuple[float, ...]:
     return cycles if isinstance(cycles, tuple) else (cycles,)
 
 
+def several(cycles: Cycles) -> tuple[float, ...]:
+    """The dead times where each entry has its own; else an empty tuple."""
+    return cycles if isinstance(cycles, tuple) else ()
+
+
 def check_cycles(owner: str, cycles: Cycles, name: str = "cycles") -> None:
     """Raise InvalidValue for a dead time that is negative, not finite, or beyond 1000 cycles, and for an empty tuple."""
     values = every(cycles)

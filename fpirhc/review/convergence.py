@@ -129,7 +129,7 @@ def _steep(grid: ReviewGrid, controller: Controller) -> list[str]:
     if not eigenvalues.size:
         return ["the response Jacobian is not finite near the reference"]
     reached = float((deformation.secant_gain() * np.abs(eigenvalues) ** 2 / eigenvalues.real).max())
-    limit = largest_product(grid.problem, deformation)
+    limit = largest_product(grid.problem, deformation, eigenvalues)
     if (deformation.secant_gain() * eigenvalues.real).min() <= 0:
         return ["near the reference the response Jacobian changes its sign"]
     if reached <= limit:

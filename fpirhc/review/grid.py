@@ -43,6 +43,7 @@ class ReviewGrid:
         responses: responses of the controlled coordinates that the reference needs, shape (m, n).
         draws: exact parameters, shape (draws, np); the first row is the plant's own.
         inner: places of the simulated states.
+        mismatch: range of the exact parameters and of the dead times, percent.
     """
 
     problem: Problem
@@ -51,6 +52,7 @@ class ReviewGrid:
     responses: np.ndarray
     draws: np.ndarray
     inner: tuple[int, ...] = ()
+    mismatch: float = 0.0
 
     @cached_property
     def drawn_states(self) -> np.ndarray:
@@ -78,7 +80,8 @@ class ReviewGrid:
         """Times, and the inner states with the exact parameters."""
         times = np.linspace(0.0, self.problem.duration, _FINE)
         [motion] = inner_motion(self.problem, self.inner, self.draws[:1], times)
-        assert motion is not None
+        if motion is None:  # the coarse points, which `review_grid` has found finite
+            return self.times, self.states[:, list(self.inner)]
         return times, motion
 
     @cached_property
@@ -128,7 +131,7 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
         inner = ()
     else:
         states[:, list(inner)] = own
-    return ReviewGrid(problem, times, states, responses[:, list(plant.controlled_indices)], rows, inner)
+    return ReviewGrid(problem, times, states, responses[:, list(plant.controlled_indices)], rows, inner, mismatch)
 
 
 def parameter_box(problem: Problem, mismatch: float) -> dict[str, tuple[float, float]]:

@@ -11,6 +11,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import Planner, without_deformation
 from fpirhc.errors import FpirhcError, InvalidName, NotSupported
 from fpirhc.review.grid import ReviewGrid
+from fpirhc.review.late import is_late, scaled
 from fpirhc.review.linear import LinearLoop, controlled_gain, linear_parameters, loop_matrices, response_slopes
 from fpirhc.review.plan_feedback import PlanGain, no_gain, plan_gains
 from fpirhc.review.stand_in import linear_stand_in
@@ -28,7 +29,7 @@ class Loops:
         places: indices of the loops' points among the reference's points.
         loops: loops of the plant with its exact parameters, one for every place.
         ideal: loop of the controller without deformation whose model is the plant: the outer loop by itself.
-        drawn: loops of plants from the box of parameters.
+        drawn: loops of plants from the box of parameters, and with the shortest and the longest dead time of the box.
         reason: why there are no loops; else empty.
         learns: whether the controller changes its model on line; then the loops are those of its first model.
     """
@@ -82,7 +83,8 @@ def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
     model = linear_parameters(slopes, *first, believed, gains[places[0]])
     ideal = loop_matrices(problem, without_deformation(stand_in)).at(model, model)
     drawn = [at(k, d) for k, d in _pairs(grid, places) if np.isfinite(grid.commands[d, k]).all()]
-    return Loops(tuple(places), tuple(at(k, 0) for k in places), ideal, tuple(drawn))
+    late = [loop for edge in _late(grid) for loop in loops_at(edge, controller, places[:: max(1, len(places) // 2)])]
+    return Loops(tuple(places), tuple(at(k, 0) for k in places), ideal, (*drawn, *late))
 
 
 def loops_at(grid: ReviewGrid, controller: Controller, places: Sequence[int]) -> list[LinearLoop]:
@@ -131,6 +133,13 @@ def ideal_loops(grid: ReviewGrid, controller: Controller, count: int) -> list[tu
         gain = controlled_gain(plant, slopes, grid.states[k], needed[k], believed)
         loops.append((matrices.at(model, model), gain))
     return loops
+
+
+def _late(grid: ReviewGrid) -> list[ReviewGrid]:
+    """The points with the shortest and the longest dead time of the box."""
+    if not grid.mismatch or not is_late(grid.problem):
+        return []
+    return [replace(grid, problem=scaled(grid.problem, percent)) for percent in (-grid.mismatch, grid.mismatch)]
 
 
 def _pairs(grid: ReviewGrid, places: list[int]) -> list[tuple[int, int]]:

@@ -4,36 +4,65 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from fpirhc.contraction import leaking_limit
 from fpirhc.controllers.gain_check import product_limit
 from fpirhc.deformation.base import Deformation
 from fpirhc.task.problem import Problem
 
+_LIMIT = 2.0  # of gain times eigenvalue without delay
+
 
 def dead_cycles(problem: Problem) -> float:
     """Longest dead time between a request and its response, in control cycles beyond the one that every loop has."""
-    longest = max(problem.dead_time.inputs.values(), default=0.0)
-    return (longest + problem.dead_time.measurement) / problem.period
+    return max(channel_cycles(problem))
 
 
-def largest_product(problem: Problem, deformation: Deformation) -> float:
+def channel_cycles(problem: Problem) -> tuple[float, ...]:
+    """Dead time between each input and the measured response, in control cycles beyond the one that every loop has."""
+    times = problem.dead_time
+    return tuple((times.inputs.get(n, 0.0) + times.measurement) / problem.period for n in problem.plant.inputs)
+
+
+def largest_product(problem: Problem, deformation: Deformation, eigenvalues: np.ndarray | None = None) -> float:
     """Return the limit of effective gain times eigenvalue: 2, or less under a dead time or behind an estimator or a filter.
 
-    With a dead time of d cycles the limit is, for a map
+    It is that of the iteration by itself (`leaking_limit`), the smallest of all channels. Input k belongs to controlled coordinate
+    k where the dead times differ. The model-referenced form has another limit for every eigenvalue.
 
-        without pairing                               2 sin(pi / (2 (2 d + 1))), d rounded up
-        paired with the true dead time                2
-        with the leak p, paired wrongly by m cycles   the g of 4 p / (1 - p)^2 = g (2 + g) m^2, at most 2
-        without a leak, paired wrongly                0.5, up to which the remembered requests decay
-        paired with a mean of requests                0.5 without a leak.
+    Args:
+        problem: the problem.
+        deformation: the deformation.
+        eigenvalues: of the response Jacobian, for the model-referenced form; their smallest and largest sizes count.
     """
-    pairs, leak, cycles = deformation.pairing, deformation.leak, dead_cycles(problem)
-    averaged, own = pairs is not None and pairs.uncertainty > 0, (pairs.cycles or 0.0) if pairs else 0.0
-    delayed = None if averaged else product_limit(problem, deformation)
-    if delayed is not None:
-        return delayed
-    wrong = abs(own - cycles)
-    if own == 0 and not leak:
-        return 2 * math.sin(math.pi / (2 * (2 * math.ceil(cycles - 1e-9) + 1)))
-    if wrong < 1e-6 and not averaged:
-        return 2.0
-    return min(2.0, math.sqrt(1 + 4 * leak / ((1 - leak) * wrong) ** 2) - 1) if leak else 0.5
+    pairing = deformation.pairing
+    averaged = pairing is not None and pairing.uncertainty > 0
+    behind = None if averaged else product_limit(problem, deformation)
+    if behind is not None:
+        return behind
+    late = channel_cycles(problem)
+    if not any(late) and not (pairing and pairing.cycles):
+        return _LIMIT
+    own = (pairing.channels or (pairing.cycles or 0.0,) * len(late)) if pairing else (0.0,) * len(late)
+    sizes = np.array([1.0]) if eigenvalues is None or deformation.mirror is None else np.abs(eigenvalues)
+    extremes = {float(sizes.min()), float(sizes.max())}
+    return min(_limit(deformation, *pair, size) for pair in set(zip(late, own, strict=True)) for size in extremes)
+
+
+def _limit(deformation: Deformation, late: float, own: float, size: float) -> float:
+    """Limit of gain times an eigenvalue of this size, of one channel."""
+    pairing = deformation.pairing
+    whole = math.floor(late + 1e-9)
+    share = max(late - whole, 0.0)
+    weights = np.append(np.zeros(whole), [1 - share, share])
+    limit = leaking_limit(
+        weights,
+        cycles=own,
+        leak=deformation.leak,
+        pole=deformation.error_pole,
+        eigenvalue=size,
+        referenced=deformation.mirror is not None,
+        width=pairing.uncertainty if pairing else 0,
+    )
+    return min(limit * size, _LIMIT)

@@ -12,6 +12,8 @@ from fpirhc.review.question import Case
 QUESTION = "Does adaptation lower the response error?"
 _HARM = 0.5  # share of the error without adaptation that adaptation may make of a model that is right
 
+ROUNDING = 1e-6  # of the desired response's rms, below which a response error is rounding
+
 
 def pays(case: Case) -> Answer:
     """Return the rms response errors without adaptation, with it, and with it on a right model, where every change does harm."""
@@ -26,6 +28,8 @@ def pays(case: Case) -> Answer:
     if case.loops.loops and case.loops.radii.min() >= 1 and not case.loops.learns:
         change = "The prediction leaves the outer loop out, and this one does not converge: see the convergence."
         return Answer(QUESTION, Verdict.NO, f"{text}, but errors grow in every cycle", change, numbers)
+    if max(without, adapted) <= ROUNDING * nominal_size(nominal):
+        return Answer(QUESTION, Verdict.UNKNOWN, f"{text}: there is no error to lower", "", numbers)
     if not adapted < without:
         change = "Raise the gain, shorten the period, or leave the deformation out: the model is right enough."
         return Answer(QUESTION, Verdict.NO, text, change, numbers)
@@ -41,3 +45,8 @@ def rms(nominal: NominalRun, errors: ResponseErrors) -> float:
     with np.errstate(over="ignore", invalid="ignore"):
         size = float(np.sqrt(np.mean(np.sum(errors.error[first:] ** 2, axis=1))))
     return size if np.isfinite(size) else float("inf")
+
+
+def nominal_size(nominal: NominalRun) -> float:
+    """Return the rms of the desired response over all coordinates."""
+    return float(np.sqrt(np.mean(np.sum(nominal.desired**2, axis=1))))

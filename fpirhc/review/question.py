@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pkgutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -17,16 +17,15 @@ from typing import TypeVar
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.errors import FpirhcError
 from fpirhc.review import questions
 from fpirhc.review.answer import Answer
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Loops
-from fpirhc.review.prediction import NominalRun, nominal_run
+from fpirhc.review.nominal_runs import NominalRuns
+from fpirhc.review.prediction import NominalRun
 from fpirhc.task.problem import Problem
 
 GROUP = "fpirhc.questions"  # of entry points
-CYCLES = 2000  # of runs of the model that a question may need
 
 Kind = TypeVar("Kind", "ProblemQuestion", "ControllerQuestion")
 
@@ -39,11 +38,13 @@ class Case:
         grid: points of the reference and draws of the parameters.
         controller: the controller, with its automatic settings chosen.
         loops: its linear loops.
+        runs: the models' own runs of this review.
     """
 
     grid: ReviewGrid
     controller: Controller
     loops: Loops
+    runs: NominalRuns
 
     @property
     def problem(self) -> Problem:
@@ -56,18 +57,9 @@ class Case:
         return self.controller.parameters(self.problem.plant)
 
     @cached_property
-    def shortened(self) -> Problem:
-        """The problem with at most `CYCLES` cycles."""
-        duration = min(self.problem.duration, CYCLES * self.problem.period)
-        return replace(self.problem, duration=duration, measure_from=min(self.problem.measure_from, 0.5 * duration))
-
-    @cached_property
     def nominal(self) -> NominalRun | str:
-        """The model's own run over the shortened duration, or the reason why there is none."""
-        try:
-            return nominal_run(self.shortened, self.controller, compiled=False)
-        except FpirhcError as error:
-            return str(error)
+        """The model's own run over at most `nominal_runs.CYCLES` cycles, or the reason why there is none."""
+        return self.runs.of(self.controller)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from fpirhc.controllers.base import Controller
@@ -22,6 +22,7 @@ from fpirhc.review.loops import Loops, loops_along
 from fpirhc.review.maps import largest_product
 from fpirhc.review.margins import margins_enough
 from fpirhc.review.neighbourhood import spectrum_near
+from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.orders import relative_orders
 from fpirhc.review.pays import pays
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, known_questions
@@ -58,7 +59,9 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
     reach = horizon_long_enough(grid)
     more = (question.ask(grid) for question in known_questions(ProblemQuestion))
     general += [answer for answer in (reach, discretisation_follows(grid), *more) if answer is not None]
-    return Review(tuple(general), {name: _of(grid, one, general) for name, one in controllers.items()}, mismatch)
+    runs = NominalRuns(problem)
+    answers = {name: _of(grid, one, general, runs) for name, one in controllers.items()}
+    return Review(tuple(general), answers, mismatch)
 
 
 def predict(problem: Problem, controller: Controller) -> Answer:
@@ -73,11 +76,12 @@ def predict(problem: Problem, controller: Controller) -> Answer:
     ready = resolved(problem, controller)
     general = [well_posed(own), inverse_exists(own), commands_inside(own)]
     loops = loops_along(own, ready)
-    case = Case(own, ready, loops)
-    return converges(own, ready, loops, _doubts([*general, *_speed_and_range(own, ready, loops), *_doubtful(case)]))
+    case = Case(own, ready, loops, NominalRuns(problem))
+    suited = [*_speed_and_range(own, ready, loops), *_doubtful(case), free_of_two_cycles(own, ready, loops)]
+    return converges(own, ready, loops, _doubts([*general, *suited]))
 
 
-def _of(grid: ReviewGrid, controller: Controller, general: list[Answer]) -> tuple[Answer, ...]:
+def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: NominalRuns) -> tuple[Answer, ...]:
     try:
         ready = resolved(grid.problem, controller)
         ready.check(grid.problem)
@@ -87,11 +91,9 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer]) -> tupl
     if schedule is not None:
         return (schedule,)
     loops = loops_along(grid, ready)
-    outer = [
-        rates_inside(grid, ready, loops),
-        zero_dynamics(grid.problem, zero_dynamics_rate(grid), is_planned(ready), loops),
-    ]
-    case = Case(grid, ready, loops)
+    still = zero_dynamics(grid.problem, zero_dynamics_rate(grid), is_planned(ready), loops)
+    outer = [rates_inside(grid, ready, loops), still]
+    case = Case(grid, ready, loops, runs)
     inner = [] if not ready.deformation.adapts else _of_map(case, general)
     return (*inner, *outer, margins_enough(grid.problem, loops, adapts=ready.deformation.adapts), *_more(case))
 
@@ -116,15 +118,12 @@ def _of_map(case: Case, general: list[Answer]) -> list[Answer]:
         own, boxed = (spectrum_near(grid, believed, draws, near=False) for draws in (grid.draws[:1], grid.draws))
     except InvalidValue as error:
         return [Answer("Do the eigenvalues of the response Jacobian have one sign?", Verdict.UNKNOWN, str(error))]
-    limit = largest_product(grid.problem, deformation)
+    limit = largest_product(grid.problem, deformation, own.eigenvalues)
+    two_cycles = free_of_two_cycles(grid, controller, loops)
     suited = [*_speed_and_range(grid, controller, loops), *_doubtful(case)]
-    verdict = converges(grid, controller, loops, _doubts([*general, *suited]))
+    verdict = converges(grid, controller, loops, _doubts([*general, *suited, two_cycles]))
     gains = [one_sign(own, boxed), gain_admissible(deformation, own, boxed, limit)]
-    law = [
-        fast_enough(grid, controller, own),
-        bears_lag(grid, controller, own),
-        free_of_two_cycles(grid, controller, loops),
-    ]
+    law = [fast_enough(grid, controller, own), bears_lag(grid, controller, own), two_cycles]
     known = [a for a in (*law, chatter_small(grid, controller)) if a is not None]
     form = right_form(grid.problem, deformation)
     return [verdict, box_converges(loops), *gains, *suited, *known, form, pays(case)]
@@ -137,5 +136,5 @@ def _speed_and_range(grid: ReviewGrid, controller: Controller, loops: Loops) -> 
     return [a for a in answers if a is not None]
 
 
-def _doubts(answers: list[Answer]) -> list[str]:
-    return [f"'{a.question}' is answered no" for a in answers if a.verdict == Verdict.NO]
+def _doubts(answers: Sequence[Answer | None]) -> list[str]:
+    return [f"'{a.question}' is answered no" for a in answers if a is not None and a.verdict == Verdict.NO]

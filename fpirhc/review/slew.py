@@ -33,8 +33,8 @@ def slew_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray
     problem = grid.problem
     after_start = 0.0 if ideal is None else _speed_after_start(grid, believed, ideal)
     speed = max(_speed(grid, believed), after_start)
-    sudden = max((d.jump * _effect(grid, name) for name, d in problem.disturbances.items()), default=0.0)
-    steady = sum(d.slew * _effect(grid, name) for name, d in problem.disturbances.items())
+    sudden = max((d.jump * effect(grid, name) for name, d in problem.disturbances.items()), default=0.0)
+    steady = sum(d.slew * effect(grid, name) for name, d in problem.disturbances.items())
     needed, step = speed + steady, deformation.largest_step()
     numbers = {"needed": needed, "limit": step / problem.period, "jump": sudden}
     text = f"the request changes by up to {needed:.3g} per {problem.time_unit}"
@@ -80,8 +80,8 @@ def _speed_after_start(grid: ReviewGrid, believed: np.ndarray, ideal: LinearLoop
     return float(changes.max() / grid.problem.period)
 
 
-def _effect(grid: ReviewGrid, name: str) -> float:
-    """Change of the responses by one unit of a disturbance: 1 on a coordinate, the exact gain on an input."""
+def effect(grid: ReviewGrid, name: str) -> float:
+    """Return the change of the responses by one unit of a disturbance: 1 on a coordinate, the exact gain on an input."""
     plant = grid.problem.plant
     if name not in plant.inputs:
         return 1.0

@@ -16,7 +16,7 @@ _CYCLES = 3.0  # of lag that it should bear
 
 def fast_enough(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer | None:
     """Return the smallest a lambda beside the one that the plain form needs; None for other forms and laws without known poles."""
-    law = _law(grid, controller)
+    law = law_of(grid, controller)
     if law is None or not controller.deformation.slows_desired:
         return None
     rate, poles = law
@@ -25,7 +25,10 @@ def fast_enough(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answ
     text = f"gain x eigenvalue is at least {product:.3g}, {ratio:.3g} times what {poles} poles"
     text += f" at {rate:g} {grid.problem.rate_unit} need"
     numbers = {"product": product, "ratio": ratio}
-    change = "Raise the gain, lower the rate or the period, or use the form that passes the desired response at once (Increment)."
+    change = (
+        f"Multiply the gain by {_SPARE / ratio:.2g} or more, lower rate x period, or use a form that passes the desired response "
+        "at once (Increment, ModelReferenced)."
+    )
     if ratio >= _SPARE:
         return Answer(FAST, Verdict.YES, text, "", numbers)
     return Answer(FAST, Verdict.NO if ratio < 1 else Verdict.UNKNOWN, text, change, numbers)
@@ -36,7 +39,7 @@ def bears_lag(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer
 
     None for laws without known poles, and where the response is late already.
     """
-    law, period, unit = _law(grid, controller), grid.problem.period, grid.problem.time_unit
+    law, period, unit = law_of(grid, controller), grid.problem.period, grid.problem.time_unit
     if law is None or grid.problem.response_delay > 0:
         return None
     (rate, poles), product = law, _products(controller, own)[1]
@@ -52,8 +55,8 @@ def bears_lag(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer
     return Answer(LAG, Verdict.UNKNOWN, text, "Lower the gain, or model the lag and pair through it.", numbers)
 
 
-def _law(grid: ReviewGrid, controller: Controller) -> tuple[float, int] | None:
-    """Rate and number of poles of the tracking law for the most demanding coordinate; None where there is no such law."""
+def law_of(grid: ReviewGrid, controller: Controller) -> tuple[float, int] | None:
+    """Return rate and number of poles of the tracking law for the most demanding coordinate; None where there is no such law."""
     law, plant = controller.law, grid.problem.plant
     laws = [law.feedback(plant.orders[k]) for k in plant.controlled_indices] if law else []
     known = [(one.rate, len(one.gains)) for one in laws if one is not None and one.rate is not None]

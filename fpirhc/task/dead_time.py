@@ -93,7 +93,8 @@ def delay_block(name: str, source: Signal, target: Signal, cycles: Sequence[floa
             whole = min(math.floor(delay + 1e-9), n)
             share = max(delay - whole, 0.0) if whole < n else 0.0
             delayed.append(past[whole] if share == 0 else (1 - share) * past[whole] + share * past[whole + 1])
-            queues_next.append(past[:n])
+            if n:  # CasADi's [:0] of one entry is that entry
+                queues_next.append(past[:n])
         return {target.name: ca.vertcat(*delayed), f"{queues.name}_next": ca.vertcat(*queues_next)}
 
     return Block(name, Layout((source,)), Layout((target,)), step, Layout((queues,)))

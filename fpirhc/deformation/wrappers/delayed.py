@@ -31,7 +31,7 @@ import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Pairing
 from fpirhc.deformation.leaky import check_pole, chosen_pole
-from fpirhc.deformation.queue import MOST, Cycles, Queue, check_cycles, check_uncertainty, every
+from fpirhc.deformation.queue import MOST, Cycles, Queue, check_cycles, check_uncertainty, every, several
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -62,7 +62,7 @@ class _Queued(Wrapper):
     @property
     def pairing(self) -> Pairing:
         """The believed dead time, the longest of several."""
-        return Pairing(max(every(self.cycles)))
+        return Pairing(max(every(self.cycles)), channels=several(self.cycles))
 
     @property
     def channels(self) -> int | None:
@@ -141,7 +141,7 @@ class Paired(_Queued):
     @property
     def pairing(self) -> Pairing:
         """The believed dead time, the longest of several, and the width of the mean."""
-        return Pairing(max(every(self.cycles)), self.uncertainty)
+        return Pairing(max(every(self.cycles)), self.uncertainty, several(self.cycles))
 
     @property
     def _queue(self) -> Queue:

@@ -15,6 +15,7 @@ from fpirhc.deformation.base import innermost
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, NotSupported, nearest
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.review.null_runs import null_runs
 from fpirhc.review.response_prediction import Prediction, predict_response
 from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
 from fpirhc.simulation.metrics import Metrics, measure
@@ -261,6 +262,8 @@ def _entry(
     adaptive = ready.deformation.adapts
     view = lyapunov_view(problem, ready, run)
     metrics = measure(problem, run, task.metrics)
+    headline = adaptive and name in (task.headline or ())
+    null = _null_test(problem, ready) if headline else ()
     return Entry(
         name=name,
         run=run,
@@ -270,9 +273,9 @@ def _entry(
         pair=_pair(controllers, name) if adaptive else None,
         contraction=_contraction(problem, ready, run, metrics),
         optimality=measure_optimality(problem, ready, run, compiled=compiled),
-        notes=(*_notes(controller, ready), *ready.notes(problem), *([view.text] if view else [])),
+        notes=(*_notes(controller, ready), *ready.notes(problem), *([view.text] if view else []), *null),
         lyapunov=view,
-        prediction=_predicted(problem, controller, compiled) if adaptive and name in (task.headline or ()) else None,
+        prediction=_predicted(problem, controller, compiled) if headline else None,
     )
 
 
@@ -282,6 +285,16 @@ def _predicted(problem: Problem, controller: Controller, compiled: bool) -> Pred
         return predict_response(problem, controller, compiled=compiled)
     except FpirhcError:
         return None
+
+
+def _null_test(problem: Problem, controller: Controller) -> tuple[str, ...]:
+    """What adaptation does to a right model; empty where it cannot be run."""
+    try:
+        runs = null_runs(problem, controller)
+    except FpirhcError:
+        return ()
+    outcome = "passed" if runs.passes else "failed" if runs.fails else "in doubt"
+    return (f"null test {outcome}: {runs.text}",)
 
 
 def _pair(controllers: Mapping[str, Controller], name: str) -> str | None:

@@ -1,0 +1,39 @@
+"""Problems with other dead times, for questions about a dead time that is not known exactly."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+from fpirhc.task.problem import Problem
+
+_WHOLE = 1e-9  # of a cycle
+
+
+def shifted(problem: Problem, cycles: Mapping[str, int]) -> Problem:
+    """Return the problem with the dead time of these inputs longer by some cycles, or shorter."""
+    times = problem.dead_time.inputs
+    changed = {name: max(0.0, times.get(name, 0.0) + m * problem.period) for name, m in cycles.items()}
+    return replace(problem, dead_time=replace(problem.dead_time, inputs={**times, **changed}))
+
+
+def scaled(problem: Problem, percent: float) -> Problem:
+    """Return the problem with all dead times longer by so many percent, rounded away from the true one to whole cycles.
+
+    A fraction of a cycle is interpolated between two commands, which damps requests that alternate.
+    """
+    rounded: Callable[[float], int] = math.ceil if percent > 0 else math.floor
+    sign = _WHOLE if percent > 0 else -_WHOLE
+
+    def changed(time: float) -> float:
+        return rounded(time / problem.period * (1 + percent / 100) - sign) * problem.period
+
+    times = problem.dead_time
+    inputs = {name: changed(time) for name, time in times.inputs.items()}
+    return replace(problem, dead_time=replace(times, inputs=inputs, measurement=changed(times.measurement)))
+
+
+def is_late(problem: Problem) -> bool:
+    """Whether there is a dead time."""
+    return bool(problem.dead_time.measurement or any(problem.dead_time.inputs.values()))

@@ -1,0 +1,50 @@
+"""The models' own runs of one review: controllers that differ in their deformation alone share one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import resolved, without_deformation
+from fpirhc.describe import describe
+from fpirhc.errors import FpirhcError
+from fpirhc.review.prediction import NominalRun, nominal_run
+from fpirhc.task.problem import Problem
+
+CYCLES = 2000  # of a run
+
+
+@dataclass(frozen=True, eq=False)
+class NominalRuns:
+    """Runs of a problem's models, each made when it is first asked for.
+
+    Args:
+        problem: the problem; its runs are shortened to at most `CYCLES` cycles.
+    """
+
+    problem: Problem
+    _known: dict[str, NominalRun | str] = field(default_factory=dict, init=False)
+
+    def of(self, controller: Controller) -> NominalRun | str:
+        """Return the nominal run with the controller's deformation, or the reason why there is none."""
+        try:
+            bare = without_deformation(resolved(self.problem, controller))
+        except FpirhcError as error:
+            return str(error)
+        name = repr((type(controller), describe(bare)))
+        if name not in self._known:
+            self._known[name] = self._run(controller)
+        run = self._known[name]
+        return run if isinstance(run, str) else replace(run, controller=controller)
+
+    def _run(self, controller: Controller) -> NominalRun | str:
+        try:
+            return nominal_run(shortened(self.problem, CYCLES), controller, compiled=False)
+        except FpirhcError as error:
+            return str(error)
+
+
+def shortened(problem: Problem, cycles: int) -> Problem:
+    """Return the problem with at most so many cycles; errors count from its middle on at the latest."""
+    duration = min(problem.duration, cycles * problem.period)
+    return replace(problem, duration=duration, measure_from=min(problem.measure_from, 0.5 * duration))

@@ -1,0 +1,113 @@
+"""Does adaptation leave a right model alone? The null test: with the model as the plant, adaptation must not do harm.
+
+Without simulation the response error that adaptation makes on the model's own run says so (`prediction`); where it is not zero, the
+model is run as its own plant over at most 2000 cycles, with the deformation and without (`null_runs`). The iteration takes whatever
+moves the response within a cycle for an error of the model: a plant that is fast against the period drifts within it, and the
+plain form and `Increment` ask for less or more than they should.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from fpirhc.deformation.base import Deformation
+from fpirhc.errors import FpirhcError
+from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.forms import forms_of
+from fpirhc.review.null_runs import SLIGHT, NullRuns, null_problem, null_runs, with_form
+from fpirhc.review.pays import ROUNDING, nominal_size, rms
+from fpirhc.review.prediction import NominalRun, response_errors
+from fpirhc.review.question import Case, ControllerQuestion
+
+QUESTION_TEXT = "Does adaptation leave a right model alone?"
+_PRACTICAL = 100  # times, by which a period may be shortened in earnest
+_SHORTER = 16  # times, of the interpolated run from which on the error falls in proportion to the period
+
+
+def leaves_right_model_alone(case: Case) -> Answer:
+    """Return the errors with the model as the plant, with adaptation and without."""
+    nominal = None if isinstance(case.nominal, str) else case.nominal
+    predicted = None if nominal is None else rms(nominal, response_errors(nominal, exact=nominal.believed))
+    numbers, text = {}, ""
+    if nominal is not None and predicted is not None:
+        numbers = {"response_without": 0.0, "response_with": predicted}
+        text = f"predicted rms response error on a right model {predicted:.3g}, without adaptation 0; "
+        if predicted <= ROUNDING * nominal_size(nominal):
+            return Answer(QUESTION_TEXT, Verdict.YES, f"{text}the request stays the desired response", "", numbers)
+    ideal = case.loops.ideal
+    if ideal is not None and ideal.radius >= 1:
+        text += "the loop with the right model does not converge without adaptation"
+        return Answer(QUESTION_TEXT, Verdict.UNKNOWN, text, "See the rates.", numbers)
+    try:
+        runs = null_runs(case.problem, case.controller, nominal)
+    except FpirhcError as error:
+        return Answer(QUESTION_TEXT, Verdict.UNKNOWN, f"{text}no run of the model: {error}", "", numbers)
+    worst = runs.worst
+    numbers |= {"without": runs.without[worst], "with": runs.adapted[worst], "added": runs.added(worst)}
+    text += runs.text
+    if runs.passes:
+        return Answer(QUESTION_TEXT, Verdict.YES, text, "", numbers)
+    verdict = Verdict.NO if runs.fails and not case.controller.learns else Verdict.UNKNOWN
+    change, more = _remedy(case, runs, predicted)
+    return Answer(QUESTION_TEXT, verdict, text, change, numbers | more)
+
+
+QUESTION = ControllerQuestion(leaves_right_model_alone, order=10)
+
+
+def _remedy(case: Case, runs: NullRuns, predicted: float | None) -> tuple[str, dict[str, float]]:
+    """Which form passes, by a run, and which period would do, by the prediction."""
+    sentences, numbers = [], {}
+    for name, form in reversed(forms_of(case.problem, case.controller.deformation).items()):
+        other = _other(case, form, runs)
+        if other is not None and other.passes:
+            sentences.append(f"The {name} form passes: rms error of {runs.worst} {other.adapted[runs.worst]:.3g}.")
+            numbers["with_form"] = other.adapted[runs.worst]
+            break
+    grows = bool(case.loops.loops) and case.loops.radii.max() >= 1
+    period = None if predicted is None or grows else _period(case, runs, predicted)
+    if period is not None and period < case.problem.period:
+        shorter = case.problem.period / period
+        text = f"The form in use needs a period about {shorter:.2g} times shorter, {period:.2g}."
+        sentences.append(text if shorter <= _PRACTICAL else "No practical period would do for the form in use.")
+        numbers["period"] = period
+    if not sentences:
+        sentences.append("No form passes: lower the gain, or choose other controlled coordinates.")
+    return " ".join(sentences), numbers
+
+
+def _other(case: Case, form: Deformation, runs: NullRuns) -> NullRuns | None:
+    try:
+        model = null_problem(case.problem, case.controller)
+        return with_form(runs, model, case.controller.with_deformation(form))
+    except FpirhcError:
+        return None
+
+
+def _period(case: Case, runs: NullRuns, predicted: float) -> float | None:
+    """The period with which the predicted response error is as small as the null test asks for.
+
+    The prediction leaves the outer loop out, and the error that adaptation adds to the coordinates is taken to be proportional to
+    the response error. From a period `_SHORTER` times shorter on, the response error is taken to fall in proportion to it.
+    """
+    nominal, added = case.nominal, runs.added(runs.worst)
+    if isinstance(nominal, str) or not math.isfinite(added):
+        return None
+    faster = _faster(nominal, _SHORTER)
+    error = rms(faster, response_errors(faster, exact=faster.believed))
+    share = predicted * SLIGHT / added / error
+    return min(case.problem.period, case.problem.period / _SHORTER * share)
+
+
+def _faster(nominal: NominalRun, share: int) -> NominalRun:
+    """The run at a period `share` times shorter, interpolated."""
+    coarse = np.arange(nominal.cycles + 1)
+    fine = np.arange(nominal.cycles * share + 1) / share
+    states = np.column_stack([np.interp(fine, coarse, column) for column in nominal.states.T])
+    desired = np.column_stack([np.interp(fine[:-1], coarse[:-1], column) for column in nominal.desired.T])
+    return replace(
+        nominal, problem=replace(nominal.problem, period=nominal.problem.period / share), states=states, desired=desired
+    )

@@ -1,0 +1,133 @@
+"""The null test of a review: with its own model as the plant a controller with adaptation must not do worse than without."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from test_review_laws import moving
+
+import fpirhc as fp
+from fpirhc.deformation import Deformation
+from fpirhc.review.forms import forms_of, map_inside
+from fpirhc.review.null_runs import null_runs
+from fpirhc.studies.comparison.compare import compare
+
+POLE = 86.7  # 1/s
+MAP = fp.Affine(gain=-1.0)
+
+
+def drifting(period: float, *, exact: float = POLE, wrong: float = POLE) -> fp.Problem:
+    """Y' = -p y + p u behind a pole that is fast against the period, along a sine."""
+    plant = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "m"},
+        order=1,
+        parameters={"p": fp.Parameter(wrong, exact, "1/s")},
+        response=lambda y, u, p: {"y": p.p * (u.u - y.y)},
+    )
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"y": ca.sin(8 * t)}),
+        start={"y": 0.0},
+        period=period,
+        duration=2.0,
+        horizon=fp.Horizon(stages=10, step=0.005),
+        cost=fp.Quadratic(states={"y": 1.0}, deviation={"u": 1e-3}),
+        measure_from=1.0,
+    )
+
+
+def planned(deformation: Deformation | None = None) -> fp.RecedingHorizon:
+    """A plan with a deformation."""
+    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-3)
+    return fp.RecedingHorizon(optimiser) if deformation is None else fp.RecedingHorizon(optimiser, deformation)
+
+
+def alone(problem: fp.Problem, controller: fp.RecedingHorizon | fp.ComputedTorque) -> fp.Answer:
+    """The answer to the null test."""
+    answers = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).controllers["it"]
+    [answer] = [a for a in answers if "right model alone" in a.question]
+    return answer
+
+
+def rms(problem: fp.Problem, controller: fp.RecedingHorizon | fp.ComputedTorque) -> float:
+    """Rms tracking error of a run."""
+    run = fp.simulate(problem, controller, seed=0, compiled=False)
+    assert run.stop is None
+    return float(np.sqrt(np.mean(run["error"][run.time >= problem.measure_from] ** 2)))
+
+
+def test_a_period_that_is_long_against_the_plant_fails():
+    """P T = 0.43: the plain form takes the drift within a cycle for an error. The answer has the errors that runs show."""
+    problem = drifting(0.005)
+    answer = alone(problem, planned(MAP))
+    assert answer.verdict == "no"
+    assert answer.numbers["without"] == pytest.approx(rms(problem, planned()), rel=0.02)
+    assert answer.numbers["with"] == pytest.approx(rms(problem, planned(MAP)), rel=0.02)
+    assert answer.numbers["with"] > 5 * answer.numbers["without"]
+    assert answer.numbers["response_with"] > 0
+    assert "model-referenced form passes" in answer.change
+
+
+def test_the_form_that_passes_passes():
+    """The advice is followed: yes, and equal to no adaptation to rounding. The wrong model is what the null test must not see."""
+    problem = drifting(0.005, exact=0.8 * POLE)
+    answer = alone(problem, planned(fp.ModelReferenced(MAP)))
+    assert answer.verdict == "yes"
+    model = drifting(0.005)
+    assert rms(model, planned(fp.ModelReferenced(MAP))) == pytest.approx(rms(model, planned()), rel=1e-9)
+
+
+def test_the_period_that_is_named_would_do():
+    """At the named period, rounded to a part of the stage, the same form passes."""
+    answer = alone(drifting(0.005), planned(MAP))
+    times = math.ceil(0.005 / answer.numbers["period"])
+    assert 2 <= times <= 20
+    assert alone(drifting(0.005 / times), planned(MAP)).verdict == "yes"
+
+
+def test_masses_that_do_not_drift_pass():
+    """A mass without a spring has no drift within a cycle: the plain form leaves a right model as it is."""
+    assert alone(moving(1.5), fp.ComputedTorque(fp.Exponential(rate=20.0), fp.Affine(gain=-1.0))).verdict == "yes"
+
+
+def test_dead_time_that_is_not_paired_fails():
+    """The prediction does not cover dead time; the runs do. An outer loop that does not converge is not the deformation's fault."""
+    late = replace(moving(), dead_time=fp.DeadTime(inputs={"u": 0.01}))
+    wrong = alone(late, fp.ComputedTorque(fp.Exponential(rate=5.0), fp.Affine(gain=-0.4)))
+    assert wrong.verdict == "no"
+    assert "response_with" not in wrong.numbers
+    assert "form passes" in wrong.change
+    outer = alone(late, fp.ComputedTorque(fp.Exponential(rate=200.0), fp.Affine(gain=-0.4)))
+    assert outer.verdict == "unknown"
+    assert "without adaptation" in outer.evidence
+
+
+def test_forms_are_around_the_map_itself():
+    """Forms are taken off and put on; they are told the dead times of the problem."""
+    late = replace(drifting(0.005), dead_time=fp.DeadTime(inputs={"u": 0.01}, measurement=0.005))
+    inner = fp.Filtered(MAP, pole=0.3)
+    for form in (fp.Increment(inner, cycles=0), fp.ModelReferenced(inner), fp.Paired(inner, cycles=2), inner):
+        assert map_inside(form) == inner
+    forms = forms_of(late, inner)
+    assert forms == {
+        "increment": fp.Increment(inner, cycles=3.0),
+        "model-referenced": fp.ModelReferenced(inner, cycles=2.0, measurement=1.0),
+    }
+    assert list(forms_of(drifting(0.005), inner)) == ["plain", "increment", "model-referenced"]
+
+
+def test_a_comparison_shows_the_null_test():
+    """Two masses, the headline pair: the note of the adaptive controller has the errors of the two runs on its model."""
+    task = fp.load_problem("two_mass")
+    [name] = [n for n in task.headline or () if task.controllers[n].deformation.adapts]
+    short = replace(task, problem=replace(task.problem, duration=0.5, measure_from=0.2))
+    entry = compare(short, seed=0, controllers=[name], compiled=False)[name]
+    [note] = [n for n in entry.notes if n.startswith("null test")]
+    runs = null_runs(short.problem, short.controllers[name])
+    assert runs.text in note
+    assert note.startswith("null test passed") == runs.passes

@@ -1,0 +1,168 @@
+"""A review and a dead time that is not known exactly: the pairing, the margin in cycles, the box, dead times that differ."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.contraction import leaking_limit
+from fpirhc.controllers.base import Controller
+from fpirhc.deformation import Deformation
+
+PERIOD, RATE = 1e-3, 6.0  # s, 1/s
+MAP = fp.Affine(gain=-1.0)  # effective gain 0.5
+
+
+def mass(cycles: int, **settings) -> fp.Problem:
+    """A mass behind a dead time, the model's 1.3 times too large."""
+    plant = fp.Plant(
+        coordinates={"q": "m"},
+        inputs={"u": "N"},
+        parameters={"m": fp.Parameter(1.3, 1.0, "kg")},
+        response=lambda q, v, u, p: {"q": u.u / p.m},
+    )
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(2 * t)}),
+        start={"q": 0.0},
+        period=PERIOD,
+        duration=4.0,
+        measure_from=2.0,
+        dead_time=fp.DeadTime(inputs={"u": cycles * PERIOD}),
+        **settings,
+    )
+
+
+def told(deformation: Deformation, cycles: int = 20) -> Controller:
+    """The controller that believes in a dead time."""
+    return fp.Predicted(fp.ComputedTorque(fp.Exponential(rate=RATE), deformation), inputs=cycles * PERIOD)
+
+
+def asked(problem: fp.Problem, controller: Controller, mismatch: float = 0.0) -> dict[str, fp.Answer]:
+    """Answers about the controller by question."""
+    answers = fp.review(problem, {"it": controller}, mismatch=mismatch, seed=0).controllers["it"]
+    return {a.question: a for a in answers}
+
+
+def about(answers: dict[str, fp.Answer], words: str) -> fp.Answer:
+    [question] = [q for q in answers if words in q]
+    return answers[question]
+
+
+def grows(problem: fp.Problem, controller: Controller) -> bool:
+    """Whether the response error of a run grows."""
+    run = fp.simulate(problem, controller, seed=0, compiled=False)
+    if run.stop is not None:
+        return True
+    sizes = np.abs(run["realised"] - run["desired"])[:, 0]
+    early, late = sizes[200:1000].max(), sizes[-500:].max()
+    return bool(late > 3 * early)
+
+
+@pytest.mark.parametrize(
+    ("form", "borne"),
+    [
+        (fp.Increment(MAP, cycles=20, uncertainty=0), False),
+        (fp.Paired(MAP, cycles=20), False),
+        (fp.Increment(MAP, cycles=20, uncertainty=5), True),
+        (fp.Paired(MAP, cycles=20, uncertainty=5), True),
+        (fp.ModelReferenced(MAP, cycles=20), True),
+    ],
+)
+def test_a_pairing_that_is_wrong_by_a_cycle(form, borne):
+    """Without a leak it grows whatever the gain: a no although the loop converges with the true dead time. Runs agree."""
+    controller = told(form)
+    answers = asked(mass(20), controller)
+    assert about(answers, "Does the deformation converge").verdict == "yes"
+    margin = about(answers, "wrong by a cycle")
+    assert margin.verdict == ("yes" if borne else "no")
+    assert (margin.numbers["delay_margin"] >= 1) == borne
+    assert grows(mass(20), controller) is False
+    assert grows(mass(21), controller) == (not borne)
+    assert grows(mass(19), controller) == (not borne)
+
+
+def test_what_survives_is_ready_and_what_grows_is_not():
+    """The plant's dead time is one cycle longer than believed: no with certainty, and ready with an uncertainty of five."""
+    for form in (fp.Increment, fp.Paired):
+        sure, unsure = (asked(mass(21), told(form(MAP, cycles=20, uncertainty=m))) for m in (0, 5))
+        assert about(sure, "Does the deformation converge").verdict == "no"
+        assert about(sure, "gain admissible").verdict == "no"
+        assert {q: a for q, a in unsure.items() if a.verdict == "no"} == {}
+        assert about(unsure, "Does the deformation converge").verdict == "yes"
+
+
+def test_the_box_contains_the_dead_time():
+    """With 10 % of twenty cycles two cycles are in the box: a pairing without a leak is stable at the true dead time alone."""
+    for uncertainty, verdict in ((0, "unknown"), (5, "yes")):
+        controller = told(fp.Increment(MAP, cycles=20, uncertainty=uncertainty))
+        assert about(asked(mass(20), controller), "over the box").verdict == "yes"
+        boxed = about(asked(mass(20), controller, mismatch=10.0), "over the box")
+        assert boxed.verdict == verdict
+        assert (boxed.numbers["radius"] < 1) == (verdict == "yes")
+
+
+def two_masses(second: int) -> fp.Problem:
+    """Two masses that do not know each other, behind 5 and some other cycles."""
+    plant = fp.Plant(
+        coordinates={"a": "m", "b": "m"},
+        inputs={"u": "N", "v": "N"},
+        parameters={"m": fp.Parameter(1.3, 1.0, "kg")},
+        response=lambda q, v, u, p: {"a": u.u / p.m, "b": u.v / p.m},
+    )
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"a": 0.5 * ca.sin(2 * t), "b": 0.3 * ca.sin(t)}),
+        start={"a": 0.0, "b": 0.0},
+        period=PERIOD,
+        duration=4.0,
+        dead_time=fp.DeadTime(inputs={"u": 5 * PERIOD, "v": second * PERIOD}),
+    )
+
+
+def test_dead_times_that_differ_are_judged():
+    """Told each its own: yes and borne. Told the longer one for both: the shorter channel is wrong by seven cycles, and no."""
+    law = fp.Exponential(rate=2.0)
+    both = asked(two_masses(12), fp.ComputedTorque(law, fp.Increment(MAP, cycles=(5.0, 12.0), uncertainty=2)))
+    assert about(both, "gain admissible").verdict == "yes"
+    assert about(both, "wrong by a cycle").verdict == "yes"
+    assert about(both, "Does the deformation converge").verdict == "yes"
+    one = asked(two_masses(12), fp.ComputedTorque(law, fp.Increment(MAP, cycles=12.0, uncertainty=0)))
+    assert about(one, "gain admissible").verdict == "no"
+    assert about(one, "Does the deformation converge").verdict == "no"
+
+
+@pytest.mark.parametrize(("late", "own", "width"), [(20, 20, 5), (21, 20, 5), (26, 20, 5), (4, 3, 1)])
+def test_limit_of_a_mean_is_where_the_roots_leave_the_circle(late, own, width):
+    """Against the roots of the polynomial, written down from the definition of the triangular mean."""
+    limit = leaking_limit(np.append(np.zeros(late), [1.0, 0.0]), cycles=own, width=width)
+
+    def radius(gain: float) -> float:
+        polynomial = np.zeros(max(late, own + width) + 2)
+        polynomial[0] = 1.0
+        for j in range(-width, width + 1):
+            polynomial[own + j + 1] -= (1 - abs(j) / (width + 1)) / (width + 1)
+        polynomial[late + 1] += gain
+        return float(np.abs(np.roots(polynomial)).max())
+
+    assert radius(0.99 * limit) < 1 < radius(1.01 * limit)
+
+
+def test_an_input_without_dead_time_beside_one_with():
+    """Their queues have none and three entries: the run is that of the mass behind three cycles."""
+    problem = replace(two_masses(3), dead_time=fp.DeadTime(inputs={"v": 3 * PERIOD}), duration=0.5)
+    run = fp.simulate(problem, fp.ComputedTorque(fp.Exponential(rate=2.0)), seed=0, compiled=False)
+    arriving = run["arriving"]
+    np.testing.assert_allclose(arriving[3:, 1], run["command"][:-3, 1], rtol=1e-12)
+    np.testing.assert_allclose(arriving[:, 0], run["command"][:, 0], rtol=1e-12)
+
+
+def test_no_question_without_dead_time():
+    """Nothing is late, nothing is paired: nothing to be wrong."""
+    problem = replace(mass(20), dead_time=fp.DeadTime())
+    answers = asked(problem, fp.ComputedTorque(fp.Exponential(rate=RATE), MAP))
+    assert not [q for q in answers if "wrong by a cycle" in q]
