@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.controllers.base import Controller
 from fpirhc.review.grid import review_grid
 from fpirhc.review.inner import inner_motion, inner_places
 
@@ -38,7 +39,7 @@ def companion(rate: float, *, weigh: bool = False, **settings: Any) -> fp.Proble
     return fp.Problem(plant=plant, **(usual | settings))
 
 
-def answer(problem: fp.Problem, controller: fp.Controller, words: str) -> fp.Answer:
+def answer(problem: fp.Problem, controller: Controller, words: str) -> fp.Answer:
     every = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).answers
     [one] = [a for a in every if words in a.question]
     return one
@@ -180,7 +181,7 @@ def test_states_that_leave_every_bound_are_left_on_the_reference():
 def test_currents_of_the_nerve_cell_are_those_of_a_run():
     """The gates move with the voltage: the exact model's commands in a run without a pulse, and not those of gates at rest."""
     task = fp.load_problem("problems/gallery/hodgkin_huxley.py")
-    problem = replace(task.problem, disturbances={}, start=task.problem.start | {"V": -65.0})
+    problem = replace(task.problem, disturbances={}, start={**task.problem.start, "V": -65.0})
     run = fp.simulate(problem, fp.ExactModel(fp.ComputedTorque(fp.Exponential(rate=1.0))), seed=0)
     grid = review_grid(problem, 0.0, 0)
     needed = grid.commands[0, 1:-1, 0]

@@ -10,9 +10,10 @@ import casadi as ca
 import pytest
 
 import fpirhc as fp
+from fpirhc.controllers.base import Controller
 
 
-def answer(problem: fp.Problem, controllers: dict[str, fp.Controller], words: str) -> fp.Answer | None:
+def answer(problem: fp.Problem, controllers: dict[str, Controller], words: str) -> fp.Answer | None:
     """The answer to the one question with these words; None where it is not asked."""
     every = fp.review(problem, controllers, mismatch=0.0, seed=0).answers
     return next((a for a in every if words in a.question), None)
@@ -42,7 +43,7 @@ def test_parameters_in_reach_have_their_effect():
     """A stiffness 10 % wrong as well: 128.02 N m/rad of the twist / 20 / 0.5 kg m2 are felt, the load is not."""
     problem = servo()
     stiffness = fp.Parameter(approximate=0.9 * 1280.2, exact=1280.2, unit="N m/rad")
-    plant = replace(problem.plant, parameters=problem.plant.parameters | {"k": stiffness})
+    plant = replace(problem.plant, parameters={**problem.plant.parameters, "k": stiffness})
     problem = replace(problem, plant=plant, reference=fp.Trajectory(lambda t: {"load": 0.1 * t, "motor": 2 * t + 1.0}))
     one = answer(replace(problem, judged=("motor", "load")), {"it": ADAPTIVE}, "reach the wrong parameters")
     assert one is not None
@@ -117,7 +118,7 @@ def test_limits_that_are_touched_are_not_covered():
 
 def test_limits_inside_leave_the_linear_loop_known():
     """State, rate and path limits that do not bind: no answer is unknown for their sake."""
-    limits = {
+    limits: dict[str, Any] = {
         "states": {"q": (-1.0, 1.0)},
         "rates": {"u": (-9.0, 9.0)},
         "paths": {"power": replace(POWER, lower=-9.0, upper=9.0)},
