@@ -34,13 +34,28 @@ def test_tutorial_does_what_it_says(tmp_path, monkeypatch, capsys):
     Path("drone.py").write_text(text)
     assert main(["compare", "drone.py"]) == 0
     said = capsys.readouterr().out.replace("\n", " ")
-    assert "from 0.0235 to 0.00011 m" in said
-    Path("turned.py").write_text(text.replace("gain=-0.5", "gain=0.5"))
+    assert "from 0.0235 to 5.65e-06 m" in said
+    Path("turned.py").write_text(text.replace("gain=-3.1", "gain=3.1"))
     assert main(["compare", "turned.py"]) == 2
     assert "has the wrong sign" in capsys.readouterr().err
     Path("light.py").write_text(text.replace("exact=1.6", "exact=0.2"))
     assert main(["compare", "light.py"]) == 0
+    assert "errors grow by the factor 5.15" in capsys.readouterr().out.replace("\n", " ")
+    assert main(["review", "light.py"]) == 1
     assert main(["review", "drone.py"]) == 0
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/tutorial.md", "fpirhc/scaffold/problem.txt"])
+def test_first_gain_is_the_one_that_review_recommends(page, tmp_path):
+    """Within 5 %: where a user begins, nobody has guessed."""
+    text = (DOCS.parent / page).read_text(encoding="utf-8")
+    if page.endswith(".md"):
+        text = "\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)).partition("run = fp.simulate")[0]
+    (tmp_path / "first.py").write_text(text)
+    task = fp.load_problem(str(tmp_path / "first.py"))
+    answers = fp.review(task.problem, {"it": task.controllers["RHC+FPI"]}, mismatch=0.0, seed=0).controllers["it"]
+    [gain] = [a for a in answers if "gain admissible" in a.question]
+    assert gain.numbers["gain"] == pytest.approx(gain.numbers["recommended"], rel=0.05)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)

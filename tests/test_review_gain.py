@@ -37,8 +37,9 @@ def test_a_gentle_gain_is_worse_than_none_and_what_would_do():
     assert slow.numbers["ratio"] < 1
     assert about(answers, "lower the response error").verdict == "no"
     needed = float(slow.change.split("gain = ")[1].split(" ")[0])
-    map_ = gentle.deformation
-    larger = map_.with_effective_gain(map_.effective_gain() * needed / map_.gain)
+    map_ = fp.Sigmoid(gain=-0.3, shift=0.3, scale=gentle.deformation.scale)  # type: ignore[attr-defined]
+    assert replace(map_) == gentle.deformation
+    larger = replace(map_, gain=needed)
     assert gain_times(map_, needed / map_.gain) == f"gain = {needed:.3g}"
     for mended in (larger, fp.Increment(map_, cycles=0), fp.ModelReferenced(map_)):
         better = asked(DAILY.problem, gentle.with_deformation(mended))

@@ -11,7 +11,7 @@ from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.noise_along import chatter_of
 
 QUESTION = "Is the chatter from measured responses small?"
-_SMALL = 0.01  # of the range between an input's limits
+SMALL = 0.01  # of the range between an input's limits
 
 
 def chatter_small(grid: ReviewGrid, controller: Controller) -> Answer | None:
@@ -27,7 +27,7 @@ def chatter_small(grid: ReviewGrid, controller: Controller) -> Answer | None:
     share = float(np.max(np.array(list(steps.values())) / (upper - lower)))
     text = "rms step per cycle from noise: " + ", ".join(f"{i} {v:.3g}" for i, v in steps.items())
     numbers = {f"step_{i}": v for i, v in steps.items()} | {"share_of_limits": share}
-    if share < _SMALL:
+    if share < SMALL:
         return Answer(QUESTION, Verdict.YES, text, "", numbers)
     change = "fp.suggest(problem, controller, chatter=...) gives the gain and the filter for a smaller one."
     return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
