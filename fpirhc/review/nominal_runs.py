@@ -45,6 +45,8 @@ class NominalRuns:
 
 
 def shortened(problem: Problem, cycles: int) -> Problem:
-    """Return the problem with at most so many cycles; errors count from its middle on at the latest."""
-    duration = min(problem.duration, cycles * problem.period)
+    """Return the problem with at most so many cycles; where it is shortened, errors count from its middle on at the latest."""
+    if problem.cycles <= cycles:
+        return problem
+    duration = cycles * problem.period
     return replace(problem, duration=duration, measure_from=min(problem.measure_from, 0.5 * duration))

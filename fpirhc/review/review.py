@@ -91,10 +91,8 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: N
     if schedule is not None:
         return (schedule,)
     loops = loops_along(grid, ready)
-    outer = [
-        rates_inside(grid, ready, loops),
-        zero_dynamics(grid.problem, zero_dynamics_rate(grid), is_planned(ready), loops),
-    ]
+    still = zero_dynamics(grid.problem, zero_dynamics_rate(grid), is_planned(ready), loops)
+    outer = [rates_inside(grid, ready, loops), still]
     case = Case(grid, ready, loops, runs)
     inner = [] if not ready.deformation.adapts else _of_map(case, general)
     return (*inner, *outer, margins_enough(grid.problem, loops, adapts=ready.deformation.adapts), *_more(case))

@@ -12,14 +12,15 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import FpirhcError
-from fpirhc.plant.integrators import Integrator, RungeKutta4
+from fpirhc.horizon.problem import Horizon
+from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.linear import response_slopes
 from fpirhc.review.state_matrix import state_matrices
 
 CLOSE = 0.05  # distance of a pole of the step from exp(pole of the plant x step)
-_SUBSTEPS = (2, 4, 8, 16, 32, 64)
+_FINER = (2, 4, 8, 16, 32, 64)  # times the sub-steps in use
 
 
 @dataclass(frozen=True)
@@ -79,25 +80,26 @@ def step_poles(plant: Plant, integrator: Integrator, step: float, place: Place) 
     )
 
 
-def advice(plant: Plant, step: float, place: Place) -> str:
-    """Return the integrator that follows the plant: Runge-Kutta with the fewest sub-steps, else an implicit one."""
-    for count in _SUBSTEPS:
-        if step_poles(plant, RungeKutta4(count), step, place).follows:
-            return f"RungeKutta4(substeps={count}), which follows every mode, or RadauIIA() for modes that need not be followed"
-    return "RadauIIA(): no number of sub-steps up to 64 of RungeKutta4 follows it"
+def advice(plant: Plant, integrator: Integrator, step: float, place: Place) -> str:
+    """Return the integrator that follows the plant: that in use or the usual one with few sub-steps, else an implicit one."""
+    for method in (integrator, Horizon(stages=1, step=step).discretisation):
+        for times in _FINER:
+            finer = method.finer(times)
+            if finer is not None and step_poles(plant, finer, step, place).follows:
+                return f"{finer!r}, which follows every mode, or RadauIIA() for modes that need not be followed"
+    return f"RadauIIA(): no number of sub-steps up to {_FINER[-1]} times that in use follows it"
 
 
 def stiff_advice(grid: ReviewGrid, believed: np.ndarray, *, planned: bool) -> str:
     """Return what to change where a step of the horizon or of the simulated plant grows by itself; empty where none does."""
     problem, plant = grid.problem, grid.problem.plant
     try:
-        place = first_place(grid, believed)
-        if planned and problem.horizon is not None:
-            horizon = problem.horizon
-            if step_poles(plant, horizon.discretisation, horizon.step, place).unstable:
-                return f"Its discretisation grows: use Horizon(discretisation={advice(plant, horizon.step, place)})."
-        if not problem.integrator.opaque and step_poles(plant, problem.integrator, problem.period, place).unstable:
-            return f"The integrator of the plant grows: use Problem(integrator={advice(plant, problem.period, place)})."
+        place, horizon, cycle = first_place(grid, believed), problem.horizon, problem.integrator
+        if planned and horizon is not None and step_poles(plant, horizon.discretisation, horizon.step, place).unstable:
+            cure = advice(plant, horizon.discretisation, horizon.step, place)
+            return f"Its discretisation grows: use Horizon(discretisation={cure})."
+        if not cycle.opaque and step_poles(plant, cycle, problem.period, place).unstable:
+            return f"The integrator of the plant grows: use Problem(integrator={advice(plant, cycle, problem.period, place)})."
     except (FpirhcError, np.linalg.LinAlgError):
         return ""
     return ""

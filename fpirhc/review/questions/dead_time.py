@@ -41,14 +41,15 @@ def bears_wrong_dead_time(case: Case) -> Answer | None:
         return Answer(TEXT, Verdict.UNKNOWN, str(error))
     if borne:
         more = "or more" if beyond is None else f"at {beyond[0]} the slowest mode changes by {beyond[1]:.6g} per cycle"
-        return Answer(TEXT, Verdict.YES, f"it bears {borne} cycles, {more}", "", {"delay_margin": float(borne)})
+        return Answer(TEXT, Verdict.YES, f"it bears {borne} cycles, {more}", "", {"borne": float(borne)})
     assert beyond is not None
     margin = _margin_below_one(case)
     text = (
         f"delay margin {margin:.3g} cycles; wrong by one cycle, the slowest mode changes by {beyond[1]:.6g} per cycle"
     )
     verdict = Verdict.UNKNOWN if case.loops.learns or not case.controller.deformation.constant else Verdict.NO
-    return Answer(TEXT, verdict, text, _CHANGE, {"delay_margin": margin, "radius_one_cycle": beyond[1]})
+    numbers = {"borne": 0.0, "radius_one_cycle": beyond[1]} | ({"delay_margin": margin} if margin < 1 else {})
+    return Answer(TEXT, verdict, text, _CHANGE, numbers)
 
 
 QUESTION = ControllerQuestion(bears_wrong_dead_time, order=20)
@@ -90,7 +91,7 @@ def _radius(case: Case, problem: Problem) -> float:
 
 
 def _margin_below_one(case: Case) -> float:
-    """The delay margin of the loops, in cycles, below the one that was tried."""
+    """The delay margin of the loop, in cycles; it may be above one where a dead time that is too long is the harm."""
     loop = case.loops.loops[int(np.argmax(case.loops.radii))]
     delays = [margins(loop, i)[2] / case.problem.period for i in range(len(case.problem.plant.inputs))]
-    return min(1.0, *delays)
+    return min(delays)

@@ -28,13 +28,9 @@ def plan_keeps_up(case: Case) -> Answer | None:
     deformation = case.controller.deformation
     if case.controller.law is not None or not deformation.slows_desired or not deformation.constant:
         return None
-    if not case.loops.loops or deformation.effective_gain() == 0:
-        return None
-    try:
-        factor = _least_factor(case)
-    except (FpirhcError, np.linalg.LinAlgError):
-        return None
-    if factor is None:
+    factor = _least_factor(case) if case.loops.loops and deformation.effective_gain() else None
+    too_large = factor is not None and factor <= 1 and case.loops.radii.max() >= 1  # which other questions say
+    if factor is None or too_large:
         return None
     ratio = 1 / factor
     size = abs(deformation.effective_gain())
@@ -62,7 +58,10 @@ def _least_factor(case: Case) -> float | None:
     gain = controller.deformation.effective_gain()
     chosen = np.unique(np.linspace(0, len(loops.places) - 1, _POINTS).astype(int))
     lower = controller.with_deformation(controller.deformation.with_effective_gain(_LOWER * gain))
-    others = loops_at(case.grid, lower, [loops.places[k] for k in chosen])
+    try:
+        others = loops_at(case.grid, lower, [loops.places[k] for k in chosen])
+    except (FpirhcError, np.linalg.LinAlgError):
+        return None
     own = [loops.loops[k].dynamics for k in chosen]
     slopes = [(f - other.dynamics) / (1 - _LOWER) for f, other in zip(own, others, strict=True)]
     factors = np.geomspace(_SMALLEST, _LARGEST, _STEPS)

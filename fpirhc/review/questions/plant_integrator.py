@@ -35,7 +35,7 @@ def integrator_follows(grid: ReviewGrid) -> Answer | None:
     numbers = {"apart": one.apart, "fastest_mode": one.fastest, "largest_pole": one.largest}
     if one.follows:
         return Answer(TEXT, Verdict.YES, text, "", numbers)
-    change = f"Use Problem(integrator={advice(plant, problem.period, places[worst])})."
+    change = f"Use Problem(integrator={advice(plant, problem.integrator, problem.period, places[worst])})."
     return Answer(TEXT, Verdict.NO if one.unstable else Verdict.UNKNOWN, text, change, numbers)
 
 

@@ -1,0 +1,68 @@
+"""What a review says of the reactor and of a cart behind a dead time with a user's own map, against runs."""
+
+from __future__ import annotations
+
+import importlib
+
+import numpy as np
+import pytest
+from abroad import load
+
+import fpirhc as fp
+from fpirhc.controllers.base import Controller
+from fpirhc.review.forms import forms_of
+
+
+def asked(problem: fp.Problem, controller: Controller) -> dict[str, fp.Answer]:
+    """Answers about the controller by question."""
+    found = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).controllers["it"]
+    return {a.question: a for a in found}
+
+
+def about(answers: dict[str, fp.Answer], words: str) -> fp.Answer:
+    [question] = [q for q in answers if words in q]
+    return answers[question]
+
+
+def test_the_reactor_drifts_within_a_cycle():
+    """0.43 of the jacket's pole passes in a cycle: with its exact model C_b is thousands of times worse with adaptation.
+
+    Both questions about it are answered no. The model-referenced form leaves C_b as it is.
+    """
+    task = load("cstr")
+    adaptive = task.controllers["RHC+FPI"]
+    answers = asked(task.problem, adaptive)
+    null = about(answers, "right model alone")
+    assert null.verdict == "no"
+    assert null.numbers["response_with"] > 1e-3
+    assert null.numbers["without"] < 1e-4
+    assert 0.3 < null.numbers["with"] < 0.6
+    run = fp.simulate(task.problem, adaptive, seed=0, compiled=False)
+    late = run["error.C_b"][run.time >= task.problem.measure_from]
+    assert null.numbers["with"] == pytest.approx(float(np.sqrt(np.mean(late**2))), rel=0.01)
+    assert "model-referenced form passes" in null.change
+    assert about(answers, "lower the response error").verdict == "no"
+    referenced = forms_of(task.problem, adaptive.deformation)["model-referenced"]
+    assert about(asked(task.problem, adaptive.with_deformation(referenced)), "right model alone").verdict == "yes"
+
+
+@pytest.mark.parametrize(("name", "verdict"), [("unpaired", "no"), ("RHC+FPI", "no"), ("RHC+FPI, increment", "yes")])
+def test_a_map_of_one_s_own_behind_a_dead_time(name, verdict):
+    """Unpaired its gain is beyond 2 sin(pi / 18); paired, the plain form is too slow for the plan; the increment converges."""
+    task = load("own_map")
+    unpaired = importlib.import_module("abroad.own_map").unpaired
+    controller = task.controllers.get(name, unpaired)
+    answers = asked(task.problem, controller)
+    assert about(answers, "Does the deformation converge").verdict == verdict
+    assert (about(answers, "right model alone").verdict == "yes") == (verdict == "yes")
+    if name == "unpaired":
+        gain = about(answers, "gain admissible")
+        assert gain.verdict == "no"
+        assert 1.5 * gain.numbers["linear_limit"] == pytest.approx(2 * np.sin(np.pi / 18), rel=0.1)
+    if name == "RHC+FPI":
+        assert about(answers, "keep up").verdict == "no"
+    if verdict == "yes":
+        assert about(answers, "wrong by a cycle").numbers["borne"] == 1
+    run = fp.simulate(task.problem, controller, seed=0, compiled=False)
+    sizes = np.abs(run["realised"] - run["desired"])[:, 0]
+    assert (run.stop is None and sizes[-400:].max() < 0.5 * sizes[:400].max()) == (verdict == "yes")
