@@ -387,8 +387,7 @@ BUILDS = {
     "controllers/contract.py": {"Identity"},  # no adaptation: the neutral map
     "review/linear.py": {"RungeKutta4", "Step"},  # of the linear problem
     "review/forms.py": {"Increment", "ModelReferenced"},  # the forms that are compared
-    "review/pays.py": {"Identity"},  # no adaptation
-    "review/response_prediction.py": {"Identity"},  # no adaptation
+    "review/prediction.py": {"Identity"},  # no adaptation
     "review/suggest.py": {"Filtered"},  # the suggested deformation
     "studies/comparison/optimality.py": {"FixedPoint"},  # the converged optimum
     "task/problem.py": {"RungeKutta4"},  # the default

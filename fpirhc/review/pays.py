@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fpirhc.deformation.identity import Identity
 from fpirhc.review.answer import Answer, Verdict
-from fpirhc.review.prediction import NominalRun, ResponseErrors, response_errors
+from fpirhc.review.prediction import NominalRun, ResponseErrors, errors_without_adaptation, response_errors
 from fpirhc.review.question import Case
 
 QUESTION = "Does adaptation lower the response error?"
@@ -20,7 +19,7 @@ def pays(case: Case) -> Answer:
     nominal = case.nominal
     if isinstance(nominal, str):
         return Answer(QUESTION, Verdict.UNKNOWN, nominal)
-    without = rms(nominal, response_errors(nominal, deformation=Identity()))
+    without = rms(nominal, errors_without_adaptation(nominal))
     adapted = rms(nominal, response_errors(nominal))
     null = rms(nominal, response_errors(nominal, exact=nominal.believed))
     text = f"predicted rms response error: {without:.3g} without adaptation, {adapted:.3g} with it, {null:.3g} with a right model"

@@ -26,6 +26,7 @@ from fpirhc.controllers.base import Controller, closing_blocks, like
 from fpirhc.controllers.contract import resolved, without_deformation
 from fpirhc.controllers.mirror import with_measured_state
 from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
 from fpirhc.errors import NotSupported
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
@@ -111,6 +112,11 @@ def response_errors(
     log = np.asarray(run(step.memory.start(), *(rows.T for rows in reads))[1].full()).T
     columns = ("response_error", "response_force", "command")
     return ResponseErrors(*(log[:, step.trace.slice(name)] for name in columns))
+
+
+def errors_without_adaptation(nominal: NominalRun) -> ResponseErrors:
+    """Return the response errors of the controller without its deformation."""
+    return response_errors(nominal, deformation=Identity())
 
 
 def _recursion(nominal: NominalRun, deformation: Deformation, exact: np.ndarray) -> Composite:

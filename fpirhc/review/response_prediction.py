@@ -9,12 +9,11 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
-from fpirhc.deformation.identity import Identity
 from fpirhc.errors import NotSupported
 from fpirhc.plant.mismatch import check_mismatch
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
-from fpirhc.review.prediction import NominalRun, ResponseErrors, nominal_run, response_errors
+from fpirhc.review.prediction import NominalRun, ResponseErrors, errors_without_adaptation, nominal_run, response_errors
 from fpirhc.review.tube import tube
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
@@ -114,7 +113,7 @@ def predict_response(
     adapted = response_errors(nominal)
     widest, reason = _tube(nominal, adapted, mismatch, seed)
     null = response_errors(nominal, exact=nominal.believed)
-    return Prediction(nominal, adapted, response_errors(nominal, deformation=Identity()), null, widest, reason)
+    return Prediction(nominal, adapted, errors_without_adaptation(nominal), null, widest, reason)
 
 
 def _tube(

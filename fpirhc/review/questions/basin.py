@@ -12,11 +12,10 @@ import math
 import numpy as np
 
 from fpirhc.contraction import basin_of_plain_form
-from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.neighbourhood import spectrum_near
-from fpirhc.review.prediction import response_errors
+from fpirhc.review.prediction import errors_without_adaptation, response_errors
 from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.slew import effect
 from fpirhc.review.speed import law_of
@@ -58,7 +57,7 @@ def _largest_error(case: Case) -> float | None:
     nominal = case.nominal
     if isinstance(nominal, str):
         return None
-    both = [response_errors(nominal).error, response_errors(nominal, deformation=Identity()).error]
+    both = [response_errors(nominal).error, errors_without_adaptation(nominal).error]
     sizes = np.linalg.norm(np.vstack(both), axis=1)
     jump = max((d.jump * effect(case.grid, name) for name, d in case.problem.disturbances.items()), default=0.0)
     return max(float(sizes.max()), jump) if np.isfinite(sizes).all() else None
