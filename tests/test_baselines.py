@@ -119,7 +119,7 @@ def test_settings_are_checked(kind):
     for settings in ({"iterations": 0, "tolerance": 1.0}, {"iterations": 1, "tolerance": -1.0}):
         with pytest.raises(ValueError, match="needs"):
             kind(**settings)
-    with pytest.raises(ValueError, match="memory of at least 1"):
+    with pytest.raises(ValueError, match=r"Anderson.memory: expected a whole number from 1"):
         fp.Anderson(0)
 
 

@@ -474,10 +474,6 @@ SCHEDULES = {
         fp.FixedSchedule([("cart", 0.0, 2.0), ("angle", 2.0, 2.001), ("cart", 2.001, 26.5)]),
         ["'angle' from 2 to 2.001 s is shorter than one control cycle of 0.005 s; let it end later"],
     ),
-    "no span": (
-        fp.FixedSchedule([("cart", 0.0)]),  # type: ignore[list-item]  # a span without an end is refused
-        ["('cart', 0.0) is no span; expected (coordinate, start, end)"],
-    ),
     "periodic": (
         fp.Periodic({"cart": -1.0, "angle": 1e-3, "angel": 1.0}),
         [
