@@ -645,7 +645,7 @@ def test_a_response_that_is_not_affine_is_refused():
 def test_numbers_out_of_range(changed):
     """Told by name where they are given."""
     ((name, value),) = changed.items()
-    with pytest.raises(InvalidValue, match=rf"Slotted\({name}={value!r}\): expected a"):
+    with pytest.raises(InvalidValue, match=rf"Slotted(\({name}={value!r}\)|\.{name}): expected a"):
         replace(CRANE.controllers["slots"], **changed)
 
 
