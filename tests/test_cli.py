@@ -107,12 +107,12 @@ def test_list_and_help(capsys):
 BAD = {
     "misspelt parameter": (("p.k * q.y", "p.kk * q.y"), "parameter 'kk' is unknown. Did you mean 'k'"),
     "misspelt input": (("u.u", "u.v"), "input 'v' is unknown"),
-    "approximate None": (("approximate=1.0", "approximate=None"), "approximate must be a finite number, got None"),
+    "approximate None": (("approximate=1.0", "approximate=None"), "Parameter.approximate: expected a number, got None"),
     "misspelt public name": (("fp.Sigmoid", "fp.Sigmod"), "Did you mean 'Sigmoid'"),
     "raises on import": (("tracking =", "1 / 0\ntracking ="), "line.py, line 19: 1 / 0"),
     "syntax error": (("problem = fp", "problem = = fp"), "line.py, line 11"),
     "no controllers": (("controllers =", "others ="), "it must define controllers"),
-    "start not finite": (('"y": 0.5', '"y": float("nan")'), "must be a finite number, got nan"),
+    "start not finite": (('"y": 0.5', '"y": float("nan")'), "Problem.start['y']: expected a number, got nan"),
     "unknown field": (("measure_from", "measure_form"), "measure_form"),
 }
 

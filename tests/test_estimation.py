@@ -297,7 +297,7 @@ def test_a_disturbed_plant():
         (lambda: fp.MovingHorizon(SPRING, NOISE, 5, 1.0, iterations=0), "iterations=0"),
         (lambda: fp.MovingHorizon({}, NOISE, 5, 1.0), "at least one parameter"),
         (lambda: fp.DisturbanceKalman({}, {"y": 1.0}), "drift"),
-        (lambda: fp.DisturbanceKalman({"y": 1.0}, {"y": math.nan}), "y=nan"),
+        (lambda: fp.DisturbanceKalman({"y": 1.0}, {"y": math.nan}), r"measured\['y'\]: expected a number, got nan"),
     ],
 )
 def test_bad_settings_are_refused(build, message):

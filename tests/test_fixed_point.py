@@ -387,7 +387,7 @@ def test_feedback_keeps_unstable_plants_together():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"iterations": 0}, "at least 1 iteration"),
+        ({"iterations": 0}, "iterations: expected a whole number from 1"),
         ({"tolerance": 0.0}, "positive tolerance"),
         ({"damping": -1.0}, "damping"),
     ],

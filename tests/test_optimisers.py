@@ -144,7 +144,7 @@ def test_memory_is_shifted_by_one_stage(optimiser):
 
 def test_settings_are_checked():
     """Numbers that cannot be meant are refused; traps among the solvers are refused by name with the reason."""
-    with pytest.raises(InvalidValue, match="at least 1 iteration"):
+    with pytest.raises(InvalidValue, match=r"ReducedGradient.iterations: expected a whole number from 1"):
         fp.ReducedGradient(iterations=0, tolerance=1e-3)
     with pytest.raises(InvalidValue, match="positive tolerance"):
         fp.Ipopt(tolerance=0.0)

@@ -70,10 +70,6 @@ class Horizon(Checked):
     margins: Mapping[str, Sequence[float]] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.stages, int) or self.stages < 1:
-            raise InvalidValue(f"a horizon needs at least 1 stage, got {self.stages!r}")
-        if not (math.isfinite(self.step) and self.step > 0):
-            raise InvalidValue(f"the horizon step must be a positive number of seconds, got {self.step!r}")
         if self.blocks and (sum(self.blocks) != self.stages or min(self.blocks) < 1):
             raise InvalidValue(
                 f"horizon: blocks {self.blocks} add up to {sum(self.blocks)}, expected {self.stages} stages"

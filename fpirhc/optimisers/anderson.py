@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Few
 from fpirhc.horizon.riccati import solve_free
@@ -38,10 +37,6 @@ class Anderson(Checked):
     """
 
     memory: Few
-
-    def __post_init__(self) -> None:
-        if self.memory < 1:
-            raise InvalidValue(f"Anderson needs a memory of at least 1, got {self.memory}")
 
 
 def iterated(

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Accuracy, Few
 from fpirhc.plant.plant import Plant
@@ -49,10 +48,6 @@ class RungeKutta4(Integrator):
 
     substeps: Few = 1
 
-    def __post_init__(self) -> None:
-        if self.substeps < 1:
-            raise InvalidValue(f"RungeKutta4 needs at least 1 sub-step, got {self.substeps}")
-
     def finer(self, times: int) -> RungeKutta4:
         """The same method with `times` times the sub-steps."""
         return RungeKutta4(self.substeps * times)
@@ -80,10 +75,6 @@ class Euler(Integrator):
     """
 
     substeps: Few = 1
-
-    def __post_init__(self) -> None:
-        if self.substeps < 1:
-            raise InvalidValue(f"Euler needs at least 1 sub-step, got {self.substeps}")
 
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period` seconds."""

@@ -33,8 +33,6 @@ class Sensor(Checked):
 
     def __post_init__(self) -> None:
         wrong = []
-        if self.noise is not None and not isinstance(self.noise, Disturbance):
-            wrong.append(f"noise={self.noise!r}: expected a signal such as Noise(deviation=...)")
         if self.quantum is not None and not _within(self.quantum, 0.0, math.inf):
             wrong.append(f"quantum={self.quantum!r}: expected a positive number in the unit of the quantity, or None")
         if self.dropout != 0 and not _within(self.dropout, 0.0, 1.0):

@@ -94,10 +94,7 @@ class Limits(Checked):
         for name, path in self.paths.items():
             if name in plant.state.elements or name in plant.inputs:
                 mistakes.add(f"paths: '{name}' is already the name of a state or input; choose another")
-            if not isinstance(path, PathConstraint):
-                mistakes.add(f"paths: '{name}' must be a PathConstraint(expression, lower, upper), got {path!r}")
-            else:
-                _check_interval(name, (path.lower, path.upper), mistakes)
+            _check_interval(name, (path.lower, path.upper), mistakes)
         mistakes.unknown("prices: limit of", self.prices, [*self.states, *self.paths, *self.rates])
         for name in sorted(self.prices.keys() & self.soft.keys()):
             mistakes.add(f"'{name}' is both soft and priced; choose one")
