@@ -134,7 +134,7 @@ def simulate(
         progress: called with (cycles done, cycles in all).
     """
     ready = simulator(problem, controller, compiled=compiled, flags=flags)
-    run = ready.run(seed=seed, name=name or controller.label or type(controller).__name__, progress=progress)
+    run = ready.run(seed=seed, name=name or controller.task_name or type(controller).__name__, progress=progress)
     judged = judgements(problem, ready.controller, run.layout, run.log)
     log = np.hstack([run.log, *(values for _, values in judged)])
     log.setflags(write=False)
