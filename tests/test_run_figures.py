@@ -47,7 +47,9 @@ def test_the_plot_of_a_run_names_quantities_units_and_controller():
 def test_a_shipped_task_gives_its_controllers_their_names():
     """As in the tutorial: simulate(task.problem, task.controllers[name])."""
     shipped = fp.load_problem("two_mass")
-    assert {name: c.label for name, c in shipped.controllers.items()} == {name: name for name in shipped.controllers}
+    assert {name: c.task_name for name, c in shipped.controllers.items()} == {
+        name: name for name in shipped.controllers
+    }
     fresh = fp.ComputedTorque(fp.Exponential(rate=6.0))
     short = replace(shipped.problem, duration=0.01, measure_from=0.0)
     assert fp.simulate(short, fresh, seed=0, compiled=False).controller == "ComputedTorque"

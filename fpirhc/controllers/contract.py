@@ -95,17 +95,17 @@ class Controller(Checked, ABC):
         deformation: Deformation
         inner = None
 
-    label: str = ""
+    task_name: str = ""
     """Name under which a loaded task has the controller, for results; it is no setting."""
 
     @abstractmethod
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks of one control cycle, from (time, state, realised, parameters) to 'command', and what they remember."""
 
-    def labelled(self, name: str) -> Self:
+    def named_in_task(self, name: str) -> Self:
         """Return the same controller with a name for results."""
         other = copy(self)
-        object.__setattr__(other, "label", name)
+        object.__setattr__(other, "task_name", name)
         return other
 
     def around(self, inner: Controller) -> Self:

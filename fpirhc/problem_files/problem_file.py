@@ -60,7 +60,7 @@ class Task:
     def __post_init__(self) -> None:
         if self.problem.name != self.name:
             object.__setattr__(self, "problem", replace(self.problem, name=self.name))
-        named = {name: controller.labelled(name) for name, controller in self.controllers.items()}
+        named = {name: controller.named_in_task(name) for name, controller in self.controllers.items()}
         object.__setattr__(self, "controllers", named)
 
     def __repr__(self) -> str:

@@ -154,7 +154,7 @@ def judged_run(ready: Simulator, *, seed: int, name: str = "", progress: Progres
         progress: called with (cycles done, cycles in all).
     """
     run = ready.run(
-        seed=seed, name=name or ready.controller.label or type(ready.controller).__name__, progress=progress
+        seed=seed, name=name or ready.controller.task_name or type(ready.controller).__name__, progress=progress
     )
     judged = judgements(ready.problem, ready.controller, run.layout, run.log)
     log = np.hstack([run.log, *(values for _, values in judged)])
