@@ -47,4 +47,6 @@ for substeps in (1, 8):
     answers = fp.review(other, exact, mismatch=0.0, seed=0).controllers["exact"]
     worst = max(answers, key=lambda a: a.verdict.value == "no")
     error = fp.measure(other, fp.simulate(other, exact["exact"], seed=0)).rms_error["x"]
-    print(f"{substeps} sub-steps: {1e3 * error:.3g} mm; {worst.question} {worst.evidence}")
+    print(
+        f"{substeps} sub-steps: {1e3 * error:.3g} mm; {worst.question} {worst.evidence}"
+    )
