@@ -386,6 +386,7 @@ BUILDS = {
     "review/linear.py": {"RungeKutta4", "Step"},  # of the linear problem
     "review/forms.py": {"Increment", "ModelReferenced"},  # the forms that are compared
     "review/pays.py": {"Identity"},  # no adaptation
+    "review/questions/basin.py": {"Identity"},  # no adaptation
     "review/response_prediction.py": {"Identity"},  # no adaptation
     "review/suggest.py": {"Filtered"},  # the suggested deformation
     "studies/comparison/optimality.py": {"FixedPoint"},  # the converged optimum
