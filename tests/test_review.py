@@ -115,7 +115,7 @@ def _is_worse(run: fp.Run, bare: fp.Run) -> bool:
     """Whether adaptation adds a quarter and 0.2 % of the largest error or of the largest motion, 0.8 m, to a coordinate's error."""
     if run.stop is not None:
         return bare.stop is None
-    sizes = [np.sqrt(np.mean(r["error"][len(r["error"]) // 10 :] ** 2, axis=0)) for r in (run, bare)]
+    sizes = [np.sqrt(np.mean(r["error"] ** 2, axis=0)) for r in (run, bare)]
     scale = np.maximum(np.abs(bare["error"]).max(axis=0), 0.8)
     return bool(((sizes[0] > 1.25 * sizes[1]) & (sizes[0] - sizes[1] > 2e-3 * scale)).any())
 
