@@ -19,7 +19,7 @@ from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.forms import forms_of
 from fpirhc.review.null_runs import SLIGHT, NullRuns, null_problem, null_runs, with_form
 from fpirhc.review.pays import ROUNDING, nominal_size, rms
-from fpirhc.review.prediction import NominalRun, response_errors
+from fpirhc.review.prediction import NominalRun, errors_without_adaptation, response_errors
 from fpirhc.review.question import Case, ControllerQuestion
 
 QUESTION_TEXT = "Does adaptation leave a right model alone?"
@@ -50,12 +50,22 @@ def leaves_right_model_alone(case: Case) -> Answer:
     text += runs.text
     if runs.passes:
         return Answer(QUESTION_TEXT, Verdict.YES, text, "", numbers)
-    verdict = Verdict.NO if runs.fails and not case.controller.learns else Verdict.UNKNOWN
+    harmful = runs.fails and not case.controller.learns and not _cures_more(nominal, predicted)
+    if runs.fails and not harmful:
+        text += ", less than what the wrong model costs without it" if not case.controller.learns else ""
+    verdict = Verdict.NO if harmful else Verdict.UNKNOWN
     change, more = _remedy(case, runs, predicted)
     return Answer(QUESTION_TEXT, verdict, text, change, numbers | more)
 
 
 QUESTION = ControllerQuestion(leaves_right_model_alone, order=10)
+
+
+def _cures_more(nominal: NominalRun | None, predicted: float | None) -> bool:
+    """Whether the wrong model makes a larger response error without adaptation than adaptation makes of a right model."""
+    return (
+        nominal is not None and predicted is not None and predicted < rms(nominal, errors_without_adaptation(nominal))
+    )
 
 
 def _remedy(case: Case, runs: NullRuns, predicted: float | None) -> tuple[str, dict[str, float]]:
