@@ -125,7 +125,9 @@ def load_problem(name_or_path: str) -> Task:
         pictures = ()
     _check_pictures(tuple(pictures), controllers, mistakes)
     if not isinstance(tuning, Mapping):
-        mistakes.add(f"{_at(module, 'tuning')}expected {{controller: {{setting: Span(...)}}}}, got {described(tuning)}")
+        mistakes.add(
+            f"{_at(module, 'tuning')}expected {{'controller': {{'deformation.gain': Span(low, high)}}}}, got {described(tuning)}"
+        )
     try:
         mistakes.raise_if_any()
         check_tuning(tuning, controllers)
