@@ -125,9 +125,8 @@ def load_problem(name_or_path: str) -> Task:
         pictures = ()
     _check_pictures(tuple(pictures), controllers, mistakes)
     if not isinstance(tuning, Mapping):
-        mistakes.add(
-            f"{_at(module, 'tuning')}expected {{'controller': {{'deformation.gain': Span(low, high)}}}}, got {described(tuning)}"
-        )
+        expected = "{'controller': {'deformation.gain': Span(low, high)}}"
+        mistakes.add(f"{_at(module, 'tuning')}expected {expected}, got {described(tuning)}")
     try:
         mistakes.raise_if_any()
         check_tuning(tuning, controllers)
