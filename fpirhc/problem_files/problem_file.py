@@ -118,7 +118,9 @@ def load_problem(name_or_path: str) -> Task:
     headline = _headline(module, controllers, mistakes)
     tuning, own = getattr(module, "tuning", {}), getattr(module, "metrics", ())
     if not isinstance(own, Sequence) or not all(isinstance(metric, Metric) for metric in own):
-        mistakes.add(f"{_at(module, 'metrics')}expected a sequence of fpirhc.Metric, metrics = (fpirhc.Metric(...),)")
+        mistakes.add(
+            f"{_at(module, 'metrics')}metrics must be a sequence of fpirhc.Metric, metrics = (fpirhc.Metric(...),)"
+        )
     pictures = getattr(module, "pictures", ())
     if not isinstance(pictures, Sequence):
         mistakes.add(f"{_at(module, 'pictures')}expected a sequence of pictures, got {described(pictures)}")
