@@ -127,12 +127,16 @@ def test_draws_that_could_leave_physical_bounds_are_refused(task):
 
 @pytest.mark.parametrize(
     ("bounds", "message"),
-    [((2.0, 3.0), "approximate is outside"), ((3.0, 0.0), r"\(lowest, highest\)"), (0.0, "a pair of numbers")],
+    [
+        ((2.0, 3.0), "parameter 'b': approximate is outside"),
+        ((3.0, 0.0), r"parameter 'b': .*\(lowest, highest\)"),
+        (0.0, r"Parameter.bounds: expected \(a number, a number\)"),
+    ],
 )
 def test_bounds_of_parameters_are_checked(bounds, message, task):
-    parameters = {**task.problem.plant.parameters, "b": fp.Parameter(1.0, 2.5, "1/kg", bounds)}
-    with pytest.raises(InvalidProblem, match=f"parameter 'b': .*{message}"):
-        replace(task.problem.plant, parameters=parameters)
+    plant = task.problem.plant
+    with pytest.raises(InvalidProblem, match=message):
+        replace(plant, parameters={**plant.parameters, "b": fp.Parameter(1.0, 2.5, "1/kg", bounds)})
 
 
 def test_mismatch_is_a_distance():

@@ -135,14 +135,17 @@ def load_problem(name_or_path: str) -> Task:
     headline = _headline(module, controllers, mistakes)
     tuning, own = getattr(module, "tuning", {}), getattr(module, "metrics", ())
     if not isinstance(own, Sequence) or not all(isinstance(metric, Metric) for metric in own):
-        mistakes.add(f"{_at(module, 'metrics')}expected a sequence of fpirhc.Metric, metrics = (fpirhc.Metric(...),)")
+        mistakes.add(
+            f"{_at(module, 'metrics')}metrics must be a sequence of fpirhc.Metric, metrics = (fpirhc.Metric(...),)"
+        )
     pictures = getattr(module, "pictures", ())
     if not isinstance(pictures, Sequence):
         mistakes.add(f"{_at(module, 'pictures')}expected a sequence of pictures, got {described(pictures)}")
         pictures = ()
     _check_pictures(tuple(pictures), controllers, mistakes)
     if not isinstance(tuning, Mapping):
-        mistakes.add(f"{_at(module, 'tuning')}expected {{controller: {{setting: Span(...)}}}}, got {described(tuning)}")
+        expected = "{'controller': {'deformation.gain': Span(low, high)}}"
+        mistakes.add(f"{_at(module, 'tuning')}expected {expected}, got {described(tuning)}")
     try:
         mistakes.raise_if_any()
         check_tuning(tuning, controllers)
