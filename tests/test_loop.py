@@ -170,7 +170,7 @@ def test_nan_measurement_never_reaches_the_plant():
     good, memory = stepper.step(0.0, np.array([0.1, 0.0]), np.zeros(1), memory)
     held, memory = stepper.step(1e-3, np.array([np.nan, 0.0]), np.zeros(1), memory)
     assert np.array_equal(held, good)
-    assert stepper.trace()["status"][0] == fp.Status.NON_FINITE
+    assert stepper.trace()["status"][0] == fp.Status.BAD_SAMPLE
     after, memory = stepper.step(2e-3, np.array([0.1, 0.0]), np.zeros(1), memory)
     assert np.isfinite(after).all()
 

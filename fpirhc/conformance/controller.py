@@ -101,7 +101,7 @@ class _Trial:
     @cached_property
     def stepper(self) -> Stepper:
         """The controller alone, in CasADi's virtual machine."""
-        return Stepper(self.problem, checked(self.problem, self.controller), compiled=False)
+        return Stepper(self.problem, checked(self.problem, self.controller), compiled=False, bounded=False)
 
 
 def frozen_value(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
@@ -174,10 +174,10 @@ def same_command_everywhere(trial: _Trial, generator: np.random.Generator) -> No
     run, scale = trial.run, 1 + float(np.abs(trial.run["command"]).max())
     steppers = {
         "a Stepper": trial.stepper,
-        "a second Stepper": Stepper(trial.problem, trial.controller, compiled=False),
+        "a second Stepper": Stepper(trial.problem, trial.controller, compiled=False, bounded=False),
     }
     if trial.compiled:
-        compiled = Stepper(trial.problem, trial.controller)
+        compiled = Stepper(trial.problem, trial.controller, bounded=False)
         if compiled.compiled:
             steppers["compiled C"] = compiled
     for what, stepper in steppers.items():

@@ -39,6 +39,11 @@ class Ladder(Optimiser):
         return self.first.exportable and self.second.exportable
 
     @property
+    def unbounded(self) -> str:
+        """Why one of them may take any time."""
+        return self.first.unbounded or self.second.unbounded
+
+    @property
     def logged(self) -> Mapping[str, str]:
         """How many plans the second has found since the run began."""
         return {"second_plans": _ASKED}

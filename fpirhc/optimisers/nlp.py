@@ -49,6 +49,7 @@ Setting: TypeAlias = "bool | int | float | str | Sequence[bool] | ca.Function | 
 Options: TypeAlias = Mapping[str, Setting]
 _QUIET: Options = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
 _LARGEST_MULTIPLIER = 1e12
+_OSQP_BOUNDED = 2000  # iterations that are a bound of time on a machine
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,11 @@ class QuadraticSolver(ABC):
     @abstractmethod
     def options(self) -> Options:
         """CasADi's options of the solver."""
+
+    @property
+    def unbounded(self) -> str:
+        """Why a call may take any time, with a remedy; empty where its work is bounded."""
+        return ""
 
 
 @dataclass(frozen=True)
@@ -84,9 +90,22 @@ class Qrqp(QuadraticSolver):
 
 @dataclass(frozen=True)
 class Osqp(QuadraticSolver):
-    """OSQP, an operator-splitting method."""
+    """OSQP, an operator-splitting method.
+
+    Args:
+        accuracy: that OSQP is asked for.
+        iterations: that it may use for one quadratic program. CasADi passes no time limit on.
+
+    Raises:
+        InvalidValue: fewer than one iteration.
+    """
 
     accuracy: float = 1e-8
+    iterations: int = 20000
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise InvalidValue(f"Osqp needs at least 1 iteration, got {self.iterations}")
 
     @property
     def plugin(self) -> str:
@@ -95,8 +114,18 @@ class Osqp(QuadraticSolver):
 
     def options(self) -> Options:
         """Quiet, with the accuracy for both residuals and without polishing."""
-        inner = {"verbose": False, "eps_abs": self.accuracy, "eps_rel": self.accuracy, "max_iter": 20000}
+        inner = {"verbose": False, "eps_abs": self.accuracy, "eps_rel": self.accuracy, "max_iter": self.iterations}
         return {"osqp": inner, "error_on_fail": False}
+
+    @property
+    def unbounded(self) -> str:
+        """An infeasible program takes all iterations."""
+        if self.iterations <= _OSQP_BOUNDED:
+            return ""
+        return (
+            f"OSQP has no time limit, and an infeasible program takes all {self.iterations} iterations: "
+            f"give Osqp(iterations=...), at most {_OSQP_BOUNDED}"
+        )
 
 
 def quadratic_solver(name: str) -> QuadraticSolver:
@@ -257,11 +286,22 @@ class _MultipleShooting(Optimiser):
 class Ipopt(_MultipleShooting):
     """IPOPT: the interior-point method that most tools use by default.
 
-    Parameters: tolerance of our stationarity, in the unit of the inputs; accuracy that IPOPT is asked for; iterations it may use.
+    Parameters: tolerance of our stationarity, in the unit of the inputs; accuracy that IPOPT is asked for; iterations it may use;
+    time_limit of one call in s, None for none.
     """
 
     accuracy: float = 1e-8
     iterations: int = 200
+    time_limit: float | None = None
+
+    def __post_init__(self) -> None:
+        _MultipleShooting.__post_init__(self)
+        _check_time_limit("Ipopt", self.time_limit)
+
+    @property
+    def unbounded(self) -> str:
+        """Without a time limit its restoration phase may take long."""
+        return "" if self.time_limit else "IPOPT has no time limit here: give Ipopt(time_limit=...), in s"
 
     @property
     def plugin(self) -> str:
@@ -280,6 +320,7 @@ class Ipopt(_MultipleShooting):
             "ipopt.warm_start_bound_push": 1e-9,
             "ipopt.warm_start_mult_bound_push": 1e-9,
             "ipopt.mu_init": 1e-4,
+            **({} if self.time_limit is None else {"ipopt.max_wall_time": self.time_limit}),
         }
 
 
@@ -289,6 +330,14 @@ class Fatrop(_MultipleShooting):
 
     accuracy: float = 1e-8
     iterations: int = 200
+
+    @property
+    def unbounded(self) -> str:
+        """It has no time limit, and some samples make it iterate for ever."""
+        return (
+            "fatrop has no time limit, and after an outlier its call may never return: use FixedPoint(), "
+            "or Ipopt(time_limit=...)"
+        )
 
     @property
     def plugin(self) -> str:
@@ -316,6 +365,11 @@ class SequentialQuadratic(_MultipleShooting):
     iterations: int = 20
 
     @property
+    def unbounded(self) -> str:
+        """As its quadratic solver."""
+        return self.quadratic.unbounded
+
+    @property
     def plugin(self) -> str:
         """CasADi's name of the solver."""
         return "sqpmethod"
@@ -335,6 +389,11 @@ class SequentialQuadratic(_MultipleShooting):
             "min_step_size": 1e-12,
             "hess_lag": gauss_newton_hessian(ocp),
         }
+
+
+def _check_time_limit(owner: str, limit: float | None) -> None:
+    if limit is not None and not 0 < limit < float("inf"):
+        raise InvalidValue(f"{owner}(time_limit={limit!r}): expected a positive number of seconds, or None")
 
 
 def _usable(multipliers: ca.MX) -> ca.MX:
