@@ -170,7 +170,13 @@ def _run_chunks(
         for argument, table in zip(evaluator.arguments[1:], tables, strict=True):
             argument.reshape(CHUNK, -1)[:] = table[at : at + CHUNK]
         evaluator.redirect(1, log[at : at + CHUNK])
-        evaluator.evaluate()
+        try:
+            evaluator.evaluate()
+            why = "compiled code failed" if evaluator.failed else ""
+        except RuntimeError as error:  # CasADi's own, of a solver in the loop
+            why = (str(error).strip().splitlines() or ["no reason"])[-1]
+        if why:
+            return log[:at].copy(), _failed(at, CHUNK, problem.period, why)
         rows = log[at : min(at + CHUNK, cycles)]
         bad = _first_bad(rows)
         if bad is not None:
@@ -193,6 +199,10 @@ def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:
         return None
     row = int(np.argmin(finite.all(axis=1)))
     return row, int(np.argmin(finite[row]))
+
+
+def _failed(at: int, cycles: int, period: float, why: str) -> str:
+    return f"a solver failed within {cycles} cycles after t = {at * period:g} s: {why}; the run keeps the cycles before them"
 
 
 def _why(trace: Layout, cycle: int, column: int, period: float) -> str:

@@ -147,6 +147,8 @@ class Stepper:
     def trace(self) -> dict[str, np.ndarray]:
         """Return every signal of the last step by name.
 
+        In a skipped cycle 'command', 'status' and 'skipped' are those that hold; the others are those of the step that was dropped.
+
         Raises:
             ConcurrentUse: another thread is inside this stepper.
         """
