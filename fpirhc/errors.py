@@ -75,6 +75,10 @@ class NotSupported(FpirhcError, ValueError):
     """A valid setting that this member of a family cannot serve; the message names a member that can."""
 
 
+class ConcurrentUse(FpirhcError, RuntimeError):
+    """A value that serves one thread, used by two at the same time."""
+
+
 class OutputError(FpirhcError, OSError):
     """A file or folder that cannot be written or read."""
 

@@ -6,13 +6,23 @@ from enum import IntEnum
 
 
 class Status(IntEnum):
-    """Outcome of one control cycle or one solve, ordered from best to worst."""
+    """Outcome of one control cycle or one solve; the numbers are those of saved runs, `severity` is the order."""
 
     OK = 0
     NOT_CONVERGED = 1
     INFEASIBLE = 2
     HELD = 3
     NON_FINITE = 4
+    BAD_SAMPLE = 5
+    RESTARTED = 6
+    SOLVER_FAILED = 7
+    SATURATED = 8
+    NOT_CONTRACTING = 9
+
+    @property
+    def severity(self) -> int:
+        """Place in the order from best to worst."""
+        return _BEST_TO_WORST.index(self)
 
     @property
     def remedy(self) -> str:
@@ -20,6 +30,18 @@ class Status(IntEnum):
         return _REMEDIES[self]
 
 
+_BEST_TO_WORST = (
+    Status.OK,
+    Status.NOT_CONVERGED,
+    Status.BAD_SAMPLE,
+    Status.SATURATED,
+    Status.INFEASIBLE,
+    Status.HELD,
+    Status.NOT_CONTRACTING,
+    Status.RESTARTED,
+    Status.SOLVER_FAILED,
+    Status.NON_FINITE,
+)
 _REMEDIES = {
     Status.OK: "solved: residuals are within the tolerance.",
     Status.NOT_CONVERGED: "the optimiser used all its iterations before its residual met the tolerance: "
@@ -30,4 +52,13 @@ _REMEDIES = {
     "effect and the command was held: see the cycles counted here and the signals around them.",
     Status.NON_FINITE: "a signal became NaN or infinite: look at the first such signal of the run; the "
     "model is outside its domain or the loop diverged.",
+    Status.BAD_SAMPLE: "a measurement was not finite, implausible, or out of date: the cycle was skipped, with the last command "
+    "and every memory as it was; look at the sensor, or widen the plausible range.",
+    Status.RESTARTED: "the memory was not finite and was forgotten: the controller began anew; look at where the memory is kept.",
+    Status.SOLVER_FAILED: "a solver raised an error: the cycle was skipped, with the last command and every memory as it was; "
+    "use FixedPoint(), or look at the measurement that the solver was given.",
+    Status.SATURATED: "the command has been at a limit for longer than the stated time; integrals are frozen meanwhile: check the "
+    "actuator, the sign of its gain, and whether the limits allow the task.",
+    Status.NOT_CONTRACTING: "the measured response errors grow from cycle to cycle: the gain is too large or has the wrong sign "
+    "for this plant; lower it, or put Guarded(...) around the map.",
 }

@@ -12,6 +12,8 @@ from plants import linear, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import InvalidName, InvalidProblem
+from fpirhc.simulation.simulate import CHUNK, simulator
+from fpirhc.symbolic.evaluate import Evaluator
 
 TRACK = fp.Exponential(rate=6.0)
 
@@ -170,7 +172,7 @@ def test_nan_measurement_never_reaches_the_plant():
     good, memory = stepper.step(0.0, np.array([0.1, 0.0]), np.zeros(1), memory)
     held, memory = stepper.step(1e-3, np.array([np.nan, 0.0]), np.zeros(1), memory)
     assert np.array_equal(held, good)
-    assert stepper.trace()["status"][0] == fp.Status.NON_FINITE
+    assert stepper.trace()["status"][0] == fp.Status.BAD_SAMPLE
     after, memory = stepper.step(2e-3, np.array([0.1, 0.0]), np.zeros(1), memory)
     assert np.isfinite(after).all()
 
@@ -193,6 +195,27 @@ def test_run_stops_where_a_signal_is_not_finite():
     metrics = fp.measure(problem, result)
     assert metrics.worst_status == "NON_FINITE"
     assert np.isnan(metrics.rms_error["y"])
+
+
+@pytest.mark.parametrize("fails", ["raises", "sets its flag"])
+def test_run_stops_where_a_solver_fails(fails, monkeypatch):
+    """The run keeps the cycles before, and the reason is the solver's."""
+    ready = simulator(swing(), fp.ComputedTorque(TRACK), compiled=False)
+    evaluate, calls = ready.evaluator.evaluate, []
+
+    def broken() -> object:
+        calls.append(1)
+        if len(calls) > 2 and fails == "raises":
+            raise RuntimeError("first line\nOSQP failed")
+        return evaluate()
+
+    monkeypatch.setattr(ready.evaluator, "evaluate", broken)
+    if fails != "raises":
+        monkeypatch.setattr(Evaluator, "failed", property(lambda self: len(calls) > 2))
+    found = ready.run(seed=0)
+    assert found.cycles == 2 * CHUNK
+    assert found.stop is not None
+    assert ("OSQP failed" if fails == "raises" else "compiled code failed") in found.stop
 
 
 def test_save_and_load(tmp_path):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import pickle
 import stat
+import time
 from typing import Any
 
 import casadi as ca
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 
 from fpirhc.symbolic import native as module
+from fpirhc.symbolic import private_folder
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import find_compiler, native
 
@@ -234,3 +237,86 @@ def test_a_compiler_asked_for_is_never_replaced(monkeypatch):
     result = native(model(3.0))
     assert not result.compiled
     assert "'no-such-compiler', asked for by FPIRHC_CC, was not found" in result.reason
+
+
+# Other users
+
+
+def _planted(cache, factor: float):
+    """A library in the cache that is a valid one of another model, as a hostile user would leave it; and the right numbers."""
+    native(model(factor))
+    native(model(factor + 1.0))
+    first, second = sorted(_libraries(cache), key=lambda p: p.stat().st_mtime_ns)
+    path, other = first, second
+    path.unlink()
+    path.write_bytes(other.read_bytes())
+    path.with_suffix(".sha256").write_bytes(other.with_suffix(".sha256").read_bytes())
+    module._loaded.clear()
+    return path
+
+
+needs_posix = pytest.mark.skipif(os.name != "posix", reason="owners and modes of files are those of POSIX")
+
+
+@needs_compiler
+@needs_posix
+@pytest.mark.parametrize("who", ["writable by others", "of another user", "a link"])
+def test_library_that_others_may_have_written_is_not_run(cache, monkeypatch, who):
+    """A library with a fitting checksum that is writable by others, of another user, or a link, is compiled again."""
+    path = _planted(cache, 7.0)
+    if who == "writable by others":
+        path.chmod(0o777)
+    elif who == "a link":
+        hidden = path.with_name("elsewhere")
+        path.rename(hidden)
+        path.symlink_to(hidden)
+    else:
+        stranger = os.geteuid() + 1
+        monkeypatch.setattr(private_folder, "_is_own", lambda facts: facts.st_uid == stranger)
+    assert not module._is_intact(path)
+    found = native(model(7.0))
+    np.testing.assert_array_equal(found.function(np.ones(3)).full(), model(7.0)(np.ones(3)).full())
+
+
+@needs_posix
+def test_folder_is_closed_to_others(cache):
+    """Created with mode 0700 under any umask; one that was open is closed."""
+    old = os.umask(0)
+    try:
+        assert stat.S_IMODE(module.cache_folder().stat().st_mode) == 0o700
+        cache.chmod(0o1777)
+        assert stat.S_IMODE(module.cache_folder().stat().st_mode) == 0o700
+    finally:
+        os.umask(old)
+
+
+@needs_posix
+def test_folder_of_another_user_is_not_used(cache, monkeypatch):
+    """A temporary folder takes its place."""
+    cache.mkdir()
+    monkeypatch.setattr(private_folder, "_is_own", lambda facts: False)
+    assert module.cache_folder() != cache
+
+
+@needs_compiler
+@needs_posix
+def test_fifo_in_place_of_a_checksum_does_not_hang(cache):
+    """It is no regular file, so the library is compiled again."""
+    native(model(8.0))
+    (path,) = _libraries(cache)
+    path.with_suffix(".sha256").unlink()
+    os.mkfifo(path.with_suffix(".sha256"))
+    module._loaded.clear()
+    assert native(model(8.0)).compiled
+    assert module._is_intact(path)
+
+
+def test_what_killed_processes_left_behind_is_removed(cache):
+    """A folder of a compilation is removed when it is older than any compilation, and no other."""
+    for name, age in (("building-old", 7200.0), ("building-new", 10.0), ("mine", 7200.0)):
+        (cache / name).mkdir(parents=True)
+        (cache / name / "model.c").write_text("")
+        then = time.time() - age
+        os.utime(cache / name, (then, then))
+    module.cache_folder()
+    assert sorted(p.name for p in cache.iterdir()) == ["building-new", "mine"]

@@ -17,11 +17,13 @@ from fpirhc.describe import describe
 from fpirhc.horizon.cost import Quadratic
 from fpirhc.horizon.problem import Horizon
 from fpirhc.plant.plant import Parameter, Plant
+from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.status import Status
+from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Trajectory
@@ -101,7 +103,18 @@ class _Trial:
     @cached_property
     def stepper(self) -> Stepper:
         """The controller alone, in CasADi's virtual machine."""
-        return Stepper(self.problem, checked(self.problem, self.controller), compiled=False)
+        return Stepper(
+            self.problem,
+            checked(self.problem, self.controller),
+            compiled=False,
+            bounded=False,
+            plausible=_anything(self.problem),
+        )
+
+
+def _anything(problem: Problem) -> dict[str, tuple[float, float]]:
+    """No sample of a simulated run is implausible, also not of one that diverges."""
+    return dict.fromkeys((*problem.plant.state.elements, *response_names(problem.plant)), (-np.inf, np.inf))
 
 
 def frozen_value(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
@@ -174,10 +187,12 @@ def same_command_everywhere(trial: _Trial, generator: np.random.Generator) -> No
     run, scale = trial.run, 1 + float(np.abs(trial.run["command"]).max())
     steppers = {
         "a Stepper": trial.stepper,
-        "a second Stepper": Stepper(trial.problem, trial.controller, compiled=False),
+        "a second Stepper": Stepper(
+            trial.problem, trial.controller, compiled=False, bounded=False, plausible=_anything(trial.problem)
+        ),
     }
     if trial.compiled:
-        compiled = Stepper(trial.problem, trial.controller)
+        compiled = Stepper(trial.problem, trial.controller, bounded=False, plausible=_anything(trial.problem))
         if compiled.compiled:
             steppers["compiled C"] = compiled
     for what, stepper in steppers.items():
@@ -258,9 +273,17 @@ def bad_response_never_acts(trial: _Trial, generator: np.random.Generator) -> No
 
 def _measured_once(trial: _Trial, bad: float, entry: int | None, what: str) -> None:
     """Replay a run with one bad value in one cycle: of an entry of the state, or (None) of the whole response."""
-    run, stepper = trial.run, trial.stepper
-    lower, upper = trial.problem.limits.input_bounds(trial.problem.plant)
-    memory, status = stepper.start(), 0.0
+    run, lower, upper = trial.run, *trial.problem.limits.input_bounds(trial.problem.plant)
+    # A stepper's gate keeps bad samples away; the controller itself must survive them too, inside of another one.
+    composite = compose_controller(trial.problem, trial.controller)
+    bare, parameters = Evaluator(composite.function), trial.controller.parameters(trial.problem.plant)
+
+    def step(*arguments: npt.ArrayLike) -> tuple[Array, Array, float]:
+        *measured, before = arguments
+        after, shown, command = bare(before, *measured, parameters)
+        return command, after, float(shown[composite.trace.slice("status")][0])
+
+    memory, status = composite.memory.start(), 0.0
     for cycle in range(min(2 * _STEPS + 1, run.cycles)):
         time, state, realised = float(run.time[cycle]), run["state"][cycle].copy(), run["realised"][cycle]
         matters = False
@@ -268,10 +291,9 @@ def _measured_once(trial: _Trial, bad: float, entry: int | None, what: str) -> N
             realised = np.full_like(realised, bad)
         elif cycle == _STEPS and entry is not None:
             state[entry] += 0.1
-            matters = not np.array_equal(stepper.step(time, state, realised, memory)[0], run["command"][cycle])
+            matters = not np.array_equal(step(time, state, realised, memory)[0], run["command"][cycle])
             state[entry] = bad
-        command, memory = stepper.step(time, state, realised, memory)
-        status = float(stepper.trace()["status"][0])
+        command, memory, status = step(time, state, realised, memory)
         fine = bool(np.isfinite(command).all() and (command >= lower).all() and (command <= upper).all())
         hold(fine, f"{what}: the command of cycle {cycle} is {command}")
         hold(not matters or status != Status.OK, f"{what}: the status of that cycle is OK")

@@ -70,7 +70,7 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
         remembered = {f"{m}_next": v for m, v in composite.memory.split(next_memory).items()}
         return {**composite.trace.split(trace), **remembered}
 
-    return Block(name, Layout(reads), composite.trace, step, composite.memory, opaque=True)
+    return Block(name, Layout(reads), composite.trace, step, composite.memory, opaque=composite.opaque)
 
 
 def reference_block(problem: Problem) -> Block:

@@ -40,6 +40,11 @@ class Optimiser(Checked, ABC):
         return True
 
     @property
+    def unbounded(self) -> str:
+        """Why a call may take any time, with a remedy; empty where its work is bounded."""
+        return ""
+
+    @property
     def logged(self) -> Mapping[str, str]:
         """Scalars of the memory that a run logs: signal -> name in the memory."""
         return {}

@@ -41,6 +41,11 @@ class Ladder(Optimiser):
         return self.first.exportable and self.second.exportable
 
     @property
+    def unbounded(self) -> str:
+        """Why one of them may take any time."""
+        return self.first.unbounded or self.second.unbounded
+
+    @property
     def logged(self) -> Mapping[str, str]:
         """Number of plans of the second optimiser since the run began."""
         return {"second_plans": _COUNT}

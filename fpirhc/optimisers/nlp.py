@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from fpirhc.fields.kinds import Accuracy, Count
+from fpirhc.fields.kinds import Accuracy, Count, Positive
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.multiple_shooting import MultipleShooting
 from fpirhc.optimisers.quadratic_solvers import Options, Osqp, Qrqp, QuadraticSolver
@@ -29,10 +29,17 @@ class Ipopt(MultipleShooting):
         tolerance: of the stationarity, in the unit of the inputs.
         accuracy: IPOPT's own tolerance.
         iterations: most iterations of IPOPT in one call.
+        time_limit: most time of one call, s; None: no limit.
     """
 
     accuracy: Accuracy = 1e-8
     iterations: Count = 200
+    time_limit: Positive | None = None
+
+    @property
+    def unbounded(self) -> str:
+        """Without a time limit its restoration phase may take long."""
+        return "" if self.time_limit else "IPOPT has no time limit here: give Ipopt(time_limit=...), in s"
 
     @property
     def plugin(self) -> str:
@@ -51,6 +58,7 @@ class Ipopt(MultipleShooting):
             "ipopt.warm_start_bound_push": 1e-9,
             "ipopt.warm_start_mult_bound_push": 1e-9,
             "ipopt.mu_init": 1e-4,
+            **({} if self.time_limit is None else {"ipopt.max_wall_time": self.time_limit}),
         }
 
 
@@ -66,6 +74,14 @@ class Fatrop(MultipleShooting):
 
     accuracy: Accuracy = 1e-8
     iterations: Count = 200
+
+    @property
+    def unbounded(self) -> str:
+        """It has no time limit, and some samples make it iterate for ever."""
+        return (
+            "fatrop has no time limit, and after an outlier its call may never return: use FixedPoint(), "
+            "or Ipopt(time_limit=...)"
+        )
 
     @property
     def plugin(self) -> str:
@@ -94,6 +110,11 @@ class SequentialQuadratic(MultipleShooting):
 
     quadratic: QuadraticSolver = field(default_factory=Qrqp)
     iterations: Count = 20
+
+    @property
+    def unbounded(self) -> str:
+        """As its quadratic solver."""
+        return self.quadratic.unbounded
 
     @property
     def plugin(self) -> str:

@@ -15,6 +15,7 @@ from fpirhc.fields.kinds import Accuracy, Count
 
 Setting: TypeAlias = "bool | int | float | str | Sequence[bool] | ca.Function | Mapping[str, Setting]"
 Options: TypeAlias = Mapping[str, Setting]
+_OSQP_BOUNDED = 2000  # iterations that are a bound of time on a machine
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,11 @@ class QuadraticSolver(Checked, ABC):
     @abstractmethod
     def options(self) -> Options:
         """CasADi's options of the solver."""
+
+    @property
+    def unbounded(self) -> str:
+        """Why a call may take any time, with a remedy; empty where its work is bounded."""
+        return ""
 
 
 @dataclass(frozen=True)
@@ -58,9 +64,11 @@ class Osqp(QuadraticSolver):
 
     Args:
         accuracy: of both residuals.
+        iterations: most iterations of one quadratic program. CasADi passes no time limit on.
     """
 
     accuracy: Accuracy = 1e-8
+    iterations: Count = 20000
 
     @property
     def plugin(self) -> str:
@@ -69,8 +77,18 @@ class Osqp(QuadraticSolver):
 
     def options(self) -> Options:
         """Quiet, with the accuracy for both residuals and without polishing."""
-        inner = {"verbose": False, "eps_abs": self.accuracy, "eps_rel": self.accuracy, "max_iter": 20000}
+        inner = {"verbose": False, "eps_abs": self.accuracy, "eps_rel": self.accuracy, "max_iter": self.iterations}
         return {"osqp": inner, "error_on_fail": False}
+
+    @property
+    def unbounded(self) -> str:
+        """An infeasible program takes all iterations."""
+        if self.iterations <= _OSQP_BOUNDED:
+            return ""
+        return (
+            f"OSQP has no time limit, and an infeasible program takes all {self.iterations} iterations: "
+            f"give Osqp(iterations=...), at most {_OSQP_BOUNDED}"
+        )
 
 
 def quadratic_solver(name: str) -> QuadraticSolver:

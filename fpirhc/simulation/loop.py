@@ -11,9 +11,9 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, Response, error_signal, like
+from fpirhc.controllers.base import Controller, Response, compose_controller, error_signal, like
 from fpirhc.controllers.contract import checked
-from fpirhc.controllers.mirror import with_measured_state
+from fpirhc.controllers.gate import Gate
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals, expression
@@ -29,16 +29,11 @@ def close_loop(problem: Problem, controller: Controller) -> Composite:
     input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples.
     """
     ready = checked(problem, controller)
-    blocks, delays = ready.blocks(problem)
+    acting = Gate(problem, compose_controller(problem, ready), trusted=("time", "memory"))
     disturbed = disturbance_signals(problem)
-    seeing = _sense_blocks(
-        problem, ready.response(problem), predicts="state_ahead" in [n for b in blocks for n in b.writes.names]
-    )
-    own = with_measured_state(problem.plant, blocks)
-    around = [_clock_block(problem.plant.time, problem.period), *seeing, *own, *_actuate(problem, disturbed)]
-    return compose(
-        "loop", Layout((*disturbed, *problem.sensing.drawn)), around, [*_plant_delays(problem, ready), *delays]
-    )
+    seeing = _sense_blocks(problem, ready.response(problem), predicts="state_ahead" in acting.inner.trace)
+    around = [_clock_block(problem.plant.time, problem.period), *seeing, acting.block(), *_actuate(problem, disturbed)]
+    return compose("loop", Layout((*disturbed, *problem.sensing.drawn)), around, _plant_delays(problem, ready))
 
 
 def start_memory(loop: Composite, problem: Problem, controller: Controller) -> np.ndarray:

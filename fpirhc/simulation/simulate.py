@@ -199,8 +199,13 @@ def _run_chunks(
         evaluator.redirect(1, log[at : at + CHUNK])
         try:
             evaluator.evaluate()
+            why = "compiled code failed" if evaluator.failed else ""
         except SystemError as error:
             raise unwrapped(error) from None
+        except RuntimeError as error:  # CasADi's own, of a solver in the loop
+            why = (str(error).strip().splitlines() or ["no reason"])[-1]
+        if why:
+            return log[:at].copy(), _failed(at, problem, why)
         rows = log[at : min(at + CHUNK, cycles)]
         bad = _first_bad(rows)
         if bad is not None:
@@ -223,6 +228,13 @@ def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:
         return None
     row = int(np.argmin(finite.all(axis=1)))
     return row, int(np.argmin(finite[row]))
+
+
+def _failed(at: int, problem: Problem, why: str) -> str:
+    return (
+        f"a solver failed within {CHUNK} cycles after t = {at * problem.period:g} {problem.time_unit}: {why}; the run keeps the "
+        "cycles before them"
+    )
 
 
 def _why(trace: Layout, cycle: int, column: int, problem: Problem) -> str:

@@ -2,13 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from math import isnan
+from typing import NoReturn, Protocol, cast
+
+import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller
+from fpirhc.controllers.contract import checked
+from fpirhc.controllers.gate import HELD, Gate
+from fpirhc.controllers.plausible import plausible_range
+from fpirhc.errors import ConcurrentUse, InvalidValue, NotSupported
+from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, Watch, machine_step
+from fpirhc.simulation.sample import numbers, one_number
+from fpirhc.status import Status
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native
+from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
+
+
+class _View(Protocol):
+    """A memoryview of float64 as it is used here; its stub has views of bytes only."""
+
+    def __getitem__(self, k: int) -> float: ...
+    def __setitem__(self, k: int | slice, value: object) -> None: ...
+    def __len__(self) -> int: ...
 
 
 class Stepper:
@@ -19,43 +40,190 @@ class Stepper:
         command, memory = stepper.step(time, state, realised, memory)
 
     All memory is in the argument: the same arguments give the same command. `trace()` returns every signal of the last step.
+
+    A bad sample skips the cycle: one that is not finite, outside its plausible range, or (with `max_age`) out of date. The command
+    is the last one, every memory stays as it was, the status is BAD_SAMPLE, and the signal 'skipped' counts. Before the first good
+    sample the command is the one before the run. A memory that is not finite is forgotten: the controller begins anew, with the
+    status RESTARTED. Where a solver raises, the cycle is skipped with the status SOLVER_FAILED; `why_failed` has its words.
+    Commands at a limit for long and an iteration that does not contract have the statuses SATURATED and NOT_CONTRACTING.
+
+    One stepper serves one thread. Two threads at the same time are refused; give each a stepper of its own.
     """
 
-    def __init__(self, problem: Problem, controller: Controller, *, compiled: bool = True) -> None:
-        """Compose the controller's Function, and compile it where `compiled` is set and there is a compiler."""
-        composite = compose_controller(problem, controller)
+    def __init__(
+        self,
+        problem: Problem,
+        controller: Controller,
+        *,
+        compiled: bool = True,
+        plausible: Mapping[str, Interval] | None = None,
+        max_age: float | None = None,
+        watch: Watch | None = None,
+        bounded: bool = True,
+    ) -> None:
+        """Compose the controller's Function, and compile it where `compiled` is set and there is a compiler.
+
+        Args:
+            problem: the task.
+            controller: its automatic settings are chosen here.
+            compiled: whether it is compiled to C.
+            plausible: intervals (lower, upper) by name of a state ("q1", "q1'") or response ("q1''"), which replace the automatic
+                ones (see `fpirhc.controllers.plausible`).
+            max_age: oldest sample that is used, s; the time stamps of samples must then increase. None: they are not looked at.
+            watch: when SATURATED and NOT_CONTRACTING are reported; None: after 1 s, and over 50 cycles.
+            bounded: whether an optimiser whose call may take any time is refused.
+
+        Raises:
+            InvalidProblem: an unknown name or a wrong interval in `plausible`.
+            NotSupported: an optimiser without a bound of its time.
+        """
+        ready = checked(problem, controller)
+        if bounded:
+            _refuse_unbounded(ready)
+        inner = compose_controller(problem, ready)
+        gate = Gate(problem, inner, plausible=plausible_range(problem, plausible), max_age=max_age)
+        composite = machine_step(problem, ready, gate, watch or Watch())
         backend = native(composite.function) if compiled else None
         self.compiled = bool(backend and backend.compiled)
         self.memory: Layout = composite.memory
         self.signals: Layout = composite.trace
-        self._evaluator = Evaluator(backend.function if backend else composite.function)
-        self._memory, self._time, self._state, self._realised, parameters = self._evaluator.arguments
-        self._memory_next, self._trace, self._command = self._evaluator.results
-        parameters[:] = controller.parameters(problem.plant)
-        self._evaluate = self._evaluator.evaluate
+        self.why_failed = ""
+        self._ages = max_age is not None
+        self._may_fail = composite.opaque  # scalar code cannot fail
+        self._bind(backend.function if backend else composite.function, ready.parameters(problem.plant))
 
     def start(self) -> np.ndarray:
         """Return the memory of the controller before its first cycle."""
         return self.memory.start()
 
     def step(
-        self, time: float, state: np.ndarray, realised: np.ndarray, memory: np.ndarray
+        self, time: float, state: np.ndarray, realised: np.ndarray, memory: np.ndarray, *, taken: float | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return (command, memory for the next cycle).
 
         Args:
             time: s.
             state: the measured state, shape (nx,).
-            realised: the measured response of the controlled coordinates to the last command; ignored in the first cycle.
+            realised: the measured response of the controlled coordinates to the last command; any finite value in the first cycle,
+                and for a controller that does not adapt.
             memory: from `start` or from the step before.
+            taken: time stamp of the sample, s; None: it was taken at `time`. Read with `max_age` only.
+
+        Raises:
+            InvalidShape: a wrong number of entries, named.
+            InvalidValue: an argument that is not made of numbers, or the memory of another controller.
+            ConcurrentUse: another thread is inside this stepper.
         """
-        self._time[0] = time
-        self._state[:] = state
-        self._realised[:] = realised
-        self._memory[:] = memory
-        self._evaluate()
-        return self._command.copy(), self._memory_next.copy()
+        # Taking the only token out of a list is atomic, and five times as fast as a lock.
+        try:
+            token = self._tokens.pop()
+        except IndexError:
+            _refuse_thread()
+        try:
+            try:
+                # A view takes arrays of float64 of its own shape and nothing else; numpy's assignment broadcasts, and is slower.
+                self._time[0] = time
+                self._state[:] = state
+                self._realised[:] = realised
+                self._memory[:] = memory
+            except (TypeError, ValueError, NotImplementedError):
+                self._accept(time, state, realised, memory)
+            if self._memory[0] != self._fingerprint:
+                self._inspect()
+            if self._ages:
+                self._taken[0] = one_number("taken", time if taken is None else taken)
+            if self._may_fail:
+                self._command[0] = _NOT_WRITTEN
+            try:
+                self._evaluate()
+            except RuntimeError as error:
+                return self._failed(str(error))
+            if self._may_fail and isnan(self._command[0]):
+                return self._failed("the compiled solver failed")
+            return self._new_command(), self._new_memory()
+        finally:
+            self._tokens.append(token)
 
     def trace(self) -> dict[str, np.ndarray]:
-        """Return every signal of the last step by name."""
-        return {name: value.copy() for name, value in self.signals.unpack(self._trace).items()}
+        """Return every signal of the last step by name.
+
+        In a skipped cycle 'command', 'status' and 'skipped' are those that hold; the others are those of the step that was dropped.
+
+        Raises:
+            ConcurrentUse: another thread is inside this stepper.
+        """
+        try:
+            token = self._tokens.pop()
+        except IndexError:
+            _refuse_thread()
+        try:
+            return {name: value.copy() for name, value in self.signals.unpack(self._trace).items()}
+        finally:
+            self._tokens.append(token)
+
+    def _bind(self, function: ca.Function, parameters: np.ndarray) -> None:
+        """Views of the arguments and results, once for all steps."""
+        self._tokens = [True]
+        self._evaluator = Evaluator(function)
+        self._evaluate = self._evaluator.evaluate
+        arguments = dict(zip(function.name_in(), self._evaluator.arguments, strict=True))
+        arguments["parameters"][:] = parameters
+        memory_next, self._trace, command = self._evaluator.results
+        self._new_command, self._new_memory = command.copy, memory_next.copy
+        self._memory, self._time, self._state, self._realised = (
+            _view(arguments[n]) for n in ("memory", "time", "state", "realised")
+        )
+        self._memory_array = arguments["memory"]
+        self._taken = _view(arguments["taken"]) if self._ages else self._time
+        self._command = _view(command)
+        self._fingerprint = float(self.memory[FINGERPRINT].start[0])
+
+    def _accept(self, time: object, state: object, realised: object, memory: object) -> None:
+        """Take arguments that are no arrays of float64, or say what is wrong with them."""
+        values = {
+            "state": (self._state, state),
+            "realised": (self._realised, realised),
+            "memory": (self._memory, memory),
+        }
+        checked_values = {name: numbers(name, value, len(view)) for name, (view, value) in values.items()}
+        self._time[0] = one_number("time", time)
+        for name, (view, _) in values.items():
+            view[:] = checked_values[name]
+
+    def _inspect(self) -> None:
+        """Raise for another controller's memory; a memory of NaN is a restart."""
+        number = self._memory[0]
+        if isnan(number):
+            return
+        raise InvalidValue(
+            "argument 'memory' is not this controller's: it comes from another controller, another problem, or other settings; "
+            "begin with start()"
+        )
+
+    def _failed(self, why: str) -> tuple[np.ndarray, np.ndarray]:
+        """The last command and the memory as it was, after a solver that raised or failed."""
+        self.why_failed = why
+        memory = np.where(np.isfinite(self._memory_array), self._memory_array, self.memory.start())
+        self._trace[self.signals.slice("status")] = int(Status.SOLVER_FAILED)
+        self._trace[self.signals.slice("command")] = memory[self.memory.slice(HELD)]
+        memory[self.memory.slice(f"{SKIPPED}_before")] += 1
+        self._trace[self.signals.slice(SKIPPED)] = memory[self.memory.slice(f"{SKIPPED}_before")]
+        return memory[self.memory.slice(HELD)].copy(), memory
+
+
+_NOT_WRITTEN = float("nan")  # the gate's command is finite: what is still NaN was not written
+
+
+def _view(array: np.ndarray) -> _View:
+    return cast(_View, memoryview(array.data))
+
+
+def _refuse_thread() -> NoReturn:
+    raise ConcurrentUse("this Stepper is in use by another thread: one stepper serves one thread, build one for each")
+
+
+def _refuse_unbounded(controller: Controller) -> None:
+    planner = controller.planner
+    why = planner.optimiser.unbounded if planner is not None else ""
+    if why:
+        raise NotSupported(f"{why}; Stepper(..., bounded=False) accepts it away from a machine")

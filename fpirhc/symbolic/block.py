@@ -141,8 +141,15 @@ def compose(
         ["memory_next", "trace", *outputs],
     )
     if not any(b.opaque for b in blocks):
-        function = _scalar_code(function)
+        function = scalar_code(function)
     return Composite(name, tuple(blocks), tuple(delays), reads, memory, trace, function)
+
+
+def scalar_code(function: ca.Function) -> ca.Function:
+    """Write all calls out as scalar expressions and compute common parts of blocks once."""
+    inputs = [ca.SX.sym(function.name_in(k), function.size1_in(k)) for k in range(function.n_in())]
+    shared = ca.cse([ca.SX(v) for v in function.call(inputs)])
+    return ca.Function(function.name(), inputs, shared, function.name_in(), function.name_out())
 
 
 def every(block: Block, cycles: int) -> Block:
@@ -210,13 +217,6 @@ def _call(block: Block, known: dict[str, ca.MX], next_memory: dict[str, ca.MX]) 
             raise InvalidName(f"block '{block.name}' writes '{name}', which is already written")
         known[name] = results[name]
     next_memory.update({m: results[f"{m}_next"] for m in block.memory.names})
-
-
-def _scalar_code(function: ca.Function) -> ca.Function:
-    """Write all calls out as scalar expressions and compute common parts of blocks once."""
-    inputs = [ca.SX.sym(function.name_in(k), function.size1_in(k)) for k in range(function.n_in())]
-    shared = ca.cse([ca.SX(v) for v in function.call(inputs)])
-    return ca.Function(function.name(), inputs, shared, function.name_in(), function.name_out())
 
 
 def _lookup(reader: str, signal: Signal, source: str, known: Mapping[str, ca.MX]) -> ca.MX:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-_SIGNATURE = "(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem)"
+SIGNATURE = "(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem)"
 _FUNCTION = re.compile(r"^/\*[^\n]*\*/\nstatic int (casadi_f\d+)\([^\n]*\{\n.*?^\}\n", re.MULTILINE | re.DOTALL)
 _CALL = re.compile(r"\bcasadi_f\d+\b")
 # Large leaves are compiled without much optimising; the loops around them never are. The loops use wider registers than the
@@ -49,8 +49,8 @@ class Driver:
         lines = [f"#define {name} {value}" for name, value in self.constants.items()]
         lines += [f"#define {name} fpirhc_leaf_{name}" for name in self.leaves]
         lines += [
-            f"#define WORK {max(f.sz_w() for f in renamed)}",
-            f"#define INTEGERS {max(f.sz_iw() for f in renamed)}",
+            f"#define WORK {max((f.sz_w() for f in renamed), default=0)}",
+            f"#define INTEGERS {max((f.sz_iw() for f in renamed), default=0)}",
         ]
         # The leaves belong to this file alone: the same names in other drivers must not meet in one library.
         generated = re.sub(r"^CASADI_SYMBOL_EXPORT ", "static ", generator.dump(), flags=re.MULTILINE)
@@ -77,7 +77,7 @@ def substitute(source: str) -> tuple[str, list[str]]:
         entry = f"{name}_driver"
         source, count = body.subn(rf"\1  return {entry}(arg, res, iw, w, mem);\n}}", source)
         if count:
-            declaration = f"int {entry}{_SIGNATURE};\n"
+            declaration = f"int {entry}{SIGNATURE};\n"
             source = source.replace(f"/* {name}:(", f"{declaration}/* {name}:(", 1)
             files.append(f"#define ENTRY {entry}\n{_drivers[name]}")
     return (_without_unused(source) if files else source), files

@@ -3,7 +3,7 @@
 The key of a library is a hash of the generated C, the compiler and its version, the flags, the machine and CasADi's version, so
 a library can never be another model's. It is compiled in a folder of its own, its checksum is stored, and both are renamed into
 place atomically: any number of processes may compile the same or different Functions at once. A library whose checksum does not
-fit is compiled again.
+fit is compiled again, and so is one that another user may have written (see `private_folder`).
 
 FPIRHC_CC names the compiler ('none' turns compilation off); FPIRHC_CACHE names the cache folder.
 A compiled Function has no derivatives: differentiate first, compile last.
@@ -30,6 +30,7 @@ import casadi as ca
 
 from fpirhc.errors import CompileError, NotSupported
 from fpirhc.symbolic.driver import substitute
+from fpirhc.symbolic.private_folder import BUILDING, private_folder, read_own
 
 # -ffp-contract=off: no fused multiply-add, so that C and the virtual machine round alike.
 # -z defs: a missing symbol must fail here and not end the process at the first call.
@@ -110,12 +111,15 @@ def generate(function: ca.Function) -> tuple[str, ...]:
 
 
 def cache_folder() -> Path:
-    """Folder of compiled libraries: FPIRHC_CACHE, or fpirhc in the user's cache; a temporary folder if that one is not writable."""
+    """Folder of compiled libraries: FPIRHC_CACHE, or fpirhc in the user's cache.
+
+    It is a temporary folder of this process where that one cannot be written, or belongs to another user.
+    """
     setting = os.environ.get("FPIRHC_CACHE")
     try:
         base = Path(setting) if setting else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fpirhc"
         base = base.absolute()  # a bare file name would be looked for in the system's library folders
-        base.mkdir(parents=True, exist_ok=True)
+        private_folder(base)
         with tempfile.TemporaryFile(dir=base):
             return base
     except (OSError, RuntimeError):  # RuntimeError: there is no home folder
@@ -203,15 +207,14 @@ def _checksum_file(path: Path) -> Path:
 
 def _is_intact(path: Path) -> bool:
     try:
-        expected = _checksum_file(path).read_text(encoding="ascii")
-        return hashlib.sha256(path.read_bytes()).hexdigest() == expected
-    except (OSError, UnicodeDecodeError):
+        return hashlib.sha256(read_own(path)).hexdigest().encode() == read_own(_checksum_file(path))
+    except OSError:
         return False
 
 
 def _compile(sources: Sequence[str], command: Sequence[str], path: Path) -> None:
     """Compile into a folder of its own beside the cache entry, then rename library and checksum into place."""
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix="building-", ignore_cleanup_errors=True) as work:
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=BUILDING, ignore_cleanup_errors=True) as work:
         library, checksum = (Path(work) / f for f in (f"model{_suffix()}", "model.sha256"))
         texts = [Path(work) / f"model{k or ''}.c" for k in range(len(sources))]
         for text, source in zip(texts, sources, strict=True):
@@ -221,6 +224,8 @@ def _compile(sources: Sequence[str], command: Sequence[str], path: Path) -> None
             message = _first_error(process.stderr.replace(work + os.sep, "")) or f"exit code {process.returncode}"
             raise CompileError(f"the C compiler '{command[0]}' failed: {message}")
         checksum.write_text(hashlib.sha256(library.read_bytes()).hexdigest(), encoding="ascii")
+        library.chmod(0o700)
+        checksum.chmod(0o600)
         library.replace(path)
         checksum.replace(_checksum_file(path))
 

@@ -94,7 +94,7 @@ class Metrics:
     @property
     def worst_status(self) -> str:
         """The worst status that occurred."""
-        return max((Status[name] for name in self.statuses), default=Status.OK).name
+        return max((Status[name] for name in self.statuses), default=Status.OK, key=lambda s: s.severity).name
 
     def __repr__(self) -> str:
         facts = (

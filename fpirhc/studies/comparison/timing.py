@@ -116,7 +116,7 @@ def measure_cycle(problem: Problem, controller: Controller, run: Run, *, compile
     cycles = min(run.cycles, REPLAYED)
     if cycles < 2:
         return None
-    stepper = Stepper(problem, controller, compiled=compiled)
+    stepper = Stepper(problem, controller, compiled=compiled, bounded=False)
     memory = stepper.start()
     taken = np.empty(cycles)
     times, states, realised = run.time[:cycles], run["state"][:cycles], run["realised"][:cycles]

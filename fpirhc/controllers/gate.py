@@ -1,0 +1,176 @@
+"""The gate in front of a controller: a bad sample is a skipped cycle.
+
+    sample fits:  the controller's step, unchanged
+    otherwise:    the last command again, and every memory as it was
+
+A sample fits when time, state and response are finite and inside their plausible range. The controller itself is only given samples
+that fit: in a skipped cycle it is given the last good one again, and its results are dropped. So no solver inside meets a number
+that is not finite. What is remembered is selected, never blended: a product with NaN would be NaN.
+
+Before the first good sample nothing has begun: the command is the one before the run, and the memory is that of the start. A memory
+that is not finite is forgotten, and the controller begins anew.
+
+The gate is built once, around the composed step. Loop, stepper, virtual machine and C have it alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.controllers.base import clip
+from fpirhc.status import Status
+from fpirhc.symbolic.block import Block, Composite
+from fpirhc.symbolic.expression import Signals, expression
+from fpirhc.symbolic.finite import FINITE, every_finite, finite
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.task.limits import Interval
+from fpirhc.task.problem import Problem
+
+HELD = "held_command"  # in the memory: the command that a skipped cycle repeats
+TAKEN = "taken"  # time stamp of a sample
+_SAMPLE = ("time", "state", "realised", TAKEN)
+_INNER = "controller_memory"
+
+
+@dataclass(frozen=True, eq=False)
+class Gate:
+    """The gate around a controller's step.
+
+    Args:
+        problem: that the step is composed for.
+        inner: the step of a controller, with the output 'command'.
+        trusted: what is always good and not checked, such as the 'time' of a simulated clock, or the 'memory' that a loop keeps.
+        plausible: intervals (lower, upper) by column of the sample, "state.q1" or "realised.q1"; every finite number fits where
+            there is none.
+        max_age: s; where given, the step also reads 'taken', the time stamp of the sample, which must be later than the last one's,
+            not later than the time, and not older than this. None: time stamps are not looked at.
+    """
+
+    problem: Problem
+    inner: Composite
+    trusted: Sequence[str] = ()
+    plausible: Mapping[str, Interval] = field(default_factory=dict)
+    max_age: float | None = None
+
+    @property
+    def reads(self) -> Layout:
+        """What the step reads: as the controller, and the time stamp of the sample where its age counts."""
+        return self.inner.reads if self.max_age is None else self.inner.reads + Layout((scalar(TAKEN, "s"),))
+
+    @property
+    def sample(self) -> Layout:
+        """The signals of one sample that are checked."""
+        return Layout(tuple(s for s in self.reads.signals if s.name in _SAMPLE and s.name not in self.trusted))
+
+    @property
+    def memory(self) -> Layout:
+        """The last command, the last good sample, and the controller's memory."""
+        plant = self.problem.plant
+        starts = {"state": tuple(float(v) for v in self.problem.start_state), TAKEN: (-FINITE,)}
+        first = self.problem.inputs_before
+        held = Signal(HELD, plant.input.elements, plant.input.units, tuple(float(v) for v in first))
+        good = [replace(s, name=f"good_{s.name}", start=starts.get(s.name, ())) for s in self.sample.signals]
+        return Layout((held, *good)) + self.controller_memory
+
+    @property
+    def controller_memory(self) -> Layout:
+        """The controller's memory; of a graph as one signal, because a graph copies every signal of a long memory one by one."""
+        memory = self.inner.memory
+        if not self.inner.opaque:
+            return memory
+        return Layout((Signal(_INNER, memory.columns, memory.units, tuple(float(v) for v in memory.start())),))
+
+    def named(self, memory: Layout) -> Layout:
+        """Return a layout with the controller's memory under the names of its signals, where it is one signal there."""
+        whole = {_INNER: self.inner.memory.signals}
+        return Layout(tuple(s for signal in memory.signals for s in whole.get(signal.name, (signal,))))
+
+    def block(self) -> Block:
+        """Return the step behind the gate as one block: (sample, parameters) -> the controller's trace."""
+        choose = self._switched if self.inner.opaque else self._selected
+        trace = self.inner.trace
+
+        entry = self._entry()
+
+        def step(s: Signals) -> dict[str, Expression]:
+            now = [getattr(s, n) for n in self.sample.names]
+            good = [getattr(s, f"good_{n}") for n in self.sample.names]
+            fits, held, seen_column = entry(ca.vertcat(*now), getattr(s, HELD), ca.vertcat(*good))
+            seen = self.sample.split(seen_column)
+            given = [seen.get(r, getattr(s, r)) for r in self.inner.reads.names]
+            memory = self.controller_memory.join({m: getattr(s, m) for m in self.controller_memory.names})
+            usable = expression(1.0) if "memory" in self.trusted else finite(memory, opaque=self.inner.opaque)
+            memory_next, shown, command = choose(fits, usable, memory, given, held)
+            values = trace.split(shown)
+            if "status" in trace:
+                status = ca.if_else(usable, values["status"], int(Status.RESTARTED))
+                values["status"] = ca.if_else(fits, status, int(Status.BAD_SAMPLE))
+            remembered = {**self.controller_memory.split(memory_next), HELD: command}
+            remembered |= {f"good_{n}": v for n, v in seen.items()}
+            return {**values, "command": command, **{f"{m}_next": v for m, v in remembered.items()}}
+
+        return Block("gate", self.reads, trace, step, self.memory, opaque=self.inner.opaque)
+
+    def _entry(self) -> ca.Function:
+        """Function (sample, held command, last good sample) -> (whether the sample fits, command to hold, sample to use).
+
+        It is scalar code: a graph would pass over these few numbers one operation after the other.
+        """
+        size, inputs = self.sample.size, self.problem.plant.input.size
+        sample, good, held = ca.SX.sym("sample", size), ca.SX.sym("good", size), ca.SX.sym("held", inputs)
+        fits = self._fits(sample, good)
+        command, last = held, good
+        if "memory" not in self.trusted:
+            names = (HELD, *(f"good_{n}" for n in self.sample.names))
+            start = ca.DM(np.concatenate([self.memory[n].start_vector() for n in names]))
+            both = ca.if_else(every_finite(ca.vertcat(held, good)), ca.vertcat(held, good), start)
+            command, last = clip(both[:inputs], *self.problem.limits.input_bounds(self.problem.plant)), both[inputs:]
+        results = [fits, command, ca.if_else(fits, sample, last)]
+        return ca.Function("fpirhc_gate_entry", [sample, held, good], [ca.densify(r) for r in results])
+
+    def _fits(self, sample: Expression, good: Expression) -> Expression:
+        """Whether every entry is finite and inside its interval; NaN is inside none."""
+        fits: Expression = ca.SX(1)
+        for k, column in enumerate(self.sample.columns):
+            lower, upper = np.clip(self.plausible.get(column, (-FINITE, FINITE)), -FINITE, FINITE)
+            inside = (
+                ca.fabs(sample[k]) <= upper if lower == -upper else ca.logic_and(sample[k] >= lower, sample[k] <= upper)
+            )
+            fits = ca.logic_and(fits, inside)
+        if self.max_age is None:
+            return fits
+        time, taken = (sample[self.sample.slice(n)] for n in ("time", TAKEN))
+        fresh = ca.logic_and(
+            taken > good[self.sample.slice(TAKEN)], ca.logic_and(taken <= time, time - taken <= self.max_age)
+        )
+        return ca.logic_and(fits, fresh)
+
+    def _selected(
+        self, fits: Expression, usable: Expression, memory: Expression, given: Sequence[Expression], held: Expression
+    ) -> tuple[Expression, Expression, Expression]:
+        """(memory, trace, command) of a step of scalar code: it is evaluated, and its results are selected."""
+        remembered = ca.if_else(usable, memory, ca.DM(self.inner.memory.start()))
+        memory_next, trace, command = self.inner.function(remembered, *given)
+        return ca.if_else(fits, memory_next, remembered), trace, ca.if_else(fits, command, held)
+
+    def _switched(
+        self, fits: Expression, usable: Expression, memory: Expression, given: Sequence[Expression], held: Expression
+    ) -> tuple[Expression, Expression, Expression]:
+        """The same of a graph: one of three branches is evaluated, so that a long memory is not selected entry by entry."""
+        step = self.inner.function
+        symbols = [ca.MX.sym(step.name_in(k), step.size1_in(k)) for k in range(step.n_in())]
+        last = ca.MX.sym("held", held.numel())
+        skip = (symbols[0], step(*symbols)[1], last)
+        run = step.call(symbols, True, False)
+        restart = step(ca.DM(self.inner.memory.start()), *symbols[1:])
+        skipped, running, restarted = (
+            ca.Function(f"fpirhc_gate_{name}", [*symbols, last], list(results))
+            for name, results in (("skip", skip), ("run", run), ("restart", restart))
+        )
+        choice = ca.Function.conditional("fpirhc_gate_choice", [skipped, running], restarted)
+        memory_next, trace, command = choice(ca.if_else(fits, 2 - usable, 0), memory, *given, held)
+        return memory_next, trace, command

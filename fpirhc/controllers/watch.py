@@ -1,0 +1,121 @@
+"""Statuses for what is wrong but finite: a command that stays at a limit, and an iteration that does not contract.
+
+    SATURATED         some command has been at a limit in every cycle for longer than a stated time
+    NOT_CONTRACTING   the measured factor |1 - a lambda| has been above 1.05 in every cycle of a window
+
+lambda is the slope of the response over the request, fitted to the last changes of both with exponential forgetting,
+
+    lambda = sum w^j dr.df / sum w^j dr.dr,      w = exp(-1 / window),
+
+and a is the effective gain of the map. Small changes have no slope: the mean square of dr must exceed (|r| / 1000)^2. The
+watch changes no command. It is for maps that compare the last request with its response, without dead time or estimators.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.controllers.contract import Controller
+from fpirhc.plant.plant import Plant
+from fpirhc.status import Status
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.finite import every_finite
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+from fpirhc.task.problem import Problem
+
+_DIVERGES = 1.05  # measured factor from which a cycle counts
+_FLOOR = 1e-18  # square of a change that is no change, in units of the response
+_SMALL = 1e-3  # change of the request, as a share of it, that has a slope
+
+
+def watch_block(problem: Problem, controller: Controller, status: str, *, longest: int, window: int) -> Block:
+    """Return the block (command, status, request, response) -> 'status'.
+
+    Args:
+        problem: of the controller.
+        controller: resolved.
+        status: name of the signal with the status so far.
+        longest: cycles at a limit, beyond which the status is SATURATED.
+        window: cycles of the fit, and of the factor above one.
+    """
+    plant, watched = problem.plant, _iterates(problem, controller)
+    pair = (plant.response_signal("deformed"), plant.response_signal("realised")) if watched else ()
+    own = _fit_memory(plant) if watched else ()
+    reads = Layout((scalar(status), plant.input, *pair))
+    gain = controller.deformation.effective_gain()
+    lower, upper = problem.limits.input_bounds(plant)
+
+    parts = Layout((scalar("watch_saturated"), *own))
+    # One signal, because a graph copies every signal by itself.
+    memory = Signal("watch", parts.columns)
+
+    def step(s: Signals) -> dict[str, Expression]:
+        before = getattr(s, status)
+        past = parts.split(ca.if_else(every_finite(s.watch), s.watch, 0))
+        at_limit = _any(
+            [s.command[k] <= v for k, v in enumerate(lower) if np.isfinite(v)]
+            + [s.command[k] >= v for k, v in enumerate(upper) if np.isfinite(v)]
+        )
+        now = {"watch_saturated": ca.if_else(at_limit, ca.fmin(past["watch_saturated"] + 1, longest + 1), 0)}
+        worse = ca.if_else(now["watch_saturated"] > longest + 0.5, int(Status.SATURATED), before)
+        if watched:
+            now |= _fit(past, s.deformed, s.realised, gain, window)
+            worse = ca.if_else(now["watch_growing"] > window - 0.5, int(Status.NOT_CONTRACTING), worse)
+        fine = before < int(Status.NOT_CONVERGED) + 0.5
+        counts = before != int(Status.BAD_SAMPLE)  # a skipped cycle is no evidence
+        remembered = ca.if_else(counts, parts.join(now), parts.join(past))
+        return {"status": ca.if_else(fine, worse, before), "watch_next": remembered}
+
+    return Block("watch", reads, Layout((scalar("status"),)), step, Layout((memory,)))
+
+
+def _iterates(problem: Problem, controller: Controller) -> bool:
+    """Whether the map compares the last request with its response, undelayed."""
+    deformation = controller.deformation
+    plain = deformation.mirror is None and deformation.pairing is None and not deformation.error_pole
+    direct = problem.response_delay == 0 and controller.response(problem) is None and controller.deforms_response
+    return deformation.adapts and plain and direct and deformation.effective_gain() != 0
+
+
+def _fit_memory(plant: Plant) -> tuple[Signal, ...]:
+    names = plant.controlled_names
+    requests = vector("watch_requests", [f"{n}@{k}" for k in (1, 2) for n in names])
+    return (
+        requests,
+        vector("watch_response", names),
+        vector("watch_sums", ("fr", "rr")),
+        *map(scalar, ("watch_cycles", "watch_growing")),
+    )
+
+
+def _fit(
+    past: Mapping[str, Expression], request: Expression, response: Expression, gain: float, window: int
+) -> dict[str, Expression]:
+    """The memory of the fit one cycle later."""
+    size, forget = request.numel(), math.exp(-1 / window)
+    last, older = past["watch_requests"][:size], past["watch_requests"][size:]
+    change, answer = last - older, response - past["watch_response"]
+    new = ca.if_else(past["watch_cycles"] > 2.5, ca.vertcat(ca.dot(change, answer), ca.dot(change, change)), 0)
+    sums = forget * past["watch_sums"] + new
+    enough = sums[1] > window * _SMALL**2 * ca.dot(last, last) + _FLOOR
+    factor = ca.fabs(1 - gain * sums[0] / ca.fmax(sums[1], _FLOOR))
+    growing = ca.if_else(ca.logic_and(enough, factor > _DIVERGES), ca.fmin(past["watch_growing"] + 1, window), 0)
+    return {
+        "watch_requests": ca.vertcat(request, last),
+        "watch_response": response,
+        "watch_sums": sums,
+        "watch_cycles": ca.fmin(past["watch_cycles"] + 1, 3),
+        "watch_growing": growing,
+    }
+
+
+def _any(conditions: list[Expression]) -> Expression | float:
+    result: Expression | float = 0.0
+    for condition in conditions:
+        result = ca.logic_or(result, condition)
+    return result

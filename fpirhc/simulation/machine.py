@@ -1,0 +1,93 @@
+"""A controller as it runs against a machine: behind its gate, with a fingerprint in its memory, and watched.
+
+fingerprint -> gate (controller) -> watch -> count of skipped cycles
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, replace
+
+import casadi as ca
+
+from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.gate import Gate
+from fpirhc.controllers.watch import watch_block
+from fpirhc.describe import describe
+from fpirhc.status import Status
+from fpirhc.symbolic.block import Block, Composite, compose
+from fpirhc.symbolic.expression import Signals, expression
+from fpirhc.symbolic.finite import FINITE
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.task.problem import Problem
+
+FINGERPRINT = "fingerprint"  # first entry of the memory
+SKIPPED = "skipped"  # number of skipped cycles since the start
+_STATUS = "_status_of_cycle"
+
+
+@dataclass(frozen=True)
+class Watch:
+    """How long something may be wrong before a cycle's status says so.
+
+    Args:
+        saturated_after: time at a limit, s.
+        window: cycles over which the contraction is measured.
+    """
+
+    saturated_after: float = 1.0
+    window: int = 50
+
+
+def machine_step(problem: Problem, controller: Controller, gate: Gate, watch: Watch) -> Composite:
+    """Return the step (memory, sample, parameters) -> (memory, trace, command).
+
+    Args:
+        problem: of the controller.
+        controller: resolved.
+        gate: around the controller's step.
+        watch: the limits of the watch.
+    """
+    block = _renamed(gate.block(), "status", _STATUS)
+    longest = round(watch.saturated_after / problem.period)
+    watched = watch_block(problem, controller, _STATUS, longest=longest, window=watch.window)
+    own = _identity_block(fingerprint(problem, controller, block.memory))
+    composite = compose("controller", gate.reads, [own, block, watched, _count_block()], outputs=("command",))
+    return replace(composite, memory=gate.named(composite.memory))
+
+
+def fingerprint(problem: Problem, controller: Controller, memory: Layout) -> float:
+    """Return a number that another controller, or the same one on another problem, does not have."""
+    facts = json.dumps([describe(problem), describe(controller), memory.columns], sort_keys=True, default=str)
+    return float(int.from_bytes(hashlib.sha256(facts.encode()).digest()[:6], "big") + 1)
+
+
+def _identity_block(number: float) -> Block:
+    memory = Layout((scalar(FINGERPRINT, start=number),))
+    return Block("identity", Layout(), Layout(), lambda _: {f"{FINGERPRINT}_next": number}, memory)
+
+
+def _count_block() -> Block:
+    """Block (status) -> number of skipped cycles; a count that is not finite begins anew."""
+    count = Signal(f"{SKIPPED}_before")
+
+    def step(s: Signals) -> dict[str, Expression]:
+        before = getattr(s, count.name)
+        safe = ca.if_else(ca.fabs(before) <= FINITE, before, 0)
+        total = safe + (s.status == int(Status.BAD_SAMPLE))
+        return {SKIPPED: total, f"{count.name}_next": total}
+
+    return Block("count", Layout((scalar("status"),)), Layout((scalar(SKIPPED),)), step, Layout((count,)))
+
+
+def _renamed(block: Block, name: str, other: str) -> Block:
+    """The block with one of its written signals under another name."""
+    writes = Layout(tuple(replace(s, name=other) if s.name == name else s for s in block.writes.signals))
+
+    def step(s: Signals) -> dict[str, Expression]:
+        values = dict(block.step(s))
+        values[other] = values.pop(name)
+        return {key: expression(value) for key, value in values.items()}
+
+    return replace(block, writes=writes, step=step)

@@ -1,0 +1,49 @@
+"""Arguments of a step that are no arrays of float64: lists, other types of numbers, and mistakes."""
+
+from __future__ import annotations
+
+from numbers import Real
+
+import numpy as np
+
+from fpirhc.errors import InvalidShape, InvalidValue
+
+
+def numbers(name: str, value: object, size: int) -> np.ndarray:
+    """Return `value` as float64, shape (size,).
+
+    Raises:
+        InvalidValue: text, truth values, None, complex numbers, or anything else that is not made of real numbers.
+        InvalidShape: a wrong number of entries, or a matrix.
+    """
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise InvalidValue(f"argument '{name}' is not made of numbers: {error}") from None
+    if array.dtype.kind == "O":
+        raise InvalidValue(f"argument '{name}' is not made of numbers, got {_short(value)}; expected {size} numbers")
+    if array.dtype.kind not in "fiu":
+        raise InvalidValue(
+            f"argument '{name}' must be made of real numbers, got {_short(value)} of type '{array.dtype}'"
+        )
+    if array.size != size or sum(n != 1 for n in array.shape) > 1 or array.ndim == 0:
+        raise InvalidShape(f"argument '{name}' has {size} entries (shape ({size},)), got shape {array.shape}")
+    return np.ascontiguousarray(array.ravel(), dtype=np.float64)
+
+
+def one_number(name: str, value: object) -> float:
+    """Return `value` as a float.
+
+    Raises:
+        InvalidValue: anything that is not one real number.
+    """
+    if isinstance(value, np.ndarray) and value.size == 1 and value.dtype.kind in "fiu":
+        return float(value.item())
+    if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
+        raise InvalidValue(f"argument '{name}' must be a number of seconds, got {_short(value)}")
+    return float(value)
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

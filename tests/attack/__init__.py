@@ -1,0 +1,1 @@
+"""Attacks on loops, files and processes: what a machine must survive."""

@@ -1,0 +1,73 @@
+"""Attacks on the cache of compiled libraries: flipped bits, and processes that are killed while they compile."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+_COMPILE = """
+import casadi as ca
+import numpy as np
+from fpirhc.symbolic.native import native
+x = ca.SX.sym("x", 3)
+function = ca.Function("fpirhc_attacked", [x], [ca.sin(x) * 1.25 + x**2])
+ready = native(function)
+assert ready.compiled, ready.reason
+value = np.array([0.5, 1.0, 2.0])
+assert np.array_equal(ready.function(value).full(), function(value).full())
+"""
+
+
+def flipped_bits(folder: Path, count: int, *, seed: int) -> int:
+    """Flip one bit at a time in a compiled library or its checksum; return how many flips go unnoticed."""
+    from fpirhc.symbolic import native as module
+
+    _compiled(folder)
+    library = next(p for p in folder.iterdir() if p.suffix in {".so", ".dylib", ".dll"})
+    generator, unnoticed = np.random.default_rng(seed), 0
+    for path in (library, library.with_suffix(".sha256")):
+        whole = path.read_bytes()
+        for place in generator.integers(0, 8 * len(whole), size=count // 2):
+            damaged = bytearray(whole)
+            damaged[place // 8] ^= 1 << (place % 8)
+            path.write_bytes(damaged)
+            unnoticed += module._is_intact(library)
+        path.write_bytes(whole)
+    assert module._is_intact(library), "the whole library is refused"
+    return unnoticed
+
+
+def killed_compilations(folder: Path, count: int, *, seed: int) -> int:
+    """Kill processes while they compile; return after how many kills the next process fails."""
+    _compiled(folder)  # how long one takes
+    begin = time.perf_counter()
+    _compiled(folder / "timed")
+    longest = time.perf_counter() - begin
+    generator, failed = np.random.default_rng(seed), 0
+    for k in range(count):
+        place = folder / str(k)
+        process = subprocess.Popen([sys.executable, "-c", _COMPILE], env=_environment(place), stderr=subprocess.DEVNULL)
+        try:
+            process.wait(timeout=longest * generator.uniform(0.3, 1.0))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        try:
+            _compiled(place)
+        except subprocess.SubprocessError:
+            failed += 1
+    return failed
+
+
+def _compiled(folder: Path) -> None:
+    command = [sys.executable, "-c", _COMPILE]
+    subprocess.run(command, env=_environment(folder), check=True, capture_output=True, timeout=120)
+
+
+def _environment(folder: Path) -> dict[str, str]:
+    return {**os.environ, "FPIRHC_CACHE": str(folder)}

@@ -1,0 +1,155 @@
+"""Drives a stepper and its plant through a fault, and says what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+import fpirhc as fp
+from attack.faults import Cycle, Fault
+from fpirhc.controllers.contract import Controller, checked
+from fpirhc.errors import FpirhcError
+from fpirhc.simulation.loop import _own_response
+from fpirhc.status import Status
+
+CYCLES, LATE = 80, 15  # cycles of a run, and of its end, in which a controller must act again
+SKIPPING = {Status.BAD_SAMPLE, Status.NON_FINITE, Status.SOLVER_FAILED, Status.RESTARTED}
+PROBLEMS = (
+    "two_mass",
+    "van_der_pol",
+    "cart_pole",
+    "delayed_mass",
+    "noisy_motor",
+    "two_link_arm",
+    "mass_spring_slots",
+    "delayed_tanks",
+    "three_link_arm",
+    "chain_of_masses",
+    "mrac_pendulum",
+)
+
+
+@dataclass
+class Outcome:
+    """What one fault did to one controller.
+
+    Args:
+        raw: an error that is none of fpirhc's; empty: there was none.
+        outside: number of commands that were not finite or outside the limits.
+        frozen: whether the controller still skipped its cycles, or held its command, at the end of the run.
+        differs: for a single bad sample, whether something differs from the tick left out.
+        statuses: that occurred.
+    """
+
+    raw: str = ""
+    outside: int = 0
+    frozen: bool = False
+    differs: bool = False
+    statuses: set[Status] = field(default_factory=set)
+
+    @property
+    def wrong(self) -> str:
+        """What a machine would suffer from; empty where nothing did."""
+        facts = {
+            self.raw: bool(self.raw),
+            f"{self.outside} commands outside": self.outside > 0,
+            "frozen": self.frozen,
+            "not equal to the tick left out": self.differs,
+        }
+        return "; ".join(text for text, true in facts.items() if true)
+
+
+class Bench:
+    """A controller on its plant, ready for any number of faults."""
+
+    def __init__(self, problem: fp.Problem, controller: Controller) -> None:
+        """Build stepper and plant in the virtual machine."""
+        self.problem, plant = problem, problem.plant
+        self.stepper = fp.Stepper(problem, controller, compiled=False)
+        self.limits = problem.limits.input_bounds(plant)
+        self._advance = problem.integrator.step(plant, problem.period)
+        response = checked(problem, controller).response(problem) or _own_response(plant)
+        self._response = response.function
+        self._calm = np.zeros(len(plant.names))
+        self.lost = False  # whether the plant itself left its domain, such as a tank below its bottom
+        self.clean = self._run(None)[0]
+
+    def outcome(self, fault: Fault) -> Outcome:
+        """Run the loop with the fault and judge it."""
+        result = Outcome()
+        try:
+            result.differs = fault.single and self._differs(fault)
+            commands, statuses = self._run(fault)
+        except FpirhcError as error:
+            result.raw = f"refused: {error}"
+            return result
+        except Exception as error:  # noqa: BLE001 -- every error that gets here is what is looked for
+            result.raw = f"{type(error).__name__}: {error}"
+            return result
+        lower, upper = self.limits
+        result.outside = int((~np.isfinite(commands) | (commands < lower) | (commands > upper)).any(axis=1).sum())
+        result.statuses = set(statuses)
+        late = range(CYCLES - LATE, CYCLES)
+        # A command at a limit stays there for good reason; one that is held between its limits does not move again.
+        still = bool((np.ptp(commands[-LATE:], axis=0) == 0).all()) and bool(
+            ((commands[-1] > lower) & (commands[-1] < upper)).any()
+        )
+        moves = np.ptp(self.clean[-LATE:], axis=0).max() > 0
+        skips = all(statuses[k] in SKIPPING for k in late)
+        result.frozen = not self.lost and fault.end < CYCLES - LATE and (skips or (still and moves))
+        return result
+
+    def _run(self, fault: Fault | None) -> tuple[np.ndarray, list[Status]]:
+        commands, statuses = [], []
+        past: list[tuple[np.ndarray, np.ndarray]] = []
+        plant, period = self.problem.plant, self.problem.period
+        memory, x = self.stepper.start(), np.array(self.problem.start_state)
+        u, exact = np.zeros(plant.input.size), np.array(plant.exact)
+        self.lost = False
+        for k in range(CYCLES):
+            active = fault is not None and fault.first <= k < fault.end
+            if active and fault is not None and exact.size:
+                exact = np.array(plant.exact) * np.where(np.arange(exact.size) == 0, fault.heavier, 1.0)
+            realised = np.asarray(self._response(x, u, exact, self._calm).full()).ravel()
+            cycle = Cycle(k, k * period, x.copy(), realised, memory, past)
+            if active and fault is not None and fault.sample is not None:
+                fault.sample(cycle)
+            past.append((x.copy(), realised))
+            command, memory = self.stepper.step(cycle.time, cycle.state, cycle.realised, cycle.memory)
+            commands.append(command)
+            statuses.append(Status(int(self.stepper.trace()["status"][0])))
+            u = command
+            if active and fault is not None and fault.actuator is not None:
+                u = fault.actuator(command, *self.limits)
+            x = np.asarray(self._advance(x, u, exact, self._calm).full()).ravel()
+            self.lost |= not np.isfinite(x).all()
+        return np.array(commands), statuses
+
+    def _differs(self, fault: Fault) -> bool:
+        """Whether later commands differ from those with the tick of the fault left out, for the same measurements."""
+        memories = [self.stepper.start()] * 2
+        x = np.array(self.problem.start_state)
+        generator = np.random.default_rng(0)
+        size = self.stepper.signals["desired"].size
+        for k in range(fault.first + 10):
+            state, realised = x + 1e-3 * generator.standard_normal(x.size), generator.standard_normal(size)
+            cycle = Cycle(k, k * self.problem.period, state, realised, memories[0], [])
+            if k == fault.first and fault.sample is not None:
+                fault.sample(cycle)
+            one, memories[0] = self.stepper.step(cycle.time, cycle.state, cycle.realised, cycle.memory)
+            if k == fault.first:
+                continue
+            other, memories[1] = self.stepper.step(k * self.problem.period, state, realised, memories[1])
+            if not np.array_equal(one, other):
+                return True
+        return False
+
+
+def shipped() -> Iterator[tuple[str, fp.Problem, Controller]]:
+    """Every shipped controller that a machine may run: 'problem/controller', the problem, the controller."""
+    for name in PROBLEMS:
+        task = fp.load_problem(name)
+        for label, controller in task.controllers.items():
+            yield f"{name}/{label}", task.problem, controller

@@ -1,0 +1,416 @@
+"""A controller against a machine: bad samples, misuse, threads, solvers that raise, and what is wrong but finite."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from plants import linear
+
+import fpirhc as fp
+from fpirhc.conformance.controller import two_masses
+from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.plausible import plausible_range
+from fpirhc.deformation.base import Deformation
+from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidProblem, InvalidShape, InvalidValue, NotSupported
+from fpirhc.simulation.machine import Watch
+from fpirhc.status import Status
+
+TRACK = fp.Exponential(rate=6.0)
+SHAPE = fp.Sigmoid(gain=-0.5, scale=50.0)
+CONTROLLERS: dict[str, Controller] = {
+    "computed torque": fp.ComputedTorque(TRACK, SHAPE),
+    "filtered": fp.ComputedTorque(TRACK, fp.Filtered(SHAPE, pole=0.5)),
+    "guarded": fp.ComputedTorque(TRACK, fp.Guarded(SHAPE, largest_deformation=1e6)),
+    "increment": fp.ComputedTorque(TRACK, fp.Increment(SHAPE, cycles=2)),
+    "plan": fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), SHAPE),
+    "predicted plan": fp.Predicted(fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), SHAPE), inputs=0.01),
+}
+BAD = {"state": np.nan, "realised": np.inf, "time": np.nan}
+PROBLEM = replace(two_masses(), duration=0.4)
+by_name = pytest.mark.parametrize("name", CONTROLLERS)
+
+
+@cache
+def case(name: str) -> tuple[fp.Stepper, fp.Run]:
+    """A stepper and a run whose measurements it is given."""
+    controller = CONTROLLERS[name]
+    return fp.Stepper(PROBLEM, controller, compiled=False), fp.simulate(PROBLEM, controller, seed=0, compiled=False)
+
+
+def sample(run: fp.Run, cycle: int, **bad: float) -> tuple[float, np.ndarray, np.ndarray]:
+    """Time, state and response of one cycle, the named ones multiplied by a bad number."""
+    time, state, realised = (bad.get(name, 1.0) for name in ("time", "state", "realised"))
+    return time * float(run.time[cycle]), state * run["state"][cycle], realised * run["realised"][cycle]
+
+
+def status(stepper: fp.Stepper) -> Status:
+    return Status(int(stepper.trace()["status"][0]))
+
+
+# Bad samples
+
+
+@by_name
+@pytest.mark.parametrize("what", BAD)
+def test_bad_sample_is_a_skipped_tick(name, what):
+    """The command of the tick is the last one, and afterwards everything is as if the tick had never been."""
+    stepper, run = case(name)
+    memory, commands = stepper.start(), []
+    for k in range(12):
+        command, memory = stepper.step(*sample(run, k), memory)
+    held, after = stepper.step(*sample(run, 12, **{what: BAD[what]}), memory)
+    assert status(stepper) == Status.BAD_SAMPLE
+    assert stepper.trace()["skipped"] == 1
+    assert np.array_equal(held, command)
+    changed = np.flatnonzero(after != memory)
+    assert [stepper.memory.columns[k] for k in changed] == ["skipped_before"]
+    for k in range(13, 25):
+        with_fault, after = stepper.step(*sample(run, k), after)
+        without, memory = stepper.step(*sample(run, k), memory)
+        commands.append(np.array_equal(with_fault, without))
+    assert all(commands)
+
+
+@by_name
+def test_controller_starts_at_the_first_good_sample(name):
+    """Five bad samples before it leave no trace but their count."""
+    stepper, run = case(name)
+    fresh = late = stepper.start()
+    for k in range(5):
+        held, late = stepper.step(*sample(run, k, state=np.nan), late)
+        assert np.isfinite(held).all()
+    for k in range(5, 20):
+        one, fresh = stepper.step(*sample(run, k), fresh)
+        other, late = stepper.step(*sample(run, k), late)
+        assert np.array_equal(one, other)
+
+
+@by_name
+def test_poisoned_memory_restarts_the_controller(name):
+    """From a memory of NaN the first good sample is the first cycle of a run; with a bad sample the start's command is held."""
+    stepper, run = case(name)
+    poisoned = np.full(stepper.memory.size, np.nan)
+    expected, begun = stepper.step(*sample(run, 3), stepper.start())
+    command, memory = stepper.step(*sample(run, 3), poisoned)
+    assert status(stepper) == Status.RESTARTED
+    assert np.array_equal(command, expected)
+    assert np.array_equal(memory, begun)
+    held, memory = stepper.step(*sample(run, 3, state=np.nan), poisoned)
+    assert np.isfinite(held).all()
+    command, memory = stepper.step(*sample(run, 3), memory)
+    assert np.array_equal(command, expected)
+
+
+@by_name
+def test_one_poisoned_number_restarts_the_controller(name):
+    """One NaN anywhere in the controller's memory, such as the plan counter, never stays."""
+    stepper, run = case(name)
+    memory = stepper.start()
+    for k in range(5):
+        _, memory = stepper.step(*sample(run, k), memory)
+    for place in range(1, memory.size):
+        poisoned = memory.copy()
+        poisoned[place] = np.nan
+        command, after = stepper.step(*sample(run, 5), poisoned)
+        assert np.isfinite(command).all()
+        assert np.isfinite(after).all(), stepper.memory.columns[place]
+
+
+@pytest.mark.parametrize("name", ["computed torque", "plan"])
+def test_compiled_gate_is_the_same(name):
+    """C and the virtual machine skip, hold and restart alike."""
+    virtual, run = case(name)
+    compiled = fp.Stepper(PROBLEM, CONTROLLERS[name])
+    memories = [virtual.start(), compiled.start()]
+    for k in range(20):
+        factor = np.nan if k in {0, 7, 8} else 1.0
+        memories = [np.full_like(m, np.nan) if k == 12 else m for m in memories]
+        (one, first), (other, second) = (
+            s.step(*sample(run, k, state=factor), m) for s, m in zip((virtual, compiled), memories, strict=True)
+        )
+        memories = [first, second]
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9, equal_nan=False)
+        assert status(virtual) == status(compiled)
+
+
+# Plausible samples and time stamps
+
+
+def test_implausible_sample_is_a_skipped_tick():
+    """An outlier far outside everything that the problem names is no measurement; a user's own range replaces the automatic one."""
+    stepper, run = case("plan")
+    command, memory = stepper.step(*sample(run, 0), stepper.start())
+    time, state, realised = sample(run, 1)
+    held, _ = stepper.step(time, state - np.array([30.0, 0, 0, 0]), realised, memory)
+    assert status(stepper) == Status.BAD_SAMPLE
+    assert np.array_equal(held, command)
+    wide = fp.Stepper(PROBLEM, CONTROLLERS["plan"], compiled=False, plausible={"a": (-1e3, 1e3)})
+    wide.step(time, state - np.array([30.0, 0, 0, 0]), realised, wide.start())
+    assert status(wide) != Status.BAD_SAMPLE
+
+
+@by_name
+def test_runs_stay_inside_the_plausible_range(name):
+    """No sample of an ordinary run is refused."""
+    _, run = case(name)
+    for column, (lower, upper) in plausible_range(PROBLEM).items():
+        values = run[column]
+        assert lower < values.min()
+        assert values.max() < upper
+
+
+def test_plausible_range_by_name():
+    """An unknown state and an interval that is none are refused by name."""
+    with pytest.raises(InvalidProblem, match=r"'aa' is unknown. Did you mean 'a'"):
+        plausible_range(PROBLEM, {"aa": (0.0, 1.0)})
+    with pytest.raises(InvalidProblem, match="needs lower < upper"):
+        plausible_range(PROBLEM, {"a": (1.0, 0.0)})
+
+
+@pytest.mark.parametrize(
+    ("taken", "fits"), [(0.0100, True), (0.0095, True), (0.002, False), (0.005, False), (0.02, False)]
+)
+def test_time_stamps(taken, fits):
+    """With max_age a sample must be newer than the last one, not from the future, and not too old."""
+    stepper = fp.Stepper(PROBLEM, CONTROLLERS["computed torque"], compiled=False, max_age=0.004)
+    _, run = case("computed torque")
+    _, memory = stepper.step(*sample(run, 1), stepper.start(), taken=0.005)
+    assert status(stepper) == Status.OK
+    stepper.step(*sample(run, 2), memory, taken=taken)
+    assert (status(stepper) == Status.OK) == fits
+
+
+# Misuse
+
+
+def misuses(memory: np.ndarray) -> dict[str, tuple[type[FpirhcError], str, tuple[Any, ...]]]:
+    """What a caller may get wrong: error, words of the message, arguments."""
+    x, r = np.zeros(4), np.zeros(2)
+    return {
+        "scalar state": (InvalidShape, "'state' has 4 entries", (0.0, 1.0, r, memory)),
+        "truth value": (InvalidValue, "'state' must be made of real numbers", (0.0, True, r, memory)),
+        "text": (InvalidValue, "'state' must be made of real numbers", (0.0, "5", r, memory)),
+        "no memory": (InvalidValue, "'memory' is not made of numbers", (0.0, x, r, None)),
+        "no response": (InvalidValue, "'realised' is not made of numbers", (0.0, x, None, memory)),
+        "short state": (InvalidShape, "'state' has 4 entries", (0.0, x[:3], r, memory)),
+        "matrix": (InvalidShape, "'state' has 4 entries", (0.0, x.reshape(2, 2), r, memory)),
+        "swapped": (InvalidShape, "'state' has 4 entries", (0.0, r, x, memory)),
+        "ragged": (InvalidValue, "'state' is not made of numbers", (0.0, [[1.0], [1.0, 2.0]], r, memory)),
+        "complex": (InvalidValue, "real numbers", (0.0, x + 0j, r, memory)),
+        "dictionary": (InvalidValue, "'state' is not made of numbers", (0.0, {"a": 1.0}, r, memory)),
+        "text as time": (InvalidValue, "'time' must be a number of seconds", ("0", x, r, memory)),
+        "no time": (InvalidValue, "'time' must be a number of seconds", (None, x, r, memory)),
+        "short memory": (InvalidShape, "'memory' has", (0.0, x, r, memory[:-1])),
+        "memory of another": (InvalidValue, "not this controller's", (0.0, x, r, memory + 1)),
+    }
+
+
+@pytest.mark.parametrize("which", misuses(np.zeros(9)))
+def test_misuse_is_refused_by_name(which):
+    """Nothing is broadcast and nothing is guessed."""
+    stepper, _ = case("computed torque")
+    error, words, arguments = misuses(stepper.start())[which]
+    with pytest.raises(error, match=words):
+        stepper.step(*arguments)
+
+
+def test_other_forms_of_numbers_are_taken():
+    """Lists, columns, strided views, integers and single precision mean what they say."""
+    stepper, _ = case("computed torque")
+    x, r, memory = np.array([0.5, -0.25, 1.0, 2.0]), np.array([1.0, -2.0]), stepper.start()
+    expected, _ = stepper.step(0.0, x, r, memory)
+    forms: list[tuple[Any, Any, Any]] = [
+        (list(x), list(r), list(memory)),
+        (x[:, None], r[None, :], memory),
+        (np.repeat(x, 2)[::2], r, memory),
+        (x.astype(np.float32), r.astype(int), memory),
+    ]
+    for form in forms:
+        assert np.array_equal(stepper.step(0, *form)[0], expected)
+
+
+def test_memory_of_the_same_size_of_another_controller_is_refused():
+    """Same layout, other gain: its memory means something else."""
+    stepper, _ = case("computed torque")
+    other = fp.Stepper(PROBLEM, fp.ComputedTorque(TRACK, replace(SHAPE, scale=40.0)), compiled=False)
+    assert other.memory.size == stepper.memory.size
+    with pytest.raises(InvalidValue, match="another controller"):
+        stepper.step(0.0, np.zeros(4), np.zeros(2), other.start())
+
+
+# Threads
+
+
+def test_second_thread_is_refused():
+    """The stepper is entered by another thread while it evaluates: that one is refused and the first finishes."""
+    stepper, _ = case("computed torque")
+    evaluate, raised = stepper._evaluate, []
+
+    def intrude() -> None:
+        for work in (lambda: stepper.step(0.0, np.zeros(4), np.zeros(2), stepper.start()), stepper.trace):
+            try:
+                work()
+            except ConcurrentUse as error:
+                raised.append(str(error))
+
+    def slow() -> object:
+        thread = threading.Thread(target=intrude)
+        thread.start()
+        thread.join()
+        return evaluate()
+
+    expected, _ = stepper.step(0.0, np.ones(4), np.zeros(2), stepper.start())
+    stepper._evaluate = slow
+    try:
+        command, _ = stepper.step(0.0, np.ones(4), np.zeros(2), stepper.start())
+    finally:
+        stepper._evaluate = evaluate
+    assert np.array_equal(command, expected)
+    assert len(raised) == 2
+    assert "one stepper serves one thread" in raised[0]
+    assert np.array_equal(stepper.step(0.0, np.ones(4), np.zeros(2), stepper.start())[0], expected)
+
+
+def test_one_stepper_per_thread():
+    """Four threads, each with a stepper of its own, have the commands of one thread."""
+    _, run = case("computed torque")
+    results: dict[int, list[bytes]] = {}
+
+    def work(number: int, stepper: fp.Stepper) -> None:
+        memory, commands = stepper.start(), []
+        for k in range(60):
+            command, memory = stepper.step(*sample(run, k), memory)
+            commands.append(command.tobytes())
+        results[number] = commands
+
+    steppers = [fp.Stepper(PROBLEM, CONTROLLERS["computed torque"], compiled=False) for _ in range(5)]
+    threads = [threading.Thread(target=work, args=(k, steppers[k])) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    work(4, steppers[4])
+    assert all(results[k] == results[4] for k in range(4))
+
+
+# Solvers
+
+
+def test_solver_that_raises_is_a_skipped_tick():
+    """The last command, the memory as it was, a status, and the solver's words."""
+    stepper, run = case("plan")
+    command, memory = stepper.step(*sample(run, 0), stepper.start())
+    evaluate = stepper._evaluate
+
+    def broken() -> object:
+        raise RuntimeError("OSQP failed")
+
+    stepper._evaluate = broken
+    try:
+        held, after = stepper.step(*sample(run, 1), memory)
+    finally:
+        stepper._evaluate = evaluate
+    assert np.array_equal(held, command)
+    assert status(stepper) == Status.SOLVER_FAILED
+    assert stepper.why_failed == "OSQP failed"
+    assert [stepper.memory.columns[k] for k in np.flatnonzero(after != memory)] == ["skipped_before"]
+    assert np.array_equal(stepper.step(*sample(run, 2), after)[0], stepper.step(*sample(run, 2), memory)[0])
+
+
+def test_failure_of_compiled_code_is_noticed():
+    """Compiled code cannot raise: its results are not written, and that is the failure flag."""
+    stepper, run = case("plan")
+    command, memory = stepper.step(*sample(run, 0), stepper.start())
+    evaluate = stepper._evaluate
+    stepper._evaluate = lambda: None
+    try:
+        held, _ = stepper.step(*sample(run, 1), memory)
+    finally:
+        stepper._evaluate = evaluate
+    assert np.array_equal(held, command)
+    assert status(stepper) == Status.SOLVER_FAILED
+
+
+@pytest.mark.parametrize(
+    ("optimiser", "words"),
+    [
+        (fp.Fatrop(), "fatrop has no time limit"),
+        (fp.Ipopt(), r"give Ipopt\(time_limit"),
+        (fp.SequentialQuadratic(quadratic=fp.Osqp()), r"give Osqp\(iterations"),
+        (fp.Ladder(fp.FixedPoint(iterations=1, tolerance=1e-3), fp.Fatrop()), "fatrop has no time limit"),
+    ],
+)
+def test_solver_without_a_bound_is_refused_on_a_machine(optimiser, words):
+    """By name, with a remedy; `bounded=False` accepts it."""
+    with pytest.raises(NotSupported, match=words):
+        fp.Stepper(PROBLEM, fp.RecedingHorizon(optimiser), compiled=False)
+    assert fp.Stepper(PROBLEM, fp.RecedingHorizon(optimiser), compiled=False, bounded=False).start().size
+
+
+@pytest.mark.parametrize(
+    "optimiser",
+    [fp.Ipopt(time_limit=10.0), fp.SequentialQuadratic(quadratic=fp.Osqp(iterations=2000)), fp.SequentialQuadratic()],
+)
+def test_solver_with_a_time_limit_runs(optimiser):
+    """The solver takes the option, and the first command is finite."""
+    stepper = fp.Stepper(PROBLEM, fp.RecedingHorizon(optimiser), compiled=False)
+    command, _ = stepper.step(0.0, PROBLEM.start_state, np.zeros(2), stepper.start())
+    assert status(stepper) <= Status.NOT_CONVERGED
+    assert np.isfinite(command).all()
+
+
+# Wrong but finite
+
+
+def driven(gain_of_plant: float, deformation: Deformation, *, cycles: int, stuck: bool = False) -> list[Status]:
+    """Statuses of computed torque on y'' = g u, believed to be y'' = u; a stuck actuator gives nothing."""
+    believed = abs(gain_of_plant)
+    problem = fp.Problem(
+        plant=linear(believed, 1.0),
+        reference=fp.Trajectory(lambda t: {"y": 1 + 0.2 * ca.sin(3 * t)}),
+        start={"y": 0.0},
+        period=1e-3,
+        duration=2.0,
+        limits=fp.Limits(inputs={"u": (-50.0, 50.0)}),
+    )
+    stepper = fp.Stepper(
+        problem, fp.ComputedTorque(TRACK, deformation), compiled=False, watch=Watch(saturated_after=0.2, window=50)
+    )
+    memory, x, u, found = stepper.start(), np.zeros(2), np.zeros(1), []
+    for k in range(cycles):
+        acting = 0.0 if stuck else gain_of_plant * float(u[0])
+        u, memory = stepper.step(k * 1e-3, x, np.array([acting]), memory)
+        found.append(status(stepper))
+        acting = 0.0 if stuck else gain_of_plant * float(u[0])
+        x = x + np.array([x[1] * 1e-3 + acting * 0.5e-6, acting * 1e-3])
+    return found
+
+
+def test_healthy_loop_is_ok_in_every_cycle():
+    """Neither a moving reference nor a wrong model is a fault."""
+    assert set(driven(0.8, fp.Affine(gain=-0.5), cycles=1500)) == {Status.OK}
+
+
+def test_flipped_sign_does_not_contract():
+    """With the opposite sign of the plant's gain the factor is 1 + a lambda; the status says so within two windows and a half."""
+    found = driven(-0.8, fp.Affine(gain=-0.5), cycles=200)
+    assert Status.NOT_CONTRACTING in found[:120]
+
+
+def test_stuck_actuator_saturates():
+    """Nothing moves, so the command goes to its limit and stays there."""
+    found = driven(0.8, fp.Affine(gain=-0.5), cycles=1500, stuck=True)
+    assert Status.SATURATED in found[:900]
+    assert found[0] == Status.OK
+
+
+def test_every_status_has_a_place_and_a_remedy():
+    """The order from best to worst names each once."""
+    assert sorted(s.severity for s in Status) == list(range(len(Status)))
+    assert all(s.remedy for s in Status)
