@@ -226,6 +226,7 @@ __all__ = [
     "Tuning",
     "Uncertain",
     "VelocityDifference",
+    "Watch",
     "accept",
     "assess_gain",
     "bless",
