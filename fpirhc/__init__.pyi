@@ -85,6 +85,7 @@ from .sensing import (
     VelocityDifference,
 )
 from .simulation.lyapunov_view import LyapunovView, lyapunov_view
+from .simulation.machine import Watch
 from .simulation.metrics import Metric, Metrics, measure
 from .simulation.pictures.base import Quantity
 from .simulation.pictures.over_time import OverTime
@@ -233,6 +234,7 @@ __all__ = [
     "Uncertain",
     "Uniform",
     "VelocityDifference",
+    "Watch",
     "accept",
     "assess_gain",
     "bless",

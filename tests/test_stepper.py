@@ -18,7 +18,6 @@ from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.plausible import plausible_range
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidProblem, InvalidShape, InvalidValue, NotSupported
-from fpirhc.simulation.machine import Watch
 from fpirhc.status import Status
 
 TRACK = fp.Exponential(rate=6.0)
@@ -153,6 +152,18 @@ def test_implausible_sample_is_a_skipped_tick():
     wide = fp.Stepper(PROBLEM, CONTROLLERS["plan"], compiled=False, plausible={"a": (-1e3, 1e3)})
     wide.step(time, state - np.array([30.0, 0, 0, 0]), realised, wide.start())
     assert status(wide) != Status.BAD_SAMPLE
+
+
+def test_lasting_implausible_sample_is_believed():
+    """Twenty in a row are no glitch: the plant is there, so the controller acts again; a sample far beyond is never believed."""
+    stepper, run = case("computed torque")
+    for size, expected in ((30.0, Status.OK), (1e155, Status.BAD_SAMPLE)):
+        _, memory = stepper.step(*sample(run, 0), stepper.start())
+        for k in range(25):
+            time, state, realised = sample(run, 1)
+            command, memory = stepper.step(time + k * 5e-3, state + np.array([size, 0, 0, 0]), realised, memory)
+            assert np.isfinite(command).all()
+            assert (status(stepper) == Status.BAD_SAMPLE) == (k < 20 or expected == Status.BAD_SAMPLE)
 
 
 @by_name
@@ -380,7 +391,7 @@ def driven(gain_of_plant: float, deformation: Deformation, *, cycles: int, stuck
         limits=fp.Limits(inputs={"u": (-50.0, 50.0)}),
     )
     stepper = fp.Stepper(
-        problem, fp.ComputedTorque(TRACK, deformation), compiled=False, watch=Watch(saturated_after=0.2, window=50)
+        problem, fp.ComputedTorque(TRACK, deformation), compiled=False, watch=fp.Watch(saturated_after=0.2, window=50)
     )
     memory, x, u, found = stepper.start(), np.zeros(2), np.zeros(1), []
     for k in range(cycles):

@@ -7,6 +7,9 @@ A sample fits when time, state and response are finite and inside their plausibl
 that fit: in a skipped cycle it is given the last good one again, and its results are dropped. So no solver inside meets a number
 that is not finite. What is remembered is selected, never blended: a product with NaN would be NaN.
 
+An implausible sample is doubted, not refused for ever: after 20 of them in a row the plant is where it should not be, and the
+controller is given what is measured, up to 100 times the range. What is not finite is never believed.
+
 Before the first good sample nothing has begun: the command is the one before the run, and the memory is that of the start. A memory
 that is not finite is forgotten, and the controller begins anew.
 
@@ -31,8 +34,11 @@ from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
 HELD = "held_command"  # in the memory: the command that a skipped cycle repeats
+DOUBTED = "doubted"  # in the memory: samples in a row that were finite but not plausible
 TAKEN = "taken"  # time stamp of a sample
 _SAMPLE = ("time", "state", "realised", TAKEN)
+_DOUBTED = 20  # samples in a row after which the plant, and not the sensor, is where it should not be
+_WIDER = 100.0  # factor of the range inside which such samples are believed
 _INNER = "controller_memory"
 
 
@@ -68,13 +74,14 @@ class Gate:
 
     @property
     def memory(self) -> Layout:
-        """The last command, the last good sample, and the controller's memory."""
+        """The last command, the last good sample, the count of doubted ones, and the controller's memory."""
         plant = self.problem.plant
         starts = {"state": tuple(float(v) for v in self.problem.start_state), TAKEN: (-FINITE,)}
         first = self.problem.inputs_before
         held = Signal(HELD, plant.input.elements, plant.input.units, tuple(float(v) for v in first))
         good = [replace(s, name=f"good_{s.name}", start=starts.get(s.name, ())) for s in self.sample.signals]
-        return Layout((held, *good)) + self.controller_memory
+        doubted = [scalar(DOUBTED)] if self.plausible else []
+        return Layout((held, *good, *doubted)) + self.controller_memory
 
     @property
     def controller_memory(self) -> Layout:
@@ -99,7 +106,8 @@ class Gate:
         def step(s: Signals) -> dict[str, Expression]:
             now = [getattr(s, n) for n in self.sample.names]
             good = [getattr(s, f"good_{n}") for n in self.sample.names]
-            fits, held, seen_column = entry(ca.vertcat(*now), getattr(s, HELD), ca.vertcat(*good))
+            before = getattr(s, DOUBTED) if self.plausible else expression(0.0)
+            fits, held, seen_column, doubted = entry(ca.vertcat(*now), getattr(s, HELD), ca.vertcat(*good), before)
             seen = self.sample.split(seen_column)
             given = [seen.get(r, getattr(s, r)) for r in self.inner.reads.names]
             memory = self.controller_memory.join({m: getattr(s, m) for m in self.controller_memory.names})
@@ -111,43 +119,58 @@ class Gate:
                 values["status"] = ca.if_else(fits, status, int(Status.BAD_SAMPLE))
             remembered = {**self.controller_memory.split(memory_next), HELD: command}
             remembered |= {f"good_{n}": v for n, v in seen.items()}
+            remembered |= {DOUBTED: doubted} if self.plausible else {}
             return {**values, "command": command, **{f"{m}_next": v for m, v in remembered.items()}}
 
         return Block("gate", self.reads, trace, step, self.memory, opaque=self.inner.opaque)
 
     def _entry(self) -> ca.Function:
-        """Function (sample, held command, last good sample) -> (whether the sample fits, command to hold, sample to use).
+        """Function (sample, held, last good sample, doubted) -> (whether the sample fits, held, sample to use, doubted).
 
         It is scalar code: a graph would pass over these few numbers one operation after the other.
         """
         size, inputs = self.sample.size, self.problem.plant.input.size
         sample, good, held = ca.SX.sym("sample", size), ca.SX.sym("good", size), ca.SX.sym("held", inputs)
-        fits = self._fits(sample, good)
-        command, last = held, good
+        doubted = ca.SX.sym("doubted")
+        command, last, count = held, good, doubted
         if "memory" not in self.trusted:
             names = (HELD, *(f"good_{n}" for n in self.sample.names))
-            start = ca.DM(np.concatenate([self.memory[n].start_vector() for n in names]))
-            both = ca.if_else(every_finite(ca.vertcat(held, good)), ca.vertcat(held, good), start)
-            command, last = clip(both[:inputs], *self.problem.limits.input_bounds(self.problem.plant)), both[inputs:]
-        results = [fits, command, ca.if_else(fits, sample, last)]
-        return ca.Function("fpirhc_gate_entry", [sample, held, good], [ca.densify(r) for r in results])
+            start = ca.DM([*np.concatenate([self.memory[n].start_vector() for n in names]), 0.0])
+            column = ca.vertcat(held, good, doubted)
+            column = ca.if_else(every_finite(column), column, start)
+            command = clip(column[:inputs], *self.problem.limits.input_bounds(self.problem.plant))
+            last, count = column[inputs:-1], column[-1]
+        possible, inside = self._possible(sample, last), self._inside(sample, 1.0)
+        believed = ca.logic_and(count > _DOUBTED - 0.5, self._inside(sample, _WIDER))
+        fits = ca.logic_and(possible, ca.logic_or(inside, believed))
+        strange = ca.logic_and(possible, ca.logic_not(inside))
+        count_next = ca.if_else(strange, ca.fmin(count + 1, _DOUBTED), ca.if_else(possible, 0, count))
+        results = [fits, command, ca.if_else(fits, sample, last), count_next]
+        return ca.Function("fpirhc_gate_entry", [sample, held, good, doubted], [ca.densify(r) for r in results])
 
-    def _fits(self, sample: Expression, good: Expression) -> Expression:
-        """Whether every entry is finite and inside its interval; NaN is inside none."""
-        fits: Expression = ca.SX(1)
-        for k, column in enumerate(self.sample.columns):
-            lower, upper = np.clip(self.plausible.get(column, (-FINITE, FINITE)), -FINITE, FINITE)
-            inside = (
-                ca.fabs(sample[k]) <= upper if lower == -upper else ca.logic_and(sample[k] >= lower, sample[k] <= upper)
-            )
-            fits = ca.logic_and(fits, inside)
+    def _possible(self, sample: Expression, good: Expression) -> Expression:
+        """Whether every entry is finite, and the time stamp is new."""
+        possible = every_finite(sample)
         if self.max_age is None:
-            return fits
+            return possible
         time, taken = (sample[self.sample.slice(n)] for n in ("time", TAKEN))
         fresh = ca.logic_and(
             taken > good[self.sample.slice(TAKEN)], ca.logic_and(taken <= time, time - taken <= self.max_age)
         )
-        return ca.logic_and(fits, fresh)
+        return ca.logic_and(possible, fresh)
+
+    def _inside(self, sample: Expression, wider: float) -> Expression:
+        """Whether every entry is inside its interval, made that many times wider; NaN is inside none."""
+        inside: Expression = ca.SX(1)
+        for k, column in enumerate(self.sample.columns):
+            lower, upper = self.plausible.get(column, (-np.inf, np.inf))
+            middle, half = (upper + lower) / 2, wider * (upper - lower) / 2
+            if np.isfinite(middle) and np.isfinite(half):
+                inside = ca.logic_and(inside, ca.fabs(sample[k] - middle) <= half)
+            else:  # half an interval is made no wider
+                inside = ca.logic_and(inside, sample[k] >= lower) if np.isfinite(lower) else inside
+                inside = ca.logic_and(inside, sample[k] <= upper) if np.isfinite(upper) else inside
+        return inside
 
     def _selected(
         self, fits: Expression, usable: Expression, memory: Expression, given: Sequence[Expression], held: Expression

@@ -14,6 +14,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.simulation.loop import _own_response
 from fpirhc.status import Status
 
+_GONE = 1e12  # size of a state that no plant comes back from
 CYCLES, LATE = 80, 15  # cycles of a run, and of its end, in which a controller must act again
 SKIPPING = {Status.BAD_SAMPLE, Status.NON_FINITE, Status.SOLVER_FAILED, Status.RESTARTED}
 PROBLEMS = (
@@ -124,7 +125,7 @@ class Bench:
             if active and fault is not None and fault.actuator is not None:
                 u = fault.actuator(command, *self.limits)
             x = np.asarray(self._advance(x, u, exact, self._calm).full()).ravel()
-            self.lost |= not np.isfinite(x).all()
+            self.lost |= not (np.abs(x) <= _GONE).all()
         return np.array(commands), statuses
 
     def _differs(self, fault: Fault) -> bool:
