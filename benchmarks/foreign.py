@@ -219,7 +219,9 @@ def body() -> Foreign:
         fp.CustomCost(
             terms=lambda v: {
                 "error": sum((10 * (v.state[k] - v.reference[k]) ** 2 for k in ("w1", "w2", "w3")), start=ca.SX(0)),
-                "effort": sum(0.01 * v.input[k] ** 2 + 0.01 * v.input[k] ** 4 for k in ("T1", "T2", "T3")),
+                "effort": sum(
+                    (0.01 * v.input[k] ** 2 + 0.01 * v.input[k] ** 4 for k in ("T1", "T2", "T3")), start=ca.SX(0)
+                ),
             },
             terminal=lambda v: sum(
                 (10 * (v.state[k] - v.reference[k]) ** 2 for k in ("w1", "w2", "w3")), start=ca.SX(0)

@@ -1,7 +1,7 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
 from .baselines.check import accept, bless, check_baseline
-from .conformance import check_controller, check_deformation, check_optimiser, check_plant, check_tracking
+from .conformance import check_controller, check_deformation, check_live, check_optimiser, check_plant, check_tracking
 from .contraction import assess_gain, check_gain, delayed_limit, response_jacobian, spectrum_over_box, spectrum_over_run
 from .controllers.computed_torque import ComputedTorque
 from .controllers.on_failure import Feedforward, HoldPlan, StopRun
@@ -93,7 +93,7 @@ from .simulation.pictures.portrait import Portrait
 from .simulation.pictures.raster import Raster
 from .simulation.run import Run
 from .simulation.run_file import load_run
-from .simulation.simulate import simulate
+from .simulation.simulate import simulate, simulator
 from .simulation.stepper import Stepper
 from .status import Status
 from .studies.comparison.compare import Comparison, compare
@@ -243,6 +243,7 @@ __all__ = [
     "check_controller",
     "check_deformation",
     "check_gain",
+    "check_live",
     "check_optimiser",
     "check_plant",
     "check_tracking",
@@ -264,6 +265,7 @@ __all__ = [
     "review",
     "signed_power",
     "simulate",
+    "simulator",
     "solve",
     "spectrum_over_box",
     "spectrum_over_run",

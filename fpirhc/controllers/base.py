@@ -12,10 +12,10 @@ A command that is not finite never reaches the plant: the last command is held, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 
 import casadi as ca
-import numpy as np
 
 from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
@@ -27,6 +27,7 @@ from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem
 
 
@@ -70,7 +71,15 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
         remembered = {f"{m}_next": v for m, v in composite.memory.split(next_memory).items()}
         return {**composite.trace.split(trace), **remembered}
 
-    return Block(name, Layout(reads), composite.trace, step, composite.memory, opaque=composite.opaque)
+    return Block(
+        name,
+        Layout(reads),
+        composite.trace,
+        step,
+        composite.memory,
+        opaque=composite.opaque,
+        derived=composite.derived_if_any,
+    )
 
 
 def reference_block(problem: Problem) -> Block:
@@ -182,7 +191,7 @@ def invert_block(plant: Plant) -> Block:
 
 def _limit_block(problem: Problem) -> Block:
     plant = problem.plant
-    lower, upper = problem.limits.input_bounds(plant)
+    lower, upper = problem.limits.input_ends(plant)
     meaning = _meaning(plant)
     reads = (
         like(plant.input, "command_unclipped"),
@@ -224,12 +233,12 @@ def _meaning(plant: Plant) -> ca.Function:
     return ca.Function("fpirhc_meaning", [x, u, unclipped, r, p], [ca.densify(meaning)])
 
 
-def clip(u: Expression, lower: np.ndarray, upper: np.ndarray) -> Expression:
+def clip(u: Expression, lower: Iterable[float], upper: Iterable[float]) -> Expression:
     """Return u clipped entry by entry; a side without a finite limit adds no operation."""
     entries = []
     for k, (low, high) in enumerate(zip(lower, upper, strict=True)):
-        entry = u[k] if np.isinf(low) else ca.fmax(u[k], low)
-        entries.append(entry if np.isinf(high) else ca.fmin(entry, high))
+        entry = u[k] if math.isinf(nominal(low)) else ca.fmax(u[k], low)
+        entries.append(entry if math.isinf(nominal(high)) else ca.fmin(entry, high))
     return ca.vertcat(*entries)
 
 

@@ -28,6 +28,7 @@ from fpirhc.optimisers.base import Optimiser
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Signal
+from fpirhc.symbolic.live import is_live, nominal
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -216,6 +217,10 @@ class Controller(Checked, ABC):
         if self.inner is not None:
             self.inner.check(self.inner_problem(problem))
 
+    def check_numbers(self, problem: Problem) -> None:
+        """Raise if other numbers of the settings cannot serve the problem; what they cannot change is checked already."""
+        self.check(problem)
+
 
 def resolved(problem: Problem, controller: Controller) -> Controller:
     """Return the controller with every automatic setting replaced by its value for this problem.
@@ -231,8 +236,15 @@ def resolved(problem: Problem, controller: Controller) -> Controller:
     return controller if demand is None else controller.with_deformation(deformation.suited(demand))
 
 
-def checked(problem: Problem, controller: Controller) -> Controller:
+def checked(problem: Problem, controller: Controller, *, numbers_only: bool = False) -> Controller:
     """Return the resolved controller, checked against the problem.
+
+    A controller with live numbers is checked with the numbers of the build, and returned as it is.
+
+    Args:
+        problem: the problem.
+        controller: the controller.
+        numbers_only: whether only numbers have changed since the last check, so that what is slow to build need not be built again.
 
     Raises:
         FpirhcError: the controller's own check fails.
@@ -240,8 +252,14 @@ def checked(problem: Problem, controller: Controller) -> Controller:
         NotSupported: a form of the deformation that cannot be used here; a response of the controller's own behind sensors or dead
             time.
     """
+    if not numbers_only and is_live(problem, controller):
+        checked(nominal(problem), nominal(controller))
+        return controller
     ready = resolved(problem, controller)
-    ready.check(problem)
+    if numbers_only:
+        ready.check_numbers(problem)
+    else:
+        ready.check(problem)
     check_form(problem, ready)
     if ready.response(problem) is None:
         check_gain_sign(problem, ready.deformation)

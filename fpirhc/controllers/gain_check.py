@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from fpirhc.contraction import Spectrum, assess_gain, delayed_limit, leaking_limit, linear_limit, spectrum_over_run
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotContractive
+from fpirhc.plant.plant import Plant
 from fpirhc.task.problem import Problem
 
 
@@ -29,11 +31,8 @@ def check_gain_sign(problem: Problem, deformation: Deformation) -> None:
     if gain == 0:
         return
     spectrum = _at_start(problem)
-    if spectrum is None:
-        return
-    report = assess_gain(deformation, spectrum)
-    if sum(report.linear_limit) * gain <= 0:
-        raise NotContractive(report.text)
+    if spectrum is not None and sum(linear_limit(spectrum.eigenvalues)) * gain <= 0:
+        raise NotContractive(assess_gain(deformation, spectrum).text)
 
 
 def check_response_delay(problem: Problem, deformation: Deformation) -> None:
@@ -141,9 +140,13 @@ def _too_late(problem: Problem, deformation: Deformation, form: _Form, limit: fl
 
 def _at_start(problem: Problem) -> Spectrum | None:
     """Eigenvalues of the response Jacobian at the start; None where the inverse response is singular there."""
-    plant = problem.plant
-    state = problem.start_state[None, :]
-    response = plant.controlled_response_function(problem.start_state, [0] * plant.input.size, plant.approximate)
+    return _spectrum(problem.plant, tuple(map(float, problem.start_state)))
+
+
+@lru_cache(maxsize=8)  # a search checks many gains at the same start
+def _spectrum(plant: Plant, start: tuple[float, ...]) -> Spectrum | None:
+    state = np.array(start)[None, :]
+    response = plant.controlled_response_function(state[0], [0] * plant.input.size, plant.approximate)
     try:
         return spectrum_over_run(plant, state, response.full().T)
     except InvalidValue:

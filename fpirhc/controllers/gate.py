@@ -26,7 +26,7 @@ import numpy as np
 
 from fpirhc.controllers.base import clip
 from fpirhc.status import Status
-from fpirhc.symbolic.block import Block, Composite
+from fpirhc.symbolic.block import Block, Composite, Derived, Values
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.finite import FINITE, every_finite, finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -122,7 +122,15 @@ class Gate:
             remembered |= {DOUBTED: doubted} if self.plausible else {}
             return {**values, "command": command, **{f"{m}_next": v for m, v in remembered.items()}}
 
-        return Block("gate", self.reads, trace, step, self.memory, opaque=self.inner.opaque)
+        derived = self._derived if self.inner.derived_if_any else None
+        return Block("gate", self.reads, trace, step, self.memory, opaque=self.inner.opaque, derived=derived)
+
+    def _derived(self, values: Values) -> Derived:
+        """What follows from live settings, with the controller's memory as this block has it."""
+        inner = self.inner.derived(values)
+        if not self.inner.opaque:
+            return inner
+        return replace(inner, memory=lambda: {_INNER: self.inner.memory.pack(inner.memory())})
 
     def _entry(self) -> ca.Function:
         """Function (sample, held, last good sample, doubted) -> (whether the sample fits, held, sample to use, doubted).

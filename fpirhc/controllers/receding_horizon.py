@@ -28,16 +28,19 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidProblem
 from fpirhc.horizon.cost import Cost
+from fpirhc.horizon.live_data import SCALE, STEEPEST, live_signals
 from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
-from fpirhc.symbolic.block import Block, Delay, every
+from fpirhc.symbolic.block import Block, Delay, Derived, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.live import DERIVED, PREFIX, is_live, live_numbers, nominal, settled
 from fpirhc.task.problem import Problem, cycles_per_stage
 
+_SCALE, _STEEPEST, _NUMBERS = (f"{PREFIX}{DERIVED}plan.{name}" for name in (SCALE, STEEPEST, "numbers"))
 _SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")
 
 
@@ -83,6 +86,16 @@ class RecedingHorizon(Controller):
             raise InvalidProblem("RecedingHorizon needs Problem(cost=...) or a cost of its own")
         self.optimiser.check(_optimal_control(self.planner.planned(problem)))
 
+    def check_numbers(self, problem: Problem) -> None:
+        """Raise if the weights of the cost are not valid; `derived` of the plan block checks the rest.
+
+        Raises:
+            InvalidProblem: a weight that is negative or not finite.
+        """
+        cost = self.cost or problem.cost
+        assert cost is not None
+        cost.check(problem.plant)
+
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, plan (every n-th cycle), nominal, deform, invert, limit, judge, running, command shift."""
         problem = self.planner.planned(problem)
@@ -121,18 +134,21 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     assert problem.horizon is not None
     assert problem.cost is not None
     plant, ocp = problem.plant, _optimal_control(problem)
-    data_of = stage_data(plant, problem.reference, problem.horizon, problem.cost)
-    memory = _first_memory(problem, optimiser, ocp, data_of)
-    solve = optimiser.step(ocp)
+    count = live_signals(ocp.settings, plant.input).size
+    data_of = stage_data(plant, problem.reference, problem.horizon, problem.cost, count)
+    start = nominal(problem)
+    memory = optimiser.memory(ocp).starting_at(_first_memory(start, optimiser, ocp, data_of))
+    solve = optimiser.step(ocp.opened())
     feedforward_of = _feedforward(problem)
+    low, high = problem.limits.input_ends(plant)
     logged = tuple(scalar(name) for name in optimiser.logged)
     writes = (like(plant.input, "planned"), Signal("solve", _SOLVE), scalar("_solve_status"), *logged)
 
     def step(s: Signals) -> dict[str, Value]:
-        data = data_of(s.time, s.parameters)
+        data = data_of(s.time, s.parameters, *_live_rows(problem, ocp, s))
         # The shift of the last cycle is added to the plan's inputs, so their rate counts from the last command without it.
         first = ocp.start(s._plan_state, s._command_before - s._command_shift_last)
-        lower, upper = ocp.input_lower - s._command_shift_last, ocp.input_upper - s._command_shift_last
+        lower, upper = _minus(low, s._command_shift_last), _minus(high, s._command_shift_last)
         before = graph(memory.join({m: getattr(s, m) for m in memory.names}))
         remembered = expression(ca.if_else(graph(s.plan_begun) > 0.5, optimiser.shifted(ocp, before), before))
         inputs, diagnostics, next_memory = solve(first, data, lower, upper, remembered)
@@ -151,21 +167,72 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
             **shown,
         }
 
+    def derived(values: Mapping[str, float]) -> Derived:
+        lower, upper = settled(problem.limits, values).input_bounds(plant)
+        ahead = replace(ocp.at(values), input_lower=lower, input_upper=upper)
+        optimiser.check(ahead)
+        signals = _derived_numbers(ahead) if ocp.settings else {}
+        return Derived(signals, lambda: optimiser.memory(ocp).unpack(_first_memory(start, optimiser, ahead, data_of)))
+
     own = memory + Layout((scalar("plan_begun"),))
-    return Block("plan", _plan_reads(plant), Layout(writes), step, own, opaque=True)
+    live = derived if is_live(problem) else None
+    return Block("plan", _plan_reads(plant, ocp), Layout(writes), step, own, opaque=True, derived=live)
 
 
-def _plan_reads(plant: Plant) -> Layout:
-    """Time, state from which the plan starts, parameters, and the command shift and command of the last cycle."""
+def _plan_reads(plant: Plant, ocp: OptimalControl) -> Layout:
+    """Time, state from which the plan starts, parameters, command shift and command of the last cycle, and derived numbers."""
     last = like(plant.input, "_command_shift_last"), like(plant.input, "_command_before")
-    return Layout((plant.time, like(plant.state, "_plan_state"), plant.parameter, *last))
+    return Layout((plant.time, like(plant.state, "_plan_state"), plant.parameter, *last, *_derived_signals(ocp)))
 
 
-def _first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> Layout:
-    """The optimiser's memory; it begins with the plan for the first horizon at the problem's start."""
+def _first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> np.ndarray:
+    """The optimiser's memory before the run: the plan for the first horizon at the problem's start."""
     first = np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel()
-    data = np.asarray(data_of(0.0, problem.plant.approximate).full())
-    return optimiser.memory(ocp).starting_at(optimiser.first_memory(ocp, first, data))
+    live = ocp.nodes[2][ocp.data.slice("settings").start :, 0] if ocp.settings else None
+    arguments = (0.0, problem.plant.approximate)
+    table = data_of(*arguments) if live is None else data_of(*arguments, live)
+    data = np.asarray(table.full())
+    return optimiser.first_memory(ocp, first, data)
+
+
+def _derived_signals(ocp: OptimalControl) -> tuple[Signal, ...]:
+    """Scale and largest eigenvalue of the horizon, which follow from live settings; nothing without any."""
+    if not ocp.settings:
+        return ()
+    starts = {name: tuple(map(float, values)) for name, values in _derived_numbers(ocp).items()}
+    elements = {_SCALE: ocp.input.elements, _STEEPEST: (), _NUMBERS: _computed(ocp)}
+    return tuple(Signal(name, elements[name], (), start) for name, start in starts.items())
+
+
+def _computed(ocp: OptimalControl) -> tuple[str, ...]:
+    """Paths of the numbers among the settings that the cost computes from the others."""
+    return tuple(path for path in ocp.settings if path.startswith(DERIVED))
+
+
+def _derived_numbers(ocp: OptimalControl) -> dict[str, np.ndarray]:
+    """Scale, largest eigenvalue, and the numbers that the cost computes, by signal."""
+    table = ocp.nodes[2][ocp.data.slice("settings"), 0]
+    computed = np.array([value for path, value in zip(ocp.settings, table, strict=True) if path.startswith(DERIVED)])
+    numbers = {_NUMBERS: computed} if computed.size else {}
+    return {_SCALE: ocp.scale, _STEEPEST: np.array([ocp.steepest]), **numbers}
+
+
+def _live_rows(problem: Problem, ocp: OptimalControl, s: Signals) -> list[Expression]:
+    """The live settings, and what follows from them, at the end of a stage's data; nothing without any."""
+    if not ocp.settings:
+        return []
+    numbers = {path: number.of(ca.MX) for path, number in live_numbers(problem.cost, problem.limits).items()}
+    if _computed(ocp):
+        numbers |= dict(zip(_computed(ocp), ca.vertsplit(getattr(s, _NUMBERS)), strict=True))
+    settings = (numbers[path] for path in ocp.settings)
+    return [expression(ca.vertcat(*settings, graph(getattr(s, _SCALE)), graph(getattr(s, _STEEPEST))))]
+
+
+def _minus(ends: Sequence[float], shift: Expression) -> Expression:
+    """Limits, which may be live, minus a column."""
+    if is_live(ends):
+        return ca.vertcat(*(end - shift[k] for k, end in enumerate(ends)))
+    return ca.DM(np.array(ends)) - shift
 
 
 def _feedforward(problem: Problem) -> ca.Function:

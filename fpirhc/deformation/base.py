@@ -240,7 +240,7 @@ def innermost(deformation: Deformation) -> Deformation:
 
 def smooth_norm(column: Expression, floor: float) -> Expression:
     """Return sqrt(|column|^2 + floor^2): the Euclidean norm, differentiable at zero and never zero."""
-    return ca.sqrt(ca.sumsqr(column) + floor**2)
+    return ca.sqrt(ca.sumsqr(column) + floor * floor)
 
 
 def require_numbers(owner: str, values: Mapping[str, float]) -> None:

@@ -72,6 +72,8 @@ def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: floa
     if pole is not None:
         return float(pole)
     error = default_uncertainty(max(every(cycles))) if uncertainty is None else uncertainty
+    if not error:
+        return 0.0
     return default_pole(min(max(1.0, abs(gain)), _LARGEST_PRODUCT), error)
 
 

@@ -71,7 +71,7 @@ class Rotation(Deformation):
         del memory
         squares = [ca.sumsqr(v) for v in (request, response, desired)]
         longest = ca.fmax(ca.fmax(squares[0], squares[1]), squares[2])
-        radius2 = ca.fmax(self.radius**2, _ROOM * longest)
+        radius2 = ca.fmax(self.radius * self.radius, _ROOM * longest)
         heights = [ca.sqrt(radius2 - square) for square in squares]
         radius = ca.sqrt(radius2)
         unit = (response / radius, heights[1] / radius)
@@ -86,7 +86,7 @@ class Rotation(Deformation):
 
     def effective_gain(self) -> float:
         """The effective gain a is the fraction."""
-        return float(self.fraction)
+        return self.fraction
 
     def secant_gain(self) -> float:
         """1.21 times the fraction: on vectors up to R / 2 the arc is at most that much longer than |f - d|."""

@@ -18,6 +18,7 @@ import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Demand, require_numbers, smooth_norm
 from fpirhc.errors import InvalidValue
+from fpirhc.symbolic.functions import atanh, signed, sqrt, tanh
 from fpirhc.symbolic.layout import Expression
 
 LARGEST_SHIFT = 5.0  # beyond it zeta'(x*) is below 2e-4: the map hardly moves and loses digits
@@ -85,19 +86,19 @@ class Sigmoid(Deformation):
     @cached_property
     def _tanh_fixed_point(self) -> float:
         """The root y = tanh(x*) of 2 t y^2 + y = t with t = tanh(D), in the form that has no 0/0 at D = 0."""
-        t = math.tanh(self.shift)
-        return 2 * t / (1 + math.sqrt(1 + 8 * t**2))
+        t = tanh(self.shift)
+        return 2 * t / (1 + sqrt(1 + 8 * (t * t)))
 
     @property
     def fixed_point(self) -> float:
         """x* = zeta(x*)."""
-        return math.atanh(self._tanh_fixed_point)
+        return atanh(self._tanh_fixed_point)
 
     @property
     def slope(self) -> float:
         """zeta'(x*), between 0 and 1/2."""
         y = self._tanh_fixed_point
-        return (1 - 4 * y**2) / (2 * (1 - y**2))
+        return (1 - 4 * (y * y)) / (2 * (1 - y * y))
 
     @cached_property
     def steepest_secant(self) -> float:
@@ -131,7 +132,7 @@ class Sigmoid(Deformation):
         size = smooth_norm(error, _FLOOR * scale)
         saturated = ca.tanh((self.gain / scale) * size)
         y = self._tanh_fixed_point
-        growth = ca.atanh(self.slope * saturated / (1 + 1.5 * y / (1 - y**2) * saturated))
+        growth = ca.atanh(self.slope * saturated / (1 + 1.5 * y / (1 - y * y) * saturated))
         return request + (scale * growth / size) * error, {}
 
     def effective_gain(self) -> float:
@@ -148,7 +149,7 @@ class Sigmoid(Deformation):
         Raises:
             InvalidValue: the scale is still to be chosen.
         """
-        return self._chosen_scale() * (math.atanh(0.5) - math.copysign(self.fixed_point, self.shift * self.gain))
+        return self._chosen_scale() * (math.atanh(0.5) - signed(self.fixed_point, self.shift * self.gain))
 
     def with_effective_gain(self, gain: float) -> Self:
         """Return the map with A_c = -a / zeta'(x*)."""

@@ -20,7 +20,9 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import total
+from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Named
+from fpirhc.symbolic.live import DERIVED, is_live, live_number, nominal
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +93,10 @@ class Cost(Checked, ABC):
     @abstractmethod
     def uses_feedforward(self) -> bool:
         """Whether a term needs the model's input along the reference."""
+
+    def derived(self, plant: Plant, linearise: Callable[[], Linearisation]) -> dict[str, float]:  # noqa: ARG002
+        """Return the numbers that Python computes from the weights, by name; they are data where weights are live."""
+        return {}
 
     @abstractmethod
     def check(self, plant: Plant) -> None:
@@ -199,9 +205,18 @@ class Quadratic(Cost):
             return step * _squares(self.states, view.state, view.reference)
         if isinstance(self.terminal, Mapping):
             return _squares(self.terminal, view.state, view.reference)
-        weight = self.terminal.weight(self, plant, linearise())
         error = view.state.vector[: plant.state.size] - view.reference.vector
-        return ca.bilin(ca.DM(weight), error, error)
+        entries = nominal(self).derived(plant, linearise)
+        live = is_live(self)
+        values = [live_number(name, value) if live else value for name, value in entries.items()]
+        return ca.bilin(ca.reshape(numbers(values), error.numel(), error.numel()), error, error)
+
+    def derived(self, plant: Plant, linearise: Callable[[], Linearisation]) -> dict[str, float]:
+        """Return the entries of P, column by column, where `terminal` computes it."""
+        if self.terminal is None or isinstance(self.terminal, Mapping):
+            return {}
+        weight = np.asarray(self.terminal.weight(self, plant, linearise()))
+        return {f"{DERIVED}terminal.{k}": float(entry) for k, entry in enumerate(weight.ravel(order="F"))}
 
 
 @dataclass(frozen=True)

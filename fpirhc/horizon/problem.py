@@ -9,8 +9,10 @@ theta_i are the data of stage i: its time, the reference, the feedforward and th
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -32,11 +34,13 @@ from fpirhc.horizon.constraint_states import (
     state_prices,
 )
 from fpirhc.horizon.cost import Cost, Linearisation, View
-from fpirhc.horizon.reference_expansion import ReferenceExpansion, expand_along, input_curvature
+from fpirhc.horizon.live_data import SCALE, STEEPEST, Withheld, live_signals, live_table, settings_in
+from fpirhc.horizon.reference_expansion import ReferenceExpansion, expand_along, input_curvature, steepest_curvature
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Expression, Layout, Named, Signal, scalar
+from fpirhc.symbolic.live import PREFIX, live_numbers, nominal, settled
 from fpirhc.task.limits import Limits
 from fpirhc.task.reference import Reference
 
@@ -111,6 +115,10 @@ class OptimalControl:
         along: quadratic model of the cost along the reference.
         written: number of the last entries of the state, which are limits of rates, paths and the end; they are zero in s_0.
         state_price: cost of a violation of a state's bounds per unit and node, shape (ns,); infinite where they are hard.
+        settings: paths of the live settings, whose numbers are among the data.
+        live_bounds: paths of the live limits of inputs, which are arguments of a call.
+        derive: function of the numbers of settings, by path, that returns the numbers that the cost computes from them.
+        functions: Functions that were built for it; problems that differ in numbers of settings only share them.
     """
 
     stages: int
@@ -132,6 +140,63 @@ class OptimalControl:
     along: ReferenceExpansion
     written: int
     state_price: np.ndarray
+    settings: tuple[str, ...] = ()
+    live_bounds: tuple[str, ...] = ()
+    derive: Callable[[Mapping[str, float]], dict[str, float]] | None = None
+    functions: dict[object, ca.Function] = field(default_factory=dict, repr=False)
+
+    @property
+    def scale(self) -> np.ndarray:
+        """D = 1 / (step c), shape (nu,): it turns a gradient into a move of the inputs."""
+        return 1 / (self.step * self.curvature)
+
+    @cached_property
+    def steepest(self) -> float:
+        """Largest eigenvalue of D V'' along the reference, with a margin."""
+        return steepest_curvature(self.along, self.scale)
+
+    def scale_in(self, data: ca.MX | None) -> ca.MX:
+        """D as an optimiser's expressions use it: numbers, or entries of the stages' data where settings are live.
+
+        Raises:
+            NotSupported: live settings, and the optimiser has no data at this place.
+        """
+        if not self.settings:
+            return cast(ca.MX, ca.DM(self.scale))
+        if data is None:
+            Withheld(self.settings).refuse()
+        return data[self.data.slice(SCALE), 0]
+
+    def opened(self) -> OptimalControl:
+        """Return the problem from which code is built: what follows from live settings or live limits has no number there."""
+        paths = (*self.settings, *self.live_bounds)
+        if not paths:
+            return self
+        nothing = cast(np.ndarray, Withheld(paths))
+        changed = replace(self, input_lower=nothing, input_upper=nothing) if self.live_bounds else self
+        if not self.settings:
+            return changed
+        nodes = cast(tuple[np.ndarray, np.ndarray, np.ndarray], nothing)
+        return replace(changed, curvature=nothing, nodes=nodes, along=cast(ReferenceExpansion, nothing))
+
+    def at(self, values: Mapping[str, float]) -> OptimalControl:
+        """Return the same problem for other numbers of its settings, by path: the expansion along the reference follows them.
+
+        The bounds of inputs stay as they are: a call of an optimiser has its own.
+        """
+        if not self.settings:
+            return self
+        if self.derive is not None:
+            values = {**values, **self.derive(values)}
+        states, inputs, table = self.nodes
+        numbers = np.array([values[path] for path in self.settings])
+        table = table.copy()
+        table[self.data.slice("settings")] = numbers[:, None]
+        nodes = states, inputs, table
+        along = expand_along(self.dynamics, self.stage_cost, self.terminal_cost, nodes, self.functions)
+        changed = replace(self, nodes=nodes, along=along, curvature=input_curvature(along, self.step))
+        table[self.data.slice(SCALE)], table[self.data.slice(STEEPEST)] = changed.scale[:, None], changed.steepest
+        return changed
 
     @property
     def hard(self) -> np.ndarray:
@@ -177,23 +242,36 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
     Raises:
         InvalidProblem: mistakes in the cost or the limits, or a cost that is not finite at the reference (the term is named).
     """
-    cost.check(plant)
+    nominal(cost).check(plant)
     limits.check(plant)
     _check_names(plant, horizon, limits)
     stage = _stage_expressions(plant, reference, horizon, cost, limits)
     binding, free = stage.binding, stage.before.numel()
     dynamics, stage_cost, terminal_cost = _stage_functions(stage, horizon.step)
     nodes = _nodes(plant, reference, horizon, cost, (free, len(binding)))
+    settings = tuple(s.name().removeprefix(PREFIX) for s in stage.settings)
+    values = {path: number.value for path, number in live_numbers(cost, limits).items()}
+
+    def derive(numbers: Mapping[str, float]) -> dict[str, float]:
+        advance = _advance(plant, horizon)
+        return settled(cost, numbers).derived(plant, lambda: _linearise(plant, reference, horizon, advance))
+
+    values |= derive(values) if settings else {}
+    if settings:
+        # The scale and the largest eigenvalue follow from the expansion; until `at` they are ones.
+        ones, numbers = np.ones(plant.input.size), np.array([values[path] for path in settings])
+        nodes = (*nodes[:2], live_table(nodes[2], numbers, ones, 1.0))
     _check_finite(tuple(stage.terms), stage_cost, terminal_cost, nodes, cost)
-    along = expand_along(dynamics, stage_cost, terminal_cost, nodes)
+    functions: dict[object, ca.Function] = {}
+    along = expand_along(dynamics, stage_cost, terminal_cost, nodes, functions)
     lower, upper = hard_state_bounds(limits, plant, horizon.margins)
     state = _stage_state(plant, bool(free), binding)
-    return OptimalControl(
+    ocp = OptimalControl(
         stages=horizon.stages,
         step=horizon.step,
         state=state,
         input=plant.input,
-        data=data_layout(plant, horizon),
+        data=data_layout(plant, horizon) + live_signals(settings, plant.input),
         dynamics=dynamics,
         stage_cost=stage_cost,
         terminal_cost=terminal_cost,
@@ -201,18 +279,26 @@ def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
         start=_start(plant, free, len(binding)),
         state_lower=np.concatenate([lower, np.full(free, -np.inf), [w.lower for w in binding]]),
         state_upper=np.concatenate([upper, np.full(free, np.inf), [w.upper for w in binding]]),
-        input_lower=limits.input_bounds(plant)[0],
-        input_upper=limits.input_bounds(plant)[1],
+        input_lower=nominal(limits).input_bounds(plant)[0],
+        input_upper=nominal(limits).input_bounds(plant)[1],
         curvature=input_curvature(along, horizon.step),
         nodes=nodes,
         along=along,
         written=len(binding),
         state_price=state_prices(limits, state, plant, horizon.step),
+        settings=settings,
+        live_bounds=tuple(live_numbers(limits.inputs)),
+        derive=derive,
+        functions=functions,
     )
+    return ocp.at(values)
 
 
-def stage_data(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost) -> ca.Function:
-    """Function (time, parameters) -> data of all stages, shape (ntheta, N + 1)."""
+def stage_data(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, live: int = 0) -> ca.Function:
+    """Function (time, parameters) -> data of all stages, shape (ntheta, N + 1).
+
+    With `live` rows of settings and what follows from them, (time, parameters, these rows) -> data that end with them.
+    """
     matrix = kind(reference.opaque or plant.inverse_opaque)
     t, p = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
     state, response = reference.function(plant)(t)
@@ -220,29 +306,40 @@ def stage_data(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost)
         needed = plant.inverse_function(state, response[list(plant.controlled_indices)], p)
     else:
         needed = matrix.zeros(plant.input.size)
-    one = ca.Function("fpirhc_stage_data", [t, p], [ca.densify(ca.vertcat(t, state, needed, p))])
+    # The live rows come out of the same call where they follow these rows: joining tables would copy both.
+    joined = bool(live) and not (horizon.blocks or horizon.terminal or horizon.margins)
+    rows = [matrix.sym("live", live)] if joined else []
+    one = ca.Function("fpirhc_stage_data", [t, p, *rows], [ca.densify(ca.vertcat(t, state, needed, p, *rows))])
     start, parameters = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
+    settings = [ca.MX.sym("live", live)] if live else []
     nodes = horizon.stages + 1
     times = start + ca.DM(np.arange(nodes) * horizon.step).T
-    table = one.map(nodes)(times, ca.repmat(parameters, 1, nodes))
+    repeated = [ca.repmat(v, 1, nodes) for v in (parameters, *(settings if joined else ()))]
+    table = one.map(nodes)(times, *repeated)
     if horizon.blocks:
         free = np.zeros((1, nodes))
         free[0, [0, *np.cumsum(horizon.blocks)]] = 1.0
         table = ca.vertcat(table, free)
     if horizon.margins:
-        rows = np.array([[*horizon.margins[e], 0.0] for e in horizon.margins], dtype=float)
-        table = ca.vertcat(table, rows)
+        margins = np.array([[*horizon.margins[e], 0.0] for e in horizon.margins], dtype=float)
+        table = ca.vertcat(table, margins)
     if horizon.terminal:
         last, after = np.zeros((1, nodes)), [*range(1, nodes), nodes - 1]
         last[0, nodes - 2] = 1.0
         targets = table[data_layout(plant, horizon).slice("reference"), :][:, after]
         table = ca.vertcat(table, last, targets)
-    return ca.Function("fpirhc_horizon_data", [start, parameters], [table], ["t", "p"], ["data"])
+    if live and not joined:
+        table = ca.vertcat(table, ca.repmat(settings[0], 1, nodes))
+    names = ["t", "p", *(["live"] if live else [])]
+    return ca.Function("fpirhc_horizon_data", [start, parameters, *settings], [table], names, ["data"])
 
 
 @dataclass(frozen=True, eq=False)
 class _Stage:
-    """Symbols x, before, u, theta of one stage, and its expressions; `before` is empty unless the input is part of the state."""
+    """Symbols x, before, u, theta of one stage, and its expressions; `before` is empty unless the input is part of the state.
+
+    theta ends with the symbols of live `settings` and of what follows from them (see `live_data`).
+    """
 
     x: Expression
     before: Expression
@@ -253,6 +350,7 @@ class _Stage:
     terms: dict[str, Expression]
     final: Expression
     binding: list[ConstraintState]
+    settings: list[ca.SX]
 
 
 def _stage_expressions(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits) -> _Stage:
@@ -277,7 +375,12 @@ def _stage_expressions(plant: Plant, reference: Reference, horizon: Horizon, cos
         final = _scalar_terms({"terminal": terminal})["terminal"] + horizon.step * end
     except InvalidName as error:
         raise InvalidProblem(f"cost: {error}") from None
-    return _Stage(x, before, u, applied, theta, x_next, terms, final, hard(written, soft_names(limits, plant)))
+    binding = hard(written, soft_names(limits, plant))
+    settings = settings_in([x_next, *terms.values(), final, *(w.expression for w in binding)], theta)
+    if settings:
+        live = live_signals(tuple(s.name() for s in settings), plant.input)
+        theta = ca.vertcat(theta, *settings, ca.SX.sym("live", live.size - len(settings)))
+    return _Stage(x, before, u, applied, theta, x_next, terms, final, binding, settings)
 
 
 def _stage_functions(stage: _Stage, step: float) -> tuple[ca.Function, ca.Function, ca.Function]:

@@ -78,6 +78,7 @@ def expand_along(
     stage_cost: ca.Function,
     terminal_cost: ca.Function,
     nodes: tuple[np.ndarray, np.ndarray, np.ndarray],
+    functions: dict[object, ca.Function] | None = None,
 ) -> ReferenceExpansion:
     """Return the quadratic model along a trajectory.
 
@@ -86,14 +87,18 @@ def expand_along(
         stage_cost: (s, u, theta) -> (l, terms).
         terminal_cost: (s, theta) -> T.
         nodes: states (ns, N + 1), inputs (nu, N) and data (ntheta, N + 1).
+        functions: keeps the Functions of derivatives for the next call; None: they are built.
     """
+    functions = {} if functions is None else functions
+    if "linearised" not in functions:
+        functions |= {"linearised": _linearised(dynamics, stage_cost), "final": _final(terminal_cost)}
     states, inputs, data = nodes
     stages = inputs.shape[1]
-    linearised = _linearised(dynamics, stage_cost)
+    linearised = functions["linearised"]
     derivatives = [
         [np.asarray(v.full()) for v in linearised(states[:, i], inputs[:, i], data[:, i])] for i in range(stages)
     ]
-    final = np.asarray(_final(terminal_cost)(states[:, stages], data[:, stages]).full())
+    final = np.asarray(functions["final"](states[:, stages], data[:, stages]).full())
     a, b, q, s, r = (np.array([stage[k] for stage in derivatives]) for k in range(5))
     return ReferenceExpansion(a, b, q, s, r, final)
 

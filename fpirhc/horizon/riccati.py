@@ -19,6 +19,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
+from fpirhc.errors import NotSupported
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.symbolic.expression import kind
 
@@ -62,7 +63,7 @@ def _stage(ocp: OptimalControl, damping: float) -> ca.Function:
     q, s, r = sym("Q", ns, ns), sym("S", nu, ns), sym("R", nu, nu)
     u, lower, upper = sym("u", nu), sym("lower", nu), sym("upper", nu)
     value_a = ca.mtimes(value, a)
-    damped = r + ca.mtimes(b.T, ca.mtimes(value, b)) + ca.DM(np.diag(damping * ocp.step * ocp.curvature))
+    damped = r + ca.mtimes(b.T, ca.mtimes(value, b)) + _damping(ocp, damping)
     coupled = s + ca.mtimes(b.T, value_a)
     input_slope = by_input + ca.mtimes(b.T, slope)
     move, gain = box_policy(nu, ns)(input_slope, damped, coupled, lower - u, upper - u)
@@ -71,6 +72,19 @@ def _stage(ocp: OptimalControl, damping: float) -> ca.Function:
     next_slope += ca.mtimes(gain.T, input_slope + ca.mtimes(damped, move))
     arguments = [value, slope, a, b, by_state, by_input, q, s, r, u, lower, upper]
     return ca.Function("fpirhc_riccati_stage", arguments, [0.5 * (next_value + next_value.T), next_slope, move, gain])
+
+
+def _damping(ocp: OptimalControl, damping: float) -> ca.DM:
+    """What the damping adds to the curvature of the inputs.
+
+    Raises:
+        NotSupported: a damping with live settings, whose curvature is no number of the code.
+    """
+    if damping and ocp.settings:
+        names = ", ".join(f"'{path}'" for path in ocp.settings)
+        raise NotSupported(f"settings {names} cannot be live with a damped optimiser; use FixedPoint(damping=0)")
+    curvature = np.zeros(ocp.input.size) if ocp.settings else ocp.curvature
+    return ca.DM(np.diag(float(damping) * ocp.step * curvature))
 
 
 def box_policy(nu: int, ns: int) -> ca.Function:

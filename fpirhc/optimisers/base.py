@@ -129,9 +129,11 @@ def largest(value: ca.MX) -> ca.MX:
     return ca.norm_inf(ca.vec(value))
 
 
-def stationarity(ocp: OptimalControl, inputs: ca.MX, gradient: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
-    """Return the projected residual of a plan (see the module's docstring)."""
-    scale = ca.repmat(ca.DM(1 / (ocp.step * ocp.curvature)), 1, ocp.stages)
+def stationarity(
+    ocp: OptimalControl, inputs: ca.MX, gradient: ca.MX, lower: ca.MX, upper: ca.MX, data: ca.MX | None = None
+) -> ca.MX:
+    """Return the projected residual of a plan (see the module's docstring); live settings need the stages' data."""
+    scale = ca.repmat(ocp.scale_in(data), 1, ocp.stages)
     return largest(inputs - clip(inputs - scale * gradient, lower, upper))
 
 
@@ -159,7 +161,7 @@ def judge(ocp: OptimalControl) -> ca.Function:
     if ocp.bounds_states:
         valid = _valid_multipliers(ocp, rollout(ocp)(s0, inputs, data)[0], multipliers)
     value, slope, states, _ = reduced_gradient(ocp)(s0, inputs, data, valid)
-    results = [value, stationarity(ocp, inputs, slope, lower, upper), state_violation(ocp, states)]
+    results = [value, stationarity(ocp, inputs, slope, lower, upper, data), state_violation(ocp, states)]
     return ca.Function("fpirhc_judge", [inputs, s0, data, lower, upper, multipliers], results)
 
 

@@ -15,11 +15,19 @@ typedef struct {
   casadi_real v[N * NU], k[N * NU * NS], t[N * NU], planned[N * NS];
   casadi_real a[N * NS * NS], b[N * NS * NU], ls[N * NS], lu[N * NU], lambda[(N + 1) * NS], final[NS * NS];
   casadi_real envelope, reach, tau, gamma, resume;
+#ifdef SCALE_AT
+  casadi_real metric[NU], first_gamma; /* settings are live: the scale and the first gamma are data of the call */
+#endif
   casadi_real w[WORK + 1];
   casadi_int iw[INTEGERS + 1];
 } Search;
 
+#ifdef SCALE_AT
+#define scale (s->metric)
+#define FIRST_GAMMA (s->first_gamma)
+#else
 static const casadi_real scale[NU] = SCALE;
+#endif
 
 /* Roll out the next plan, expanded, with its cost and gradient; 0 when something is not finite. */
 INLINE int try_next(Search* s, const Plan* best, Plan* plan, In s0, In data, In lower, In upper) {
@@ -235,9 +243,10 @@ INLINE int direct(Search* s, const Plan* plan, In data, In lower, In upper) {
 }
 
 /* max |U - clip(U - D g)| */
-INLINE casadi_real residual(const Plan* plan, In lower, In upper) {
+INLINE casadi_real residual(const Search* s, const Plan* plan, In lower, In upper) {
   int k;
   casadi_real worst = 0;
+  (void)s; /* needed where settings are live */
   for (k = 0; k < N * NU; ++k) {
     casadi_real moved = between(plan->u[k] - scale[k % NU] * plan->g[k], lower[k % NU], upper[k % NU]);
     worst = fmax(worst, fabs(plan->u[k] - moved));
@@ -281,6 +290,10 @@ INLINE int run(const casadi_real** arg, casadi_real** res) {
   Plan *best = s.plans, *plan = s.plans + 1, *other;
   int i, posed = sane(s0, data, lower, upper), count = 0, plain = 0, empty = 0, evaluated, status;
   casadi_real left = 0;
+#ifdef SCALE_AT
+  for (i = 0; i < NU; ++i) s.metric[i] = data[SCALE_AT + i];
+  s.first_gamma = SHARE / data[STEEPEST_AT];
+#endif
   begin(&s, best, memory, lower, upper);
   for (;; ++count) {
     int bold = s.tau >= SHORTEST;
@@ -288,11 +301,11 @@ INLINE int run(const casadi_real** arg, casadi_real** res) {
     plain += !bold;
     if (accepted) other = best, best = plan, plan = other;
     if (count == ITERATIONS || (STOP_EARLY && plain == PLAIN)) break;
-    if (STOP_EARLY && best->value < UNTRIED && residual(best, lower, upper) <= TOLERANCE) break;
+    if (STOP_EARLY && best->value < UNTRIED && residual(&s, best, lower, upper) <= TOLERANCE) break;
     if (accepted && direct(&s, best, data, lower, upper)) return 1;
   }
   evaluated = best->value < UNTRIED;
-  left = residual(best, lower, upper);
+  left = residual(&s, best, lower, upper);
   for (i = 0; i < NU; ++i) empty |= lower[i] > upper[i];
   status = empty ? INFEASIBLE : !(posed && evaluated) ? NON_FINITE : left <= TOLERANCE ? CONVERGED : NOT_CONVERGED;
   if (res[0]) for (i = 0; i < N * NU; ++i) res[0][i] = best->u[i];

@@ -35,7 +35,7 @@ J. K. Tar, Electronics 11, 1243, 2022, for the transition between gradient desce
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -137,7 +137,8 @@ class FixedPoint(Optimiser):
         """Interior steps for a plan without limits of states that did not converge."""
         if ocp.bounds_states:
             return None
-        limited = limited_step(ocp, self._limited(_MOST_LIMITED, realtime=False))
+        # Here the settings are numbers: a rescue runs outside the loop, for the numbers of one call.
+        limited = limited_step(replace(ocp, settings=()), self._limited(_MOST_LIMITED, realtime=False))
         return rescue(ocp, self.converging(ocp), self.memory(ocp), limited)
 
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:

@@ -118,19 +118,15 @@ class GradientFixedPoint(Optimiser):
         lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
         inputs = ca.reshape(column, nu, n)
         slope = reduced_gradient(ocp)(s0, inputs, data, ca.MX.zeros(ocp.state.size, n))[1]
-        response = ca.vec(ca.repmat(ca.DM(_scale(ocp)), 1, n) * slope)
+        response = ca.vec(ca.repmat(ocp.scale_in(data), 1, n) * slope)
         request, error, none = (expression(v) for v in (column, response, ca.MX.zeros(nu * n)))
         next_column, _ = self._map(ocp).step(request, error, none, {})
         clipped = ca.vec(clip(ca.reshape(graph(next_column), nu, n), lower, upper))
         return ca.Function("fpirhc_transformed_plan", [column, s0, data, lower, upper], [clipped])
 
 
-def _scale(ocp: OptimalControl) -> ca.DM:
-    return ca.DM(1 / (ocp.step * ocp.curvature))
-
-
 def _steepest(ocp: OptimalControl) -> float:
-    return steepest_curvature(ocp.along, 1 / (ocp.step * ocp.curvature))
+    return steepest_curvature(ocp.along, ocp.scale)
 
 
 EXAMPLES = (GradientFixedPoint(iterations=100, tolerance=1e-6),)

@@ -35,7 +35,11 @@ def improved(
     Returns:
         Plan (nu, N), diagnostics with the iterations of all calls, memory, and the number of calls.
     """
-    step, bounds, rescue = optimiser.converging(ocp), (ocp.input_lower, ocp.input_upper), None
+    # Horizons that differ in numbers of settings only share their Functions.
+    key = "converging", id(optimiser)
+    if key not in ocp.functions:
+        ocp.functions[key] = optimiser.converging(ocp.opened())
+    step, bounds, rescue = ocp.functions[key], (ocp.input_lower, ocp.input_upper), None
     status, count, iterations, violation, stuck = Status.NOT_CONVERGED, 0, 0.0, np.inf, 0
     inputs, diagnostics = np.zeros((ocp.input.size, ocp.stages)), np.zeros(5)
     while status in (Status.NOT_CONVERGED, Status.INFEASIBLE) and stuck < _PATIENCE and count < calls:

@@ -13,15 +13,17 @@ _TINY = 1e-300
 
 
 def judgement(ocp: OptimalControl) -> ca.Function:
-    """Function (U, X, V, g of the plan tried, lower, upper, anchor) -> (anchor, accepted)."""
+    """Function (U, X, V, g of the plan tried, lower, upper, anchor, [scale]) -> (anchor, accepted)."""
     n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
     inputs, states = ca.MX.sym("U", nu, n), ca.MX.sym("X", ns, n + 1)
     value, slope = ca.MX.sym("V"), ca.MX.sym("g", nu, n)
     lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
     shapes = [(nu, n), (ns, n), (nu, n), (nu, ns * n), (nu, n), (nu, n), (1, 1), (1, 1), (1, 1), (1, 1), (1, 1)]
     old = Anchor(*(ca.MX.sym(name, *shape) for name, shape in zip(Anchor._fields, shapes, strict=True)))
+    live = [ca.MX.sym("scale", nu)] if ocp.settings else []
+    scale = ca.repmat(live[0] if live else ocp.scale_in(None), 1, n)
     # Flags: whether the anchor was never evaluated, and whether the plan is a step along the sweep's direction.
-    metric, flags = _Metric(ocp, lower, upper), (old.value >= UNTRIED, old.step >= SHORTEST)
+    metric, flags = _Metric(scale, lower, upper), (old.value >= UNTRIED, old.step >= SHORTEST)
     plain = metric.plain_step(inputs, slope, old.gamma)
     envelope = value + ca.dot(slope, plain - inputs) + metric.size(plain - inputs) / (2 * old.gamma)
     finite = is_finite(ca.vertcat(value, ca.vec(slope), ca.vec(states)))
@@ -32,14 +34,15 @@ def judgement(ocp: OptimalControl) -> ca.Function:
         inputs, states[:, :n], old.move, old.gains, plain, slope, value, envelope, step, old.gamma, old.resume
     )
     next_anchor = [ca.if_else(accepted, new, back) for new, back in zip(advance, retreat, strict=True)]
-    return ca.Function("fpirhc_judgement", [inputs, states, value, slope, lower, upper, *old], [*next_anchor, accepted])
+    arguments = [inputs, states, value, slope, lower, upper, *old, *live]
+    return ca.Function("fpirhc_judgement", arguments, [*next_anchor, accepted])
 
 
 class _Metric:
     """The plain step T = clip(U - gamma D g) and the norm |d|^2 = d' D^-1 d of one call."""
 
-    def __init__(self, ocp: OptimalControl, lower: ca.MX, upper: ca.MX) -> None:
-        self._scale = ca.repmat(ca.DM(1 / (ocp.step * ocp.curvature)), 1, ocp.stages)
+    def __init__(self, scale: ca.MX, lower: ca.MX, upper: ca.MX) -> None:
+        self._scale = scale
         self._lower, self._upper = lower, upper
 
     def plain_step(self, u: ca.MX, g: ca.MX, gamma: ca.MX) -> ca.MX:

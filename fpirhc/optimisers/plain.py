@@ -7,6 +7,7 @@ from importlib import resources
 import casadi as ca
 
 from fpirhc.horizon.hessian_models import hessian_end, hessian_stage, linear_stage
+from fpirhc.horizon.live_data import SCALE, STEEPEST
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import PIVOT, rounds
 from fpirhc.optimisers.anchor import ARMIJO, DRAWN_IN, ROUNDING, SHARE, SHORTER, SHORTEST, UNTRIED
@@ -50,28 +51,33 @@ def plain_driver(ocp: OptimalControl, settings: PlainSettings) -> Driver:
     }
     folder = resources.files("fpirhc.optimisers")
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
-    return Driver("\n".join(texts), leaves, {**_sizes(ocp), **_constants(ocp, settings)})
+    return Driver("\n".join(texts), leaves, {**_sizes(ocp), **_metric(ocp), **_constants(ocp, settings)})
 
 
 def _sizes(ocp: OptimalControl) -> dict[str, object]:
-    scale = ", ".join(repr(float(v)) for v in 1 / (ocp.step * ocp.curvature))
     return {
         "NS": ocp.state.size,
         "NU": ocp.input.size,
         "NT": ocp.data.size,
         "N": ocp.stages,
         "MEMORY": plain_memory(ocp).size,
-        "SCALE": f"{{{scale}}}",
     }
+
+
+def _metric(ocp: OptimalControl) -> dict[str, object]:
+    """Definitions of the scale and of the first gamma: numbers, or places in the data where settings are live."""
+    if ocp.settings:
+        return {"SCALE_AT": ocp.data.slice(SCALE).start, "STEEPEST_AT": ocp.data.slice(STEEPEST).start}
+    scale = ", ".join(repr(float(v)) for v in ocp.scale)
+    return {"SCALE": f"{{{scale}}}", "FIRST_GAMMA": repr(first_gamma(ocp))}
 
 
 def _constants(ocp: OptimalControl, settings: PlainSettings) -> dict[str, object]:
     return {
         "ITERATIONS": settings.iterations,
         "STOP_EARLY": int(settings.converging),
-        "TOLERANCE": repr(settings.tolerance),
-        "DAMPING": repr(settings.damping),
-        "FIRST_GAMMA": repr(first_gamma(ocp)),
+        "TOLERANCE": repr(float(settings.tolerance)),
+        "DAMPING": repr(float(settings.damping)),
         "SHARE": SHARE,
         "ARMIJO": ARMIJO,
         "SHORTER": SHORTER,

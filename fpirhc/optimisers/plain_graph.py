@@ -42,7 +42,7 @@ def first_anchor(ocp: OptimalControl, arguments: Arguments, memory: ca.MX) -> An
     remembered = plain_memory(ocp).split(ca.if_else(is_finite(memory), memory, 0))
     inputs = clip(ca.reshape(remembered["plan_inputs"], nu, n), arguments.lower, arguments.upper)
     none = ca.MX.zeros(nu, n)
-    first = first_gamma(ocp)
+    first = first_gamma(ocp, arguments.data)
     resume = ca.if_else(remembered["plan_step"] > 0, ca.fmin(remembered["plan_step"], 1), 1)
     # After a rejected T a longer gamma would be rejected again, in every call of one iteration.
     longer = ca.if_else(resume < SHORTEST, 1, 2) * remembered["plan_gamma"]
@@ -77,7 +77,7 @@ def _converged(
     rest = ca.Function("fpirhc_rest", [*arguments, *symbols], list(symbols))
     choice = ca.Function.if_else("fpirhc_iteration_if_needed", work, rest)
     for _ in range(settings.iterations + 1):
-        residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper)
+        residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper, arguments.data)
         needed = ca.logic_not(ca.logic_and(anchor.value < UNTRIED, residual <= settings.tolerance))
         needed = ca.logic_and(needed, plain < MOST_PLAIN)
         plain += ca.logic_and(needed, anchor.step < SHORTEST)
@@ -96,7 +96,7 @@ def _results(
     """Plan, diagnostics and memory at the end of a call."""
     posed, evaluated = sane(*arguments), anchor.value < UNTRIED
     finite = ca.logic_and(posed, evaluated)
-    residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper)
+    residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper, arguments.data)
     empty = ca.mmax(arguments.lower - arguments.upper) > 0
     status = ca.if_else(empty, int(Status.INFEASIBLE), status_of(finite, residual, 0, settings.tolerance))
     numbers = ca.if_else(finite, ca.vertcat(anchor.value, residual), ca.MX.zeros(2))

@@ -132,7 +132,7 @@ class ReducedGradient(Optimiser):
         inputs, slope = (ca.reshape(_part(ocp, state, k), nu, n) for k in (0, 5))
         values, length = _part(ocp, state, 1), _part(ocp, state, 2)
         best, lowest = ca.reshape(_part(ocp, state, 3), nu, n), _part(ocp, state, 4)
-        scale = _scale(ocp)
+        scale = ca.repmat(ocp.scale_in(data), 1, n)
         next_inputs = clip(inputs - length * scale * slope, lower, upper)
         move = next_inputs - inputs
         value, new_slope, _, _ = reduced_gradient(ocp)(s0, next_inputs, data, ca.MX.zeros(ocp.state.size, n))
@@ -165,12 +165,7 @@ def _choose(condition: ca.MX, yes: ca.MX, no: ca.MX) -> ca.MX:
     return ca.if_else(condition, yes, no)
 
 
-def _scale(ocp: OptimalControl) -> ca.DM:
-    """D for every entry of a plan, shape (nu, N)."""
-    return ca.repmat(ca.DM(1 / (ocp.step * ocp.curvature)), 1, ocp.stages)
-
-
-def _spectral_length(move: ca.MX, scale: ca.DM, change: ca.MX, before: ca.MX) -> ca.MX:
+def _spectral_length(move: ca.MX, scale: ca.MX, change: ca.MX, before: ca.MX) -> ca.MX:
     """Barzilai-Borwein: <move, move / D> / <move, change>, kept where the curvature is not positive."""
     curvature, size = ca.dot(move, change), ca.dot(move, move / scale)
     usable = ca.logic_and(curvature > _TINY, size > _TINY)

@@ -9,16 +9,21 @@ import casadi as ca
 
 from fpirhc.deformation.base import Deformation
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, linear_stage, stage_symbols
+from fpirhc.horizon.live_data import STEEPEST
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.reference_expansion import steepest_curvature
 from fpirhc.horizon.riccati import backward_sweep
 from fpirhc.optimisers.anchor import SHARE, SHORTEST, Anchor, Arguments, Expanded
 from fpirhc.optimisers.judgement import judgement
 
 
-def first_gamma(ocp: OptimalControl) -> float:
-    """Return a gamma that is short enough near the reference: SHARE / L in the metric of D."""
-    return SHARE / steepest_curvature(ocp.along, 1 / (ocp.step * ocp.curvature))
+def first_gamma(ocp: OptimalControl, data: ca.MX | None = None) -> float | ca.MX:
+    """Return a gamma that is short enough near the reference: SHARE / L in the metric of D.
+
+    Where settings are live, L stands in the data of the stages.
+    """
+    if ocp.settings and data is not None:
+        return SHARE / data[ocp.data.slice(STEEPEST), 0]
+    return SHARE / ocp.steepest
 
 
 class Search:
@@ -42,7 +47,8 @@ class Search:
         tried = self._try(arguments.s0, arguments.data, arguments.lower, arguments.upper, *anchor[:5], anchor.step)
         inputs, states, costs, a, b, by_state, by_input = tried
         value, slope, costates = self._expand(states, inputs, costs, arguments.data, a, b, by_state, by_input)
-        judged = self._judge(inputs, states, value, slope, arguments.lower, arguments.upper, *anchor)
+        live = [self._ocp.scale_in(arguments.data)] if self._ocp.settings else []
+        judged = self._judge(inputs, states, value, slope, arguments.lower, arguments.upper, *anchor, *live)
         *fields, accepted = judged
         return Anchor(*fields), Expanded(inputs, states, a, b, by_state, by_input, costates, accepted)
 

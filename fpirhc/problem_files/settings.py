@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import fields, is_dataclass, replace
+from collections.abc import Mapping
+from dataclasses import is_dataclass
 from typing import Any
 
 from fpirhc.controllers.base import Controller
-from fpirhc.errors import InvalidName, InvalidValue, nearest
+from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import expects_whole_number
+from fpirhc.symbolic.paths import changed_at, content_at, names_in
 
 Values = Mapping[str, float]
 
@@ -28,7 +29,11 @@ def with_settings(controller: Controller, values: Values) -> Controller:
     changed: Any = controller
     for path, value in values.items():
         current_setting(controller, path)
-        changed = _changed(changed, path.split("."), value)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise InvalidValue(f"setting '{path}': expected a number, got {value!r}")
+        if is_whole(controller, path) and not isinstance(value, int):
+            raise InvalidValue(f"setting '{path}': expected a whole number, got {value!r}")
+        changed = changed_at(changed, path, value)
     assert isinstance(changed, Controller)
     return changed
 
@@ -40,20 +45,12 @@ def current_setting(controller: Controller, path: str) -> float:
         InvalidName: no such setting; the nearest one is offered.
         InvalidValue: the setting is not a number.
     """
-    value: Any = controller
-    done: list[str] = []
-    for name in path.split("."):
-        valid = _names(value)
-        if name not in valid:
-            where = f"'{'.'.join(done)}' of the controller" if done else "the controller"
-            raise InvalidName(
-                f"setting '{path}': {where} ({type(value).__name__}) has no '{name}'.{nearest(name, valid)}"
-            )
-        value = _entry(value, name)
-        done.append(name)
+    value = content_at(controller, path)
     if isinstance(value, bool) or not isinstance(value, int | float):
         hint = (
-            " give it a number first" if value is None else f" go on with one of: {', '.join(_names(value)) or 'none'}"
+            " give it a number first"
+            if value is None
+            else f" go on with one of: {', '.join(names_in(value)) or 'none'}"
         )
         raise InvalidValue(f"setting '{path}' is {value!r}, not a number;{hint}")
     return value
@@ -61,36 +58,6 @@ def current_setting(controller: Controller, path: str) -> float:
 
 def is_whole(controller: Controller, path: str) -> bool:
     """Whether the setting at a path is declared as a whole number."""
-    *parents, name = path.split(".")
-    owner: Any = controller
-    for parent in parents:
-        owner = _entry(owner, parent)
+    parent, _, name = path.rpartition(".")
+    owner: Any = content_at(controller, parent) if parent else controller
     return is_dataclass(owner) and expects_whole_number(type(owner), name)
-
-
-def _names(value: Any) -> list[str]:
-    if is_dataclass(value) and not isinstance(value, type):
-        return [f.name for f in fields(value) if f.init]
-    if isinstance(value, Mapping):
-        return [str(k) for k in value]
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [str(k) for k in range(len(value))]
-    return []
-
-
-def _entry(value: Any, name: str) -> Any:
-    if isinstance(value, Mapping):
-        return value[name]
-    return value[int(name)] if isinstance(value, Sequence) else getattr(value, name)
-
-
-def _changed(value: Any, path: Sequence[str], number: float) -> Any:
-    if not path:
-        return number
-    name, *rest = path
-    inner = _changed(_entry(value, name), rest, number)
-    if isinstance(value, Mapping):
-        return {**value, name: inner}
-    if isinstance(value, Sequence):
-        return (*value[: int(name)], inner, *value[int(name) + 1 :])
-    return replace(value, **{name: inner})

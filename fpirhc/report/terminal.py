@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -71,11 +71,20 @@ def show(comparison: Comparison, report: Path) -> None:
 def show_run(run: Run, metrics: Metrics, saved: Path) -> None:
     """Print one run's metrics and the path of its file."""
     console = Console()
+    for text in settings_in_force(run):
+        say(console, text)
     for column in columns([metrics]):
         say(console, f"{column.heading}: {column.text(column.number(metrics), missing='-', none='none')}")
     if run.stop:
         say(console, f"ended early: {run.stop}")
     say(console, f"saved: {saved}", wrap=False)
+
+
+def settings_in_force(run: Run) -> list[str]:
+    """Return one line per time from which other live settings were in force."""
+    record = cast(list[tuple[float, dict[str, float]]], run.settings.get("live", []))
+    lines = [(time, ", ".join(f"{path} = {value:g}" for path, value in numbers.items())) for time, numbers in record]
+    return [f"settings from {time:g} s: {text}" for time, text in lines]
 
 
 def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:

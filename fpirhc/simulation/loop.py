@@ -6,6 +6,7 @@ held since t_{k-1}; the controller turns them into a command; the plant moves on
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import casadi as ca
@@ -14,40 +15,63 @@ import numpy as np
 from fpirhc.controllers.base import Controller, Response, compose_controller, error_signal, like
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.gate import Gate
+from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.live import PREFIX, nominal
 from fpirhc.task.dead_time import delay_block
 from fpirhc.task.problem import Problem
 
 
-def close_loop(problem: Problem, controller: Controller) -> Composite:
+def close_loop(problem: Problem, controller: Controller, live: LiveSettings | None = None) -> Composite:
     """Return the closed loop as one step: (memory, [disturbance], [sensing]) -> (memory, trace).
 
-    Both parameter sets are part of the memory (constant), so that other values need no new Function. The disturbance
-    input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples.
+    Both parameter sets are part of the memory (constant), so that other values need no new Function; live settings likewise. The
+    disturbance input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples.
+
+    Raises:
+        NotSupported: a live setting that this loop cannot keep open.
     """
+    if live is not None:
+        return live.composed(lambda problem, controller: _closed(problem, controller, live))
+    return _closed(problem, controller, None)
+
+
+def _closed(problem: Problem, controller: Controller, live: LiveSettings | None) -> Composite:
     ready = checked(problem, controller)
-    acting = Gate(problem, compose_controller(problem, ready), trusted=("time", "memory"))
+    acting = Gate(nominal(problem), compose_controller(problem, ready), trusted=("time", "memory"))
     disturbed = disturbance_signals(problem)
     seeing = _sense_blocks(problem, ready.response(problem), predicts="state_ahead" in acting.inner.trace)
     around = [_clock_block(problem.plant.time, problem.period), *seeing, acting.block(), *_actuate(problem, disturbed)]
-    return compose("loop", Layout((*disturbed, *problem.sensing.drawn)), around, _plant_delays(problem, ready))
+    constants = live.held(around) if live is not None else []
+    delays = [*_plant_delays(problem, ready), *constants]
+    return compose("loop", Layout((*disturbed, *problem.sensing.drawn)), around, delays)
 
 
-def start_memory(loop: Composite, problem: Problem, controller: Controller) -> np.ndarray:
+def start_memory(
+    loop: Composite, problem: Problem, controller: Controller, numbers: Mapping[str, float] | None = None
+) -> np.ndarray:
     """Return the first memory of a loop, shape (loop.memory.size,).
 
     Args:
         loop: from `close_loop`.
         problem: the problem of the loop, or one that differs from it in the exact parameters only.
         controller: the controller of the loop, resolved.
+        numbers: of all live settings, by path; None: those of the build.
     """
-    sensing = _sense_blocks(problem, controller.response(problem), predicts=False)
-    remembered = [s for block in sensing for s in block.memory.signals]
+    remembered = []
+    if not problem.sees_plant:
+        sensing = _sense_blocks(problem, controller.response(problem), predicts=False)
+        remembered += [s for block in sensing for s in block.memory.signals]
     remembered += [delay.now for delay in _plant_delays(problem, controller)]
-    return loop.memory.pack({s.name: s.start_vector() for s in remembered})
+    starts = {s.name: s.start_vector() for s in remembered}
+    if numbers:
+        derived = loop.derived(numbers)
+        starts |= {PREFIX + path: np.array([value]) for path, value in numbers.items()}
+        starts |= {**derived.signals, **derived.memory()}
+    return loop.memory.pack(starts)
 
 
 def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:

@@ -41,7 +41,7 @@ class Watch:
 
 
 def machine_step(problem: Problem, controller: Controller, gate: Gate, watch: Watch) -> Composite:
-    """Return the step (memory, sample, parameters) -> (memory, trace, command).
+    """Return the step (memory, sample, parameters) -> (memory, trace, command); `Gate.named` names its memory.
 
     Args:
         problem: of the controller.
@@ -53,8 +53,7 @@ def machine_step(problem: Problem, controller: Controller, gate: Gate, watch: Wa
     longest = round(watch.saturated_after / problem.period)
     watched = watch_block(problem, controller, _STATUS, longest=longest, window=watch.window)
     own = _identity_block(fingerprint(problem, controller, block.memory))
-    composite = compose("controller", gate.reads, [own, block, watched, _count_block()], outputs=("command",))
-    return replace(composite, memory=gate.named(composite.memory))
+    return compose("controller", gate.reads, [own, block, watched, _count_block()], outputs=("command",))
 
 
 def fingerprint(problem: Problem, controller: Controller, memory: Layout) -> float:

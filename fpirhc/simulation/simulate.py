@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import resolved
+from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.describe import describe
+from fpirhc.simulation.changes import Changes, in_force
 from fpirhc.simulation.common_columns import with_common_columns
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.run import Run
@@ -32,7 +33,7 @@ SWITCHED_OFF = "compiled=False was given"  # a reason why a loop is not compiled
 
 @dataclass(frozen=True, eq=False)
 class Simulator:
-    """A closed loop that is built once and runs many times, with other seeds and exact parameters.
+    """A closed loop that is built once and runs many times, with other seeds, exact parameters and live settings.
 
     It works in one thread only and cannot be pickled: build one in each process.
 
@@ -43,6 +44,7 @@ class Simulator:
         evaluator: of the loop over `CHUNK` cycles.
         compiled: whether the loop is compiled C.
         why_not_compiled: reason where it is not; empty where it is.
+        live: the settings that a run may change.
     """
 
     problem: Problem
@@ -51,6 +53,7 @@ class Simulator:
     evaluator: Evaluator
     compiled: bool
     why_not_compiled: str
+    live: LiveSettings
 
     @property
     def remembers(self) -> bool:
@@ -65,6 +68,8 @@ class Simulator:
         variant: Problem | None = None,
         disturbed: bool = True,
         progress: Progress | None = None,
+        settings: Numbers | None = None,
+        changes: Changes | None = None,
     ) -> Run:
         """Run the loop once and return its signals.
 
@@ -74,31 +79,49 @@ class Simulator:
             variant: the simulator's problem with other exact parameters or another duration; None: the problem itself.
             disturbed: whether disturbances act; the sensors' noise always does.
             progress: called with (cycles done, cycles in all).
+            settings: numbers of live settings by path; the others have the numbers of the build.
+            changes: numbers of live settings from a time on, by time in s.
+
+        Raises:
+            InvalidName: a setting that is not live.
+            InvalidValue: a number that a setting does not accept; a change outside the run.
+            NotContractive: a gain with which the deformation cannot converge.
         """
         problem = variant or self.problem
-        start = start_memory(self.loop, problem, self.controller)
-        logged, stop = _run_chunks(problem, start, self.loop.trace, self.evaluator, seed, disturbed, progress)
+        force = in_force(self.live, self.loop, problem, settings or {}, changes or {})
+        problem, controller = force.problem, force.controller
+        start = start_memory(self.loop, problem, controller, force.numbers)
+        logged, stop = _run_chunks(
+            problem, start, self.loop.trace, self.evaluator, seed, disturbed, progress, force.patches
+        )
         layout, log = with_common_columns(self.loop.trace, logged)
         log.setflags(write=False)
-        step_limit = self.controller.deformation.largest_step()
-        planner = self.controller.planner
+        step_limit = controller.deformation.largest_step()
+        planner = controller.planner
         cost = (planner.cost or problem.cost) if planner else None
-        settings = {
+        facts: dict[str, object] = {
             "weighs_effort": cost is not None and cost.weighs_effort,
             "step_limit": step_limit if np.isfinite(step_limit) else None,
-            "effective_gain": float(self.controller.deformation.effective_gain()),
-            "parameters": [float(v) for v in self.controller.parameters(problem.plant)],
-            "controller": describe(self.controller),
+            "effective_gain": float(controller.deformation.effective_gain()),
+            "parameters": [float(v) for v in controller.parameters(problem.plant)],
+            "controller": describe(controller),
             "problem": describe(problem),
             "backend": "compiled C" if self.compiled else "CasADi virtual machine",
             "why not compiled": self.why_not_compiled,
         }
+        if force.record:
+            facts["live"] = [[time, dict(values)] for time, values in force.record]
         title = name or type(self.controller).__name__
-        return Run(problem.name, title, seed, problem.period, layout, log, stop, self.compiled, settings)
+        return Run(problem.name, title, seed, problem.period, layout, log, stop, self.compiled, facts)
 
 
 def simulator(
-    problem: Problem, controller: Controller, *, compiled: bool = True, flags: Sequence[str] = ()
+    problem: Problem,
+    controller: Controller,
+    *,
+    compiled: bool = True,
+    flags: Sequence[str] = (),
+    live: Sequence[str] = (),
 ) -> Simulator:
     """Return the closed loop of problem and controller, ready to run.
 
@@ -107,14 +130,22 @@ def simulator(
         controller: its automatic settings are chosen here.
         compiled: whether the loop is compiled to C where there is a compiler.
         flags: for the compiler, after its usual ones.
+        live: paths of settings that a run may change without another build: 'deformation.gain', 'cost.states.q1',
+            'limits.inputs.Q1'.
+
+    Raises:
+        InvalidName: no such setting; the nearest one is offered.
+        NotSupported: a setting that decides what the loop is made of, or that this loop needs as a number.
+        CompileError: the compiler fails on a loop with live settings.
     """
-    ready = resolved(problem, controller)
-    loop = close_loop(problem, ready)
+    settings = live_settings(problem, controller, live)
+    ready = settings.controller
+    loop = close_loop(problem, ready, settings if live else None)
     chunked = loop.function.mapaccum(f"{loop.function.name()}_run", CHUNK)
-    backend = native(chunked, flags) if compiled else None
+    backend = native(chunked, flags, required=bool(live)) if compiled else None
     evaluator = Evaluator(backend.function if backend else chunked)
     reason = backend.reason if backend else SWITCHED_OFF
-    return Simulator(problem, ready, loop, evaluator, bool(backend and backend.compiled), reason)
+    return Simulator(problem, ready, loop, evaluator, bool(backend and backend.compiled), reason, settings)
 
 
 def simulate(
@@ -126,6 +157,8 @@ def simulate(
     compiled: bool = True,
     flags: Sequence[str] = (),
     progress: Progress | None = None,
+    settings: Numbers | None = None,
+    changes: Changes | None = None,
 ) -> Run:
     """Run the closed loop of problem and controller and return every signal, also those that judge the run.
 
@@ -139,12 +172,23 @@ def simulate(
         compiled: whether the loop is compiled to C where there is a compiler.
         flags: for the compiler, after its usual ones.
         progress: called with (cycles done, cycles in all).
+        settings: numbers of settings by path, in place of those of the controller and the problem.
+        changes: numbers of settings from a time on, by time in s.
     """
-    ready = simulator(problem, controller, compiled=compiled, flags=flags)
-    return judged_run(ready, seed=seed, name=name, progress=progress)
+    live = tuple(dict.fromkeys(path for numbers in (settings or {}, *(changes or {}).values()) for path in numbers))
+    ready = simulator(problem, controller, compiled=compiled, flags=flags, live=live)
+    return judged_run(ready, seed=seed, name=name, progress=progress, settings=settings, changes=changes)
 
 
-def judged_run(ready: Simulator, *, seed: int, name: str = "", progress: Progress | None = None) -> Run:
+def judged_run(
+    ready: Simulator,
+    *,
+    seed: int,
+    name: str = "",
+    progress: Progress | None = None,
+    settings: Numbers | None = None,
+    changes: Changes | None = None,
+) -> Run:
     """Run a loop that is ready and return every signal, also those that judge the run; see `simulate`.
 
     Args:
@@ -152,11 +196,15 @@ def judged_run(ready: Simulator, *, seed: int, name: str = "", progress: Progres
         seed: of the noise of disturbances and sensors.
         name: of the controller in the results; '': its label, or the name of its class.
         progress: called with (cycles done, cycles in all).
+        settings: numbers of live settings by path; the others have the numbers of the build.
+        changes: numbers of live settings from a time on.
     """
-    run = ready.run(
-        seed=seed, name=name or ready.controller.task_name or type(ready.controller).__name__, progress=progress
-    )
-    judged = judgements(ready.problem, ready.controller, run.layout, run.log)
+    title = name or ready.controller.task_name or type(ready.controller).__name__
+    run = ready.run(seed=seed, name=title, progress=progress, settings=settings, changes=changes)
+    problem, controller = ready.problem, ready.controller
+    if settings:
+        problem, controller, _ = ready.live.changed(settings)
+    judged = judgements(problem, controller, run.layout, run.log)
     log = np.hstack([run.log, *(values for _, values in judged)])
     log.setflags(write=False)
     return replace(run, layout=run.layout + Layout(tuple(signal for signal, _ in judged)), log=log)
@@ -186,35 +234,43 @@ def _run_chunks(
     seed: int,
     disturbed: bool,
     progress: Progress | None,
+    patches: Sequence[tuple[int, np.ndarray, np.ndarray]] = (),
 ) -> tuple[np.ndarray, str | None]:
     cycles = problem.cycles
-    padded = -(-cycles // CHUNK) * CHUNK
+    padded = (-(-cycles // CHUNK) + (1 if patches else 0)) * CHUNK
     all_tables = float(disturbed) * disturbance_table(problem, seed, padded), sensing_table(problem, seed, padded)
     tables = [table for table in all_tables if table.shape[1]]
     log = np.empty((padded, trace.size))
     evaluator.arguments[0][:] = start
-    for at in range(0, cycles, CHUNK):
+    for at, end in _pieces(cycles, [cycle for cycle, _, _ in patches]):
+        for cycle, places, values in patches:
+            if cycle == at:
+                evaluator.arguments[0][places] = values
         for argument, table in zip(evaluator.arguments[1:], tables, strict=True):
             argument.reshape(CHUNK, -1)[:] = table[at : at + CHUNK]
         evaluator.redirect(1, log[at : at + CHUNK])
-        try:
-            evaluator.evaluate()
-            why = "compiled code failed" if evaluator.failed else ""
-        except SystemError as error:
-            raise unwrapped(error) from None
-        except RuntimeError as error:  # CasADi's own, of a solver in the loop
-            why = (str(error).strip().splitlines() or ["no reason"])[-1]
+        why = _evaluated(evaluator)
         if why:
             return log[:at].copy(), _failed(at, problem, why)
-        rows = log[at : min(at + CHUNK, cycles)]
+        rows = log[at:end]
         bad = _first_bad(rows)
         if bad is not None:
             row, column = bad
             return log[: at + row].copy(), _why(trace, at + row, column, problem)
-        evaluator.arguments[0][:] = evaluator.results[0].reshape(CHUNK, start.size)[-1]
+        evaluator.arguments[0][:] = evaluator.results[0].reshape(CHUNK, start.size)[end - at - 1]
         if progress:
             progress(at + rows.shape[0], cycles)
     return log[:cycles], None
+
+
+def _pieces(cycles: int, cuts: Sequence[int]) -> list[tuple[int, int]]:
+    """(first cycle, end) of the calls that make up a run: at most a chunk each, and none goes beyond a change."""
+    pieces, at, ends = [], 0, sorted({c for c in cuts if 0 < c < cycles} | {cycles})
+    for end in ends:
+        while at < end:
+            pieces.append((at, min(at + CHUNK, end)))
+            at = pieces[-1][1]
+    return pieces
 
 
 def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:
@@ -228,6 +284,17 @@ def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:
         return None
     row = int(np.argmin(finite.all(axis=1)))
     return row, int(np.argmin(finite[row]))
+
+
+def _evaluated(evaluator: Evaluator) -> str:
+    """Evaluate; return why that failed, empty where it did not."""
+    try:
+        evaluator.evaluate()
+    except SystemError as error:
+        raise unwrapped(error) from None
+    except RuntimeError as error:  # CasADi's own, of a solver in the loop
+        return (str(error).strip().splitlines() or ["no reason"])[-1]
+    return "compiled code failed" if evaluator.failed else ""
 
 
 def _failed(at: int, problem: Problem, why: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import isnan
 from typing import NoReturn, Protocol, cast
 
@@ -12,13 +12,17 @@ import numpy as np
 from fpirhc.controllers.base import Controller, compose_controller
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.gate import HELD, Gate
+from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.controllers.plausible import plausible_range
-from fpirhc.errors import ConcurrentUse, InvalidValue, NotSupported
+from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidName, InvalidValue, NotSupported
 from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, Watch, machine_step
-from fpirhc.simulation.sample import numbers, one_number
+from fpirhc.simulation.sample import numbers as numbers_of
+from fpirhc.simulation.sample import one_number
 from fpirhc.status import Status
+from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout
+from fpirhc.symbolic.live import PREFIX
 from fpirhc.symbolic.native import native
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
@@ -48,6 +52,11 @@ class Stepper:
     Commands at a limit for long and an iteration that does not contract have the statuses SATURATED and NOT_CONTRACTING.
 
     One stepper serves one thread. Two threads at the same time are refused; give each a stepper of its own.
+
+    With live settings, `Stepper(problem, controller, live=["deformation.gain"])`, a step may change numbers without another build,
+    `stepper.step(..., settings={"deformation.gain": -0.4})`. `numbers` are in force until the next change. Numbers that a setting
+    does not accept are refused: the old ones stay, `refused` counts, and `why_refused` states the last reason. Restarts begin with
+    the memory of the build, and SATURATED is judged by the limits of the build.
     """
 
     def __init__(
@@ -60,6 +69,7 @@ class Stepper:
         max_age: float | None = None,
         watch: Watch | None = None,
         bounded: bool = True,
+        live: Sequence[str] = (),
     ) -> None:
         """Compose the controller's Function, and compile it where `compiled` is set and there is a compiler.
 
@@ -72,32 +82,45 @@ class Stepper:
             max_age: oldest sample that is used, s; the time stamps of samples must then increase. None: they are not looked at.
             watch: when SATURATED and NOT_CONTRACTING are reported; None: after 1 s, and over 50 cycles.
             bounded: whether an optimiser whose call may take any time is refused.
+            live: paths of the live settings.
 
         Raises:
             InvalidProblem: an unknown name or a wrong interval in `plausible`.
-            NotSupported: an optimiser without a bound of its time.
+            InvalidName: a live setting that does not exist.
+            NotSupported: an optimiser without a bound of its time; a setting that cannot be live.
+            CompileError: the compiler fails on a controller with live settings.
         """
-        ready = checked(problem, controller)
+        self._live = live_settings(problem, controller, live)
+        ready = checked(problem, self._live.controller)
         if bounded:
             _refuse_unbounded(ready)
-        inner = compose_controller(problem, ready)
-        gate = Gate(problem, inner, plausible=plausible_range(problem, plausible), max_age=max_age)
-        composite = machine_step(problem, ready, gate, watch or Watch())
-        backend = native(composite.function) if compiled else None
+        plausible_ranges = plausible_range(problem, plausible)
+        self._composite, self.memory = _composed(self._live, ready, plausible_ranges, max_age, watch or Watch())
+        backend = native(self._composite.function, required=bool(live)) if compiled else None
         self.compiled = bool(backend and backend.compiled)
-        self.memory: Layout = composite.memory
-        self.signals: Layout = composite.trace
+        self.signals: Layout = self._composite.trace
         self.why_failed = ""
         self._ages = max_age is not None
-        self._may_fail = composite.opaque  # scalar code cannot fail
-        self._bind(backend.function if backend else composite.function, ready.parameters(problem.plant))
+        self._may_fail = self._composite.opaque  # scalar code cannot fail
+        self._bind(backend.function if backend else self._composite.function, ready.parameters(problem.plant))
+        self.refused, self.why_refused = 0, ""
+        self.numbers: dict[str, float] = self._live.start
+        self._force(self.numbers)
 
     def start(self) -> np.ndarray:
-        """Return the memory of the controller before its first cycle."""
-        return self.memory.start()
+        """Return the memory of the controller before its first cycle, with the settings in force."""
+        remembered = self._composite.derived(self.numbers).memory() if self.numbers else {}
+        return self._composite.memory.pack(remembered)
 
     def step(
-        self, time: float, state: np.ndarray, realised: np.ndarray, memory: np.ndarray, *, taken: float | None = None
+        self,
+        time: float,
+        state: np.ndarray,
+        realised: np.ndarray,
+        memory: np.ndarray,
+        *,
+        taken: float | None = None,
+        settings: Numbers | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return (command, memory for the next cycle).
 
@@ -108,10 +131,13 @@ class Stepper:
                 and for a controller that does not adapt.
             memory: from `start` or from the step before.
             taken: time stamp of the sample, s; None: it was taken at `time`. Read with `max_age` only.
+            settings: numbers of live settings from this step on, by path. Checks and derived numbers are computed in Python before
+                 the step, a tenth of a millisecond for gains and some tens for the weights of a horizon; see `change`.
 
         Raises:
             InvalidShape: a wrong number of entries, named.
             InvalidValue: an argument that is not made of numbers, or the memory of another controller.
+            InvalidName: a setting that is not live.
             ConcurrentUse: another thread is inside this stepper.
         """
         # Taking the only token out of a list is atomic, and five times as fast as a lock.
@@ -120,6 +146,8 @@ class Stepper:
         except IndexError:
             _refuse_thread()
         try:
+            if settings:
+                self.change(settings)
             try:
                 # A view takes arrays of float64 of its own shape and nothing else; numpy's assignment broadcasts, and is slower.
                 self._time[0] = time
@@ -143,6 +171,33 @@ class Stepper:
             return self._new_command(), self._new_memory()
         finally:
             self._tokens.append(token)
+
+    def change(self, settings: Numbers) -> bool:
+        """Put numbers of live settings in force from the next step on, by path, and return whether they were accepted.
+
+        Raises:
+            InvalidName: a setting that is not live.
+        """
+        asked = {path: value for path, value in self.numbers.items() if path in self._live.paths}
+        try:
+            _, _, numbers = self._live.changed({**asked, **self._live.flat(settings)})
+            self._force(numbers)
+        except InvalidName:
+            raise
+        except FpirhcError as error:
+            self.refused, self.why_refused = self.refused + 1, str(error)
+            return False
+        self.numbers = numbers
+        return True
+
+    def _force(self, numbers: Mapping[str, float]) -> None:
+        """Write the settings and what follows from them into the arguments; nothing is written where something is refused."""
+        if not numbers:
+            return
+        values = {PREFIX + path: np.array([value]) for path, value in numbers.items()}
+        values |= self._composite.derived(numbers).signals
+        for name, argument in self._settings.items():
+            argument[:] = values[name]
 
     def trace(self) -> dict[str, np.ndarray]:
         """Return every signal of the last step by name.
@@ -168,6 +223,8 @@ class Stepper:
         self._evaluate = self._evaluator.evaluate
         arguments = dict(zip(function.name_in(), self._evaluator.arguments, strict=True))
         arguments["parameters"][:] = parameters
+        places = {name: k + 1 for k, name in enumerate(self._composite.reads.names)}  # after the memory
+        self._settings = {name: self._evaluator.arguments[places[name]] for name in self._composite.settings.names}
         memory_next, self._trace, command = self._evaluator.results
         self._new_command, self._new_memory = command.copy, memory_next.copy
         self._memory, self._time, self._state, self._realised = (
@@ -185,7 +242,7 @@ class Stepper:
             "realised": (self._realised, realised),
             "memory": (self._memory, memory),
         }
-        checked_values = {name: numbers(name, value, len(view)) for name, (view, value) in values.items()}
+        checked_values = {name: numbers_of(name, value, len(view)) for name, (view, value) in values.items()}
         self._time[0] = one_number("time", time)
         for name, (view, _) in values.items():
             view[:] = checked_values[name]
@@ -209,6 +266,21 @@ class Stepper:
         memory[self.memory.slice(f"{SKIPPED}_before")] += 1
         self._trace[self.signals.slice(SKIPPED)] = memory[self.memory.slice(f"{SKIPPED}_before")]
         return memory[self.memory.slice(HELD)].copy(), memory
+
+
+def _composed(
+    live: LiveSettings, ready: Controller, plausible: Mapping[str, Interval], max_age: float | None, watch: Watch
+) -> tuple[Composite, Layout]:
+    """The step behind its gate and the layout of its memory. Gate and watch have the numbers of the build, and no live ones."""
+    gates: list[Gate] = []
+
+    def compose(problem: Problem, controller: Controller) -> Composite:
+        inner = compose_controller(problem, controller)
+        gates.append(Gate(live.problem, inner, plausible=plausible, max_age=max_age))
+        return machine_step(live.problem, ready, gates[-1], watch)
+
+    composite = live.composed(compose) if live.paths else compose(live.problem, ready)
+    return composite, gates[-1].named(composite.memory)
 
 
 _NOT_WRITTEN = float("nan")  # the gate's command is finite: what is still NaN was not written

@@ -5,22 +5,45 @@ CasADi expressions and has no side effects. `compose` wires blocks by signal nam
 whose Function maps (memory, reads) to (memory, trace). A `Delay` carries a signal to the next cycle, so that
 an early block reads what a late block (the actuator, say) wrote one cycle earlier. Signals whose name
 begins with '_' are wires between blocks and stay out of the trace.
+
+Live numbers in a step (see `live`) are signals too, named 'setting.PATH'. A block reads them without declaring them, and a
+composite reads those of all its blocks. Numbers that Python computes from settings are signals 'setting.derived.NAME', declared as
+reads by the block that needs them; its `derived` computes them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
+from typing import cast
 
 import casadi as ca
+import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
 from fpirhc.symbolic.expression import Expression, Signals, Value, kind
 from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.symbolic.live import PREFIX as SETTING
 
 Step = Callable[[Signals], Mapping[str, Value]]
+Values = Mapping[str, float]
 PREFIX = "fpirhc_"  # keeps generated C names away from those of libc
+
+
+@dataclass(frozen=True, eq=False)
+class Derived:
+    """Numbers that follow from the settings outside the loop.
+
+    Args:
+        signals: values of signals 'setting.derived.NAME', by their names.
+        memory: function that returns values of remembered signals at the start of a run, by their names; a change during a run
+            does not need them.
+    """
+
+    signals: Mapping[str, np.ndarray] = field(default_factory=dict)
+    memory: Callable[[], Mapping[str, np.ndarray]] = dict
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +59,7 @@ class Block:
         memory: signals that the block remembers.
         opaque: whether the step holds operations that scalar expressions cannot (solver calls, table look-up, short circuits);
             the block is then built with MX.
+        derived: function of the numbers of all settings, by path, that returns what follows from them; None: nothing does.
     """
 
     name: str
@@ -44,15 +68,25 @@ class Block:
     step: Step
     memory: Layout = field(default_factory=Layout)
     opaque: bool = False
+    derived: Callable[[Values], Derived] | None = None
 
-    @cached_property
+    @property
     def function(self) -> ca.Function:
-        """Function of (each read, each remembered) -> (each written, each remembered, one cycle later).
+        """Function of (each of `inputs`, each remembered) -> (each written, each remembered, one cycle later).
 
         Raises:
             InvalidName: the step leaves out a signal.
             InvalidShape: a signal has the wrong size.
         """
+        return self._built[0]
+
+    @property
+    def inputs(self) -> Layout:
+        """The signals that are read, and the live settings in the step."""
+        return self._built[1]
+
+    @cached_property
+    def _built(self) -> tuple[ca.Function, Layout]:
         matrix = kind(self.opaque)
         arguments = [*self.reads.signals, *self.memory.signals]
         symbols = {s.name: matrix.sym(s.name, s.size) for s in arguments}
@@ -68,7 +102,16 @@ class Block:
                 )
             results.append(ca.densify(value.reshape((signal.size, 1))))
         keys = [key for _, key in self._results()]
-        return ca.Function(PREFIX + self.name, list(symbols.values()), results, list(symbols), keys)
+        name, columns = PREFIX + self.name, list(symbols.values())
+        function = ca.Function(name, columns, results, list(symbols), keys, {"allow_free": True})
+        if not function.has_free():
+            return function, self.reads
+        open_symbols = ca.symvar(ca.veccat(*results)) if self.opaque else ca.symvar(ca.vertcat(*results))
+        settings = [v for v in open_symbols if v.name().startswith(SETTING) and v.name() not in symbols]
+        inputs = self.reads + Layout(tuple(scalar(v.name()) for v in settings))
+        at = len(self.reads.signals)
+        columns[at:at], names = settings, [*self.reads.names, *_identifiers(settings), *self.memory.names]
+        return ca.Function(name, columns, results, names, keys), inputs
 
     def _results(self) -> list[tuple[Signal, str]]:
         written = [(s, s.name) for s in self.writes.signals]
@@ -101,6 +144,22 @@ class Composite:
     function: ca.Function
 
     @property
+    def settings(self) -> Layout:
+        """The signals of settings and derived numbers among the reads."""
+        return _settings(self.reads.signals)
+
+    @property
+    def derived_if_any(self) -> Callable[[Values], Derived] | None:
+        """The function `derived`, where some block has one."""
+        return self.derived if any(b.derived is not None for b in self.blocks) else None
+
+    def derived(self, values: Values) -> Derived:
+        """Return what follows from the numbers of all settings, by path."""
+        parts = [b.derived(values) for b in self.blocks if b.derived is not None]
+        signals = {name: value for part in parts for name, value in part.signals.items()}
+        return Derived(signals, lambda: {name: value for part in parts for name, value in part.memory().items()})
+
+    @property
     def opaque(self) -> bool:
         """Whether some block holds operations that scalar expressions cannot."""
         return any(b.opaque for b in self.blocks)
@@ -123,6 +182,8 @@ def compose(
         InvalidShape: a reader and a writer disagree on a size.
     """
     memory = Layout(tuple(d.now for d in delays) + tuple(s for b in blocks for s in b.memory.signals))
+    held = {*reads.names, *memory.names}
+    reads = reads + Layout(tuple(s for s in open_settings(blocks).signals if s.name not in held))
     inputs = {s.name: ca.MX.sym(s.name, s.size) for s in reads.signals}
     remembered = ca.MX.sym("memory", memory.size)
     known: dict[str, ca.MX] = {**memory.split(remembered), **inputs}
@@ -137,7 +198,7 @@ def compose(
         PREFIX + name,
         [remembered, *inputs.values()],
         [ca.densify(ca.MX(r)) for r in returned],
-        ["memory", *inputs],
+        ["memory", *_identifiers(inputs)],
         ["memory_next", "trace", *outputs],
     )
     if not any(b.opaque for b in blocks):
@@ -150,6 +211,11 @@ def scalar_code(function: ca.Function) -> ca.Function:
     inputs = [ca.SX.sym(function.name_in(k), function.size1_in(k)) for k in range(function.n_in())]
     shared = ca.cse([ca.SX(v) for v in function.call(inputs)])
     return ca.Function(function.name(), inputs, shared, function.name_in(), function.name_out())
+
+
+def open_settings(blocks: Sequence[Block]) -> Layout:
+    """Return the signals of all settings and derived numbers that some blocks read."""
+    return _settings(chain.from_iterable(b.inputs.signals for b in blocks))
 
 
 def every(block: Block, cycles: int) -> Block:
@@ -172,7 +238,7 @@ def every(block: Block, cycles: int) -> Block:
     run, hold = _branches(block, held)
 
     def step(signals: Signals) -> dict[str, Expression]:
-        arguments = [getattr(signals, n) for n in (*held.names, *block.reads.names, *block.memory.names)]
+        arguments = [getattr(signals, n) for n in (*held.names, *block.inputs.names, *block.memory.names)]
         choice = ca.Function.if_else(f"{PREFIX}{block.name}_every", run, hold)
         due = getattr(signals, phase.name) < 0.5
         column = choice(due, *arguments)
@@ -182,7 +248,19 @@ def every(block: Block, cycles: int) -> Block:
         values[f"{phase.name}_next"] = ca.if_else(next_phase > cycles - 0.5, 0, next_phase)
         return values
 
-    return Block(f"{block.name}_every_{cycles}", block.reads, block.writes, step, own, opaque=True)
+    name = f"{block.name}_every_{cycles}"
+    return Block(name, block.inputs, block.writes, step, own, opaque=True, derived=block.derived)
+
+
+def _settings(signals: Iterable[Signal]) -> Layout:
+    """The settings among some signals, each once."""
+    return Layout(tuple({s.name: s for s in signals if s.name.startswith(SETTING)}.values()))
+
+
+def _identifiers(names: Iterable[object]) -> list[str]:
+    """Names that CasADi accepts for arguments: those of settings have dots."""
+    texts = [name if isinstance(name, str) else cast(ca.SX, name).name() for name in names]
+    return [f"setting_{k}" if t.startswith(SETTING) else t for k, t in enumerate(texts)]
 
 
 def _ends(block: Block) -> list[int]:
@@ -195,7 +273,7 @@ def _ends(block: Block) -> list[int]:
 def _branches(block: Block, held: Layout) -> tuple[ca.Function, ca.Function]:
     """The two sides of the switch, both (held writes, reads, memory) -> one column of results."""
     last_writes = [ca.MX.sym(s.name, s.size) for s in held.signals]
-    reads = [ca.MX.sym(s.name, s.size) for s in block.reads.signals]
+    reads = [ca.MX.sym(s.name, s.size) for s in block.inputs.signals]
     memory = [ca.MX.sym(s.name, s.size) for s in block.memory.signals]
     results = block.function(*reads, *memory)
     new = ca.vertcat(*results) if isinstance(results, tuple) else results
@@ -206,7 +284,7 @@ def _branches(block: Block, held: Layout) -> tuple[ca.Function, ca.Function]:
 
 
 def _call(block: Block, known: dict[str, ca.MX], next_memory: dict[str, ca.MX]) -> None:
-    reads = [_lookup(f"block '{block.name}'", s, s.name, known) for s in block.reads.signals]
+    reads = [_lookup(f"block '{block.name}'", s, s.name, known) for s in block.inputs.signals]
     returned = block.function(*reads, *(known[m] for m in block.memory.names))
     keys = [key for _, key in block._results()]
     # A Function returns a tuple of several results, one bare result, and None for none.

@@ -1,12 +1,22 @@
-"""Smooth functions that models often need."""
+"""Smooth functions that models often need, and functions of settings that round alike as numbers and as expressions.
+
+A formula of a setting is written once, for a float and for a live number (see `live`). Its operations are + - * / and the
+functions here: a power is a product, because the pow of Python and that of CasADi differ in the last digit.
+"""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TypeVar, cast
 
 import casadi as ca
 
 from fpirhc.symbolic.layout import Expression
+from fpirhc.symbolic.live import LiveNumber, is_live
 
 SMOOTHING = 1e-6  # half width, in the unit of the argument, within which the power is rounded off around zero
+T = TypeVar("T")
 
 
 def signed_power(d: Expression, exponent: Expression | float) -> Expression:
@@ -15,3 +25,41 @@ def signed_power(d: Expression, exponent: Expression | float) -> Expression:
     Computed as d (d^2 + 1e-12)^((exponent - 1)/2).
     """
     return d * ca.exp((exponent - 1) / 2 * ca.log(d * d + SMOOTHING**2))
+
+
+def power(base: T, exponent: int) -> T | float:
+    """Return base^exponent as a product; 1.0 for the exponent 0."""
+    return math.prod([base] * (exponent - 1), start=base) if exponent else 1.0  # type: ignore[call-overload]
+
+
+def tanh(x: float) -> float:
+    """Return tanh of a number, live or not."""
+    return x.called(math.tanh, ca.tanh) if isinstance(x, LiveNumber) else math.tanh(x)
+
+
+def atanh(x: float) -> float:
+    """Return atanh of a number, live or not."""
+    return x.called(math.atanh, ca.atanh) if isinstance(x, LiveNumber) else math.atanh(x)
+
+
+def exp(x: float) -> float:
+    """Return exp of a number, live or not."""
+    return x.called(math.exp, ca.exp) if isinstance(x, LiveNumber) else math.exp(x)
+
+
+def signed(size: float, sign: float) -> float:
+    """Return the size of a number, live or not, with the sign of another one."""
+    if isinstance(sign, LiveNumber):
+        sign = sign.called(lambda x: math.copysign(1.0, x), lambda x: ca.if_else(x < 0, -1, 1))
+        return abs(size) * sign
+    return math.copysign(1.0, sign) * abs(size)
+
+
+def numbers(values: Sequence[float | LiveNumber]) -> Expression:
+    """Return a column of numbers: constants, or an expression where some are live."""
+    return cast(Expression, ca.vertcat(*values) if is_live(values) else ca.DM(cast(list[float], list(values))))
+
+
+def sqrt(x: float) -> float:
+    """Return the square root of a number, live or not."""
+    return x.called(math.sqrt, ca.sqrt) if isinstance(x, LiveNumber) else math.sqrt(x)

@@ -72,8 +72,17 @@ def find_compiler() -> str | None:
     return None
 
 
-def native(function: ca.Function, flags: Sequence[str] = ()) -> Native:
-    """Return `function` compiled, or as it is with the reason why not; `flags` are appended to the usual flags."""
+def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool = False) -> Native:
+    """Return `function` compiled, or as it is with the reason why not.
+
+    Args:
+        function: to compile.
+        flags: for the compiler, after its usual ones.
+        required: whether a failure of the compiler is an error; without a compiler `function` is returned as it is all the same.
+
+    Raises:
+        CompileError: `required`, and the compiler failed.
+    """
     if function.is_a("External"):
         return Native(function, True, "")
     compiler = find_compiler()
@@ -82,6 +91,8 @@ def native(function: ca.Function, flags: Sequence[str] = ()) -> Native:
     try:
         return Native(_library(generate(function), compiler, flags), True, "")
     except (NotSupported, CompileError) as error:
+        if required and isinstance(error, CompileError):
+            raise
         return Native(function, False, str(error))
 
 

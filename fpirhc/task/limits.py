@@ -14,6 +14,7 @@ from fpirhc.fields.expected import takes
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Expression, Value
+from fpirhc.symbolic.live import nominal
 
 Interval = tuple[float, float]
 
@@ -84,6 +85,9 @@ class Limits(Checked):
         Raises:
             InvalidProblem: all mistakes together.
         """
+        nominal(self)._check(plant)
+
+    def _check(self, plant: Plant) -> None:
         mistakes = Mistakes("limits")
         mistakes.unknown("input", self.inputs, plant.inputs)
         mistakes.unknown("state", self.states, plant.state.elements)
@@ -105,6 +109,12 @@ class Limits(Checked):
             if not isinstance(weight, int | float) or not 0 < weight < math.inf:
                 mistakes.add(f"soft: the weight of '{name}' must be a positive number, got {weight!r}")
         mistakes.raise_if_any()
+
+    def input_ends(self, plant: Plant) -> tuple[list[float], list[float]]:
+        """Lower and upper end of every input, which may be live numbers; infinite where free."""
+        free = (-math.inf, math.inf)
+        intervals = [self.inputs.get(name, free) for name in plant.input.elements]
+        return [low for low, _ in intervals], [high for _, high in intervals]
 
     def input_bounds(self, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bound of every input, shape (nu,) each; infinite where free."""

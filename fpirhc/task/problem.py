@@ -20,6 +20,7 @@ from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line
+from fpirhc.symbolic.live import nominal
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.limits import Limits
@@ -140,7 +141,7 @@ class Problem(Checked):
     @cached_property
     def inputs_before(self) -> np.ndarray:
         """Inputs before the first cycle, shape (nu,)."""
-        lower, upper = self.limits.input_bounds(self.plant)
+        lower, upper = nominal(self.limits).input_bounds(self.plant)
         resting = np.clip(np.zeros(len(self.plant.inputs)), lower, upper)
         stated = {**self.dead_time.before, **self.input_before}
         values = [stated.get(name, rest) for name, rest in zip(self.plant.inputs, resting, strict=True)]

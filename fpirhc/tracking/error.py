@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import casadi as ca
 
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+from fpirhc.symbolic.live import is_live
 
 
 def law_signals(plant: Plant) -> tuple[Layout, Layout]:
@@ -36,6 +40,30 @@ def integral_update(plant: Plant, period: float) -> Block:
 def integral_delay(plant: Plant) -> tuple[Delay, ...]:
     """Delay that carries the updated integral to the next cycle."""
     return (Delay(integral_signal(plant, "_integral_before"), "integral"),)
+
+
+def gains_before(plant: Plant, gains: Sequence[float]) -> Layout:
+    """What a law remembers of its integral gains, one per controlled coordinate: the last ones where some are live."""
+    if not is_live(gains):
+        return Layout()
+    return Layout((vector("integral_gain", plant.controlled_names, "1", [1.0] * len(gains)),))
+
+
+def bumpless(s: Signals, gains: Sequence[float]) -> tuple[Expression, dict[str, Expression]]:
+    """Return the integral of the error, and the gains to remember.
+
+    The contribution of the integral stays where a live gain changes, I+ = I g_before / g, so that the command does not jump by the
+    integral's share. Without a change the factor is exactly 1.
+
+    Args:
+        s: signals of the law, with `gains_before` in its memory.
+        gains: of the integral, one per controlled coordinate.
+    """
+    if not is_live(gains):
+        return s._integral_before, {}
+    now = numbers(gains)
+    factor = ca.if_else(now == 0, 1, s.integral_gain / ca.if_else(now == 0, 1, now))
+    return factor * s._integral_before, {"integral_gain_next": now}
 
 
 def error_signal(plant: Plant) -> Signal:

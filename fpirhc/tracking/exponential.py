@@ -21,9 +21,10 @@ from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, total
+from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.layout import Expression
 from fpirhc.tracking.base import Feedback, Tracking
-from fpirhc.tracking.error import error_chains, integral_delay, integral_update, law_signals
+from fpirhc.tracking.error import bumpless, error_chains, gains_before, integral_delay, integral_update, law_signals
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Exponential(Tracking):
     def gains(self, order: int) -> tuple[float, ...]:
         """Gains of (e_int, e, e', ...) with the integral, of (e, e', ...) without; lowest derivative first."""
         degree = order + 1 if self.integral else order
-        return tuple(math.comb(degree, s) * self.rate ** (degree - s) for s in range(degree))
+        return tuple(math.comb(degree, s) * power(self.rate, degree - s) for s in range(degree))
 
     @property
     def speed(self) -> float:
@@ -65,19 +66,23 @@ class Exponential(Tracking):
         """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
         del period
         reads, writes = law_signals(plant)
+        orders = [plant.orders[k] for k in plant.controlled_indices]
+        first_gains = [self.gains(order)[0] for order in orders] if self.integral else []
 
         def step(s: Signals) -> dict[str, Expression]:
             errors = error_chains(plant, s._target - s.state)
             first_integral = ca.vertcat(*(self._first_integral(chain) for chain in errors))
-            integral = ca.if_else(s.warm_up > 0.5, s._integral_before, first_integral)
+            integral_before, remembered = bumpless(s, first_gains)
+            integral = ca.if_else(s.warm_up > 0.5, integral_before, first_integral)
             feedback = [self._feedback(integral[k], chain) for k, chain in enumerate(errors)]
             return {
                 "_target_error": ca.vertcat(*(chain[0] for chain in errors)),
                 "desired": s.nominal + ca.vertcat(*feedback),
                 "_integral_used": integral,
+                **remembered,
             }
 
-        return Block("tracking", reads, writes, step)
+        return Block("tracking", reads, writes, step, gains_before(plant, first_gains))
 
     def update(self, plant: Plant, period: float) -> Block:
         """Block that integrates the error, except while the command is clipped."""

@@ -34,6 +34,7 @@ from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.tracking.base import Tracking
 from fpirhc.tracking.error import error_chains, integral_delay, integral_update, law_signals
@@ -96,7 +97,7 @@ class Fractional(Tracking):
 
     def gains(self, order: int) -> tuple[float, ...]:
         """Gains of (e_int, e, e', ...) in S below its highest derivative, for relative order n."""
-        return tuple(math.comb(order, s) * self.rate ** (order - s) for s in range(order))
+        return tuple(math.comb(order, s) * power(self.rate, order - s) for s in range(order))
 
     @property
     def speed(self) -> float:

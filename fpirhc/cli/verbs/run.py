@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from fpirhc.cli.exit_codes import ExitCode
 from fpirhc.cli.options import add_no_compile, add_out, add_problem, add_seed
@@ -12,7 +12,10 @@ from fpirhc.cli.output import results_folder
 from fpirhc.cli.verb import Verb
 
 if TYPE_CHECKING:
+    from fpirhc.controllers.base import Controller
+    from fpirhc.simulation.run import Run
     from fpirhc.studies.comparison.compare import Progress
+    from fpirhc.task.problem import Problem
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
@@ -21,6 +24,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_out(parser)
     add_seed(parser, "the noise")
     add_no_compile(parser)
+    text = "another number for a setting, such as deformation.gain=-1.2, cost.states.q1=500 or limits.inputs.Q1=-50,20"
+    parser.add_argument("--set", action="append", default=[], dest="settings", metavar="PATH=NUMBER", help=text)
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
@@ -28,16 +33,16 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.report.figures import save_figure
     from fpirhc.report.terminal import announce_backend, progress_bars, show_run
     from fpirhc.simulation.metrics import measure
-    from fpirhc.simulation.simulate import simulate
     from fpirhc.studies.comparison.compare import select
 
     task, name = load_problem(options.problem), options.controller
     controller = select(task, [name])[name]
     folder = results_folder(options.out, task.name)
     with progress_bars() as progress:
-        run = simulate(
+        problem, run = _simulated(
             task.problem,
             controller,
+            numbers(options.settings),
             seed=options.seed,
             name=name,
             compiled=not options.no_compile,
@@ -47,8 +52,52 @@ def _run(options: argparse.Namespace) -> ExitCode:
     run.save(folder / f"{stem}.npz")
     save_figure(run.plot(), folder / f"{stem}.png")
     announce_backend([run])
-    show_run(run, measure(task.problem, run, task.metrics), folder / f"{stem}.npz")
+    show_run(run, measure(problem, run, task.metrics), folder / f"{stem}.npz")
     return ExitCode.FINISHED if run.stop is None else ExitCode.ENDED_EARLY
+
+
+def numbers(settings: Sequence[str]) -> dict[str, float | tuple[float, ...]]:
+    """Return numbers by path from texts 'PATH=NUMBER', or 'PATH=LOWER,UPPER' for an interval.
+
+    Raises:
+        InvalidValue: a text of another form.
+    """
+    from fpirhc.errors import InvalidValue
+
+    values: dict[str, float | tuple[float, ...]] = {}
+    for text in settings:
+        path, _, value = text.partition("=")
+        try:
+            parts = tuple(float(part) for part in value.split(","))
+        except ValueError:
+            raise InvalidValue(
+                f"--set {text}: expected PATH=NUMBER, such as deformation.gain=-1.2, or PATH=LOWER,UPPER for an interval"
+            ) from None
+        values[path.strip()] = parts if len(parts) > 1 else parts[0]
+    return values
+
+
+def _simulated(
+    problem: Problem, controller: Controller, settings: Mapping[str, float | tuple[float, ...]], **run: Any
+) -> tuple[Problem, Run]:
+    """The problem and a run of it with these settings: live ones where they can be, so that other numbers need no compiler."""
+    from fpirhc.controllers.live_settings import live_settings
+    from fpirhc.errors import NotSupported
+    from fpirhc.problem_files.settings import is_whole, with_settings
+    from fpirhc.simulation.simulate import simulate
+
+    if not settings:
+        return problem, simulate(problem, controller, **run)
+    try:
+        live = simulate(problem, controller, settings=settings, **run)
+        return live_settings(problem, controller, list(settings)).changed(settings)[0], live
+    except NotSupported:
+        values: dict[str, Any] = {
+            p: v if isinstance(v, tuple) or v % 1 or not is_whole(controller, p) else int(v)
+            for p, v in settings.items()
+        }
+        rebuilt = with_settings(controller, values)
+        return problem, simulate(problem, rebuilt, **run)
 
 
 def _named(progress: Progress, name: str) -> Callable[[int, int], None]:
@@ -66,6 +115,10 @@ VERB = Verb(
     },
     examples=(
         ('fpirhc run two_mass "RHC+FPI"', "one run, saved as .npz and .png"),
+        (
+            'fpirhc run two_mass "RHC+FPI" --set deformation.gain=-1.2',
+            "another gain; other numbers of it need no compiler",
+        ),
         ('fpirhc run my_arm.py "RHC+FPI" --out results --seed 3', "another folder, other noise"),
     ),
 )

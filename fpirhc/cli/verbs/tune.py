@@ -26,8 +26,11 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_mismatch(parser)
     text = "tune by this number of a run, such as settling.q1 (default: the relative error)"
     parser.add_argument("--metric", metavar="NAME", help=text)
-    text = "compile every trial, which pays where its runs last longer than the compiler"
-    parser.add_argument("--compile", action="store_true", help=text)
+    text = "compile every trial of settings that decide what the loop is made of; others share one compiled loop anyway"
+    compiling = parser.add_mutually_exclusive_group()
+    compiling.add_argument("--compile", action="store_const", const=True, dest="compiled", help=text)
+    text = "compile no loop"
+    compiling.add_argument("--no-compile", action="store_const", const=False, dest="compiled", help=text)
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
@@ -50,7 +53,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
             count=options.scenarios,
             percent=options.mismatch,
             metric=options.metric,
-            compiled=options.compile,
+            compiled=options.compiled,
             progress=progress,
         )
     write_tuned(tuning.facts(), folder / "tuning.json")

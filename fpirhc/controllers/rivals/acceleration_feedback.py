@@ -32,7 +32,9 @@ from fpirhc.errors import InvalidValue
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
+from fpirhc.symbolic.functions import exp
 from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -69,7 +71,7 @@ class AccelerationFeedback(Controller):
 
     def pole(self, period: float) -> float:
         """Return the pole p of the low-pass for control cycles of that period, s."""
-        return math.exp(-period / self.time_constant) if self.time_constant > 0 else 0.0
+        return exp(-period / self.time_constant) if nominal(self.time_constant) > 0 else 0.0
 
     def largest_gain(self, period: float) -> float:
         """Return the stability limit (1 + p) / (1 - p) of kappa lambda_max(J) for control cycles of that period, s."""

@@ -92,7 +92,7 @@ class Learning:
         plant, regressor = problem.plant, self.regressor(problem)
         believed = like(regressor.believed.parameter, "_believed")
         others = [k for k in range(len(plant.parameters)) if k not in regressor.covered]
-        lower, upper = (np.array([b[k] for b in self.bounds.values()], dtype=float) for k in (0, 1))
+        lower, upper = ([b[k] for b in self.bounds.values()] for k in (0, 1))
         equation = equation_function(regressor)
         learned = Signal("learned", regressor.signal.elements, regressor.signal.units)
         reads = (

@@ -42,6 +42,7 @@ from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.error import error_chains
@@ -122,7 +123,7 @@ class LyapunovMRAC(Controller):
         start, response, rate = _start_gains(plant), plant.controlled_response_function, self.rate
 
         def pull(row: np.ndarray, chain: list[Expression]) -> Expression:
-            return sum(w * rate ** (len(chain) - 1 - j) * e for j, (w, e) in enumerate(zip(row, chain, strict=True)))
+            return sum(w * power(rate, len(chain) - 1 - j) * e for j, (w, e) in enumerate(zip(row, chain, strict=True)))
 
         def step(s: Signals) -> dict[str, Expression]:
             errors = error_chains(plant, s.reference - s.state)

@@ -28,10 +28,19 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.errors import Mistakes
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.symbolic.live import is_live
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.error import error_chains, error_signal, integral_delay, integral_signal, integral_update
+from fpirhc.tracking.error import (
+    bumpless,
+    error_chains,
+    error_signal,
+    gains_before,
+    integral_delay,
+    integral_signal,
+    integral_update,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,20 +123,23 @@ class PID(Controller):
         plant = problem.plant
         orders = [plant.orders[k] for k in plant.controlled_indices]
         gains = [self.gains(n, order) for n, order in zip(plant.controlled_names, orders, strict=True)]
+        integral_gains = [k[0] for k in gains]
 
         def step(s: Signals) -> dict[str, Expression]:
             errors = error_chains(plant, s.reference - s.state)
             direct = [
-                sum(g * e for g, e in zip(k[1:], chain, strict=True)) for k, chain in zip(gains, errors, strict=True)
+                total(g * e for g, e in zip(k[1:], chain, strict=True)) for k, chain in zip(gains, errors, strict=True)
             ]
-            starts = [-d / k[0] if self.bumpless and k[0] else 0 * d for k, d in zip(gains, direct, strict=True)]
-            integral = ca.if_else(s.warm_up > 0.5, s._integral_before, ca.vertcat(*starts))
+            starts = [_first_integral(k[0], d) if self.bumpless else 0 * d for k, d in zip(gains, direct, strict=True)]
+            integral_before, remembered = bumpless(s, integral_gains)
+            integral = ca.if_else(s.warm_up > 0.5, integral_before, ca.vertcat(*starts))
             command = ca.vertcat(*(k[0] * integral[i] + d for i, (k, d) in enumerate(zip(gains, direct, strict=True))))
             return {
                 "_target_error": ca.vertcat(*(chain[0] for chain in errors)),
                 "_integral_used": integral,
                 "command_unclipped": command,
                 "_deformed_unclipped": plant.controlled_response_function(s.state, command, s.parameters),
+                **remembered,
             }
 
         before, in_use = integral_signal(plant, "_integral_before"), integral_signal(plant, "_integral_used")
@@ -138,7 +150,15 @@ class PID(Controller):
             like(plant.input, "command_unclipped"),
             plant.response_signal("_deformed_unclipped"),
         )
-        return Block("pid", Layout(reads), Layout(writes), step)
+        return Block("pid", Layout(reads), Layout(writes), step, gains_before(plant, integral_gains))
+
+
+def _first_integral(gain: float, direct: Expression) -> Expression:
+    """The integral with which the first command is zero; zero without an integral gain, which may change where it is live."""
+    if not is_live(gain):
+        return -direct / gain if gain else 0 * direct
+    without = ca.SX(gain) == 0
+    return ca.if_else(without, 0 * direct, -direct / ca.if_else(without, 1, gain))
 
 
 EXAMPLES = (

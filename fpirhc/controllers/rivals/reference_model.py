@@ -19,13 +19,14 @@ from fpirhc.controllers.base import like
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.tracking.error import error_chains
 
 
 def decay_gains(rate: float, order: int) -> tuple[float, ...]:
     """Return the gains of (e, e', ...) in (d/dt + rate)^n e = 0, lowest derivative first."""
-    return tuple(math.comb(order, s) * rate ** (order - s) for s in range(order))
+    return tuple(math.comb(order, s) * power(rate, order - s) for s in range(order))
 
 
 def companion(gains: tuple[float, ...]) -> np.ndarray:

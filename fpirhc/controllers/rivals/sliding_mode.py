@@ -30,6 +30,7 @@ from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.layout import Expression, Layout, vector
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.error import error_chains
@@ -98,7 +99,7 @@ class SlidingMode(Controller):
             surfaces, drifts = [], []
             for chain in error_chains(plant, s.reference - s.state):
                 degree = len(chain) - 1
-                gains = [math.comb(degree, k) * self.rate ** (degree - k) for k in range(degree + 1)]
+                gains = [math.comb(degree, k) * power(self.rate, degree - k) for k in range(degree + 1)]
                 surfaces.append(sum(g * e for g, e in zip(gains, chain, strict=True)))
                 drifts.append(sum((g * e for g, e in zip(gains, chain[1:], strict=False)), start=0 * chain[0]))
             surface = ca.vertcat(*surfaces)

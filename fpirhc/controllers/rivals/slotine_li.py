@@ -18,6 +18,7 @@ from fpirhc.members import Example
 from fpirhc.plant.regressor import Combination, Regressor
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
 from fpirhc.task.problem import Problem
 
@@ -164,8 +165,8 @@ class SlotineLi(Controller):
 
         return Block("force", Layout(reads), Layout((like(plant.input, "command_unclipped"),)), step)
 
-    def _damping(self, problem: Problem) -> ca.DM:
-        return ca.DM([self.damping[name] for name in problem.plant.names])
+    def _damping(self, problem: Problem) -> Expression:
+        return numbers([self.damping[name] for name in problem.plant.names])
 
 
 def _rates(problem: Problem, name: str) -> Signal:

@@ -23,6 +23,7 @@ from fpirhc.plant.relative_order import OutputChain, output_chain
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Named, Signal
+from fpirhc.symbolic.live import PREFIX
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -160,7 +161,7 @@ def for_channel(
         return Signal(name, signal.elements, signal.units, signal.start)
 
     begun = one.signal("warm_up")
-    reads = [renamed(s) for s in block.reads.signals]
+    reads = [s if s.name.startswith(PREFIX) else renamed(s) for s in block.inputs.signals]
     own = [renamed(s) for s in block.memory.signals]
     reads_begun = [] if not own or begun.name in [s.name for s in reads] else [begun]
 

@@ -166,7 +166,7 @@ _PER_SLOT = (*_FLAGS, *_VALUES)
 def command_block(problem: Problem, channels: Sequence[Channel]) -> Block:
     """Block that inverts the active slot's request, clips the command, and writes what the command means for every slot."""
     plant = problem.plant
-    lower, upper = problem.limits.input_bounds(plant)
+    lower, upper = problem.limits.input_ends(plant)
     places = [plant.input.elements.index(c.chain.input) for c in channels]
 
     def step(s: Signals) -> dict[str, Value]:

@@ -28,6 +28,7 @@ from fpirhc.deformation.wrappers.forgetting import forget
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.live import nominal
 
 EVENTS = {1: "oscillation at the step limit", 2: "growing oscillation", 3: "request too far from the desired response"}
 EVENTS |= {4: "not finite", 5: "fallback: no adaptation any more", 6: "recovered: full gain again"}
@@ -105,7 +106,7 @@ class Guarded(Wrapper):
         limit = own["factor"] * self.map.largest_step()
         at_limit = (
             smooth_norm(candidate - request, 1e-12) >= _AT_LIMIT * limit
-            if math.isfinite(self.map.largest_step()) and self.map.mirror is None
+            if math.isfinite(nominal(self.map.largest_step())) and self.map.mirror is None
             else 0
         )
         fast = own["fast"] + _FAST * (size - own["fast"])

@@ -10,6 +10,7 @@ import casadi as ca
 
 from fpirhc.errors import InvalidValue
 from fpirhc.learning.rules.base import Bounds, Evidence, Rule
+from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression
 
 
@@ -53,7 +54,7 @@ class LyapunovRule(Rule):
     def change(self, evidence: Evidence, bounds: Bounds, period: float) -> Expression:
         """Return period Gamma G^T w."""
         matrix, along = evidence.gradient()
-        gains = ca.DM([self.gains[name] for name in bounds])
+        gains = numbers([self.gains[name] for name in bounds])
         return (1 - evidence.clipped) * period * gains * ca.mtimes(matrix.T, along)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any
@@ -33,13 +33,13 @@ class Conditions:
         seed: of the scenarios.
         use: of the scenarios, see `draws`.
         percent: range of the exact parameters' draws, percent.
-        compiled: whether runs use compiled C.
+        compiled: whether runs use compiled C; None: only those of loops with live settings, which are compiled once.
     """
 
     seed: int
     use: int
     percent: float
-    compiled: bool
+    compiled: bool | None
 
 
 def fingerprint(task: Task, conditions: Conditions) -> dict[str, Any]:
@@ -81,29 +81,31 @@ class Bench:
     Args:
         task: the loaded problem file.
         conditions: conditions of the scenarios.
+        live: paths of the settings that `record` may change, by name of the controller.
 
     Raises:
         InvalidProblem, InvalidValue: draws that could leave the parameters' physical bounds.
     """
 
-    def __init__(self, task: Task, conditions: Conditions) -> None:
+    def __init__(self, task: Task, conditions: Conditions, live: Mapping[str, Sequence[str]] | None = None) -> None:
         exact_ranges(task.problem.plant, conditions.percent)
+        self._live = live or {}
         self._task, self._conditions = task, conditions
         self._ranges = ranges(task.problem)
         self._simulators: dict[str, Simulator | FpirhcError] = {}
         self._drawn: tuple[int, Scenario, Problem] | None = None
 
-    def record(self, number: int, name: str) -> dict[str, Any]:
+    def record(self, number: int, name: str, settings: Mapping[str, float] | None = None) -> dict[str, Any]:
         """Return the result of one controller in one scenario, as plain data; a number that is not finite becomes None.
 
-        A controller that cannot serve the problem gives {"controller": its name, "skipped": the reason}.
+        A controller that cannot serve the problem, or not with these live settings, gives {"controller": its name, "skipped": the
+        reason}.
         """
+        scenario, variant = self._scenario(number)
         try:
-            ready = self._simulator(name)
+            run = self._simulator(name).run(seed=scenario.seed, name=name, variant=variant, settings=settings)
         except FpirhcError as error:
             return {"controller": name, "skipped": str(error)}
-        scenario, variant = self._scenario(number)
-        run = ready.run(seed=scenario.seed, name=name, variant=variant)
         metrics = measure(variant, run, self._task.metrics)
         size = relative_error(metrics, self._ranges)
         return {
@@ -135,9 +137,17 @@ class Bench:
             raise ready
         return ready
 
+    def changes(self, name: str) -> bool:
+        """Whether the live settings of a controller can be changed: its loop can be built with them."""
+        if name not in self._simulators:
+            self._simulators[name] = self._built(name)
+        return isinstance(self._simulators[name], Simulator)
+
     def _built(self, name: str) -> Simulator | FpirhcError:
+        live, compiled = self._live.get(name, ()), self._conditions.compiled
+        compile_it = compiled if compiled is not None else bool(live)
         try:
-            return simulator(self._task.problem, self._task.controllers[name], compiled=self._conditions.compiled)
+            return simulator(self._task.problem, self._task.controllers[name], compiled=compile_it, live=live)
         except FpirhcError as error:
             return error
 

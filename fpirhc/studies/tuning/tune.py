@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -120,7 +120,7 @@ def tune(
     count: int = 1,
     percent: float = 0.0,
     metric: str | None = None,
-    compiled: bool = False,
+    compiled: bool | None = None,
     progress: Progress | None = None,
 ) -> Tuning:
     """Try settings of every controller with a search space and return the best; trials that `folder` holds are not repeated.
@@ -135,8 +135,8 @@ def tune(
         percent: range of the exact parameters' draws, percent.
         metric: number that is the cost, for example 'settling.q1' or 'clipped_share'; the cost has the opposite sign
             where larger is better. None: the relative error.
-        compiled: whether runs use compiled C. Other settings are other C code, so compiling pays where the runs of a
-            trial last longer than the compiler.
+        compiled: whether runs use compiled C. None: where all settings of the search can be live, so that one compiled loop
+            serves all trials; other settings are other C code, and compiling pays only where runs last longer than the compiler.
         progress: function of (controller, trials done, trials in all) that is called after every trial.
 
     Raises:
@@ -209,18 +209,22 @@ def _tuned(
     spans = task.tuning[name]
     known = {r["trial"]: r for r in ledger.records if r["controller"] == name}
     before = {path: current_setting(task.controllers[name], path) for path in spans}
+    judge = _Judge(task, name, tuple(spans), conditions, count, aim)
     study = optuna.create_study()
     ranges = dict.fromkeys(spans, optuna.distributions.FloatDistribution(0.0, 1.0))
     for number in range(_PRESENT, trials):
-        record = known.get(number)
+        record, trial = known.get(number), None
         if record is None:
-            shares = {} if number == _PRESENT else _proposal(optuna, study, ranges, conditions.seed, number)
+            trial = None if number == _PRESENT else _proposal(optuna, study, ranges, conditions.seed, number)
+            shares = {} if trial is None else dict(trial.params)
             settings = before if number == _PRESENT else _numbers(task, name, spans, shares)
             record = {"controller": name, "trial": number, "shares": shares, "settings": settings}
-            record |= _judged(task, name, settings, conditions, count, aim)
+            record |= judge.judged(settings)
             ledger.append(record)
             known[number] = record
-        if number != _PRESENT:
+        if trial is not None:
+            study.tell(trial, record["cost"])
+        elif number != _PRESENT:
             finished = optuna.trial.create_trial(params=record["shares"], distributions=ranges, value=record["cost"])
             study.add_trial(finished)
         if progress:
@@ -231,13 +235,11 @@ def _tuned(
     return TunedController(name, before, best["settings"], tried[0]["cost"], best["cost"], failed)
 
 
-def _proposal(optuna: ModuleType, study: Any, ranges: Mapping[str, Any], seed: int, number: int) -> dict[str, float]:
-    """Shares of the spans that trial `number` is to try, given all trials before it."""
+def _proposal(optuna: ModuleType, study: Any, ranges: Mapping[str, Any], seed: int, number: int) -> Any:
+    """Optuna's trial `number` with shares of the spans to try, given all trials before it; its cost is told to the study later."""
     state = int(np.random.SeedSequence(seed, spawn_key=(TUNING, number)).generate_state(1)[0])
-    # A copy of the study proposes, because a proposal stays in its study as a running trial until its cost is added.
-    proposing = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=state))
-    proposing.add_trials(study.get_trials(deepcopy=False))
-    return dict(proposing.ask(ranges).params)
+    study.sampler = optuna.samplers.TPESampler(seed=state)
+    return study.ask(ranges)
 
 
 def _numbers(task: Task, name: str, spans: TuningSpans, shares: Mapping[str, float]) -> dict[str, float]:
@@ -245,15 +247,33 @@ def _numbers(task: Task, name: str, spans: TuningSpans, shares: Mapping[str, flo
     return {p: round(v) if is_whole(task.controllers[name], p) else v for p, v in settings.items()}
 
 
-def _judged(
-    task: Task, name: str, settings: Mapping[str, float], conditions: Conditions, count: int, aim: Objective
-) -> dict[str, float]:
-    """Cost of these settings, and in how many scenarios they fail; settings that are refused fail in all of them."""
-    try:
-        changed = with_settings(task.controllers[name], settings)
-        bench = Bench(replace(task, controllers={name: changed}), conditions)
-        records = [bench.record(k, name) for k in range(count)]
-    except (InvalidValue, InvalidProblem):
-        return {"cost": aim.refused, "failures": count}
-    costs = [aim.cost(record) for record in records]
-    return {"cost": math.fsum(costs) / count, "failures": sum(r.get("outcome") != "finished" for r in records)}
+class _Judge:
+    """Judges settings of one controller in all scenarios: with one loop where the settings can be live, else one for each."""
+
+    def __init__(
+        self, task: Task, name: str, paths: Sequence[str], conditions: Conditions, count: int, aim: Objective
+    ) -> None:
+        # A trial keeps its cost alone, so no other metric is measured.
+        needed = {"rms_error", aim.metric.name if aim.metric else ""}
+        self._task = replace(task, metrics=[metric for metric in task.metrics if metric.name in needed])
+        self._name, self._conditions, self._count, self._aim = name, conditions, count, aim
+        self._paths, self._bench = paths, cast(Bench | None, None)
+
+    def judged(self, settings: Mapping[str, float]) -> dict[str, float]:
+        """Cost of these settings, and in how many scenarios they fail; settings that are refused fail in all of them."""
+        try:
+            records = self._records(settings)
+        except (InvalidValue, InvalidProblem):
+            return {"cost": self._aim.refused, "failures": self._count}
+        costs = [self._aim.cost(record) for record in records]
+        failures = sum(r.get("outcome") != "finished" for r in records)
+        return {"cost": math.fsum(costs) / self._count, "failures": failures}
+
+    def _records(self, settings: Mapping[str, float]) -> list[dict[str, Any]]:
+        if self._bench is None:
+            self._bench = Bench(self._task, self._conditions, {self._name: self._paths})
+        if self._bench.changes(self._name):
+            return [self._bench.record(k, self._name, settings) for k in range(self._count)]
+        changed = with_settings(self._task.controllers[self._name], settings)
+        bench = Bench(replace(self._task, controllers={self._name: changed}), self._conditions)
+        return [bench.record(k, self._name) for k in range(self._count)]

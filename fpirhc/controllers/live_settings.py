@@ -1,0 +1,262 @@
+"""Settings that stay open in a compiled loop: which numbers of a controller and its problem they are, and what they may be.
+
+    live = live_settings(problem, controller, ["deformation.gain", "cost.states.q1", "limits.inputs.Q1"])
+
+A path begins at the controller, or at the problem for its cost and limits. The path of an interval stands for its finite ends,
+'limits.inputs.Q1.0' and '.1'. Automatic settings of the controller, such as the scale of a sigmoid, are recomputed from the
+others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, is_dataclass
+from typing import cast
+
+import numpy as np
+
+from fpirhc.controllers.contract import Controller, checked, resolved
+from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotSupported, nearest
+from fpirhc.fields.checked import expects_whole_number
+from fpirhc.symbolic.block import Block, Composite, Delay, open_settings
+from fpirhc.symbolic.constants import holds_nan
+from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.symbolic.live import PREFIX, copied, live_number
+from fpirhc.symbolic.paths import changed_at, content_at, names_in
+from fpirhc.task.problem import Problem
+
+_OF_PROBLEM = ("cost", "limits")
+_ALWAYS_DATA = "parameters (exact and approximate) and the start are data of every loop; they need no live setting"
+Numbers = Mapping[str, float | Sequence[float]]  # by path; a pair for an interval
+
+
+@dataclass(frozen=True, eq=False)
+class LiveSettings:
+    """The live settings of one loop.
+
+    Args:
+        problem: the problem with the numbers of the build.
+        given: the controller as it was given, with the numbers of the build.
+        controller: the same with its automatic settings chosen.
+        paths: of all live numbers, intervals as their ends.
+        automatic: paths of automatic settings, which follow from the others.
+    """
+
+    problem: Problem
+    given: Controller
+    controller: Controller
+    paths: tuple[str, ...] = ()
+    automatic: tuple[str, ...] = ()
+
+    @property
+    def start(self) -> dict[str, float]:
+        """The numbers of the build by path."""
+        return {path: float(self._content(path)) for path in (*self.paths, *self.automatic)}
+
+    @property
+    def signals(self) -> Layout:
+        """One signal per setting, with the number of the build as its start."""
+        return Layout(tuple(scalar(PREFIX + path, start=value) for path, value in self.start.items()))
+
+    def planted(self) -> tuple[Problem, Controller]:
+        """Return problem and controller with live numbers in place of the settings."""
+        problem, controller = self.problem, self.controller
+        for path, value in self.start.items():
+            if self._in_problem(path):
+                problem = changed_at(problem, path, live_number(path, value), copied)
+            else:
+                controller = changed_at(controller, path, live_number(path, value), copied)
+        return problem, controller
+
+    def composed(self, compose: Callable[[Problem, Controller], Composite]) -> Composite:
+        """Return what `compose` makes of problem and controller with live numbers.
+
+        Raises:
+            NotSupported: a setting that is needed as a number while the loop is built, or that the loop does not use.
+        """
+        problem, controller = self.planted()
+        try:
+            composite = compose(problem, controller)
+        except (ArithmeticError, AttributeError, FpirhcError, RuntimeError, TypeError, ValueError) as error:
+            raise self._refusal(error) from None
+        read = {s.name for b in composite.blocks for s in b.inputs.signals}
+        for path in self.paths:
+            if PREFIX + path not in read:
+                raise NotSupported(
+                    f"setting '{path}' cannot be live: the loop of {type(self.controller).__name__} does not use it, or uses only "
+                    "numbers that are computed from it while the loop is built"
+                )
+        _refuse_lost(composite, self.paths)
+        return composite
+
+    def _refusal(self, error: Exception) -> Exception:
+        """The error that names the settings, for an error of the build."""
+        if isinstance(error, FpirhcError) and any(f"'{path}'" in str(error) for path in self.start):
+            return error
+        lost = [path for path in self.start if f"{PREFIX}{path}" in str(error)]
+        if lost:
+            what = "a part of the loop that is built by itself needs its number"
+            return NotSupported(f"setting '{lost[0]}' cannot be live here: {what}")
+        names = ", ".join(f"'{path}'" for path in self.start)
+        return NotSupported(f"settings {names} cannot be live together: the loop cannot be built with them ({error})")
+
+    def held(self, blocks: Sequence[Block]) -> list[Delay]:
+        """Return the settings and derived numbers that some blocks read, as constants of a memory."""
+        return [Delay(s, s.name) for s in self.read_by(blocks)]
+
+    def read_by(self, blocks: Sequence[Block]) -> list[Signal]:
+        """Return the signals of settings and derived numbers that some blocks read, with their numbers of the build."""
+        starts = {s.name: s for s in self.signals.signals}
+        return [starts.get(s.name, s) for s in open_settings(blocks).signals]
+
+    def changed(self, numbers: Numbers) -> tuple[Problem, Controller, dict[str, float]]:
+        """Return problem and controller with other numbers, checked, and the numbers of all settings by path.
+
+        Args:
+            numbers: by path, a pair for an interval; settings that are not named have the numbers of the build.
+
+        Raises:
+            InvalidName: a setting that is not live.
+            InvalidValue: a number that the setting does not accept, or with which the loop does not contract.
+        """
+        values = {path: value for path, value in self.start.items() if path in self.paths}
+        values |= self.flat(numbers)
+        problem, given = self.problem, self.given
+        for path, value in values.items():
+            self._check_side(path, value)
+            if self._in_problem(path):
+                problem = changed_at(problem, path, value)
+            else:
+                given = changed_at(given, path, value)
+        controller = resolved(problem, given)
+        for path in self.automatic:
+            values[path] = float(cast(float, content_at(controller, path)))
+        return problem, checked(problem, controller, numbers_only=True), values
+
+    def flat(self, numbers: Numbers) -> dict[str, float]:
+        """Return numbers by path, with the ends of intervals one by one.
+
+        Raises:
+            InvalidName: a setting that is not live; the nearest one is offered.
+            InvalidValue: no number, or no pair of numbers for an interval.
+        """
+        values: dict[str, float] = {}
+        for path, value in numbers.items():
+            ends = [p for p in self.paths if p in (path, f"{path}.0", f"{path}.1")]
+            if not ends:
+                raise InvalidName(f"setting '{path}' is not live in this loop.{nearest(path, self.paths)}")
+            parts = [(path, value)] if ends == [path] else self._parts(path, value, ends)
+            for name, part in parts:
+                if isinstance(part, bool) or not isinstance(part, int | float | np.number) or math.isnan(part):
+                    raise InvalidValue(f"setting '{name}': expected a number, got {part!r}")
+                values[name] = float(part)
+        return values
+
+    def _parts(self, path: str, value: object, ends: list[str]) -> list[tuple[str, object]]:
+        if not isinstance(value, Sequence) or len(value) != 2:
+            raise InvalidValue(f"setting '{path}' is an interval: expected a pair (lower, upper), got {value!r}")
+        both = {f"{path}.{k}": value[k] for k in (0, 1)}
+        for name in both.keys() - set(ends):
+            if both[name] != self._content(name):
+                raise InvalidValue(f"setting '{path}': its end '{name}' is {self._content(name)} and not live")
+        return [(name, both[name]) for name in ends]
+
+    def _check_side(self, path: str, value: float) -> None:
+        """Refuse an infinite end of a limit: whether there is a limit decides what is compiled."""
+        if not math.isfinite(value):
+            raise InvalidValue(
+                f"setting '{path}' cannot become {value}: the compiled loop has this number in its code; use a large one"
+            )
+
+    def _in_problem(self, path: str) -> bool:
+        return _owner(self.problem, self.controller, path) is self.problem
+
+    def _content(self, path: str) -> float:
+        return cast(float, content_at(_owner(self.problem, self.controller, path), path))
+
+
+def live_settings(problem: Problem, controller: Controller, paths: Sequence[str] = ()) -> LiveSettings:
+    """Return the live settings of a loop, with the controller resolved.
+
+    Raises:
+        InvalidName: no such setting; the nearest one is offered.
+        InvalidValue: no number stands at a path.
+        NotSupported: a setting that decides what the loop is made of.
+    """
+    ready = resolved(problem, controller)
+    every = tuple(dict.fromkeys(end for path in paths for end in _ends(problem, controller, path)))
+    automatic = tuple(_differences(controller, ready)) if every else ()
+    return LiveSettings(problem, controller, ready, every, automatic)
+
+
+def _ends(problem: Problem, controller: Controller, path: str) -> list[str]:
+    """The path of a number, or the paths of the finite ends of an interval."""
+    owner = _owner(problem, controller, path)
+    content = content_at(owner, path, "the problem" if owner is problem else "the controller")
+    if isinstance(content, tuple) and len(content) == 2 and owner is problem:
+        ends = [f"{path}.{k}" for k in (0, 1) if math.isfinite(content[k])]
+        if not ends:
+            raise InvalidValue(f"setting '{path}' is {content!r}: there is no limit that could change")
+        return ends
+    if isinstance(content, bool) or _is_whole(owner, path):
+        raise NotSupported(
+            f"setting '{path}' is {content!r} and cannot be live: a whole number or a switch decides what the loop is made of; "
+            "build one loop for each"
+        )
+    if not isinstance(content, int | float | np.number):
+        ways = ", ".join(names_in(content)) or "none"
+        hint = "give it a number first" if content is None else f"go on with one of: {ways}"
+        raise InvalidValue(f"setting '{path}' is {content!r}, not a number; {hint}")
+    if not math.isfinite(content):
+        raise InvalidValue(
+            f"setting '{path}' is {content}: there is no limit that could change; give it a finite number"
+        )
+    return [path]
+
+
+def _is_whole(owner: object, path: str) -> bool:
+    parent, _, name = path.rpartition(".")
+    value = content_at(owner, parent) if parent else owner
+    return is_dataclass(value) and expects_whole_number(type(value), name)
+
+
+def _owner(problem: Problem, controller: Controller, path: str) -> Problem | Controller:
+    """The controller, or the problem for a cost or limits that the controller does not have."""
+    first = path.partition(".")[0]
+    if first in names_in(controller) and getattr(controller, first) is not None:
+        return controller
+    if first in _OF_PROBLEM and getattr(problem, first) is not None:
+        return problem
+    valid = [n for n in names_in(controller) if getattr(controller, n) is not None]
+    valid += [n for n in _OF_PROBLEM if getattr(problem, n) is not None]
+    hint = f" {_ALWAYS_DATA}" if first in ("start", "plant", "parameters") else nearest(first, valid)
+    raise InvalidName(f"setting '{path}': neither the controller nor the problem's {_OF_PROBLEM} have '{first}'.{hint}")
+
+
+def _refuse_lost(composite: Composite, paths: Sequence[str]) -> None:
+    """Raise where a Function holds the number NaN: CasADi makes it of a symbol that is turned into a number.
+
+    Raises:
+        NotSupported: some block has such a constant.
+    """
+    for block in composite.blocks:
+        if holds_nan(block.function):
+            names = ", ".join(map(repr, paths))
+            raise NotSupported(
+                f"settings {names} cannot be live together: block '{block.name}' turns one of them into a number, which is NaN"
+            )
+
+
+def _differences(before: object, after: object, path: str = "") -> Iterator[str]:
+    """Paths of the numbers that were chosen: None before, a number after."""
+    if before is after:
+        return
+    if before is None:
+        if isinstance(after, int | float) and not isinstance(after, bool):
+            yield path
+        return
+    for name in names_in(after):
+        inner = getattr(before, name, None) if not isinstance(before, Mapping | Sequence) else None
+        if not isinstance(after, Mapping | Sequence):
+            yield from _differences(inner, getattr(after, name), f"{path}.{name}".lstrip("."))

@@ -1,0 +1,69 @@
+"""Live settings of one run: the numbers at its start, and changes while it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.live_settings import LiveSettings, Numbers
+from fpirhc.errors import InvalidValue
+from fpirhc.symbolic.block import Composite
+from fpirhc.symbolic.live import PREFIX
+from fpirhc.task.problem import Problem
+
+Changes = Mapping[float, Numbers]  # by time, s
+
+
+@dataclass(frozen=True, eq=False)
+class InForce:
+    """The settings of one run.
+
+    Args:
+        problem: the problem with the numbers at the start.
+        controller: the controller with them.
+        numbers: of all live settings at the start, by path.
+        patches: (first cycle, places in the memory, values) of every change, in the order of time.
+        record: what was in force when, as plain data: [time in s, {path: number}], ...
+    """
+
+    problem: Problem
+    controller: Controller
+    numbers: Mapping[str, float]
+    patches: Sequence[tuple[int, np.ndarray, np.ndarray]]
+    record: Sequence[tuple[float, Mapping[str, float]]]
+
+
+def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Numbers, changes: Changes) -> InForce:
+    """Return the settings of a run, checked before it starts.
+
+    Raises:
+        InvalidName, InvalidValue: a setting that is not live, or a number that it does not accept; a time outside the run.
+    """
+    if not (live.paths or settings or changes):
+        return InForce(problem, live.controller, {}, (), ())
+    first = replace(live, problem=problem)
+    ready, controller, numbers = first.changed(settings)
+    record: list[tuple[float, Mapping[str, float]]] = [(0.0, numbers)] if numbers else []
+    patches, asked = [], dict(first.flat(settings))
+    for time in sorted(changes):
+        if not 0 <= time < problem.duration:
+            raise InvalidValue(f"a change of settings at {time!r} s: expected a time in [0, {problem.duration:g}) s")
+        asked |= first.flat(changes[time])
+        _, _, values = first.changed(asked)
+        cycle = int(np.ceil(time / problem.period - 1e-9))
+        patches.append((cycle, *patch(loop, values)))
+        record.append((cycle * problem.period, values))
+    return InForce(ready, controller, numbers, patches, record)
+
+
+def patch(loop: Composite, numbers: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return places in a loop's memory, and the values that these settings and what follows from them have there."""
+    values = {PREFIX + path: np.array([value]) for path, value in numbers.items()}
+    values |= loop.derived(numbers).signals
+    known = {name: value for name, value in values.items() if name in loop.memory}
+    places = [np.arange(loop.memory.slice(n).start, loop.memory.slice(n).stop) for n in known]
+    none = np.zeros(0)
+    return np.concatenate([none.astype(int), *places]), np.concatenate([none, *known.values()])

@@ -1,0 +1,238 @@
+"""Numbers that stay open while a loop is built, so that a compiled loop takes other values of them.
+
+A `LiveNumber` stands in a field of a frozen value in place of a float. Steps use it as they use a float: CasADi turns it into the
+symbol of the setting, SX or MX as the block needs it, and `Block` makes that symbol one more signal that it reads. Formulas of live
+numbers are live numbers. Whatever needs the number itself while the loop is built (float, math, numpy, a branch) is refused with
+the setting's name: CasADi would make NaN of the symbol without an error.
+
+Checks that are meant for the number use `nominal`, and `LiveNumber.value` is the number of the build.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from typing import NoReturn, TypeVar, cast
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import NotSupported
+from fpirhc.symbolic.number import SymbolicNumber
+
+PREFIX = "setting."  # of the names of signals that are settings
+DERIVED = "derived."  # of the paths of numbers that Python computes from settings
+T = TypeVar("T")
+Kind = TypeVar("Kind", float, ca.SX, ca.MX)
+_Of = Callable[[type], object]  # kind (float, ca.SX or ca.MX) -> number or expression of that kind
+_Operation = Callable[[object, object], object]
+
+
+class LiveNumber(SymbolicNumber):
+    """A number of a setting, or a formula of such numbers.
+
+    Args:
+        paths: dotted paths of the settings in it.
+        of: function of a kind (float, ca.SX, ca.MX) that returns the number of the build, or the expression of that kind.
+    """
+
+    __array_ufunc__ = None  # numpy leaves arithmetic with its arrays to this class, which refuses it
+    __slots__ = ("_of", "paths")
+
+    def __init__(self, paths: tuple[str, ...], of: _Of) -> None:
+        self.paths = paths
+        self._of = of
+
+    @property
+    def value(self) -> float:
+        """The number with which the loop is built."""
+        return self.of(float)
+
+    def of(self, kind: type[Kind]) -> Kind:
+        """Return the number of the build (float), or the expression (ca.SX, ca.MX)."""
+        return cast(Kind, self._of(kind))
+
+    def __repr__(self) -> str:
+        return f"LiveNumber({', '.join(self.paths)})"
+
+    def __SX__(self) -> ca.SX:
+        return self.of(ca.SX)
+
+    def __MX__(self) -> ca.MX:
+        return self.of(ca.MX)
+
+    def __add__(self, other: object) -> LiveNumber:
+        return _combined(operator.add, self, other)
+
+    def __radd__(self, other: object) -> LiveNumber:
+        return _combined(operator.add, other, self)
+
+    def __sub__(self, other: object) -> LiveNumber:
+        return _combined(operator.sub, self, other)
+
+    def __rsub__(self, other: object) -> LiveNumber:
+        return _combined(operator.sub, other, self)
+
+    def __mul__(self, other: object) -> LiveNumber:
+        return _combined(operator.mul, self, other)
+
+    def __rmul__(self, other: object) -> LiveNumber:
+        return _combined(operator.mul, other, self)
+
+    def __truediv__(self, other: object) -> LiveNumber:
+        return _combined(operator.truediv, self, other)
+
+    def __rtruediv__(self, other: object) -> LiveNumber:
+        return _combined(operator.truediv, other, self)
+
+    def __pow__(self, exponent: object) -> LiveNumber:
+        # A power is a product, which rounds alike everywhere; the pow of Python and that of CasADi differ in the last digit.
+        if not isinstance(exponent, int) or exponent < 1:
+            self._refuse(f"a power with the exponent {exponent!r}")
+        return math.prod([self] * (exponent - 1), start=self)
+
+    def __neg__(self) -> LiveNumber:
+        return self.called(operator.neg, operator.neg)
+
+    def __pos__(self) -> LiveNumber:
+        return self
+
+    def __abs__(self) -> LiveNumber:
+        return self.called(abs, ca.fabs)
+
+    def called(self, number: Callable[[float], float], expression: Callable[[ca.SX], object]) -> LiveNumber:
+        """Return a function of it: `number` for the number of the build, `expression` for CasADi."""
+        return LiveNumber(
+            self.paths, lambda kind: number(self.value) if kind is float else expression(cast(ca.SX, self._of(kind)))
+        )
+
+    def __float__(self) -> NoReturn:
+        self._refuse("its number")
+
+    def __int__(self) -> NoReturn:
+        self._refuse("its number")
+
+    __index__ = __trunc__ = __floor__ = __ceil__ = __int__
+
+    def __bool__(self) -> NoReturn:
+        self._refuse("a branch on its number")
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, LiveNumber):
+            return self is other
+        if isinstance(other, int | float):
+            self._refuse("a branch on its number")
+        return NotImplemented
+
+    __hash__ = object.__hash__
+
+    def __lt__(self, other: object) -> NoReturn:
+        self._refuse("a branch on its number")
+
+    __le__ = __gt__ = __ge__ = __lt__
+
+    def __mod__(self, other: object) -> NoReturn:
+        self._refuse("its number")
+
+    __rmod__ = __floordiv__ = __rfloordiv__ = __rpow__ = __mod__
+
+    def __round__(self, digits: int | None = None) -> NoReturn:
+        self._refuse("its number")
+
+    def __format__(self, style: str) -> NoReturn:
+        self._refuse("its number in a text")
+
+    def _refuse(self, what: str) -> NoReturn:
+        names = " and ".join(f"'{path}'" for path in self.paths)
+        raise NotSupported(f"setting {names} cannot be live here: {what} is needed while the loop is built")
+
+
+Number = float | LiveNumber  # a field that may be live
+
+
+def live_number(path: str, value: float) -> LiveNumber:
+    """Return the live number of one setting, with its number of the build."""
+    symbols: dict[type, object] = {ca.SX: ca.SX.sym(PREFIX + path), ca.MX: ca.MX.sym(PREFIX + path)}
+    return LiveNumber((path,), lambda kind: float(value) if kind is float else symbols[kind])
+
+
+def _expressed(value: object, kind: type) -> object:
+    """A number of a step as an expression of that kind; what is no live number stays as it is."""
+    return value._of(kind) if isinstance(value, LiveNumber) else value
+
+
+def nominal(value: T) -> T:
+    """Return a value with the numbers of the build in place of all live numbers in it; the value itself where it has none.
+
+    Dataclasses, mappings and tuples are searched. Copies are made without validation, because their numbers were valid before.
+    """
+    return cast(T, _mapped(value, lambda number: number.value))
+
+
+def live_numbers(*values: object) -> dict[str, LiveNumber]:
+    """Return the live numbers in some values, by path."""
+    numbers: dict[str, LiveNumber] = {}
+
+    def note(number: LiveNumber) -> LiveNumber:
+        numbers.setdefault(number.paths[0], number)
+        return number
+
+    for value in values:
+        _mapped(value, note)
+    return numbers
+
+
+def is_live(*values: object) -> bool:
+    """Return whether a live number stands in one of the values."""
+    return bool(live_numbers(*values))
+
+
+def settled(value: T, numbers: Mapping[str, float]) -> T:
+    """Return a value with other numbers, by path, in place of all live numbers in it."""
+    return cast(T, _mapped(value, lambda number: numbers[number.paths[0]]))
+
+
+def copied(value: T, changes: Mapping[str, object]) -> T:
+    """Return a frozen dataclass with other contents of some fields, without validation and without cached facts."""
+    copy = object.__new__(type(value))
+    for field in fields(value):  # type: ignore[arg-type]  # mypy does not narrow type variables
+        object.__setattr__(copy, field.name, changes.get(field.name, getattr(value, field.name)))
+    return copy
+
+
+def _mapped(value: object, change: Callable[[LiveNumber], object]) -> object:
+    """The value with `change` applied to its live numbers; the same object where nothing changes."""
+    if isinstance(value, LiveNumber):
+        return change(value)
+    if isinstance(value, Mapping):
+        entries = {key: _mapped(entry, change) for key, entry in value.items()}
+        return value if all(entries[key] is entry for key, entry in value.items()) else entries
+    if isinstance(value, tuple | list):
+        items = [_mapped(entry, change) for entry in value]
+        same = all(new is old for new, old in zip(items, value, strict=True))
+        return value if same else type(value)(items)
+    if is_dataclass(value) and not isinstance(value, type):
+        contents = {f.name: getattr(value, f.name) for f in fields(value)}
+        changed = {name: _mapped(content, change) for name, content in contents.items()}
+        same = all(changed[name] is content for name, content in contents.items())
+        return value if same else copied(value, changed)
+    return value
+
+
+def _combined(operation: _Operation, left: object, right: object) -> LiveNumber:
+    """A formula of live numbers and numbers; where one side is an expression, an expression under the same type."""
+    live = [side for side in (left, right) if isinstance(side, LiveNumber)]
+    for side in (left, right):
+        if isinstance(side, ca.SX | ca.MX):
+            kind = type(side)
+            return cast(LiveNumber, operation(_expressed(left, kind), _expressed(right, kind)))
+        if isinstance(side, ca.DM):
+            return cast(LiveNumber, operation(_expressed(left, ca.SX), _expressed(right, ca.SX)))
+        if isinstance(side, np.ndarray):
+            live[0]._refuse("an array of numbers")
+        if not isinstance(side, LiveNumber | int | float | np.number):
+            return NotImplemented
+    paths = tuple(dict.fromkeys(path for side in live for path in side.paths))
+    return LiveNumber(paths, lambda kind: operation(_expressed(left, kind), _expressed(right, kind)))

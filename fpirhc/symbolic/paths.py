@@ -1,0 +1,85 @@
+"""Numbers inside frozen values by dotted path: 'deformation.gain', 'cost.states.q1', 'inputs.Q1.1'.
+
+A path leads through fields of dataclasses, keys of mappings and places of tuples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, is_dataclass, replace
+from typing import TypeVar, cast
+
+from fpirhc.errors import InvalidName, nearest
+
+T = TypeVar("T")
+Copy = Callable[[object, Mapping[str, object]], object]  # (dataclass, changes by field) -> the changed copy
+
+
+def names_in(value: object) -> list[str]:
+    """Return the names with which a path can go on."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return [f.name for f in fields(value) if f.init]
+    if isinstance(value, Mapping):
+        return [str(key) for key in value]
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [str(k) for k in range(len(value))]
+    return []
+
+
+def entry(value: object, name: str) -> object:
+    """Return the content of a field, the value of a key, or the item at a place."""
+    if isinstance(value, Mapping):
+        return value[name]
+    return value[int(name)] if isinstance(value, Sequence) else getattr(value, name)
+
+
+def content_at(owner: object, path: str, what: str = "the controller") -> object:
+    """Return what stands at a path.
+
+    Raises:
+        InvalidName: there is nothing; the nearest name is offered.
+    """
+    value = owner
+    done: list[str] = []
+    for name in path.split("."):
+        valid = names_in(value)
+        if name not in valid:
+            where = f"'{'.'.join(done)}' of {what}" if done else what
+            raise InvalidName(
+                f"setting '{path}': {where} ({type(value).__name__}) has no '{name}'.{nearest(name, valid)}"
+            )
+        value = entry(value, name)
+        done.append(name)
+    return value
+
+
+def is_declared(owner: object, path: str, kinds: Sequence[object]) -> bool:
+    """Whether the field at a path is declared with one of some types, such as (int, 'int')."""
+    *parents, name = path.split(".")
+    value = owner
+    for parent in parents:
+        value = entry(value, parent)
+    return is_dataclass(value) and any(f.name == name and f.type in kinds for f in fields(value))
+
+
+def validated(value: object, changes: Mapping[str, object]) -> object:
+    """Return a dataclass with other contents of some fields, checked as a new one is."""
+    return replace(value, **changes)  # type: ignore[type-var]  # only dataclasses have fields
+
+
+def changed_at(value: T, path: str, content: object, copy: Copy = validated) -> T:
+    """Return the value with another content at a path.
+
+    Args:
+        value: the value; it stays as it is.
+        path: of the content.
+        content: the other content.
+        copy: function (dataclass, changes by field) -> the changed copy; the default one validates.
+    """
+    name, _, rest = path.partition(".")
+    inner = changed_at(entry(value, name), rest, content, copy) if rest else content
+    if isinstance(value, Mapping):
+        return cast(T, {**value, name: inner})
+    if isinstance(value, Sequence):
+        return cast(T, (*value[: int(name)], inner, *value[int(name) + 1 :]))
+    return cast(T, copy(value, {name: inner}))

@@ -1,0 +1,314 @@
+"""Live settings: one compiled loop for every setting, bit by bit the loop that would be built with the number."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.cli.main import main
+from fpirhc.controllers.live_settings import live_settings
+from fpirhc.errors import CompileError, InvalidName, InvalidValue, NotContractive, NotSupported
+from fpirhc.problem_files.problem_file import load_problem
+from fpirhc.simulation.loop import close_loop
+from fpirhc.simulation.simulate import simulator
+from fpirhc.studies.scenarios.bench import Bench, Conditions
+from fpirhc.studies.scenarios.draws import TUNING
+from fpirhc.studies.tuning.tune import tune
+from fpirhc.symbolic.constants import holds_nan
+from fpirhc.symbolic.live import live_number
+from fpirhc.symbolic.native import generate
+
+TASK = load_problem("two_mass")
+PROBLEM = replace(TASK.problem, duration=0.3, measure_from=0.0)
+TORQUE, PLANNED = TASK.controllers["CTC+FPI (eq 6)"], TASK.controllers["RHC+FPI"]
+FOUR = ["tracking.rate", "deformation.gain", "deformation.scale", "deformation.shift"]
+FIVE = ["deformation.gain", "cost.states.q1", "cost.states.q2'", "cost.deviation.Q1", "limits.inputs.Q1.1"]
+
+
+def rebuilt(ready, numbers, *, compiled):
+    """The run of a loop that is built with these numbers."""
+    problem, controller, _ = ready.live.changed(numbers)
+    return simulator(problem, controller, compiled=compiled).run(seed=0)
+
+
+def random_numbers(rng):
+    """Numbers for the settings of `FOUR` and `FIVE`."""
+    four = dict(
+        zip(FOUR, (rng.uniform(3, 9), -rng.uniform(0.1, 1.2), rng.uniform(0.8, 3), rng.uniform(0.05, 0.6)), strict=True)
+    )
+    five = (
+        -rng.uniform(0.1, 1.2),
+        rng.uniform(200, 2e3),
+        rng.uniform(0.3, 3),
+        rng.uniform(5e-4, 3e-3),
+        rng.uniform(2, 40),
+    )
+    return four, dict(zip(FIVE, five, strict=True))
+
+
+@pytest.mark.parametrize("compiled", [True, False], ids=["C", "VM"])
+def test_a_changed_loop_is_the_rebuilt_one_bit_by_bit(compiled):
+    """Formulas of settings round alike as numbers and as expressions, and what follows from them is recomputed the same way."""
+    rng = np.random.default_rng(7)
+    torque = simulator(PROBLEM, TORQUE, compiled=compiled, live=FOUR)
+    planned = simulator(PROBLEM, PLANNED, compiled=compiled, live=FIVE)
+    for k in range(3):
+        four, five = random_numbers(rng)
+        assert np.array_equal(torque.run(seed=0, settings=four).log, rebuilt(torque, four, compiled=compiled).log), four
+        if k == 0:
+            assert np.array_equal(planned.run(seed=0, settings=five).log, rebuilt(planned, five, compiled=compiled).log)
+
+
+def test_the_numbers_of_the_build_give_the_loop_without_live_settings():
+    """Nothing but the place of a number changes."""
+    for controller, paths in ((TORQUE, FOUR), (PLANNED, FIVE)):
+        live, plain = (simulator(PROBLEM, controller, live=p).run(seed=0) for p in (paths, ()))
+        assert np.array_equal(live.log, plain.log)
+
+
+def test_a_change_during_a_run_is_that_of_a_loop_that_goes_on_with_the_number():
+    """Before the change the run is the one without it; a change at the start is a run with the number."""
+    ready = simulator(PROBLEM, PLANNED, live=FIVE)
+    numbers = {"deformation.gain": -0.9, "cost.states.q1": 400.0}
+    changed, plain = ready.run(seed=0, changes={0.1234: numbers}), ready.run(seed=0)
+    assert np.array_equal(changed.log[:124], plain.log[:124])
+    assert not np.array_equal(changed["deformed"][124:130], plain["deformed"][124:130])
+    record: Any = changed.settings["live"]
+    assert [time for time, _ in record] == [0.0, 0.124]
+    assert record[1][1]["deformation.gain"] == -0.9
+
+
+def test_nothing_live_is_the_same_c_text():
+    """The list of live settings is chosen at the build; the default loop has constants, as ever."""
+    for controller in (TORQUE, PLANNED):
+        plain = close_loop(PROBLEM, live_settings(PROBLEM, controller).controller)
+        empty = simulator(PROBLEM, controller, compiled=False, live=()).loop
+        assert generate(plain.function) == generate(empty.function)
+        assert "#define SCALE_AT" not in "".join(generate(plain.function))
+
+
+WRONG = [
+    (["deformation.gian"], InvalidName, "gain"),
+    (["start.q1"], InvalidName, "data of every loop"),
+    (["cost.states.q3"], InvalidName, "q1"),
+    (["optimiser.iterations"], NotSupported, "what the loop is made of"),
+    (["optimiser.tolerance"], NotSupported, "optimiser.tolerance"),
+    (["optimiser.damping"], NotSupported, "optimiser.damping"),
+    (["optimiser.map.gain"], NotSupported, "optimiser.map.gain"),
+    (["deformation"], InvalidValue, "go on with one of"),
+]
+
+
+@pytest.mark.parametrize(("paths", "error", "words"), WRONG, ids=[w[0][0] for w in WRONG])
+def test_what_cannot_be_live_is_refused_by_name(paths, error, words):
+    """A setting that is needed as a number would become NaN in CasADi, without an error."""
+    with pytest.raises(error, match=words):
+        simulator(PROBLEM, PLANNED, live=paths)
+
+
+def test_a_setting_that_the_loop_does_not_use_is_refused():
+    """Computed torque has no cost."""
+    with pytest.raises(NotSupported, match="does not use it"):
+        simulator(PROBLEM, TORQUE, live=["cost.states.q1"])
+
+
+def test_numbers_are_checked_at_every_change():
+    """Unknown names, numbers outside a setting's range, infinite limits and gains that diverge."""
+    ready = simulator(PROBLEM, PLANNED, live=FIVE, compiled=False)
+    cases: tuple[tuple[dict[str, Any], type[Exception], str], ...] = (
+        ({"deformation.gian": 1.0}, InvalidName, "deformation.gain"),
+        ({"deformation.shift": 0.2}, InvalidName, "not live"),
+        ({"deformation.gain": 0.0}, InvalidValue, "other than zero"),
+        ({"deformation.gain": 0.5}, NotContractive, "gain"),
+        ({"cost.states.q1": -1.0}, fp.errors.InvalidProblem, "at least 0"),
+        ({"limits.inputs.Q1.1": float("inf")}, InvalidValue, "use a large one"),
+        ({"limits.inputs.Q1.1": -400.0}, fp.errors.InvalidProblem, "above upper"),
+        ({"deformation.gain": "high"}, InvalidValue, "expected a number"),
+    )
+    for numbers, error, words in cases:
+        with pytest.raises(error, match=words):
+            ready.run(seed=0, settings=numbers)
+    with pytest.raises(InvalidValue, match="expected a time"):
+        ready.run(seed=0, changes={99.0: {"deformation.gain": -0.4}})
+
+
+@pytest.mark.parametrize("compiled", [True, False], ids=["C", "VM"])
+def test_a_stepper_that_changes_is_the_one_that_is_rebuilt(compiled):
+    """The same measurements through a changed and a rebuilt controller give the same commands, bit by bit."""
+    run = simulator(PROBLEM, PLANNED, compiled=False).run(seed=0)
+    numbers = {"deformation.gain": -0.8, "cost.states.q1": 600.0, "limits.inputs.Q1.1": 25.0}
+    live = fp.Stepper(PROBLEM, PLANNED, compiled=compiled, live=FIVE)
+    assert live.change(numbers)
+    problem, controller, _ = live_settings(PROBLEM, PLANNED, FIVE).changed(numbers)
+    built = fp.Stepper(problem, controller, compiled=compiled)
+    memories = live.start(), built.start()
+    for k in range(60):
+        given = run.time[k], run["state"][k], run["realised"][k]
+        (one, first), (two, second) = (s.step(*given, m) for s, m in zip((live, built), memories, strict=True))
+        memories = first, second
+        assert np.array_equal(one, two), k
+
+
+def test_a_stepper_refuses_numbers_and_keeps_the_old_ones():
+    """A device goes on with the numbers in force; the refusal is counted, and an unknown name is a mistake of the program."""
+    stepper = fp.Stepper(PROBLEM, TORQUE, compiled=False, live=["deformation.gain"])
+    memory, state = stepper.start(), PROBLEM.start_state
+    _, memory = stepper.step(0.0, state, np.zeros(2), memory, settings={"deformation.gain": -0.9})
+    plain, _ = stepper.step(1e-3, state + 1e-3, np.ones(2), memory)
+    refused, _ = stepper.step(1e-3, state + 1e-3, np.ones(2), memory, settings={"deformation.gain": 0.9})
+    assert np.array_equal(plain, refused)
+    assert stepper.refused == 1
+    assert "gain" in stepper.why_refused
+    assert stepper.numbers == {"deformation.gain": -0.9}
+    accepted, _ = stepper.step(1e-3, state + 1e-3, np.ones(2), memory, settings={"deformation.gain": -0.3})
+    assert not np.array_equal(plain, accepted)
+    with pytest.raises(InvalidName, match=r"deformation\.gain"):
+        stepper.change({"deformation.gian": -0.3})
+
+
+def test_the_command_line_sets_numbers(tmp_path, monkeypatch, capsys):
+    """A live setting and an interval; wrong texts exit with a sentence."""
+    monkeypatch.chdir(tmp_path)
+    line = (
+        "import fpirhc as fp\n"
+        "plant = fp.Plant({'q': 'm'}, {'u': 'N'}, {'m': fp.Parameter(1.2, 1.0, 'kg')}, lambda q, v, u, p: {'q': u.u / p.m}, 2)\n"
+        "problem = fp.Problem(plant, fp.Trajectory(lambda t: {'q': 0 * t + 1}), {'q': 0.0}, 1e-2, 0.5,\n"
+        "    limits=fp.Limits(inputs={'u': (-50.0, 50.0)}))\n"
+        "controllers = {'C': fp.ComputedTorque(fp.Exponential(rate=4.0), fp.Affine(gain=-0.5))}\n"
+    )
+    (tmp_path / "line.py").write_text(line)
+    settings = ["--set", "deformation.gain=-0.7", "--set", "limits.inputs.u=-5,3", "--no-compile"]
+    assert main(["run", "line.py", "C", *settings]) == 0
+    assert "settings from 0 s: deformation.gain = -0.7, limits.inputs.u.0 = -5, limits.inputs.u.1 = 3" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    run = fp.load_run(tmp_path / "results" / "line" / "C.npz")
+    assert run["command"].max() == 3.0
+    for text, words in (
+        ("deformation.gian=1", "gain"),
+        ("deformation.gain=x", "PATH=NUMBER"),
+        ("deformation.gain=2", "sign"),
+    ):
+        assert main(["run", "line.py", "C", "--set", text]) == 2
+        assert words in capsys.readouterr().err
+
+
+def jumps(controller, numbers, signal):
+    """Change of a signal by other numbers in the cycle of the change, and its largest change per cycle before."""
+    ready = simulator(replace(PROBLEM, duration=1.5), controller, live=list(numbers))
+    changed, plain = ready.run(seed=0, changes={1.0: numbers}), ready.run(seed=0)
+    usual = np.abs(np.diff(plain[signal][500:1000], axis=0)).max()
+    return (changed[signal] - plain[signal])[1000], usual, plain
+
+
+def test_another_rate_leaves_the_integrals_share():
+    """The desired response changes by what the law feeds back of e and e'; rate^3 e_int, most of it all, stays as it was."""
+    jump, usual, plain = jumps(TASK.controllers["CTC"], {"tracking.rate": 9.0}, "desired")
+    error, velocity = (
+        np.array([plain[f"reference.{c}{d}"][1000] - plain[f"state.{c}{d}"][1000] for c in ("q1", "q2")])
+        for d in ("", "'")
+    )
+    slow, fast = (fp.Exponential(rate=rate).gains(2) for rate in (6.0, 9.0))
+    expected = (fast[1] - slow[1]) * error + (fast[2] - slow[2]) * velocity
+    share = np.abs((fast[0] - slow[0]) * plain["integral"][999]).max()
+    assert np.abs(jump - expected).max() < 1e-9
+    assert share > 20 * usual  # the jump without the rule
+
+
+BUMPLESS: list[tuple[str, dict[str, Any]]] = [
+    ("CTC+FPI (eq 6)", {"deformation.gain": -1.0}),
+    ("CTC+FPI (eq 6)", {"deformation.scale": 3.0}),
+    ("CTC+FPI (eq 6)", {"deformation.shift": 0.1}),
+    ("CTC+FPI (eq 3)", {"deformation.gain": 4e-5}),
+    ("RHC+FPI", {"cost.states.q1": 2e3}),
+    ("RHC+FPI", {"limits.inputs.Q1": (-200.0, 200.0)}),
+]
+
+
+@pytest.mark.parametrize(("name", "numbers"), BUMPLESS, ids=[f"{n} {next(iter(v))}" for n, v in BUMPLESS])
+def test_gains_scales_weights_and_limits_change_without_a_jump(name, numbers):
+    """The command changes by a usual cycle's change times the factor of a gain; without a rule an integral changes it by 100."""
+    jump, usual, _ = jumps(TASK.controllers[name], numbers, "command")
+    assert np.abs(jump).max() <= 4 * usual
+
+
+@pytest.mark.parametrize("name", ["CTC+FPI (eq 6)", "RHC+FPI"])
+def test_a_search_finds_the_same_with_one_compiled_loop(name, tmp_path):
+    """Every trial costs what a loop costs that is built for it, to 1e-9, so the best settings are the same."""
+    task = replace(TASK, problem=PROBLEM)
+    tuned = tune(task, trials=4, seed=3, folder=tmp_path, controllers=[name])
+    records = [json.loads(line) for line in (tmp_path / "trials.jsonl").read_text().splitlines()][1:]
+    conditions = Conditions(3, TUNING, 0.0, compiled=False)
+    costs = []
+    for record in records:
+        built = replace(task, controllers={name: fp.with_settings(task.controllers[name], record["settings"])})
+        costs.append(Bench(built, conditions).record(0, name)["error"])
+        assert record["cost"] == pytest.approx(costs[-1], rel=1e-9)
+    assert tuned.entries[0].settings == records[int(np.argmin(costs))]["settings"]
+
+
+def test_a_search_among_whole_numbers_builds_a_loop_for_each(tmp_path):
+    """Iterations decide what the code is."""
+    spans: dict[str, dict[str, fp.Span | fp.LogSpan]] = {
+        "RHC+FPI": {"optimiser.iterations": fp.Span(1, 3), "deformation.gain": fp.LogSpan(-1.0, -0.1)}
+    }
+    tuned = tune(replace(TASK, problem=PROBLEM, tuning=spans), trials=1, seed=0, folder=tmp_path)
+    assert isinstance(tuned.entries[0].settings["optimiser.iterations"], int)
+
+
+def test_a_compiler_that_fails_is_an_error(monkeypatch):
+    """A loop without live settings runs in the virtual machine then; one with live settings must not hide what went wrong."""
+    monkeypatch.setenv("FPIRHC_CC", "false")
+    short = replace(PROBLEM, duration=0.01)
+    assert not simulator(short, TORQUE).compiled
+    with pytest.raises(CompileError):
+        simulator(short, TORQUE, live=["deformation.gain"])
+    monkeypatch.setenv("FPIRHC_CC", "none")
+    assert not simulator(short, TORQUE, live=["deformation.gain"]).compiled
+
+
+def test_nan_is_found_in_scalar_code_graphs_and_calls():
+    """The constant that CasADi makes of a symbol, wherever it stands."""
+    x, m = ca.SX.sym("x"), ca.MX.sym("m")
+    lost = ca.Function("lost", [x], [x + float("nan")])
+    assert holds_nan(lost)
+    assert holds_nan(ca.Function("graph", [m], [m + ca.MX(ca.DM([1.0, float("nan")]))]))
+    assert holds_nan(ca.Function("caller", [m], [2 * lost(m)]))
+    assert not holds_nan(ca.Function("fine", [m], [2 * m]))
+
+
+def test_a_live_number_refuses_to_be_a_number():
+    """Each way in which Python and numpy would take its number names the setting."""
+    number = live_number("deformation.gain", -0.5)
+    ways = (
+        float,
+        int,
+        bool,
+        round,
+        math.exp,
+        math.floor,
+        lambda n: n > 0,
+        lambda n: n == 0,
+        lambda n: n % 1,
+        lambda n: 2.0**n,
+        lambda n: n**0.5,
+        lambda n: f"{n:g}",
+        lambda n: range(n),
+        lambda n: np.array([n], dtype=float),
+        lambda n: np.array([1.0]) * n,
+        lambda n: float(2 * n + 1),
+    )
+    for way in ways:
+        with pytest.raises(NotSupported, match=r"'deformation\.gain'"):
+            way(number)
+    formula = 1 - 2 * number**2 / abs(number)
+    assert formula.value == 1 - 2 * 0.25 / 0.5
+    assert isinstance(formula * ca.MX.sym("m"), ca.MX)
+    assert isinstance(ca.SX.sym("x") - formula, ca.SX)

@@ -1,0 +1,148 @@
+"""Every number of every member either is refused by name as a live setting, or runs bit by bit as the loop built with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+import fpirhc as fp
+from fpirhc.conformance.controller import two_masses
+from fpirhc.conformance.live import check_live, number_paths
+from fpirhc.controllers.base import Controller
+from fpirhc.errors import FpirhcError
+from fpirhc.members import Example, examples
+from fpirhc.problem_files.problem_file import load_problem
+from fpirhc.simulation.simulate import simulator
+from fpirhc.task.problem import Problem
+
+SIGMOID = fp.Sigmoid(gain=-0.5, scale=50.0)
+TRACKING = fp.Exponential(rate=8.0)
+WEIGHTS: dict[str, Any] = {"states": {"a": 1e2, "b": 1e2, "a'": 1.0, "b'": 1.0}, "deviation": {"Fa": 1e-3, "Fb": 1e-3}}
+
+
+def on_problem(member: Any) -> tuple[Controller, Problem]:
+    """A controller of the shipped examples with its problem."""
+    if not isinstance(member, Example):
+        return member, two_masses()
+    task = load_problem(member.problem) if member.problem else None
+    problem = replace(task.problem if task else two_masses(), **{"measure_from": 0.0, **member.changes})
+    return (task.controllers[member.controller] if task and member.value is None else member.value), problem
+
+
+def some_paths(problem: Problem, controller: Controller) -> list[str]:
+    """All numbers, but one entry of every group of more than four, and one limit: entries of a group are treated alike."""
+    paths = [p for p in number_paths(problem, controller) if not p.startswith("limits")]
+    groups: dict[str, list[str]] = {}
+    for path in paths:
+        groups.setdefault(path.rpartition(".")[0], []).append(path)
+    grouped = [p for group in groups.values() for p in (group if len(group) < 5 and "." in group[0] else group[:6])]
+    bounds = [p for p in grouped if "bounds." in p][:2]
+    chosen = [p for p in grouped if "bounds." not in p and not ("rule.gains" in p and not p.endswith("J1"))]
+    if controller.planner is None:
+        chosen = [p for p in chosen if not p.startswith("cost.")]
+    return [*chosen, *bounds, *[p for p in number_paths(problem, controller) if p.startswith("limits")][:1]]
+
+
+def named(values: Any) -> list[str]:
+    return [f"{type(v).__name__}-{k}" for k, v in enumerate(values)]
+
+
+def check(controller: Controller, problem: Problem, least: int = 1) -> None:
+    """Check some paths, and that at least so many of them can be live."""
+    tried = check_live(problem, controller, paths=some_paths(problem, controller), cycles=30)
+    assert sum(t.factor is not None for t in tried) >= least, tried
+
+
+MAPS = [d for d in examples("deformations", SIGMOID) if d.effective_gain() >= 0]
+
+
+@pytest.mark.parametrize("deformation", MAPS, ids=named(MAPS))
+def test_every_number_of_a_deformation(deformation):
+    """No map loses a number on its way into the loop."""
+    check(fp.ComputedTorque(TRACKING, deformation), two_masses())
+
+
+LAWS = examples("tracking laws")
+
+
+@pytest.mark.parametrize("tracking", LAWS, ids=named(LAWS))
+def test_every_number_of_a_tracking_law(tracking):
+    """No law loses a number on its way into the loop."""
+    check(fp.ComputedTorque(tracking, SIGMOID), two_masses())
+
+
+CONTROLLERS = examples("controllers", fp.ComputedTorque(TRACKING, SIGMOID))
+
+
+@pytest.mark.parametrize(
+    "member", CONTROLLERS, ids=named([m.value or m if isinstance(m, Example) else m for m in CONTROLLERS])
+)
+def test_every_number_of_a_controller(member):
+    """No controller, and no wrapper, loses a number on its way into the loop."""
+    check(*on_problem(member))
+
+
+SOLVERS = {
+    "reduced gradient": fp.ReducedGradient(iterations=3, tolerance=1e-3),
+    "gradient FPI": fp.GradientFixedPoint(iterations=5, tolerance=1e-3),
+    "damped": fp.FixedPoint(iterations=1, tolerance=1e-3, damping=0.1),
+}
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_an_optimiser_keeps_no_old_number(name):
+    """What follows from a weight (scale, step length) is data of the call, or the weight is refused."""
+    controller = fp.RecedingHorizon(SOLVERS[name], cost=fp.Quadratic(**WEIGHTS))
+    tried = check_live(two_masses(), controller, paths=["cost.states.a", "limits.inputs.Fa.1"], cycles=30)
+    assert tried[1].factor
+    assert bool(tried[0].factor) == (name == "reduced gradient")
+
+
+def test_numbers_that_follow_from_settings_follow():
+    """The terminal weight of the LQR, the scale that a sigmoid chooses from the limits, the step length and the first plan."""
+    one = fp.FixedPoint(iterations=1, tolerance=1e-3)
+    weighed = fp.RecedingHorizon(one, fp.Sigmoid(gain=-0.5), cost=fp.Quadratic(**WEIGHTS, terminal=fp.LQRTerminal()))
+    tried = check_live(
+        two_masses(), weighed, paths=["cost.states.a", "cost.deviation.Fb", "limits.inputs.Fa.1"], cycles=30
+    )
+    assert all(t.factor for t in tried), tried
+    ready = simulator(two_masses(), weighed, live=["limits.inputs.Fa.1"], compiled=False)
+    scale = ready.live.start["deformation.scale"]
+    assert ready.live.changed({"limits.inputs.Fa.1": 60.0})[2]["deformation.scale"] > 1.2 * scale
+
+
+def test_the_law_catches_a_lost_number():
+    """A map that computes with the number where nobody sees it is found out."""
+
+    class Deaf(fp.Affine):
+        """Affine, with half of its gain taken from the build."""
+
+        def step(self, request, response, desired, memory):
+            """Return r + (A_c / 2) (f - d), half of it with the number of the build."""
+            del memory
+            from fpirhc.symbolic.live import nominal
+
+            return request + 0.25 * (self.gain + nominal(self.gain)) * (response - desired), {}
+
+    with pytest.raises(AssertionError, match=r"deformation\.gain.*differently"):
+        check_live(two_masses(), fp.ComputedTorque(TRACKING, Deaf(gain=-0.5)), paths=["deformation.gain"])
+
+
+def test_a_symbol_turned_into_a_number_is_refused():
+    """CasADi makes NaN of it without an error; the loop is never built."""
+    import casadi as ca
+
+    class Lossy(fp.Affine):
+        """Affine with its gain in a matrix of numbers."""
+
+        def step(self, request, response, desired, memory):
+            """Return r + (A_c / 2) (f - d)."""
+            del memory
+            return request + ca.DM([0.5 * self.gain]) * (response - desired) + 0 * self.gain * response, {}
+
+    with pytest.raises(FpirhcError, match=r"deformation\.gain"):
+        fp.simulate(
+            two_masses(), fp.ComputedTorque(TRACKING, Lossy(gain=-0.5)), seed=0, settings={"deformation.gain": -0.4}
+        )
