@@ -17,8 +17,9 @@ from importlib import resources
 import casadi as ca
 import numpy as np
 
-from fpirhc.horizon.hessian_models import ExactHessian, GaussNewton, hessian_end, hessian_stage, linear_stage
+from fpirhc.horizon.hessian_models import ExactHessian, GaussNewton, hessian_end, hessian_stage
 from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.split_stage import split_stage
 from fpirhc.horizon.sweep import PIVOT
 from fpirhc.optimisers import limited_settings as numbers
 from fpirhc.optimisers.base import FEASIBLE, shift
@@ -59,7 +60,7 @@ def shifted_limited(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
 def _driver(ocp: OptimalControl, settings: LimitedSettings) -> Driver:
     measures = scales(ocp)
     leaves = {
-        "linear": linear_stage(ocp),
+        **{name: split_stage(ocp)[name] for name in ("evaluate", "linearise")},
         "exact": hessian_stage(ocp, settings.hessian or ExactHessian()),
         "plain": hessian_stage(ocp, GaussNewton()),
         "end": hessian_end(ocp),
@@ -77,6 +78,7 @@ def _sizes(ocp: OptimalControl, measures: Scales) -> dict[str, object]:
         "NS": ocp.state.size,
         "NU": ocp.input.size,
         "NT": ocp.data.size,
+        "NM": split_stage(ocp)["pull"].numel_in(0),
         "N": ocp.stages,
         "NB": len(places),
         "MEMORY": limited_memory(ocp).size,

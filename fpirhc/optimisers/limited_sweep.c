@@ -1,6 +1,6 @@
 /* One expansion along a plan, and one Riccati sweep around it, with the weights and gradients of its limits.
 
-   Generated before this text: the stage functions linear, exact, plain, end and deformed and the sizes NS, NU, NT, N, NB (bounded
+   Generated before this text: the stage functions evaluate, linearise, exact, plain, end and deformed and the sizes NS, NU, NT, N, NB (bounded
    states), WORK and INTEGERS. Entry r of stage i is input r, or the state place[r - NU] one stage later. */
 
 #define ROWS (NU + NB)
@@ -30,7 +30,7 @@ static int expand(Point* p, In k, int rolled, In s0, In data, In lower, In upper
   int i, j, l, ok;
   In arg[8];
   Out res[8];
-  casadi_real cost, at[NS];
+  casadi_real cost, at[NS], partials[NM];
   for (j = 0; j < NS; ++j) at[j] = s0[j];
   p->value = 0;
   for (i = 0; i < N; ++i) {
@@ -41,9 +41,11 @@ static int expand(Point* p, In k, int rolled, In s0, In data, In lower, In upper
     }
     for (j = 0; j < NS && (rolled || i == 0); ++j) x[j] = at[j];
     arg[0] = x, arg[1] = u, arg[2] = data + i * NT;
-    res[0] = p->f + i * NS, res[1] = &cost, res[2] = p->a + i * NS * NS, res[3] = p->b + i * NS * NU;
-    res[4] = p->ls + i * NS, res[5] = p->lu + i * NU;
-    if (linear(arg, res, s->iw, s->w, 0)) return 0;
+    res[0] = p->f + i * NS, res[1] = &cost, res[2] = partials;
+    if (evaluate(arg, res, s->iw, s->w, 0)) return 0;
+    arg[0] = partials;
+    res[0] = p->a + i * NS * NS, res[1] = p->b + i * NS * NU, res[2] = p->ls + i * NS, res[3] = p->lu + i * NU;
+    if (linearise(arg, res, s->iw, s->w, 0)) return 0;
     p->value += cost;
     for (j = 0; j < NS; ++j) at[j] = p->f[i * NS + j];
   }

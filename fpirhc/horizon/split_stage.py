@@ -1,0 +1,48 @@
+"""The linear expansion of a stage in parts, for loops that need its Jacobians later, or not at all.
+
+    evaluate   (s, u, theta) -> (s+, l, m),           m: the partial derivatives of the stage's elementary operations
+    pull       (m, lambda of s+) -> (A' lambda + l_s, B' lambda + l_u)
+    linearise  m -> (A, B, l_s, l_u)
+
+Together they do the work of `fpirhc.horizon.hessian_models.linear_stage` with fewer operations, and repeat nothing
+(`fpirhc.symbolic.chain_rule`).
+"""
+
+from __future__ import annotations
+
+from weakref import WeakKeyDictionary
+
+import casadi as ca
+
+from fpirhc.horizon.hessian_models import stage_symbols
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.symbolic.chain_rule import chain_rule
+
+_built: WeakKeyDictionary[OptimalControl, dict[str, ca.Function]] = WeakKeyDictionary()
+
+
+def split_stage(ocp: OptimalControl) -> dict[str, ca.Function]:
+    """Return the Functions evaluate, pull and linearise, built once for a problem."""
+    if ocp not in _built:
+        _built[ocp] = _split(ocp)
+    return _built[ocp]
+
+
+def _split(ocp: OptimalControl) -> dict[str, ca.Function]:
+    ns, nu = ocp.state.size, ocp.input.size
+    s, u, theta = stage_symbols(ocp)
+    next_state, (cost, _) = ocp.dynamics(s, u, theta), ocp.stage_cost(s, u, theta)
+    parts = chain_rule(ca.densify(ca.vertcat(next_state, cost)), ca.vertcat(s, u), theta)
+    after = ca.SX.sym("lambda", ns)
+    pulled = ca.substitute(parts.pulled, parts.weights, ca.vertcat(after, 1))
+    rates, slopes = parts.jacobian[:ns, :], parts.jacobian[ns, :].T
+    blocks = [rates[:, :ns], rates[:, ns:], slopes[:ns], slopes[ns:]]
+    return {
+        "evaluate": _dense("evaluate", [s, u, theta], [next_state, cost, parts.partials]),
+        "pull": _dense("pull", [parts.symbols, after], [pulled[:ns], pulled[ns : ns + nu]]),
+        "linearise": _dense("linearise", [parts.symbols], blocks),
+    }
+
+
+def _dense(name: str, arguments: list[ca.SX], results: list[ca.SX]) -> ca.Function:
+    return ca.Function(f"fpirhc_{name}_stage", arguments, ca.cse([ca.densify(r) for r in results]))
