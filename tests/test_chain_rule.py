@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.horizon.hessian_models import linear_stage
+from fpirhc.horizon.hessian_models import hessian_stage, linear_stage
 from fpirhc.horizon.problem import OptimalControl, transcribe
-from fpirhc.horizon.split_stage import split_stage
+from fpirhc.horizon.split_stage import split_hessian, split_stage
 from fpirhc.symbolic.chain_rule import chain_rule
 
 X, P = ca.SX.sym("x", 3), ca.SX.sym("p", 2)
@@ -88,3 +88,18 @@ def test_nothing_is_computed_twice(ocp):
 
 def test_a_problem_has_one_split_stage(ocp):
     assert split_stage(ocp) is split_stage(ocp)
+
+
+@pytest.mark.parametrize("hessian", [fp.GaussNewton(), fp.ExactHessian()])
+def test_second_derivatives_in_parts_are_those_of_the_stage(ocp, hessian):
+    """Q, S and R agree with CasADi's Hessian, with fewer divisions."""
+    whole, parts, rng = hessian_stage(ocp, hessian), split_hessian(ocp, hessian), np.random.default_rng(6)
+    states, inputs, data = ocp.nodes
+    for _ in range(5):
+        s = states[:, 0] + 0.1 * rng.normal(size=ocp.state.size)
+        u, after = inputs[:, 0] + 0.1 * rng.normal(size=ocp.input.size), rng.normal(size=ocp.state.size)
+        expected = whole(s, u, data[:, 0], after)
+        for mine, theirs in zip(parts["curve"](parts["bend"](s, u, data[:, 0], after)), expected, strict=True):
+            np.testing.assert_allclose(mine.full(), theirs.full(), rtol=1e-11, atol=1e-12)
+    counted = operations(parts["bend"]) + operations(parts["curve"])
+    assert counted[ca.OP_DIV] <= operations(whole)[ca.OP_DIV]

@@ -1,11 +1,13 @@
-"""The linear expansion of a stage in parts, for loops that need its Jacobians later, or not at all.
+"""The expansion of a stage in parts, for loops that need its Jacobians later, or not at all.
 
     evaluate   (s, u, theta) -> (s+, l, m),           m: the partial derivatives of the stage's elementary operations
     pull       (m, lambda of s+) -> (A' lambda + l_s, B' lambda + l_u)
     linearise  m -> (A, B, l_s, l_u)
+    bend       (s, u, theta, lambda of s+) -> n,      n: those of the gradient of a Hessian model's scalar
+    curve      n -> (Q, S, R)
 
-Together they do the work of `fpirhc.horizon.hessian_models.linear_stage` with fewer operations, and repeat nothing
-(`fpirhc.symbolic.chain_rule`).
+Together they do the work of `linear_stage` and `hessian_stage` in `fpirhc.horizon.hessian_models` with fewer operations, and repeat
+nothing (`fpirhc.symbolic.chain_rule`).
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from weakref import WeakKeyDictionary
 
 import casadi as ca
 
-from fpirhc.horizon.hessian_models import stage_symbols
+from fpirhc.horizon.hessian_models import HessianModel, stage_symbols
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.symbolic.chain_rule import chain_rule
 
@@ -26,6 +28,22 @@ def split_stage(ocp: OptimalControl) -> dict[str, ca.Function]:
     if ocp not in _built:
         _built[ocp] = _split(ocp)
     return _built[ocp]
+
+
+def split_hessian(ocp: OptimalControl, hessian: HessianModel) -> dict[str, ca.Function]:
+    """Return the Functions bend and curve of a model of the second derivatives."""
+    ns = ocp.state.size
+    s, u, theta = stage_symbols(ocp)
+    after, variables = ca.SX.sym("lambda", ns), ca.vertcat(s, u)
+    cost, _ = ocp.stage_cost(s, u, theta)
+    slope = ca.gradient(hessian.curved(cost, ocp.dynamics(s, u, theta), after), variables)
+    parts = chain_rule(ca.cse(ca.densify(slope)), variables, ca.vertcat(theta, after))
+    # Only the lower triangle is computed.
+    whole = ca.tril2symm(ca.tril(parts.jacobian))
+    return {
+        "bend": _dense("bend", [s, u, theta, after], [parts.partials]),
+        "curve": _dense("curve", [parts.symbols], [whole[:ns, :ns], whole[ns:, :ns], whole[ns:, ns:]]),
+    }
 
 
 def _split(ocp: OptimalControl) -> dict[str, ca.Function]:

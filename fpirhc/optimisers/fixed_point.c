@@ -85,7 +85,7 @@ INLINE int judged(Search* s, Plan* best, Plan* plan, int ok, In lower, In upper)
       envelope = plan->value + plain_step(s, plan, lower, upper, &reach) + reach;
       for (i = 0; i < N * NU; ++i) descent += best->g[i] * (plan->u[i] - best->u[i]);
       ok = envelope <= s->envelope - SHARE * (1 - SHARE) * s->reach + slack ||
-           plan->value <= best->value + ARMIJO * fmin(descent, 0) + slack;
+           plan->value <= best->value + ARMIJO * smaller(descent, 0) + slack;
       ok = ok && envelope <= s->envelope + slack && plan->value <= best->value + slack;
       if (!ok) for (i = 0; i < N * NU; ++i) s->t[i] = before[i];
     } else {
@@ -102,7 +102,7 @@ INLINE int judged(Search* s, Plan* best, Plan* plan, int ok, In lower, In upper)
   }
   if (!untried && !bold) {
     /* The quadratic that the cost followed along T - U says which gamma would have been short enough. */
-    s->gamma *= rise > 2 ? fmax(1 / rise, DRAWN_IN) : 0.5;
+    s->gamma *= rise > 2 ? larger(1 / rise, DRAWN_IN) : 0.5;
     s->envelope = best->value + plain_step(s, best, lower, upper, &s->reach) + s->reach;
   }
   s->tau = untried ? SHORTEST * SHORTER : SHORTER * s->tau;
@@ -255,9 +255,9 @@ INLINE void begin(Search* s, Plan* best, In memory, In lower, In upper) {
   best->value = s->envelope = 10 * UNTRIED;
   s->reach = 0;
   s->tau = 1;
-  s->resume = tau > 0 ? fmin(tau, 1) : 1;
+  s->resume = tau > 0 ? smaller(tau, 1) : 1;
   /* After a rejected T a longer gamma would be rejected again, in every call of one iteration. */
-  s->gamma = gamma > 0 ? fmin((s->resume < SHORTEST ? 1 : 2) * gamma, FIRST_GAMMA) : FIRST_GAMMA;
+  s->gamma = gamma > 0 ? smaller((s->resume < SHORTEST ? 1 : 2) * gamma, FIRST_GAMMA) : FIRST_GAMMA;
 }
 
 INLINE void remember(const Search* s, const Plan* best, Out memory) {

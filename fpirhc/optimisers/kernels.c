@@ -16,6 +16,10 @@ INLINE int all_finite(In v, int n) {
   return (int)ok;
 }
 
+/* fmax and fmin without calls of the library: where one is not a number, the other. */
+INLINE casadi_real larger(casadi_real a, casadi_real b) { return a > b || b != b ? a : b; }
+INLINE casadi_real smaller(casadi_real a, casadi_real b) { return a < b || b != b ? a : b; }
+
 /* fmin(fmax(v, low), high) without calls of the library: a v that is not a number becomes low there and here. */
 INLINE casadi_real between(casadi_real v, casadi_real low, casadi_real high) {
   casadi_real above = v > low ? v : low;

@@ -19,7 +19,7 @@ import numpy as np
 
 from fpirhc.horizon.hessian_models import ExactHessian, GaussNewton, hessian_end, hessian_stage
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.split_stage import split_stage
+from fpirhc.horizon.split_stage import split_hessian, split_stage
 from fpirhc.horizon.sweep import PIVOT
 from fpirhc.optimisers import limited_settings as numbers
 from fpirhc.optimisers.base import FEASIBLE, shift
@@ -61,7 +61,7 @@ def _driver(ocp: OptimalControl, settings: LimitedSettings) -> Driver:
     measures = scales(ocp)
     leaves = {
         **{name: split_stage(ocp)[name] for name in ("evaluate", "linearise")},
-        "exact": hessian_stage(ocp, settings.hessian or ExactHessian()),
+        **split_hessian(ocp, settings.hessian or ExactHessian()),
         "plain": hessian_stage(ocp, GaussNewton()),
         "end": hessian_end(ocp),
         "deformed": deformed_move(settings.map, ocp.input.size * ocp.stages),
@@ -69,7 +69,8 @@ def _driver(ocp: OptimalControl, settings: LimitedSettings) -> Driver:
     }
     folder = resources.files("fpirhc.optimisers")
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
-    return Driver("\n".join(texts), leaves, {**_sizes(ocp, measures), **_constants(settings, measures)})
+    sizes = {"NM": leaves["linearise"].numel_in(0), "NH": leaves["curve"].numel_in(0), **_sizes(ocp, measures)}
+    return Driver("\n".join(texts), leaves, {**sizes, **_constants(settings, measures)})
 
 
 def _sizes(ocp: OptimalControl, measures: Scales) -> dict[str, object]:
@@ -78,7 +79,6 @@ def _sizes(ocp: OptimalControl, measures: Scales) -> dict[str, object]:
         "NS": ocp.state.size,
         "NU": ocp.input.size,
         "NT": ocp.data.size,
-        "NM": split_stage(ocp)["pull"].numel_in(0),
         "N": ocp.stages,
         "NB": len(places),
         "MEMORY": limited_memory(ocp).size,
