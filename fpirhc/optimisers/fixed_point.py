@@ -72,7 +72,8 @@ class FixedPoint(Optimiser):
         tolerance: of the stationarity (in the unit of the inputs), below which a plan is converged.
         feasible: violation of a state bound (in its unit) below which a plan counts as converged.
         map: the deformation that makes the next plan; Affine(gain=-2.0) is the full step, a Sigmoid's scale limits it.
-        hessian: GaussNewton() or ExactHessian(); None is Gauss-Newton without limits of states and the exact Hessian with them.
+        hessian: GaussNewton() or ExactHessian(); None is Gauss-Newton without limits of states; with them the exact Hessian, and
+            Gauss-Newton first where a remembered plan is improved until it converges.
         damping: mu >= 0 added to the input's curvature, in units of it: 0 is Gauss-Newton, large values are gradient descent.
 
     Raises:

@@ -122,7 +122,7 @@ static void keep(Machine* m, const Point* p) {
 /* Leave the pure phase: for an interior phase near its best plan, or back to the interior plan it came from. */
 static void enter_interior(Machine* m, Point* p) {
   int k;
-  m->phase = INTERIOR, m->again = 1, m->filtered = m->raises = m->halvings = 0;
+  m->phase = INTERIOR, m->again = m->use_exact = 1, m->filtered = m->raises = m->halvings = 0;
   if (m->place_of == BEGINS) {
     m->slacks = WARM;
     m->mu = REALTIME ? between(m->mu, MU_WARM * COST, MU_MOST * COST) : MU_WARM * COST, m->floor = MU_END * COST;
@@ -215,6 +215,8 @@ static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, I
     waits = m->misses < PATIENCE && c.error < HOPELESS && (!REALTIME || m->ahead > 2);
     ok = ok && (halved || waits) && ++m->steps <= PURE_STEPS;
     if (!ok) { enter_interior(m, old); return 0; }
+    /* Gauss-Newton goes on only where the contraction that was seen ends the call with one more step. */
+    m->use_exact |= c.error * c.error > AHEAD * SCALED_TOLERANCE * m->error;
     m->misses = halved ? 0 : m->misses + 1;
     for (k = 0; k < COUNT; ++k) m->y.z[0][k] = m->next_z[0][k], m->y.z[1][k] = m->next_z[1][k];
     for (k = 0; k < N * NU; ++k) m->g[k] = g[k];
@@ -267,7 +269,7 @@ static void direct(Machine* m, Point* p, In data) {
   }
   ok = m->use_exact && swept(&m->move, p, m->weight, m->lean, m->costates, m->delta, 1, data, &m->scratch);
   ok = ok || swept(&m->move, p, m->weight, m->lean, m->costates, m->delta, 0, data, &m->scratch);
-  m->use_exact = 1;
+  m->use_exact |= m->phase == INTERIOR || !ok;
   if (!ok) {
     m->delta = larger(10 * m->delta, 1e-6);
     m->stuck |= m->delta > 1e8;
@@ -302,7 +304,7 @@ static void begin(Machine* m, Point* p, In memory, In s0, In data, In lower, In 
   for (k = 0; k < N * NS; ++k) p->x[NS + k] = memory[N * NU + k], m->costates[NS + k] = memory[N * NU + N * NS + k];
   for (k = 0; k < N * NU * NS; ++k) m->move.k[k] = memory[N * NU + 2 * N * NS + k];
   m->mu = memory[MEMORY - 2] * COST, m->delta = memory[MEMORY - 1], m->floor = MU_END * COST;
-  m->phase = PURE, m->place_of = BEGINS, m->fresh = 1, m->slacks = WARM, m->use_exact = 1;
+  m->phase = PURE, m->place_of = BEGINS, m->fresh = 1, m->slacks = WARM, m->use_exact = !PLAIN_FIRST;
 }
 
 static void remember(const Machine* m, const Point* p, Out memory) {

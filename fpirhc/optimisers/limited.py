@@ -99,6 +99,7 @@ def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]
         "SEVERAL",
         "PATIENCE",
         "HOPELESS",
+        "AHEAD",
         "PURE_STEPS",
         "MU_WARM",
         "MU_MOST",
@@ -127,6 +128,7 @@ def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]
         "SCALED_TOLERANCE": repr(settings.scaled_tolerance(measures)),
         "ITERATIONS": settings.iterations,
         "REALTIME": int(settings.realtime),
+        "PLAIN_FIRST": int(settings.plain_first),
     }
 
 

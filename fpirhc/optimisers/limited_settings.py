@@ -12,6 +12,7 @@ NEAR = 1e-3  # scaled error below which a remembered plan is improved by pure st
 SEVERAL = 3  # iterations per call from which on pure steps are tried first in any case
 PATIENCE = 3  # pure steps in a row that may fail to halve the error: the active limits are changing
 HOPELESS = 1e2  # scaled error from which on there is no patience: multipliers are at their largest value
+AHEAD = 0.1  # of the tolerance: where one more step by Gauss-Newton is expected to arrive, the exact Hessian is not computed
 PURE_STEPS = 10
 MU_WARM, MU_MOST = (
     1e-4,
@@ -45,6 +46,11 @@ class LimitedSettings:
     damping: float
     iterations: int
     realtime: bool
+
+    @property
+    def plain_first(self) -> bool:
+        """Whether a remembered plan is improved by Gauss-Newton before the exact Hessian is computed."""
+        return self.hessian is None and not self.realtime
 
     def scaled_tolerance(self, scales: Scales) -> float:
         """Return the tolerance in units of the inputs' half ranges."""
