@@ -93,7 +93,7 @@ class FixedPoint(Optimiser):
             raise InvalidValue(f"FixedPoint(damping={self.damping!r}): expected a finite number of at least 0")
 
     def check(self, ocp: OptimalControl) -> None:
-        """Raise if the cost is not convex along the reference, or the tolerance cannot be met.
+        """Raise if the cost is not convex along the reference and the Hessian needs that, or the tolerance cannot be met.
 
         Raises:
             NotSupported: a quadratic model of such a cost has no minimum; a model-referenced map.
@@ -108,10 +108,11 @@ class FixedPoint(Optimiser):
                 f"use {1e3 * rounding:.0g}"
             )
         least = ocp.along.least_curvature()
-        if least < -_CONVEX:
+        if least < -_CONVEX and (self.hessian is None or self.hessian.needs_convex_cost):
             raise NotSupported(
                 f"FixedPoint needs a cost that bends upwards; along the reference the stage or terminal cost has an eigenvalue of "
-                f"{least:.2g} times its largest. Use ReducedGradient() or Ipopt(), or add a convex term to the cost"
+                f"{least:.2g} times its largest. Use ReducedGradient() or Ipopt(), or FixedPoint(hessian=ExactHessian()), which takes economic "
+                f"costs, or add a convex term to the cost"
             )
 
     def memory(self, ocp: OptimalControl) -> Layout:
