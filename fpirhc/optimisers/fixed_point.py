@@ -111,8 +111,8 @@ class FixedPoint(Optimiser):
         if least < -_CONVEX and (self.hessian is None or self.hessian.needs_convex_cost):
             raise NotSupported(
                 f"FixedPoint needs a cost that bends upwards; along the reference the stage or terminal cost has an eigenvalue of "
-                f"{least:.2g} times its largest. Use ReducedGradient() or Ipopt(), or FixedPoint(hessian=ExactHessian()), which takes economic "
-                f"costs, or add a convex term to the cost"
+                f"{least:.2g} times its largest. Use ReducedGradient() or Ipopt(), or FixedPoint(hessian=ExactHessian()) for an "
+                f"economic cost, or add a convex term to the cost"
             )
 
     def memory(self, ocp: OptimalControl) -> Layout:
