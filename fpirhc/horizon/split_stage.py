@@ -20,18 +20,27 @@ from fpirhc.horizon.hessian_models import HessianModel, stage_symbols
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.symbolic.chain_rule import chain_rule
 
-_built: WeakKeyDictionary[OptimalControl, dict[str, ca.Function]] = WeakKeyDictionary()
+_Parts = dict[str, ca.Function]
+_stages: WeakKeyDictionary[OptimalControl, _Parts] = WeakKeyDictionary()
+_hessians: WeakKeyDictionary[OptimalControl, dict[HessianModel, _Parts]] = WeakKeyDictionary()
 
 
 def split_stage(ocp: OptimalControl) -> dict[str, ca.Function]:
     """Return the Functions evaluate, pull and linearise, built once for a problem."""
-    if ocp not in _built:
-        _built[ocp] = _split(ocp)
-    return _built[ocp]
+    if ocp not in _stages:
+        _stages[ocp] = _split(ocp)
+    return _stages[ocp]
 
 
 def split_hessian(ocp: OptimalControl, hessian: HessianModel) -> dict[str, ca.Function]:
-    """Return the Functions bend and curve of a model of the second derivatives."""
+    """Return the Functions bend and curve of a model of the second derivatives, built once for a problem."""
+    models = _hessians.setdefault(ocp, {})
+    if hessian not in models:
+        models[hessian] = _bent(ocp, hessian)
+    return models[hessian]
+
+
+def _bent(ocp: OptimalControl, hessian: HessianModel) -> _Parts:
     ns = ocp.state.size
     s, u, theta = stage_symbols(ocp)
     after, variables = ca.SX.sym("lambda", ns), ca.vertcat(s, u)
@@ -46,7 +55,7 @@ def split_hessian(ocp: OptimalControl, hessian: HessianModel) -> dict[str, ca.Fu
     }
 
 
-def _split(ocp: OptimalControl) -> dict[str, ca.Function]:
+def _split(ocp: OptimalControl) -> _Parts:
     ns, nu = ocp.state.size, ocp.input.size
     s, u, theta = stage_symbols(ocp)
     next_state, (cost, _) = ocp.dynamics(s, u, theta), ocp.stage_cost(s, u, theta)

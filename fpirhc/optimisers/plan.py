@@ -91,7 +91,7 @@ class Plan:
         return tuple(text for _, _, text in sorted(violations)[:_WORST])
 
     def reasons(self) -> tuple[str, ...]:
-        """Return for every limit that the plan violates what stops it, and whether softening would help; empty when it keeps all."""
+        """Return for every limit that the plan violates what stops it, and whether softening would help."""
         return reasons(self.problem, self.states, self.inputs, self.bounds)
 
     def overflow(self) -> str:
