@@ -84,6 +84,37 @@ def test_nine_states_and_three_inputs_with_walls_have_the_optimum_of_ipopt(state
     assert room.min() < 1e-6
 
 
+def behind_a_wall(speed: float):
+    """The quadrotor flies towards a wall at x = .3 m: its position is held by a limit of its tilt, four integrations away."""
+    case = FOREIGN["quadrotor"]()
+    limits = fp.Limits(inputs=dict(case.limits.inputs), states={"tilt": (-0.35, 0.35), "x": (-3.0, 0.3)})
+    ocp = transcribe(case.plant, case.reference, case.horizon, case.cost, limits)
+    data = np.asarray(
+        stage_data(case.plant, case.reference, case.horizon, case.cost)(0.0, case.plant.approximate).full()
+    )
+    return ocp, data, np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("speed", [1.0, 1.2, 1.4])
+def test_a_wall_that_the_inputs_feel_late_is_solved_in_one_call(speed):
+    """Multipliers of neighbouring stages are nearly dependent: the barrier must go down to 1e-13 and less."""
+    ocp, data, first = behind_a_wall(speed)
+    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp)), first, data)
+    best = fp.solve(ocp, fp.Ipopt(accuracy=1e-9), first, data)
+    assert (plan.status, plan.calls) == (fp.Status.OK, 1)
+    assert known(plan.cost) == pytest.approx(known(best.cost), rel=1e-6)
+    assert plan.states[0].max() == pytest.approx(0.3, abs=1e-7)
+
+
+def test_too_fast_for_the_wall_is_said_with_the_stage_at_which_the_plan_is_back():
+    ocp, data, first = behind_a_wall(2.0)
+    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp)), first, data)
+    assert plan.status == fp.Status.INFEASIBLE
+    assert plan.reasons()[0].startswith(
+        "'x' above 0.3: begins inside, passes it by 0.0831 m and cannot be back before stage 10"
+    )
+
+
 @cache
 def linear_horizon():
     """Two states and two inputs whose every coefficient is a parameter: one horizon serves all plants."""

@@ -18,7 +18,8 @@ MU_WARM, MU_MOST = (
     1e-4,
     0.1,
 )  # barrier parameter of a remembered plan, and most of a real-time iteration, in units of the cost
-MU_END, MU_LEAST = 1e-5, 1e-11  # where pure steps are tried first, and last
+# Where pure steps are tried first, and last: at the last one limits whose multipliers nearly vanish are 1e-7 of a unit away.
+MU_END, MU_LEAST = 1e-5, 1e-15
 MU_ROUNDS = 8  # reductions after one accepted plan
 FILTER = 64  # pairs that the filter holds
 MOST_RAISES = 12  # of the Levenberg-Marquardt term before another first plan is tried
