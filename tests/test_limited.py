@@ -59,6 +59,62 @@ def test_horizons_of_other_people_are_solved_from_nothing(name):
     assert plan.cost == pytest.approx(OPTIMA[name], rel=3e-5)
 
 
+WALLS = {"a wall": {"y1": (-0.02, 5.0)}, "ceiling and wall": {"z1": (-0.22, 5.0), "xe": (-5.0, 1.0)}}
+WALLS["speeds"] = {"y1'": (-0.97, 0.27), "z1'": (-1.0, 0.26), "x1'": (-0.36, 1.04)}
+
+
+@pytest.mark.parametrize("states", WALLS.values(), ids=WALLS.keys())
+def test_nine_states_and_three_inputs_with_walls_have_the_optimum_of_ipopt(states):
+    """The chain of masses of Wirsching, Bock and Diehl behind walls: from nothing, in one call, with a limit active."""
+    p = fp.load_problem("chain_of_masses").problem
+    assert p.horizon is not None
+    assert p.cost is not None
+    ocp = transcribe(p.plant, p.reference, p.horizon, p.cost, fp.Limits(inputs=p.limits.inputs, states=states))
+    data = np.asarray(stage_data(p.plant, p.reference, p.horizon, p.cost)(0.0, p.plant.approximate).full())
+    first = np.asarray(ocp.start(p.start_state, np.zeros(3)).full()).ravel()
+    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp)), first, data)
+    best = fp.solve(ocp, fp.Ipopt(accuracy=1e-9), first, data)
+    judged = Judge(ocp)(plan.inputs, first, data)
+    assert (ocp.state.size, plan.status, plan.calls) == (9, fp.Status.OK, 1)
+    assert judged.residual <= 1e-6
+    assert judged.violation <= 1e-6
+    assert known(plan.cost) == pytest.approx(known(best.cost), rel=1e-7)
+    places = [ocp.state.elements.index(name) for name in states]
+    room = np.minimum(plan.states.T - ocp.state_lower, ocp.state_upper - plan.states.T)[1:, places]
+    assert room.min() < 1e-6
+
+
+def behind_a_wall(speed: float):
+    """The quadrotor flies towards a wall at x = .3 m: its position is held by a limit of its tilt, four integrations away."""
+    case = FOREIGN["quadrotor"]()
+    limits = fp.Limits(inputs=dict(case.limits.inputs), states={"tilt": (-0.35, 0.35), "x": (-3.0, 0.3)})
+    ocp = transcribe(case.plant, case.reference, case.horizon, case.cost, limits)
+    data = np.asarray(
+        stage_data(case.plant, case.reference, case.horizon, case.cost)(0.0, case.plant.approximate).full()
+    )
+    return ocp, data, np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("speed", [1.0, 1.2, 1.4])
+def test_a_wall_that_the_inputs_feel_late_is_solved_in_one_call(speed):
+    """Multipliers of neighbouring stages are nearly dependent: the barrier must go down to 1e-13 and less."""
+    ocp, data, first = behind_a_wall(speed)
+    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp)), first, data)
+    best = fp.solve(ocp, fp.Ipopt(accuracy=1e-9), first, data)
+    assert (plan.status, plan.calls) == (fp.Status.OK, 1)
+    assert known(plan.cost) == pytest.approx(known(best.cost), rel=1e-6)
+    assert plan.states[0].max() == pytest.approx(0.3, abs=1e-7)
+
+
+def test_too_fast_for_the_wall_is_said_with_the_stage_at_which_the_plan_is_back():
+    ocp, data, first = behind_a_wall(2.0)
+    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp)), first, data)
+    assert plan.status == fp.Status.INFEASIBLE
+    assert plan.reasons()[0].startswith(
+        "'x' above 0.3: begins inside, passes it by 0.0831 m and cannot be back before stage 10"
+    )
+
+
 @cache
 def linear_horizon():
     """Two states and two inputs whose every coefficient is a parameter: one horizon serves all plants."""

@@ -20,6 +20,11 @@ from fpirhc.horizon.problem import OptimalControl
 class HessianModel(Checked, ABC):
     """Contract: a model of a stage's second derivatives."""
 
+    @property
+    def needs_convex_cost(self) -> bool:
+        """Whether the model says nothing useful of a cost that does not bend upwards."""
+        return True
+
     @abstractmethod
     def curved(self, cost: ca.SX, next_state: ca.SX, costate: ca.SX) -> ca.SX:
         """Return the scalar whose Hessian with respect to (s, u) the sweep uses."""
@@ -36,7 +41,15 @@ class GaussNewton(HessianModel):
 
 @dataclass(frozen=True)
 class ExactHessian(HessianModel):
-    """The Hessian of the stage's Hamiltonian: quadratic convergence near a strict minimum, indefinite far from it."""
+    """The Hessian of the stage's Hamiltonian: quadratic convergence near a strict minimum, indefinite far from it.
+
+    It sees the curvature that the dynamics give to a cost that has none of its own, such as a production rate.
+    """
+
+    @property
+    def needs_convex_cost(self) -> bool:
+        """Whether the model needs a convex cost: it does not, because it is the curvature of the whole problem."""
+        return False
 
     def curved(self, cost: ca.SX, next_state: ca.SX, costate: ca.SX) -> ca.SX:
         """Return l + lambda' F."""

@@ -1,9 +1,9 @@
 /* The iteration of FixedPoint as loops around generated stage functions.
 
    The same mathematics as the composed graph in fixed_point.py and search.py, which is the reference it is tested against:
-   names follow those files. What is generated stands before this text: the stage functions linear, hessian, end and deformed, the
-   sizes NS, NU, NT (entries of the data of a stage), N, WORK and INTEGERS (of the stage functions), the constants of the
-   search, and ENTRY, the name of the function. Matrices are column-major, stages follow each other. Nothing is allocated:
+   names follow those files. What is generated stands before this text: the stage functions evaluate, pull, linearise, hessian, end
+   and deformed, the sizes NS, NU, NT (entries of the data of a stage), NM (partial derivatives of a stage), N, WORK and INTEGERS
+   (of the stage functions), the constants of the search, and ENTRY, the name of the function. Matrices are column-major, stages follow each other. Nothing is allocated:
    everything lies on the stack. */
 
 typedef struct {
@@ -13,7 +13,7 @@ typedef struct {
 typedef struct {
   Plan plans[2];
   casadi_real v[N * NU], k[N * NU * NS], t[N * NU], planned[N * NS];
-  casadi_real a[N * NS * NS], b[N * NS * NU], ls[N * NS], lu[N * NU], lambda[(N + 1) * NS], final[NS * NS];
+  casadi_real partials[N * NM], lambda[(N + 1) * NS], final[NS * NS];
   casadi_real envelope, reach, tau, gamma, resume;
 #ifdef SCALE_AT
   casadi_real metric[NU], first_gamma; /* settings are live: the scale and the first gamma are data of the call */
@@ -29,7 +29,8 @@ typedef struct {
 static const casadi_real scale[NU] = SCALE;
 #endif
 
-/* Roll out the next plan, expanded, with its cost and gradient; 0 when something is not finite. */
+/* Roll out the next plan, with its cost and gradient; 0 when something is not finite. The partial derivatives stay, for the
+   Jacobians of a plan that is accepted. */
 INLINE int try_next(Search* s, const Plan* best, Plan* plan, In s0, In data, In lower, In upper) {
   int i, j, l, bold = s->tau >= SHORTEST;
   In arg[8];
@@ -47,9 +48,8 @@ INLINE int try_next(Search* s, const Plan* best, Plan* plan, In s0, In data, In 
       u[l] = bold ? between(wanted, lower[l], upper[l]) : s->t[i * NU + l];
     }
     arg[0] = x, arg[1] = u, arg[2] = data + i * NT;
-    res[0] = x + NS, res[1] = &cost, res[2] = s->a + i * NS * NS, res[3] = s->b + i * NS * NU;
-    res[4] = s->ls + i * NS, res[5] = s->lu + i * NU;
-    if (linear(arg, res, s->iw, s->w, 0)) return 0;
+    res[0] = x + NS, res[1] = &cost, res[2] = s->partials + i * NM;
+    if (evaluate(arg, res, s->iw, s->w, 0)) return 0;
     plan->value += cost;
   }
   arg[0] = plan->x + N * NS, arg[1] = data + N * NT;
@@ -58,17 +58,9 @@ INLINE int try_next(Search* s, const Plan* best, Plan* plan, In s0, In data, In 
   plan->value += cost;
   for (j = 0; j < NS; ++j) s->lambda[N * NS + j] = slope[j];
   for (i = N - 1; i >= 0; --i) {
-    In after = s->lambda + (i + 1) * NS;
-    for (l = 0; l < NU; ++l) {
-      casadi_real sum = s->lu[i * NU + l];
-      for (j = 0; j < NS; ++j) sum += s->b[(i * NU + l) * NS + j] * after[j];
-      plan->g[i * NU + l] = sum;
-    }
-    for (l = 0; l < NS; ++l) {
-      casadi_real sum = s->ls[i * NS + l];
-      for (j = 0; j < NS; ++j) sum += s->a[(i * NS + l) * NS + j] * after[j];
-      s->lambda[i * NS + l] = sum;
-    }
+    arg[0] = s->partials + i * NM, arg[1] = s->lambda + (i + 1) * NS;
+    res[0] = s->lambda + i * NS, res[1] = plan->g + i * NU;
+    if (pull(arg, res, s->iw, s->w, 0)) return 0;
   }
   return all_finite(&plan->value, 1) && all_finite(plan->g, N * NU) && all_finite(plan->x, (N + 1) * NS);
 }
@@ -101,7 +93,7 @@ INLINE int judged(Search* s, Plan* best, Plan* plan, int ok, In lower, In upper)
       envelope = plan->value + plain_step(s, plan, lower, upper, &reach) + reach;
       for (i = 0; i < N * NU; ++i) descent += best->g[i] * (plan->u[i] - best->u[i]);
       ok = envelope <= s->envelope - SHARE * (1 - SHARE) * s->reach + slack ||
-           plan->value <= best->value + ARMIJO * fmin(descent, 0) + slack;
+           plan->value <= best->value + ARMIJO * smaller(descent, 0) + slack;
       ok = ok && envelope <= s->envelope + slack && plan->value <= best->value + slack;
       if (!ok) for (i = 0; i < N * NU; ++i) s->t[i] = before[i];
     } else {
@@ -118,7 +110,7 @@ INLINE int judged(Search* s, Plan* best, Plan* plan, int ok, In lower, In upper)
   }
   if (!untried && !bold) {
     /* The quadratic that the cost followed along T - U says which gamma would have been short enough. */
-    s->gamma *= rise > 2 ? fmax(1 / rise, DRAWN_IN) : 0.5;
+    s->gamma *= rise > 2 ? larger(1 / rise, DRAWN_IN) : 0.5;
     s->envelope = best->value + plain_step(s, best, lower, upper, &s->reach) + s->reach;
   }
   s->tau = untried ? SHORTEST * SHORTER : SHORTER * s->tau;
@@ -200,18 +192,21 @@ INLINE int direct(Search* s, const Plan* plan, In data, In lower, In upper) {
   for (j = 0; j < NS * NS; ++j) p[j] = s->final[j];
   for (j = 0; j < NS; ++j) lean[j] = s->lambda[N * NS + j];
   for (i = N - 1; i >= 0; --i) {
-    In a = s->a + i * NS * NS, b = s->b + i * NS * NU;
+    casadi_real a[NS * NS], b[NS * NU], ls[NS], lu[NU];
     casadi_real q[NS * NS], cross[NU * NS], r[NU * NU], turned[NS * NS], flat[NU * NS];
     casadi_real steep[NU], low[NU], high[NU], factor[NU * NU], pivots[NU], *v = wanted + i * NU, *k = s->k + i * NU * NS;
     casadi_real next[NS], pull[NU], gap[NU];
     int free[NU];
+    arg[0] = s->partials + i * NM;
+    res[0] = a, res[1] = b, res[2] = ls, res[3] = lu;
+    if (linearise(arg, res, s->iw, s->w, 0)) return 1;
     arg[0] = plan->x + i * NS, arg[1] = plan->u + i * NU, arg[2] = data + i * NT, arg[3] = s->lambda + (i + 1) * NS;
     res[0] = q, res[1] = cross, res[2] = r;
     if (hessian(arg, res, s->iw, s->w, 0)) return 1;
     condense(q, cross, r, p, a, b, turned);
     for (l = 0; l < NU; ++l) {
       r[l * NU + l] += DAMPING / scale[l];
-      steep[l] = s->lu[i * NU + l];
+      steep[l] = lu[l];
       for (j = 0; j < NS; ++j) steep[l] += b[l * NS + j] * lean[j];
       low[l] = lower[l] - plan->u[i * NU + l];
       high[l] = upper[l] - plan->u[i * NU + l];
@@ -226,7 +221,7 @@ INLINE int direct(Search* s, const Plan* plan, In data, In lower, In upper) {
       for (m = 0; m < NU; ++m) gap[l] += r[m * NU + l] * v[m];
       pull[l] = v[l];
     }
-    for (j = 0; j < NS; ++j) next[j] = s->ls[i * NS + j];
+    for (j = 0; j < NS; ++j) next[j] = ls[j];
     for (m = 0; m < NS; ++m)
       for (j = 0; j < NS; ++j) next[j] += turned[m * NS + j] * lean[m];
     for (j = 0; j < NS; ++j)
@@ -249,7 +244,8 @@ INLINE casadi_real residual(const Search* s, const Plan* plan, In lower, In uppe
   (void)s; /* needed where settings are live */
   for (k = 0; k < N * NU; ++k) {
     casadi_real moved = between(plan->u[k] - scale[k % NU] * plan->g[k], lower[k % NU], upper[k % NU]);
-    worst = fmax(worst, fabs(plan->u[k] - moved));
+    casadi_real move = fabs(plan->u[k] - moved);
+    worst = move > worst ? move : worst;
   }
   return worst;
 }
@@ -268,9 +264,9 @@ INLINE void begin(Search* s, Plan* best, In memory, In lower, In upper) {
   best->value = s->envelope = 10 * UNTRIED;
   s->reach = 0;
   s->tau = 1;
-  s->resume = tau > 0 ? fmin(tau, 1) : 1;
+  s->resume = tau > 0 ? smaller(tau, 1) : 1;
   /* After a rejected T a longer gamma would be rejected again, in every call of one iteration. */
-  s->gamma = gamma > 0 ? fmin((s->resume < SHORTEST ? 1 : 2) * gamma, FIRST_GAMMA) : FIRST_GAMMA;
+  s->gamma = gamma > 0 ? smaller((s->resume < SHORTEST ? 1 : 2) * gamma, FIRST_GAMMA) : FIRST_GAMMA;
 }
 
 INLINE void remember(const Search* s, const Plan* best, Out memory) {

@@ -72,7 +72,8 @@ class FixedPoint(Optimiser):
         tolerance: of the stationarity (in the unit of the inputs), below which a plan is converged.
         feasible: violation of a state bound (in its unit) below which a plan counts as converged.
         map: the deformation that makes the next plan; Affine(gain=-2.0) is the full step, a Sigmoid's scale limits it.
-        hessian: GaussNewton() or ExactHessian(); None is Gauss-Newton without limits of states and the exact Hessian with them.
+        hessian: GaussNewton() or ExactHessian(); None is Gauss-Newton without limits of states; with them the exact Hessian, and
+            Gauss-Newton first where a remembered plan is improved until it converges.
         damping: mu >= 0 added to the input's curvature, in units of it: 0 is Gauss-Newton, large values are gradient descent.
 
     Raises:
@@ -92,7 +93,7 @@ class FixedPoint(Optimiser):
             raise InvalidValue(f"FixedPoint(damping={self.damping!r}): expected a finite number of at least 0")
 
     def check(self, ocp: OptimalControl) -> None:
-        """Raise if the cost is not convex along the reference, or the tolerance cannot be met.
+        """Raise if the cost is not convex along the reference and the Hessian needs that, or the tolerance cannot be met.
 
         Raises:
             NotSupported: a quadratic model of such a cost has no minimum; a model-referenced map.
@@ -107,10 +108,11 @@ class FixedPoint(Optimiser):
                 f"use {1e3 * rounding:.0g}"
             )
         least = ocp.along.least_curvature()
-        if least < -_CONVEX:
+        if least < -_CONVEX and (self.hessian is None or self.hessian.needs_convex_cost):
             raise NotSupported(
                 f"FixedPoint needs a cost that bends upwards; along the reference the stage or terminal cost has an eigenvalue of "
-                f"{least:.2g} times its largest. Use ReducedGradient() or Ipopt(), or add a convex term to the cost"
+                f"{least:.2g} times its largest. Use ReducedGradient() or Ipopt(), or FixedPoint(hessian=ExactHessian()) for an "
+                f"economic cost, or add a convex term to the cost"
             )
 
     def memory(self, ocp: OptimalControl) -> Layout:

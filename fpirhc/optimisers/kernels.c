@@ -10,13 +10,20 @@ typedef const casadi_real* In;
 typedef casadi_real* Out;
 
 INLINE int all_finite(In v, int n) {
-  int i, ok = 1;
-  for (i = 0; i < n; ++i) ok &= v[i] <= FINITE && v[i] >= -FINITE; /* false for NaN */
-  return ok;
+  int i;
+  long long ok = 1; /* as wide as a number, so that the loop uses wide registers */
+  for (i = 0; i < n; ++i) ok &= fabs(v[i]) <= FINITE; /* false for NaN */
+  return (int)ok;
 }
 
+/* fmax and fmin without calls of the library: where one is not a number, the other. */
+INLINE casadi_real larger(casadi_real a, casadi_real b) { return a > b || b != b ? a : b; }
+INLINE casadi_real smaller(casadi_real a, casadi_real b) { return a < b || b != b ? a : b; }
+
+/* fmin(fmax(v, low), high) without calls of the library: a v that is not a number becomes low there and here. */
 INLINE casadi_real between(casadi_real v, casadi_real low, casadi_real high) {
-  return fmin(fmax(v, low), high);
+  casadi_real above = v > low ? v : low;
+  return above < high ? above : high;
 }
 
 /* c (rows, columns) += a (rows, inner) b (inner, columns) */

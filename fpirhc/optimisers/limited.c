@@ -56,10 +56,10 @@ static casadi_real barrier_error(const Machine* m, const Point* p, casadi_real* 
   EACH_LIMIT(&m->limits) {
     casadi_real t = m->y.t[side][k], z = m->y.z[side][k], e = m->y.e[side][k];
     push[k] -= SIGN(side) * z;
-    worst = fmax(worst, fabs(distance(&m->limits, p, side, i, r) - t + e) / unit[r]);
-    *least = fmin(*least, t * z), *most = fmax(*most, t * z);
+    worst = larger(worst, fabs(distance(&m->limits, p, side, i, r) - t + e) / unit[r]);
+    *least = smaller(*least, t * z), *most = larger(*most, t * z);
     if (r < NU) continue;
-    *least = fmin(*least, e * (capacity(r) - z)), *most = fmax(*most, e * (capacity(r) - z));
+    *least = smaller(*least, e * (capacity(r) - z)), *most = larger(*most, e * (capacity(r) - z));
   }
   for (i = 0; i < N; ++i) {
     In after = m->costates + (i + 1) * NS;
@@ -67,7 +67,7 @@ static casadi_real barrier_error(const Machine* m, const Point* p, casadi_real* 
     for (l = 0; l < NU; ++l) {
       casadi_real sum = p->lu[i * NU + l] + push[i * ROWS + l];
       for (j = 0; j < NS; ++j) sum += p->b[(i * NU + l) * NS + j] * after[j];
-      worst = fmax(worst, fabs(sum) * unit[l] / COST);
+      worst = larger(worst, fabs(sum) * unit[l] / COST);
     }
     for (l = 0; l < NS; ++l) {
       rest[l] = -after[l];
@@ -76,7 +76,7 @@ static casadi_real barrier_error(const Machine* m, const Point* p, casadi_real* 
         rest[l] += p->a[((i + 1) * NS + l) * NS + j] * after[NS + j];
     }
     for (l = 0; l < NB; ++l) rest[place[l]] += push[i * ROWS + NU + l];
-    for (l = 0; l < NS; ++l) worst = fmax(worst, fabs(rest[l]) * spread[l] / COST);
+    for (l = 0; l < NS; ++l) worst = larger(worst, fabs(rest[l]) * spread[l] / COST);
   }
   return worst;
 }
@@ -96,7 +96,7 @@ static void begin_cold(Machine* m, Point* p, In s0, In data, In lower, In upper,
     guess(arg, res, m->scratch.iw, m->scratch.w, 0);
     for (j = 0; j < NS; ++j) p->x[i * NS + j] = m->start == REFERENCE ? x[j] : s0[j];
     for (l = 0; l < NU && i < N; ++l) {
-      casadi_real hair = fmin(0.01 * unit[l], 0.25 * (upper[l] - lower[l]));
+      casadi_real hair = smaller(0.01 * unit[l], 0.25 * (upper[l] - lower[l]));
       p->u[i * NU + l] = between(inputs && m->start == 0 ? inputs[i * NU + l] : u[l], lower[l] + hair, upper[l] - hair);
     }
   }
@@ -122,7 +122,7 @@ static void keep(Machine* m, const Point* p) {
 /* Leave the pure phase: for an interior phase near its best plan, or back to the interior plan it came from. */
 static void enter_interior(Machine* m, Point* p) {
   int k;
-  m->phase = INTERIOR, m->again = 1, m->filtered = m->raises = m->halvings = 0;
+  m->phase = INTERIOR, m->again = m->use_exact = 1, m->filtered = m->raises = m->halvings = 0;
   if (m->place_of == BEGINS) {
     m->slacks = WARM;
     m->mu = REALTIME ? between(m->mu, MU_WARM * COST, MU_MOST * COST) : MU_WARM * COST, m->floor = MU_END * COST;
@@ -149,12 +149,12 @@ static void advance_interior(Machine* m, const Point* p) {
   int k;
   casadi_real least, most, rest = barrier_error(m, p, &least, &most);
   for (k = 0; k < MU_ROUNDS; ++k) {
-    casadi_real worst = fmax(rest, fmax(most - m->mu, least < FINITE ? m->mu - least : 0) / COST);
+    casadi_real worst = larger(rest, larger(most - m->mu, least < FINITE ? m->mu - least : 0) / COST);
     if (worst > 10 * m->mu / COST || m->mu <= m->floor) break;
-    m->mu = fmax(m->floor, fmin(0.2 * m->mu, m->mu * sqrt(m->mu / COST)));
+    m->mu = larger(m->floor, smaller(0.2 * m->mu, m->mu * sqrt(m->mu / COST)));
     m->filtered = 0;
   }
-  if (m->mu <= m->floor && fmax(rest, most / COST) <= 0.3 * sqrt(m->floor / COST)) enter_pure(m, p, ENDS);
+  if (m->mu <= m->floor && larger(rest, most / COST) <= 0.3 * sqrt(m->floor / COST)) enter_pure(m, p, ENDS);
 }
 
 static int passes(Machine* m, casadi_real theta, casadi_real phi) {
@@ -188,8 +188,8 @@ static void adopt_costates(Machine* m, casadi_real share) {
 
 /* mu of a real-time iteration follows how well the last step went. */
 static void adapt_mu(Machine* m, casadi_real rest) {
-  if (m->alpha < 0.5 || rest > 0.3) m->mu = fmin(10 * m->mu, MU_MOST * COST);
-  else if (m->alpha > 0.9 && rest < 0.05) m->mu = fmax(m->mu / 5, MU_WARM * COST);
+  if (m->alpha < 0.5 || rest > 0.3) m->mu = smaller(10 * m->mu, MU_MOST * COST);
+  else if (m->alpha > 0.9 && rest < 0.05) m->mu = larger(m->mu / 5, MU_WARM * COST);
 }
 
 /* Judge the plan that was expanded; returns whether it is the new one. */
@@ -215,6 +215,8 @@ static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, I
     waits = m->misses < PATIENCE && c.error < HOPELESS && (!REALTIME || m->ahead > 2);
     ok = ok && (halved || waits) && ++m->steps <= PURE_STEPS;
     if (!ok) { enter_interior(m, old); return 0; }
+    /* Gauss-Newton goes on only where the contraction that was seen ends the call with one more step. */
+    m->use_exact |= c.error * c.error > AHEAD * SCALED_TOLERANCE * m->error;
     m->misses = halved ? 0 : m->misses + 1;
     for (k = 0; k < COUNT; ++k) m->y.z[0][k] = m->next_z[0][k], m->y.z[1][k] = m->next_z[1][k];
     for (k = 0; k < N * NU; ++k) m->g[k] = g[k];
@@ -242,14 +244,14 @@ static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, I
       if (m->last.error < NEAR) enter_pure(m, p, BEGINS);
       return 1;
     }
-    m->delta = m->halvings >= 3 ? fmax(4 * m->delta, 1e-4) : m->halvings ? m->delta : m->delta > 5e-7 ? m->delta / 5 : 0;
+    m->delta = m->halvings >= 3 ? larger(4 * m->delta, 1e-4) : m->halvings ? m->delta : m->delta > 5e-7 ? m->delta / 5 : 0;
     m->halvings = m->raises = 0;
     advance_interior(m, p);
     return 1;
   }
   if (++m->halvings <= 8 && !REALTIME) { m->alpha *= 0.5; return 0; }
   m->halvings = m->filtered = 0;
-  m->delta = fmax(10 * m->delta, 1e-3);
+  m->delta = larger(10 * m->delta, 1e-3);
   if (++m->raises > MOST_RAISES || m->delta > 1e8 || REALTIME) { restart(m, old, s0, data, lower, upper); return 0; }
   m->again = 1; /* the same plan, a shorter step */
   return 0;
@@ -267,9 +269,9 @@ static void direct(Machine* m, Point* p, In data) {
   }
   ok = m->use_exact && swept(&m->move, p, m->weight, m->lean, m->costates, m->delta, 1, data, &m->scratch);
   ok = ok || swept(&m->move, p, m->weight, m->lean, m->costates, m->delta, 0, data, &m->scratch);
-  m->use_exact = 1;
+  m->use_exact |= m->phase == INTERIOR || !ok;
   if (!ok) {
-    m->delta = fmax(10 * m->delta, 1e-6);
+    m->delta = larger(10 * m->delta, 1e-6);
     m->stuck |= m->delta > 1e8;
     m->fresh = 2; /* try again from the same plan */
   } else if (m->phase == PURE) {
@@ -302,7 +304,7 @@ static void begin(Machine* m, Point* p, In memory, In s0, In data, In lower, In 
   for (k = 0; k < N * NS; ++k) p->x[NS + k] = memory[N * NU + k], m->costates[NS + k] = memory[N * NU + N * NS + k];
   for (k = 0; k < N * NU * NS; ++k) m->move.k[k] = memory[N * NU + 2 * N * NS + k];
   m->mu = memory[MEMORY - 2] * COST, m->delta = memory[MEMORY - 1], m->floor = MU_END * COST;
-  m->phase = PURE, m->place_of = BEGINS, m->fresh = 1, m->slacks = WARM, m->use_exact = 1;
+  m->phase = PURE, m->place_of = BEGINS, m->fresh = 1, m->slacks = WARM, m->use_exact = !PLAIN_FIRST;
 }
 
 static void remember(const Machine* m, const Point* p, Out memory) {
@@ -365,7 +367,7 @@ int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_rea
     pushes(push, &m.limits, best, m.y.z, NEAR_LIMIT);
     adjoint(best, push, g);
     for (c.left = 0, i = 0; i < N * NU; ++i)
-      c.left = fmax(c.left, fabs(best->u[i] - between(best->u[i] - g[i] / curvature[i % NU], lower[i % NU], upper[i % NU])));
+      c.left = larger(c.left, fabs(best->u[i] - between(best->u[i] - g[i] / curvature[i % NU], lower[i % NU], upper[i % NU])));
     ok = c.error < FINITE;
   }
   /* A call of few iterations may still get inside; one that has tried everything has not. */
@@ -375,7 +377,7 @@ int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_rea
     for (i = 0; i < N * NU; ++i)
       res[0][i] = between(ok ? best->u[i] : all_finite(memory, MEMORY) ? memory[i] : 0, lower[i % NU], upper[i % NU]);
   if (res[1]) {
-    res[1][0] = ok ? best->value : 0, res[1][1] = ok ? c.left : 0, res[1][2] = ok ? fmax(c.violation, 0) : 0;
+    res[1][0] = ok ? best->value : 0, res[1][1] = ok ? c.left : 0, res[1][2] = ok ? larger(c.violation, 0) : 0;
     res[1][3] = count, res[1][4] = status;
   }
   if (res[2]) {

@@ -17,8 +17,9 @@ from importlib import resources
 import casadi as ca
 import numpy as np
 
-from fpirhc.horizon.hessian_models import ExactHessian, GaussNewton, hessian_end, hessian_stage, linear_stage
+from fpirhc.horizon.hessian_models import ExactHessian, GaussNewton, hessian_end, hessian_stage
 from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.split_stage import split_hessian, split_stage
 from fpirhc.horizon.sweep import PIVOT
 from fpirhc.optimisers import limited_settings as numbers
 from fpirhc.optimisers.base import FEASIBLE, shift
@@ -59,8 +60,8 @@ def shifted_limited(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
 def _driver(ocp: OptimalControl, settings: LimitedSettings) -> Driver:
     measures = scales(ocp)
     leaves = {
-        "linear": linear_stage(ocp),
-        "exact": hessian_stage(ocp, settings.hessian or ExactHessian()),
+        **{name: split_stage(ocp)[name] for name in ("evaluate", "linearise")},
+        **split_hessian(ocp, settings.hessian or ExactHessian()),
         "plain": hessian_stage(ocp, GaussNewton()),
         "end": hessian_end(ocp),
         "deformed": deformed_move(settings.map, ocp.input.size * ocp.stages),
@@ -68,7 +69,8 @@ def _driver(ocp: OptimalControl, settings: LimitedSettings) -> Driver:
     }
     folder = resources.files("fpirhc.optimisers")
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
-    return Driver("\n".join(texts), leaves, {**_sizes(ocp, measures), **_constants(settings, measures)})
+    sizes = {"NM": leaves["linearise"].numel_in(0), "NH": leaves["curve"].numel_in(0), **_sizes(ocp, measures)}
+    return Driver("\n".join(texts), leaves, {**sizes, **_constants(settings, measures)})
 
 
 def _sizes(ocp: OptimalControl, measures: Scales) -> dict[str, object]:
@@ -97,6 +99,7 @@ def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]
         "SEVERAL",
         "PATIENCE",
         "HOPELESS",
+        "AHEAD",
         "PURE_STEPS",
         "MU_WARM",
         "MU_MOST",
@@ -125,6 +128,7 @@ def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]
         "SCALED_TOLERANCE": repr(settings.scaled_tolerance(measures)),
         "ITERATIONS": settings.iterations,
         "REALTIME": int(settings.realtime),
+        "PLAIN_FIRST": int(settings.plain_first),
     }
 
 

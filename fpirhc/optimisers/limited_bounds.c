@@ -79,7 +79,7 @@ static void adjoint(const Point* p, In push, Out g) {
 static casadi_real largest_gap(const Point* p) {
   int k;
   casadi_real worst = 0;
-  for (k = 0; k < N * NS; ++k) worst = fmax(worst, fabs(p->f[k] - p->x[k + NS]) / spread[k % NS]);
+  for (k = 0; k < N * NS; ++k) worst = larger(worst, fabs(p->f[k] - p->x[k + NS]) / spread[k % NS]);
   return worst;
 }
 
@@ -92,19 +92,19 @@ static Certificate certified(const Limits* limits, const Point* p, casadi_real z
   adjoint(p, push, g);
   for (k = 0; k < N * NU; ++k) {
     casadi_real u = p->u[k], low = limits->at[0][k % NU], high = limits->at[1][k % NU];
-    c.error = fmax(c.error, fabs(u - between(u - reach(k % NU) * g[k], low, high)) / unit[k % NU]);
-    c.left = fmax(c.left, fabs(u - between(u - g[k] / curvature[k % NU], low, high)));
+    c.error = larger(c.error, fabs(u - between(u - reach(k % NU) * g[k], low, high)) / unit[k % NU]);
+    c.left = larger(c.left, fabs(u - between(u - g[k] / curvature[k % NU], low, high)));
   }
   EACH_LIMIT(limits) {
     casadi_real d = distance(limits, p, side, i, r), y = z[side][k];
     if (r < NU) continue;
-    c.violation = fmax(c.violation, -d * hard[r - NU]);
-    c.error = fmax(c.error, reach(r) * fmax(-y, 0) / unit[r]);
+    c.violation = larger(c.violation, -d * hard[r - NU]);
+    c.error = larger(c.error, reach(r) * larger(-y, 0) / unit[r]);
     if (y >= ENOUGH * capacity(r)) {
-      c.error = fmax(c.error, fmax(d, 0) / unit[r]);
+      c.error = larger(c.error, larger(d, 0) / unit[r]);
     } else {
-      c.error = fmax(c.error, fabs(fmin(d, reach(r) * between(y, 0, capacity(r)))) / unit[r]);
-      c.broken = fmax(c.broken, -d);
+      c.error = larger(c.error, fabs(smaller(d, reach(r) * between(y, 0, capacity(r)))) / unit[r]);
+      c.broken = larger(c.broken, -d);
     }
   }
   if (!all_finite(g, N * NU)) c.error = c.left = 10 * FINITE; /* fmax would hide NaN */
@@ -118,7 +118,7 @@ static void pure_terms(const Limits* limits, const Point* p, Duals* y, In g, Out
   EACH_LIMIT(limits) {
     casadi_real d = distance(limits, p, side, i, r), *z = &y->z[side][k], kappa = STIFF / reach(r);
     /* An input on its limit that the cost holds there has a multiplier. */
-    if (r < NU && closed && *z == 0 && d == 0) *z = fmax(SIGN(side) * g[i * NU + r], 0);
+    if (r < NU && closed && *z == 0 && d == 0) *z = larger(SIGN(side) * g[i * NU + r], 0);
     if (*z >= ENOUGH * capacity(r) && d < 0) {
       lean[k] -= SIGN(side) * capacity(r);
     } else if (reach(r) * *z > d) {
@@ -133,7 +133,7 @@ static void pure_multipliers(const Limits* limits, const Point* p, const Duals* 
   EACH_LIMIT(limits) {
     casadi_real d = distance(limits, p, side, i, r), z = y->z[side][k], kappa = STIFF / reach(r);
     if (z >= ENOUGH * capacity(r) && d < 0) next[side][k] = capacity(r);
-    else if (reach(r) * z > d) next[side][k] = fmin(z - kappa * (SIGN(side) * moved(move, i, r) + d), capacity(r));
+    else if (reach(r) * z > d) next[side][k] = smaller(z - kappa * (SIGN(side) * moved(move, i, r) + d), capacity(r));
     else next[side][k] = 0;
   }
 }
@@ -144,11 +144,11 @@ static void put_inside(const Limits* limits, const Point* p, Duals* y, casadi_re
   EACH_LIMIT(limits) {
     casadi_real d = distance(limits, p, side, i, r), m = d - reach(r) * y->z[side][k], rho = capacity(r), t, z, e = 0;
     t = sqrt(m * m + 4 * reach(r) * mu);
-    t = !warm ? fmax(d, 0.1 * unit[r]) : m > 0 ? 0.5 * (m + t) : 2 * reach(r) * mu / (t - m);
+    t = !warm ? larger(d, 0.1 * unit[r]) : m > 0 ? 0.5 * (m + t) : 2 * reach(r) * mu / (t - m);
     z = mu / t;
     if (r >= NU) {
-      e = fmax(mu / (rho - fmin(z, 0.5 * rho)), z > 0.5 * rho ? -d : 0);
-      z = fmax(fmin(z, rho - mu / e), 0.5 * fmin(z, rho));
+      e = larger(mu / (rho - smaller(z, 0.5 * rho)), z > 0.5 * rho ? -d : 0);
+      z = larger(smaller(z, rho - mu / e), 0.5 * smaller(z, rho));
     }
     y->t[side][k] = t, y->z[side][k] = z, y->e[side][k] = e;
   }
@@ -176,7 +176,7 @@ static void interior_terms(const Limits* limits, const Point* p, const Duals* y,
 static void interior_moves(const Limits* limits, const Point* p, const Duals* y, Duals* by, const Direction* move, casadi_real mu,
                            casadi_real* primal, casadi_real* dual) {
   int side, i, r, k;
-  casadi_real tau = fmax(BOUNDARY, 1 - mu / COST);
+  casadi_real tau = larger(BOUNDARY, 1 - mu / COST);
   *primal = *dual = 1;
   EACH_LIMIT(limits) {
     casadi_real z = y->z[side][k], t = y->t[side][k], e = y->e[side][k], rho = capacity(r), dz, dt, de;
@@ -184,9 +184,9 @@ static void interior_moves(const Limits* limits, const Point* p, const Duals* y,
     dt = (mu - z * t - t * dz) / z;
     de = r < NU ? 0 : (mu - (rho - z) * e + e * dz) / (rho - z);
     by->z[side][k] = dz, by->t[side][k] = dt, by->e[side][k] = de;
-    if (dt < 0) *primal = fmin(*primal, -tau * t / dt);
-    if (de < 0) *primal = fmin(*primal, -tau * e / de);
-    if (dz < 0) *dual = fmin(*dual, -tau * z / dz);
-    if (dz > 0 && r >= NU) *dual = fmin(*dual, tau * (rho - z) / dz);
+    if (dt < 0) *primal = smaller(*primal, -tau * t / dt);
+    if (de < 0) *primal = smaller(*primal, -tau * e / de);
+    if (dz < 0) *dual = smaller(*dual, -tau * z / dz);
+    if (dz > 0 && r >= NU) *dual = smaller(*dual, tau * (rho - z) / dz);
   }
 }

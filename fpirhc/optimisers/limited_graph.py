@@ -79,7 +79,7 @@ def _first_state(call: Call, memory: ca.MX) -> State:
         "mu": remembered["plan_barrier"] * call.scales.cost,
         "floor": constant(MU_END * call.scales.cost),
         "delta": remembered["plan_damping"],
-        **fixed(phase=PURE, place_of=BEGINS, fresh=1, slacks=WARM, use_exact=1, start=-1),
+        **fixed(phase=PURE, place_of=BEGINS, fresh=1, slacks=WARM, use_exact=not call.settings.plain_first, start=-1),
     }
     has_guess = ca.norm_inf(ca.vec(memory[: nu * n])) <= FINITE
     guess = ca.if_else(has_guess, ca.reshape(memory[: nu * n], nu, n), 0)

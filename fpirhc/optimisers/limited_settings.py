@@ -12,12 +12,14 @@ NEAR = 1e-3  # scaled error below which a remembered plan is improved by pure st
 SEVERAL = 3  # iterations per call from which on pure steps are tried first in any case
 PATIENCE = 3  # pure steps in a row that may fail to halve the error: the active limits are changing
 HOPELESS = 1e2  # scaled error from which on there is no patience: multipliers are at their largest value
+AHEAD = 0.1  # of the tolerance: where one more step by Gauss-Newton is expected to arrive, the exact Hessian is not computed
 PURE_STEPS = 10
 MU_WARM, MU_MOST = (
     1e-4,
     0.1,
 )  # barrier parameter of a remembered plan, and most of a real-time iteration, in units of the cost
-MU_END, MU_LEAST = 1e-5, 1e-11  # where pure steps are tried first, and last
+# Where pure steps are tried first, and last: at the last one limits whose multipliers nearly vanish are 1e-7 of a unit away.
+MU_END, MU_LEAST = 1e-5, 1e-15
 MU_ROUNDS = 8  # reductions after one accepted plan
 FILTER = 64  # pairs that the filter holds
 MOST_RAISES = 12  # of the Levenberg-Marquardt term before another first plan is tried
@@ -45,6 +47,11 @@ class LimitedSettings:
     damping: float
     iterations: int
     realtime: bool
+
+    @property
+    def plain_first(self) -> bool:
+        """Whether a remembered plan is improved by Gauss-Newton before the exact Hessian is computed."""
+        return self.hessian is None and not self.realtime
 
     def scaled_tolerance(self, scales: Scales) -> float:
         """Return the tolerance in units of the inputs' half ranges."""

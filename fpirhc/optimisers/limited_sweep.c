@@ -1,7 +1,8 @@
 /* One expansion along a plan, and one Riccati sweep around it, with the weights and gradients of its limits.
 
-   Generated before this text: the stage functions linear, exact, plain, end and deformed and the sizes NS, NU, NT, N, NB (bounded
-   states), WORK and INTEGERS. Entry r of stage i is input r, or the state place[r - NU] one stage later. */
+   Generated before this text: the stage functions evaluate, linearise, bend, curve, plain, end and deformed, and the sizes NS, NU,
+   NT, NM and NH (partial derivatives of a stage and of its gradient), N, NB (bounded states), WORK and INTEGERS. Entry r of stage i
+   is input r, or the state place[r - NU] one stage later. */
 
 #define ROWS (NU + NB)
 #define COUNT (N * ROWS)
@@ -30,7 +31,7 @@ static int expand(Point* p, In k, int rolled, In s0, In data, In lower, In upper
   int i, j, l, ok;
   In arg[8];
   Out res[8];
-  casadi_real cost, at[NS];
+  casadi_real cost, at[NS], partials[NM];
   for (j = 0; j < NS; ++j) at[j] = s0[j];
   p->value = 0;
   for (i = 0; i < N; ++i) {
@@ -41,9 +42,11 @@ static int expand(Point* p, In k, int rolled, In s0, In data, In lower, In upper
     }
     for (j = 0; j < NS && (rolled || i == 0); ++j) x[j] = at[j];
     arg[0] = x, arg[1] = u, arg[2] = data + i * NT;
-    res[0] = p->f + i * NS, res[1] = &cost, res[2] = p->a + i * NS * NS, res[3] = p->b + i * NS * NU;
-    res[4] = p->ls + i * NS, res[5] = p->lu + i * NU;
-    if (linear(arg, res, s->iw, s->w, 0)) return 0;
+    res[0] = p->f + i * NS, res[1] = &cost, res[2] = partials;
+    if (evaluate(arg, res, s->iw, s->w, 0)) return 0;
+    arg[0] = partials;
+    res[0] = p->a + i * NS * NS, res[1] = p->b + i * NS * NU, res[2] = p->ls + i * NS, res[3] = p->lu + i * NU;
+    if (linearise(arg, res, s->iw, s->w, 0)) return 0;
     p->value += cost;
     for (j = 0; j < NS; ++j) at[j] = p->f[i * NS + j];
   }
@@ -94,15 +97,20 @@ INLINE int sweep(Direction* d, const Point* p, In weight, In lean, In costates, 
     In a = p->a + i * NS * NS, b = p->b + i * NS * NU;
     Out value = values + (i + 1) * NS * NS, slope = slopes + (i + 1) * NS, k = d->k + i * NU * NS, v = d->v + i * NU;
     casadi_real q[NS * NS], cross[NU * NS], r[NU * NU], turned[NS * NS], flat[NU * NS];
-    casadi_real pushed[NS], factor[NU * NU], pivots[NU];
+    casadi_real bends[NH], pushed[NS], factor[NU * NU], pivots[NU];
     for (m = 0; m < NB; ++m) {
       value[place[m] * NS + place[m]] += weight[i * ROWS + NU + m];
       slope[place[m]] += lean[i * ROWS + NU + m];
     }
     for (j = 0; j < NS; ++j) value[j * NS + j] += 0.01 * delta * COST / (spread[j] * spread[j]);
     arg[0] = p->x + i * NS, arg[1] = p->u + i * NU, arg[2] = data + i * NT, arg[3] = costates + (i + 1) * NS;
+    if (use_exact) {
+      res[0] = bends;
+      if (bend(arg, res, s->iw, s->w, 0)) return 0;
+      arg[0] = bends;
+    }
     res[0] = q, res[1] = cross, res[2] = r;
-    if (use_exact ? exact(arg, res, s->iw, s->w, 0) : plain(arg, res, s->iw, s->w, 0)) return 0;
+    if (use_exact ? curve(arg, res, s->iw, s->w, 0) : plain(arg, res, s->iw, s->w, 0)) return 0;
     for (j = 0; j < NS; ++j) {
       pushed[j] = slope[j];
       for (m = 0; m < NS; ++m) pushed[j] += value[m * NS + j] * (p->f[i * NS + m] - p->x[(i + 1) * NS + m]);

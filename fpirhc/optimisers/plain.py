@@ -6,10 +6,11 @@ from importlib import resources
 
 import casadi as ca
 
-from fpirhc.horizon.hessian_models import hessian_end, hessian_stage, linear_stage
+from fpirhc.horizon.hessian_models import hessian_end, hessian_stage
 from fpirhc.horizon.live_data import SCALE, STEEPEST
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import PIVOT, rounds
+from fpirhc.horizon.split_stage import split_stage
 from fpirhc.optimisers.anchor import ARMIJO, DRAWN_IN, ROUNDING, SHARE, SHORTER, SHORTEST, UNTRIED
 from fpirhc.optimisers.base import shift
 from fpirhc.optimisers.plain_graph import plain_graph
@@ -44,7 +45,7 @@ def shifted_plain(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
 def plain_driver(ocp: OptimalControl, settings: PlainSettings) -> Driver:
     """Return the loops in C with what they call."""
     leaves = {
-        "linear": linear_stage(ocp),
+        **split_stage(ocp),
         "hessian": hessian_stage(ocp, settings.hessian),
         "end": hessian_end(ocp),
         "deformed": deformed_move(settings.map, ocp.input.size * ocp.stages),
@@ -59,6 +60,7 @@ def _sizes(ocp: OptimalControl) -> dict[str, object]:
         "NS": ocp.state.size,
         "NU": ocp.input.size,
         "NT": ocp.data.size,
+        "NM": split_stage(ocp)["pull"].numel_in(0),
         "N": ocp.stages,
         "MEMORY": plain_memory(ocp).size,
     }

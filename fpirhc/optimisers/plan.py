@@ -13,6 +13,7 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.base import FEASIBLE, Optimiser, judge
 from fpirhc.optimisers.improved import improved
+from fpirhc.optimisers.infeasible import reasons
 from fpirhc.optimisers.multipliers import fit_multipliers
 from fpirhc.status import Status
 from fpirhc.summary import line, number, table
@@ -55,7 +56,7 @@ class Plan:
 
     def _repr_html_(self) -> str:
         """The numbers of the plan and its faults as a table, for notebooks."""
-        notes = [self.status.remedy, *self.violations(), self.overflow()]
+        notes = [self.status.remedy, *self.violations(), *self.reasons(), self.overflow()]
         return table(f"Plan: {self.status.name}", ("", "value"), self._facts(), notes)
 
     def _facts(self) -> list[tuple[str, str]]:
@@ -88,6 +89,10 @@ class Plan:
                     side = f"below {low:g}" if value < low else f"above {high:g}"
                     violations.append((stage > 0, -by, f"'{name}' is {value:.6g} {unit}, {side}, at stage {stage}"))
         return tuple(text for _, _, text in sorted(violations)[:_WORST])
+
+    def reasons(self) -> tuple[str, ...]:
+        """Return for every limit that the plan violates what stops it, and whether softening would help."""
+        return reasons(self.problem, self.states, self.inputs, self.bounds)
 
     def overflow(self) -> str:
         """Return where the plan stops being finite: the state, input or cost term and its stage, in words; empty when nowhere."""

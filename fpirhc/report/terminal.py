@@ -101,6 +101,8 @@ def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
     for one in solved:
         for text in one.plan.violations():
             say(console, f"{one.name}: {text}")
+        for text in one.plan.reasons():
+            say(console, f"{one.name}: {text}")
         for name, price in one.plan.slacks().items():
             say(console, f"{one.name}: soft limit '{name}' costs {price:.4g}")
         if one.plan.overflow():

@@ -38,10 +38,11 @@ class Direction:
         barrier = limits.interior(p, y, s["mu"])
         weight, lean = (ca.if_else(pure, a, b) for a, b in zip((weights, leans), barrier, strict=True))
         v, gains, dx, du, swept, ok = self._swept(s, p, weight, lean, needed)
-        now = {**s, "z": ca.if_else(pure, held, y.z), **fixed(again=0, use_exact=1)}
+        use_exact = ca.logic_or(s["use_exact"], ca.logic_not(pure))
+        now = {**s, "z": ca.if_else(pure, held, y.z), "use_exact": use_exact, **fixed(again=0)}
         now = choose(now, pure, now, {**now, "t": y.t, "e": y.e, **fixed(slacks=KEPT)})
         delta = ca.fmax(10 * s["delta"], 1e-6)
-        failed = {**now, "delta": delta, "stuck": ca.logic_or(s["stuck"], delta > 1e8), **fixed(fresh=2)}
+        failed = {**now, "delta": delta, "stuck": ca.logic_or(s["stuck"], delta > 1e8), **fixed(fresh=2, use_exact=1)}
         stepped = {**now, "v": v, "gains": gains, "dx": dx, "du": du, "swept": swept}
         steps = {**stepped, "next_z": limits.pure_multipliers(p, held, du, dx)}
         inside = self._inside(stepped, p, y, s["mu"])

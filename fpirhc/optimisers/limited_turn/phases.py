@@ -34,7 +34,7 @@ def enter_pure(call: Call, s: State, place: int) -> State:
 def enter_interior(call: Call, s: State) -> State:
     """Leave the pure phase: for an interior phase near its best plan, or back to the interior plan it came from."""
     cost = call.scales.cost
-    s = {**s, **fixed(phase=INTERIOR, again=1, filtered=0, raises=0, halvings=0)}
+    s = {**s, **fixed(phase=INTERIOR, again=1, use_exact=1, filtered=0, raises=0, halvings=0)}
     best = {"point_inputs": s["best_inputs"], "point_states": s["best_states"], "z": s["best_z"]}
     back = {**s, **best, **fixed(fresh=1)}
     warm = constant(MU_WARM * cost)

@@ -1,0 +1,170 @@
+"""Derivatives in two parts: the partial derivatives of the elementary operations, and what the chain rule makes of them.
+
+CasADi's Jacobian of scalar code carries one direction per variable through every operation, and divides in each direction where
+the operation divides. Here every operation's partial derivatives are computed once, beside its value, as a vector m. Products and
+sums of m alone make
+
+    the Jacobian J(m), by elimination of the intermediate results, and the pull-back J(m)' w of any weights w.
+
+Intermediate results are eliminated first where that adds no edge to the graph (this finds the Jacobians of the parts from which
+the expression was composed), and then in the order of the computation. A gradient that is wanted alone costs about as much as the
+value; a Jacobian that is wanted later repeats nothing.
+
+Reference: A. Griewank, A. Walther, Evaluating Derivatives, SIAM 2008, chapters 9 and 10 (vertex elimination).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import casadi as ca
+
+_OPERANDS = 2  # most operands of an elementary operation
+_Edges = list[dict[int, ca.SX]]  # for every result, its partial derivatives by the result that they are of
+
+
+class ChainRule(NamedTuple):
+    """The two parts of a derivative.
+
+    Args:
+        partials: m, a column of expressions of the variables and parameters.
+        symbols: a column of as many symbols for m.
+        jacobian: J of the symbols.
+        pulled: J' w of the symbols and of the symbols `weights`.
+        weights: w, as long as the results.
+    """
+
+    partials: ca.SX
+    symbols: ca.SX
+    jacobian: ca.SX
+    pulled: ca.SX
+    weights: ca.SX
+
+
+def chain_rule(results: ca.SX, variables: ca.SX, parameters: ca.SX) -> ChainRule:
+    """Return both parts of the derivative of a column of results.
+
+    Args:
+        results: a dense column of expressions.
+        variables: a column of symbols, by which they are differentiated.
+        parameters: a column of all other symbols.
+    """
+    function = ca.Function("fpirhc_values", [variables, parameters], [results], {"cse": True})
+    weights = ca.SX.sym("w", results.numel())
+    edges, ends, values = _graph(function, variables, parameters)
+    partials, symbols = _named(edges, values)
+    pulled = _pulled(edges, ends, weights, variables.numel())
+    return ChainRule(partials, symbols, _eliminated(edges, ends, variables.numel()), pulled, weights)
+
+
+def _graph(function: ca.Function, variables: ca.SX, parameters: ca.SX) -> tuple[_Edges, list[int], list[ca.SX]]:
+    """The edges between active results, the place of every output, and all values.
+
+    The first places are the variables; a result that does not depend on them has no edges.
+    """
+    values = ca.vertsplit(variables) if variables.numel() else []
+    edges: _Edges = [{} for _ in values]
+    active, at, ends = [True] * len(values), dict[int, int](), [0] * function.numel_out(0)
+    for k in range(function.n_instructions()):
+        kind, operands, target = (
+            function.instruction_id(k),
+            function.instruction_input(k),
+            function.instruction_output(k),
+        )
+        if kind == ca.OP_OUTPUT:
+            ends[target[1]] = at[operands[0]]
+            continue
+        if kind == ca.OP_INPUT and operands[0] == 0:
+            at[target[0]] = operands[1]
+            continue
+        by: dict[int, ca.SX] = {}
+        if kind == ca.OP_INPUT:
+            value = parameters[operands[1]]
+        elif kind == ca.OP_CONST:
+            value = ca.SX(function.instruction_constant(k))
+        else:
+            places = [at[j] for j in operands]
+            value, *slopes = _operation(kind, len(places))(*(values[j] for j in places))
+            for place, slope in zip(places, slopes, strict=True):
+                if active[place] and not slope.is_zero():
+                    by[place] = by[place] + slope if place in by else slope
+        at[target[0]] = len(values)
+        values.append(value)
+        edges.append(by)
+        active.append(bool(by))
+    return edges, ends, values
+
+
+@cache
+def _operation(kind: int, operands: int) -> ca.Function:
+    """Function operands -> (value, partial derivatives) of one elementary operation."""
+    symbols = [ca.SX.sym(name) for name in "ab"[:operands]]
+    value = ca.SX.unary(kind, *symbols) if operands < _OPERANDS else ca.SX.binary(kind, *symbols)
+    return ca.Function("fpirhc_operation", symbols, [value, *(ca.densify(ca.jacobian(value, s)) for s in symbols)])
+
+
+def _named(edges: _Edges, values: list[ca.SX]) -> tuple[ca.SX, ca.SX]:
+    """The partial derivatives that are not constant, each once, and symbols, which take their place at the edges."""
+    places = [(n, place) for n, by in enumerate(edges) for place, slope in by.items() if not slope.is_constant()]
+    slopes = ca.cse(ca.vertcat(*(edges[n][place] for n, place in places), *values))
+    partials, symbols = list[ca.SX](), dict[int, ca.SX]()
+    for (n, place), slope in zip(places, ca.vertsplit(slopes[: len(places)]) if places else [], strict=True):
+        key = slope.element_hash()
+        if key not in symbols:
+            symbols[key] = ca.SX.sym(f"m{len(partials)}")
+            partials.append(slope)
+        edges[n][place] = symbols[key]
+    if not partials:  # linear: a column must have an entry
+        return ca.SX(0.0), ca.SX.sym("m")
+    return ca.vertcat(*partials), ca.vertcat(*symbols.values())
+
+
+def _pulled(edges: _Edges, ends: list[int], weights: ca.SX, count: int) -> ca.SX:
+    """J' w, from the last result back to the variables."""
+    bars = [ca.SX(0) for _ in edges]
+    for end, weight in zip(ends, ca.vertsplit(weights), strict=True):
+        bars[end] += weight
+    for n in reversed(range(count, len(edges))):
+        for place, slope in edges[n].items():
+            bars[place] += slope * bars[n]
+    return ca.vertcat(*bars[:count])
+
+
+def _eliminated(edges: _Edges, ends: list[int], count: int) -> ca.SX:
+    """J, by elimination of everything between the variables and the results."""
+    first = len(edges)
+    back = [dict(by) for by in edges] + [{end: ca.SX(1)} if edges[end] or end < count else {} for end in ends]
+    ahead: list[set[int]] = [set() for _ in back]
+    for n, by in enumerate(back):
+        for place in by:
+            ahead[place].add(n)
+    between = [n for n in range(count, first) if back[n]]
+    left = 0
+    while len(between) != left:
+        left = len(between)
+        between = [n for n in between if _adds_edges(back[n], ahead[n]) or _eliminate(n, back, ahead)]
+    for n in between:
+        _eliminate(n, back, ahead)
+    jacobian = ca.SX(len(ends), count)
+    for row in range(len(ends)):
+        for place, slope in back[first + row].items():
+            jacobian[row, place] = slope
+    return jacobian
+
+
+def _adds_edges(by: dict[int, ca.SX], after: set[int]) -> bool:
+    return len(by) * len(after) > len(by) + len(after)
+
+
+def _eliminate(n: int, back: _Edges, ahead: list[set[int]]) -> bool:
+    """Connect what is before and after a result, and take it out; returns False, for filters."""
+    for later in ahead[n]:
+        slope, by = back[later].pop(n), back[later]
+        for place, before in back[n].items():
+            product = slope * before
+            by[place] = by[place] + product if place in by else product
+            ahead[place].add(later)
+    for place in back[n]:
+        ahead[place].discard(n)
+    return False

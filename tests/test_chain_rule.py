@@ -1,0 +1,105 @@
+"""Derivatives in two parts are CasADi's, with fewer operations; what is known of a stage is not computed again."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.horizon.hessian_models import hessian_stage, linear_stage
+from fpirhc.horizon.problem import OptimalControl, transcribe
+from fpirhc.horizon.split_stage import split_hessian, split_stage
+from fpirhc.symbolic.chain_rule import chain_rule
+
+X, P = ca.SX.sym("x", 3), ca.SX.sym("p", 2)
+EXPRESSIONS = {
+    "smooth": ca.vertcat(ca.sin(X[0]) * ca.exp(X[1] / P[0]), X[2] ** 3 / (1 + X[0] ** 2), ca.sqrt(2 + X[1])),
+    "branches": ca.vertcat(ca.if_else(X[0] > P[1], X[1] * X[2], X[1] / 3), ca.fmin(X[0], X[2]) + ca.fabs(X[1])),
+    "linear": ca.vertcat(2 * X[0] - X[1], X[2], X[2] - X[2]),
+    "shared": ca.vertcat(X[0] * X[0], X[0], X[0], P[0] * P[1], 5),
+    "power": ca.vertcat(ca.fabs(X[0]) ** P[0] * ca.sign(X[0]), ca.atan2(X[1], X[2]), ca.tanh(X[0] * X[1] * X[2])),
+}
+_OF_TIME = ("two_mass", "cart_pole", "van_der_pol", "chain_of_masses")
+
+
+@pytest.fixture(scope="module", params=_OF_TIME)
+def ocp(request) -> OptimalControl:
+    p = fp.load_problem(request.param).problem
+    return transcribe(p.plant, p.reference, p.horizon, p.cost, p.limits)
+
+
+def operations(function: ca.Function) -> Counter[int]:
+    return Counter(function.instruction_id(k) for k in range(function.n_instructions()))
+
+
+@pytest.mark.parametrize("results", EXPRESSIONS.values(), ids=EXPRESSIONS.keys())
+def test_both_parts_are_the_derivative(results):
+    """J(m) is the Jacobian, and J(m)' w its transpose times any w."""
+    parts = chain_rule(ca.densify(results), X, P)
+    made = ca.Function("made", [X, P], [parts.partials])
+    jacobian = ca.Function("jacobian", [parts.symbols], [ca.densify(parts.jacobian)])
+    pulled = ca.Function("pulled", [parts.symbols, parts.weights], [ca.densify(parts.pulled)])
+    expected = ca.Function("expected", [X, P], [ca.densify(ca.jacobian(results, X))])
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        x, p, w = rng.normal(size=3), rng.uniform(0.5, 1.5, size=2), rng.normal(size=results.numel())
+        m, j = made(x, p), expected(x, p).full()
+        np.testing.assert_allclose(jacobian(m).full(), j, rtol=1e-13, atol=1e-14)
+        np.testing.assert_allclose(pulled(m, w).full().ravel(), j.T @ w, rtol=1e-12, atol=1e-13)
+
+
+def test_linear_results_have_no_partial_derivatives_to_compute():
+    parts = chain_rule(ca.densify(EXPRESSIONS["linear"]), X, P)
+    assert parts.partials.numel() == 1
+    assert float(parts.partials) == 0
+    assert ca.DM(parts.jacobian).full().tolist() == [[2, -1, 0], [0, 0, 1], [0, 0, 0]]
+
+
+def test_a_stage_in_parts_is_the_linear_stage(ocp):
+    """Next state, cost, Jacobians and gradients agree with CasADi's, and the adjoint with theirs."""
+    whole, parts, rng = linear_stage(ocp), split_stage(ocp), np.random.default_rng(5)
+    states, inputs, data = ocp.nodes
+    for _ in range(5):
+        s = states[:, 0] + 0.1 * rng.normal(size=ocp.state.size)
+        u, after = inputs[:, 0] + 0.1 * rng.normal(size=ocp.input.size), rng.normal(size=ocp.state.size)
+        next_state, cost, a, b, by_state, by_input = (v.full() for v in whole(s, u, data[:, 0]))
+        split_next, split_cost, m = parts["evaluate"](s, u, data[:, 0])
+        assert (split_next.full() == next_state).all()
+        assert float(split_cost) == cost
+        for mine, theirs in zip(parts["linearise"](m), (a, b, by_state, by_input), strict=True):
+            np.testing.assert_allclose(mine.full(), theirs, rtol=1e-12, atol=1e-13)
+        before, slope = parts["pull"](m, after)
+        np.testing.assert_allclose(before.full(), by_state + a.T @ after[:, None], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(slope.full(), by_input + b.T @ after[:, None], rtol=1e-12, atol=1e-12)
+
+
+def test_nothing_is_computed_twice(ocp):
+    """The second parts multiply and add only, and both together take less than CasADi's Jacobian."""
+    whole, parts = operations(linear_stage(ocp)), {k: operations(f) for k, f in split_stage(ocp).items()}
+    plain = {ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, ca.OP_MUL, ca.OP_ADD, ca.OP_SUB, ca.OP_NEG, ca.OP_SQ, ca.OP_TWICE}
+    assert parts["pull"].keys() <= plain
+    assert parts["linearise"].keys() <= plain
+    assert 2 * parts["evaluate"][ca.OP_DIV] < whole[ca.OP_DIV]
+    assert parts["evaluate"].total() + parts["linearise"].total() < whole.total()
+
+
+def test_a_problem_has_one_split_stage(ocp):
+    assert split_stage(ocp) is split_stage(ocp)
+
+
+@pytest.mark.parametrize("hessian", [fp.GaussNewton(), fp.ExactHessian()])
+def test_second_derivatives_in_parts_are_those_of_the_stage(ocp, hessian):
+    """Q, S and R agree with CasADi's Hessian, with fewer divisions."""
+    whole, parts, rng = hessian_stage(ocp, hessian), split_hessian(ocp, hessian), np.random.default_rng(6)
+    states, inputs, data = ocp.nodes
+    for _ in range(5):
+        s = states[:, 0] + 0.1 * rng.normal(size=ocp.state.size)
+        u, after = inputs[:, 0] + 0.1 * rng.normal(size=ocp.input.size), rng.normal(size=ocp.state.size)
+        expected = whole(s, u, data[:, 0], after)
+        for mine, theirs in zip(parts["curve"](parts["bend"](s, u, data[:, 0], after)), expected, strict=True):
+            np.testing.assert_allclose(mine.full(), theirs.full(), rtol=1e-11, atol=1e-12)
+    counted = operations(parts["bend"]) + operations(parts["curve"])
+    assert counted[ca.OP_DIV] <= operations(whole)[ca.OP_DIV]
