@@ -103,6 +103,7 @@ from .task.dead_time import DeadTime
 from .task.disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
 from .task.limits import Limits, PathConstraint
 from .task.problem import Problem
+from .task.reality import Reality
 from .task.reference import Table, Trajectory
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
@@ -197,6 +198,7 @@ __all__ = [
     "RFPTVector",
     "RadauIIA",
     "Raster",
+    "Reality",
     "RecedingHorizon",
     "RecursiveLeastSquares",
     "ReducedGradient",

@@ -14,9 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from fpirhc.contraction import Spectrum, assess_gain, delayed_limit, leaking_limit, linear_limit, spectrum_over_run
+from fpirhc.contraction.sampled import sampled_jacobians
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotContractive
 from fpirhc.task.problem import Problem
+
+_NOTHING = 1e-12  # largest eigenvalue of a Jacobian that has no effect
 
 
 def check_gain_sign(problem: Problem, deformation: Deformation) -> None:
@@ -140,11 +143,19 @@ def _too_late(problem: Problem, deformation: Deformation, form: _Form, limit: fl
 
 
 def _at_start(problem: Problem) -> Spectrum | None:
-    """Eigenvalues of the response Jacobian at the start; None where the inverse response is singular there."""
+    """Eigenvalues of the response Jacobian at the start; None where the inverse response is singular there.
+
+    With a reality they are those of the response at the end of a cycle; None where the command has not reached it by then.
+    """
     plant = problem.plant
     state = problem.start_state[None, :]
     response = plant.controlled_response_function(problem.start_state, [0] * plant.input.size, plant.approximate)
     try:
-        return spectrum_over_run(plant, state, response.full().T)
+        if problem.reality is None:
+            return spectrum_over_run(plant, state, response.full().T)
+        real = problem.real_start[None, :]
+        [jacobian] = sampled_jacobians(problem, real, state, response.full().T, plant.approximate)
+        spectrum = Spectrum(np.linalg.eigvals(jacobian)) if np.isfinite(jacobian).all() else None
     except InvalidValue:
         return None
+    return spectrum if spectrum is not None and np.abs(spectrum.eigenvalues).max() > _NOTHING else None

@@ -21,6 +21,8 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.dead_time import delay_block
 from fpirhc.task.problem import Problem
 
+REALITY_STATE = "reality_state"  # signal of the state of a reality, in its own coordinates
+
 
 def close_loop(problem: Problem, controller: Controller) -> Composite:
     """Return the closed loop as one step: (memory, [disturbance], [sensing]) -> (memory, trace).
@@ -63,16 +65,16 @@ def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:
 
 
 def _plant_delays(problem: Problem, controller: Controller) -> list[Delay]:
-    plant = problem.plant
-    start = tuple(float(v) for v in problem.start_state)
-    approximate = tuple(float(v) for v in controller.parameters(plant))
+    plant, model = problem.real_plant, controller.model_plant(problem)
+    start = tuple(float(v) for v in problem.real_start)
+    approximate = tuple(float(v) for v in controller.parameters(model))
     exact = tuple(float(v) for v in plant.exact)
     acting = tuple(map(float, problem.inputs_before))
     return [
         Delay(Signal("_state_before", plant.state.elements, plant.state.units, start), "_state_after"),
         Delay(Signal("_acting_before", plant.input.elements, plant.input.units, acting), "_acting"),
         Delay(_forcing(plant, "_forcing_before"), "_forcing"),
-        Delay(Signal("parameters", plant.parameter.elements, plant.parameter.units, approximate), "parameters"),
+        Delay(Signal("parameters", model.parameter.elements, model.parameter.units, approximate), "parameters"),
         Delay(Signal("_exact", plant.parameter.elements, plant.parameter.units, exact), "_exact"),
     ]
 
@@ -94,26 +96,42 @@ def _clock_block(time: Signal, period: float) -> Block:
 def _sense_blocks(problem: Problem, other: Response | None, *, predicts: bool) -> list[Block]:
     """State and response as the controller is given them; where these are not the plant's own, also the true ones and the error."""
     plant, behind = problem.plant, problem.dead_time.measurement / problem.period
-    response = other or _own_response(plant)
+    response = other or _own_response(problem, seen=False)
     if problem.sees_plant:
-        sense = [_sense_block(plant, plant.state, response)]
+        sense = [_sense_block(problem, plant.state, response)]
         return [*sense, _truth_block(problem, plant.state)] if predicts or problem.dead_time.inputs else sense
     true_state, true_response = like(plant.state, "plant_state"), like(response.signal, "plant_realised")
     true = [
-        _sense_block(plant, true_state, Response(true_response, response.function)),
+        _sense_block(problem, true_state, Response(true_response, response.function)),
         _truth_block(problem, true_state),
     ]
+    shown, function = (true_state, true_response), response.function
+    if problem.reality is not None and problem.reality.seen:
+        direct = problem.sensing.ideal and not behind
+        shown = (
+            (plant.state, response.signal)
+            if direct
+            else (like(plant.state, "_seen_state"), like(response.signal, "_seen"))
+        )
+        function = _own_response(problem, seen=True).function
+        true.append(_seen_block(problem, shown, function))
+        if direct:
+            return true
+    start, before, calm = problem.real_start, problem.inputs_before, np.zeros(len(problem.real_plant.names))
+    resting = function(start, before, problem.real_plant.exact, calm).full().ravel()
+    first = problem.start_state
+    if problem.reality is not None:
+        of_reality = problem.reality.state_function(plant, seen=True)
+        first = of_reality(start, before, problem.real_plant.exact, calm).full().ravel()
     if not problem.sensing.ideal:
-        signals = true_state, true_response
-        first, before = problem.start_state, problem.inputs_before
-        return [*true, *problem.sensing.blocks(plant, problem.period, first, behind, signals, before)]
-    start, calm = tuple(float(v) for v in problem.start_state), np.zeros(len(plant.names))
-    resting = response.function(start, problem.inputs_before, plant.exact, calm).full().ravel()
+        return [*true, *problem.sensing.blocks(plant, problem.period, first, behind, shown, resting)]
     delayed = Signal("realised", true_response.elements, true_response.units, tuple(map(float, resting)))
     return [
         *true,
-        delay_block("see_state", true_state, replace(plant.state, start=start), [behind] * plant.state.size),
-        delay_block("see_response", true_response, delayed, [behind] * delayed.size),
+        delay_block(
+            "see_state", shown[0], replace(plant.state, start=tuple(map(float, first))), [behind] * plant.state.size
+        ),
+        delay_block("see_response", shown[1], delayed, [behind] * delayed.size),
     ]
 
 
@@ -129,32 +147,56 @@ def _truth_block(problem: Problem, state: Signal) -> Block:
     return Block("truth", Layout((plant.time, state)), writes, step, opaque=problem.reference.opaque)
 
 
-def _own_response(plant: Plant) -> Response:
-    """The response of the controlled coordinates."""
+def _own_response(problem: Problem, *, seen: bool) -> Response:
+    """The response of the controlled coordinates of the plant that moves; where `seen`, the measured one."""
+    plant = problem.plant
+    if problem.reality is not None:
+        return Response(plant.response_signal("realised"), problem.reality.response_function(plant, seen=seen))
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
     response = plant.controlled_response_function(x, u, p) + w[list(plant.controlled_indices)]
     return Response(plant.response_signal("realised"), ca.Function("fpirhc_realised", [x, u, p, w], [response]))
 
 
-def _sense_block(plant: Plant, state: Signal, response: Response) -> Block:
-    """Block -> the true state, and the true response just before this cycle's command.
+def _real_signals(problem: Problem) -> tuple[Signal, ...]:
+    """What the plant that moves carries over a cycle: state, acting input, parameters, forcing."""
+    plant = problem.real_plant
+    names = "_state_before", "_acting_before", "_exact"
+    signals = (like(s, n) for s, n in zip((plant.state, plant.input, plant.parameter), names, strict=True))
+    return (*signals, _forcing(plant, "_forcing_before"))
+
+
+def _sense_block(problem: Problem, state: Signal, response: Response) -> Block:
+    """Block -> the true state, and the true response just before this cycle's command; with a reality also its state.
 
     The response is computed here and not at the end of the last cycle, because it shares its costly terms with the first
     Runge-Kutta evaluation of this cycle.
     """
-    reads = (
-        like(plant.state, "_state_before"),
-        like(plant.input, "_acting_before"),
-        _forcing(plant, "_forcing_before"),
-        like(plant.parameter, "_exact"),
-    )
+    reality = problem.reality
+    reads, writes = _real_signals(problem), (state, response.signal)
+    state_of = None if reality is None else reality.state_function(problem.plant, seen=False)
+    own = () if reality is None else (like(reality.plant.state, REALITY_STATE),)
 
     def step(s: Signals) -> dict[str, Expression]:
-        measured = response.function(s._state_before, s._acting_before, s._exact, s._forcing_before)
-        return {state.name: s._state_before, response.signal.name: measured}
+        now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
+        measured = response.function(*now)
+        if state_of is None:
+            return {state.name: s._state_before, response.signal.name: measured}
+        return {state.name: state_of(*now), response.signal.name: measured, REALITY_STATE: s._state_before}
 
-    return Block("sense", Layout(reads), Layout((state, response.signal)), step)
+    return Block("sense", Layout(reads), Layout((*writes, *own)), step)
+
+
+def _seen_block(problem: Problem, shown: tuple[Signal, Signal], response: ca.Function) -> Block:
+    """Block -> the state and the response that are measured in place of the true ones."""
+    assert problem.reality is not None
+    state = problem.reality.state_function(problem.plant, seen=True)
+
+    def step(s: Signals) -> dict[str, Expression]:
+        now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
+        return {shown[0].name: state(*now), shown[1].name: response(*now)}
+
+    return Block("seen", Layout(_real_signals(problem)), Layout(shown), step)
 
 
 def _actuate(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:
@@ -171,10 +213,12 @@ def _actuate(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:
 
 
 def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Signal) -> Block:
-    """Block of the exact plant over one period with the arriving command held."""
-    plant = problem.plant
-    advance = problem.integrator.step(plant, problem.period)
+    """Block of the plant that moves over one period with the arriving command held."""
+    plant = problem.real_plant
+    advance = problem.real_integrator.step(plant, problem.period)
     state = plant.state if problem.sees_plant else like(plant.state, "plant_state")
+    if problem.reality is not None:
+        state = like(plant.state, REALITY_STATE)
     reads = (state, arriving, like(plant.parameter, "_exact"), *disturbed)
     writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
 
@@ -186,4 +230,4 @@ def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Si
             w = ca.vertcat(*(added.get(name, 0) for name in plant.names))
         return {"_state_after": advance(getattr(s, state.name), u, s._exact, w), "_acting": u, "_forcing": w}
 
-    return Block("advance", Layout(reads), Layout(writes), step, opaque=problem.integrator.opaque)
+    return Block("advance", Layout(reads), Layout(writes), step, opaque=problem.real_integrator.opaque)

@@ -87,7 +87,7 @@ class Simulator:
             "weighs_effort": cost is not None and cost.weighs_effort,
             "step_limit": step_limit if np.isfinite(step_limit) else None,
             "effective_gain": float(self.controller.deformation.effective_gain()),
-            "parameters": [float(v) for v in self.controller.parameters(problem.plant)],
+            "parameters": [float(v) for v in self.controller.parameters(self.controller.model_plant(problem))],
             "controller": describe(self.controller),
             "problem": describe(problem),
             "backend": "compiled C" if self.compiled else "CasADi virtual machine",

@@ -31,7 +31,7 @@ class Stepper:
         self._evaluator = Evaluator(backend.function if backend else composite.function)
         self._memory, self._time, self._state, self._realised, parameters = self._evaluator.arguments
         self._memory_next, self._trace, self._command = self._evaluator.results
-        parameters[:] = controller.parameters(problem.plant)
+        parameters[:] = controller.parameters(controller.model_plant(problem))
         self._evaluate = self._evaluator.evaluate
 
     def start(self) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import casadi as ca
@@ -24,6 +24,7 @@ from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem_view import problem_facts, problem_table
+from fpirhc.task.reality import Reality
 from fpirhc.task.reference import Reference
 
 MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
@@ -51,6 +52,7 @@ class Problem(Checked):
             else zero, moved into its limits.
         measure_from: time from which metrics count; the transient before it is left out.
         judged: coordinates whose errors are logged and measured; None: the controlled ones.
+        reality: the plant that a run moves, where it is not `plant` with its exact parameters. `plant` is then the model alone.
         name: of the problem in results; the problem of a file has the name of the file.
 
     Raises:
@@ -72,6 +74,7 @@ class Problem(Checked):
     measure_from: float = 0.0
     judged: Sequence[str] | None = None
     input_before: Mapping[str, float] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
+    reality: Reality | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
     name: str = field(default="", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
@@ -81,7 +84,8 @@ class Problem(Checked):
         plant = self.plant
         _check_input_before(self, mistakes)
         mistakes.unknown("judged: coordinate", self.judged or (), plant.coordinates)
-        mistakes.unknown("disturbances: input or coordinate", self.disturbances, [*plant.inputs, *plant.coordinates])
+        disturbed = [*self.real_plant.inputs, *self.real_plant.coordinates]
+        mistakes.unknown("disturbances: input or coordinate", self.disturbances, disturbed)
         instants, random = np.array([0.0, self.period]), np.random.default_rng(0)
         checks = (
             *((lambda one=one: one.values(instants, random)) for one in self.disturbances.values()),
@@ -89,6 +93,7 @@ class Problem(Checked):
             lambda: self.reference.function(plant),
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant),
+            lambda: self.reality.check(plant) if self.reality else None,
         )
         for check in checks:
             try:
@@ -99,6 +104,8 @@ class Problem(Checked):
         check_stage(plant, self.cost, self.limits, mistakes)
         _check_inverse(self, mistakes)
         mistakes.raise_if_any()
+        if self.reality is not None:
+            self.reality.check_motion(self.real_start, self.inputs_before, self.real_integrator, self.period)
 
     def __repr__(self) -> str:
         return line(self, *problem_facts(self))
@@ -130,7 +137,37 @@ class Problem(Checked):
     @property
     def sees_plant(self) -> bool:
         """Whether a controller receives the plant's own state and response, unchanged and without delay."""
-        return not self.dead_time.measurement and self.sensing.ideal
+        return not self.dead_time.measurement and self.sensing.ideal and not (self.reality and self.reality.seen)
+
+    @property
+    def real_plant(self) -> Plant:
+        """The plant that a run moves, with its exact parameters: the reality's, or the model's own."""
+        return self.plant if self.reality is None else self.reality.plant
+
+    @property
+    def of_model(self) -> Problem:
+        """The problem without its reality: the model's own plant moves, and disturbances of what it does not have are left out."""
+        if self.reality is None:
+            return self
+        known = {*self.plant.inputs, *self.plant.coordinates}
+        disturbances = {name: one for name, one in self.disturbances.items() if name in known}
+        return replace(self, reality=None, disturbances=disturbances)
+
+    @property
+    def real_integrator(self) -> Integrator:
+        """Integrator of the plant that a run moves."""
+        return (self.reality.integrator if self.reality else None) or self.integrator
+
+    @cached_property
+    def real_start(self) -> np.ndarray:
+        """First state of the plant that a run moves.
+
+        Raises:
+            InvalidProblem: a reality whose own states neither are given nor settle.
+        """
+        if self.reality is None:
+            return self.start_state
+        return self.reality.start_state(self.plant, self.start_state, self.inputs_before)
 
     @cached_property
     def start_state(self) -> np.ndarray:
@@ -230,7 +267,8 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
     response = plant.controlled_response_function(x, u, p)
     gain_of = ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response])
     state = ", ".join(f"{e} = {v:g}" for e, v in zip(plant.state.elements, problem.start_state, strict=True))
-    for which, values in (("approximate", plant.approximate), ("exact", plant.exact)):
+    exact = () if problem.reality else (("exact", plant.exact),)  # with a reality these values move nothing
+    for which, values in (("approximate", plant.approximate), *exact):
         gain, free = (np.asarray(m.full()) for m in gain_of(problem.start_state, problem.inputs_before, values))
         if not np.all(np.isfinite(free)):
             name = plant.controlled_names[int(np.argmin(np.isfinite(free).ravel()))]

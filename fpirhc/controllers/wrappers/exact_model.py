@@ -15,10 +15,13 @@ from fpirhc.task.problem import Problem
 
 @dataclass(frozen=True)
 class ExactModel(Controller):
-    """The wrapped controller with the plant's exact parameters in its model.
+    """The wrapped controller with the exact model: the plant's exact parameters, or the reality where the problem has one.
 
     Args:
         controller: any controller that uses its model.
+
+    Raises:
+        NotSupported: a reality whose inputs, coordinates or orders are not the model's, when the controller meets the problem.
     """
 
     controller: Controller
@@ -35,8 +38,15 @@ class ExactModel(Controller):
 
     def inner_problem(self, problem: Problem) -> Problem:
         """Return the problem with the exact parameters as approximate ones, so that work before a run uses them too."""
-        exact = {name: replace(p, approximate=p.exact) for name, p in problem.plant.parameters.items()}
-        return replace(problem, plant=replace(problem.plant, parameters=exact))
+        plant = self.model_plant(problem)
+        exact = {name: replace(p, approximate=p.exact) for name, p in plant.parameters.items()}
+        return replace(problem, plant=replace(plant, parameters=exact), reality=None)
+
+    def model_plant(self, problem: Problem) -> Plant:
+        """Return the plant that a run moves."""
+        if problem.reality is not None:
+            problem.reality.check_as_model(problem.plant)
+        return problem.real_plant
 
     def linear_around(self, inner: Controller) -> Controller:
         """Return the inner controller: `parameters` already gives the exact ones."""

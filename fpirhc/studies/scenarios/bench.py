@@ -87,7 +87,7 @@ class Bench:
     """
 
     def __init__(self, task: Task, conditions: Conditions) -> None:
-        exact_ranges(task.problem.plant, conditions.percent)
+        exact_ranges(task.problem.real_plant, conditions.percent)
         self._task, self._conditions = task, conditions
         self._ranges = ranges(task.problem)
         self._simulators: dict[str, Simulator | FpirhcError] = {}
@@ -122,7 +122,12 @@ class Bench:
         if self._drawn is None or self._drawn[0] != number:
             conditions, problem = self._conditions, self._task.problem
             scenario = draw(
-                problem.plant, seed=conditions.seed, use=conditions.use, number=number, percent=conditions.percent
+                problem.real_plant,
+                seed=conditions.seed,
+                use=conditions.use,
+                number=number,
+                percent=conditions.percent,
+                model=problem.plant,
             )
             self._drawn = (number, scenario, with_exact(problem, scenario.exact))
         return self._drawn[1:]
