@@ -101,6 +101,7 @@ from .studies.tuning.tune import Tuning, tune
 from .symbolic.functions import signed_power
 from .task.dead_time import DeadTime
 from .task.disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
+from .task.foreign import Foreign
 from .task.limits import Limits, PathConstraint
 from .task.problem import Problem
 from .task.reality import Reality
@@ -144,6 +145,7 @@ __all__ = [
     "FixedSchedule",
     "Floquet",
     "ForceMRAC",
+    "Foreign",
     "Formula",
     "FpirhcError",
     "Fractional",

@@ -54,11 +54,11 @@ class Variant:
         if self.nudge:
             start = {name: value * (1 + self.nudge) for name, value in problem.start.items()}
             moved = replace(problem, start=start)
-            return with_exact(moved, problem.real_plant.exact * (1 + self.nudge))
+            return moved if problem.foreign else with_exact(moved, problem.real_plant.exact * (1 + self.nudge))
         if self.finer > 1:
             finer = problem.real_integrator.finer(self.finer) or problem.real_integrator
-            if problem.reality is not None:
-                return replace(problem, reality=replace(problem.reality, integrator=finer))
+            if problem.symbolic_reality is not None:
+                return replace(problem, reality=replace(problem.symbolic_reality, integrator=finer))
             return replace(problem, integrator=finer)
         return problem
 
@@ -79,7 +79,7 @@ def variants(problem: Problem, *, seed: int, seeds: int, compiled: bool) -> list
     all_variants.append(
         Variant(ROUNDING, f"start and exact parameters moved by {_NUDGE:g}", seed, compiled, nudge=_NUDGE)
     )
-    if problem.real_integrator.finer(2):
+    if not problem.foreign and problem.real_integrator.finer(2):
         all_variants.append(Variant(INTEGRATOR, "twice the integrator steps", seed, compiled, finer=2))
     return all_variants
 

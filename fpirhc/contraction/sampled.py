@@ -27,7 +27,7 @@ def sampled_jacobian(problem: Problem) -> ca.Function:
     Raises:
         NotInvertible: the inputs and the controlled coordinates differ in number.
     """
-    model, plant, reality = problem.plant, problem.real_plant, problem.reality
+    model, plant, reality = problem.plant, problem.real_plant, problem.symbolic_reality
     matrix = kind(model.inverse_opaque or problem.real_integrator.opaque)
     x, state = matrix.sym("x", plant.state.size), matrix.sym("state", model.state.size)
     r, u = matrix.sym("r", len(model.controlled_names)), matrix.sym("u", model.input.size)

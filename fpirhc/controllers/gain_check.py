@@ -151,7 +151,7 @@ def _at_start(problem: Problem) -> Spectrum | None:
     state = problem.start_state[None, :]
     response = plant.controlled_response_function(problem.start_state, [0] * plant.input.size, plant.approximate)
     try:
-        if problem.reality is None:
+        if problem.symbolic_reality is None:
             return spectrum_over_run(plant, state, response.full().T)
         real = problem.real_start[None, :]
         [jacobian] = sampled_jacobians(problem, real, state, response.full().T, plant.approximate)

@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.contraction import contraction_along
+from fpirhc.contraction.identified import identified_factor
 from fpirhc.contraction.sampled import sampled_jacobians
 from fpirhc.contraction.spectrum import factors_along
 from fpirhc.controllers.base import Controller
@@ -28,16 +29,25 @@ def judgements(problem: Problem, controller: Controller, layout: Layout, log: np
         judged.append(_costs(problem, layout, log))
     gain = controller.deformation.effective_gain()
     if gain != 0 and log.shape[0] and controller.response(problem) is None:
-        judged.append((scalar("contraction"), _contraction(problem, controller, layout, log)[:, None]))
+        factors = _contraction(problem, controller, layout, log)
+        judged += [(scalar("contraction"), factors[:, None])] if np.isfinite(factors).all() else []
     return judged
 
 
 def _contraction(problem: Problem, controller: Controller, layout: Layout, log: np.ndarray) -> np.ndarray:
-    """Return the factor of every cycle: of the Jacobian at an instant, with a reality of the one over a cycle."""
+    """Return the factor of every cycle: of the Jacobian at an instant, with a reality of the one over a cycle.
+
+    With a foreign reality it is the factor that the run shows, the same in every cycle, or NaN.
+    """
     states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]
     gain, plant = controller.deformation.effective_gain(), controller.model_plant(problem)
     believed = controller.parameters(plant)
-    if problem.reality is None:
+    if problem.foreign is not None:
+        shown = (
+            np.nan if problem.response_delay else identified_factor(deformed, log[:, layout.slice("realised")], gain)
+        )
+        return np.full(len(log), shown)
+    if problem.symbolic_reality is None:
         return contraction_along(plant, states, deformed, gain, approximate=believed)
     real, modelled = log[:, layout.slice(REALITY_STATE)], replace(problem, plant=plant)
     return factors_along(

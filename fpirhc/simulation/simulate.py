@@ -16,6 +16,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.describe import describe
 from fpirhc.simulation.common_columns import with_common_columns
+from fpirhc.simulation.foreign_run import run_foreign
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.run_signals import judgements
@@ -77,7 +78,8 @@ class Simulator:
         """
         problem = variant or self.problem
         start = start_memory(self.loop, problem, self.controller)
-        logged, stop = _run_chunks(problem, start, self.loop.trace, self.evaluator, seed, disturbed, progress)
+        run_cycles = _run_chunks if problem.foreign is None else _run_foreign
+        logged, stop = run_cycles(problem, start, self.loop.trace, self.evaluator, seed, disturbed, progress)
         layout, log = with_common_columns(self.loop.trace, logged)
         log.setflags(write=False)
         step_limit = self.controller.deformation.largest_step()
@@ -110,7 +112,9 @@ def simulator(
     """
     ready = resolved(problem, controller)
     loop = close_loop(problem, ready)
-    chunked = loop.function.mapaccum(f"{loop.function.name()}_run", CHUNK)
+    chunked = loop.function  # a foreign reality is called in every cycle
+    if problem.foreign is None:
+        chunked = loop.function.mapaccum(f"{loop.function.name()}_run", CHUNK)
     backend = native(chunked, flags) if compiled else None
     evaluator = Evaluator(backend.function if backend else chunked)
     reason = backend.reason if backend else SWITCHED_OFF
@@ -189,8 +193,7 @@ def _run_chunks(
 ) -> tuple[np.ndarray, str | None]:
     cycles = problem.cycles
     padded = -(-cycles // CHUNK) * CHUNK
-    all_tables = float(disturbed) * disturbance_table(problem, seed, padded), sensing_table(problem, seed, padded)
-    tables = [table for table in all_tables if table.shape[1]]
+    tables = _tables(problem, seed, padded, disturbed)
     log = np.empty((padded, trace.size))
     evaluator.arguments[0][:] = start
     for at in range(0, cycles, CHUNK):
@@ -210,6 +213,28 @@ def _run_chunks(
         if progress:
             progress(at + rows.shape[0], cycles)
     return log[:cycles], None
+
+
+def _run_foreign(
+    problem: Problem,
+    start: np.ndarray,
+    trace: Layout,
+    evaluator: Evaluator,
+    seed: int,
+    disturbed: bool,
+    progress: Progress | None,
+) -> tuple[np.ndarray, str | None]:
+    tables = _tables(problem, seed, problem.cycles, disturbed)
+    try:
+        return run_foreign(problem, start, trace.size, evaluator, seed, tables, progress)
+    except SystemError as error:
+        raise unwrapped(error) from None
+
+
+def _tables(problem: Problem, seed: int, cycles: int, disturbed: bool) -> list[np.ndarray]:
+    """Disturbances and the sensors' random series of every cycle, where there are any."""
+    both = float(disturbed) * disturbance_table(problem, seed, cycles), sensing_table(problem, seed, cycles)
+    return [table for table in both if table.shape[1]]
 
 
 def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:

@@ -22,6 +22,7 @@ from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.disturbance import Disturbance
+from fpirhc.task.foreign import Foreign
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem_view import problem_facts, problem_table
 from fpirhc.task.reality import Reality
@@ -52,7 +53,8 @@ class Problem(Checked):
             else zero, moved into its limits.
         measure_from: time from which metrics count; the transient before it is left out.
         judged: coordinates whose errors are logged and measured; None: the controlled ones.
-        reality: the plant that a run moves, where it is not `plant` with its exact parameters. `plant` is then the model alone.
+        reality: what a run moves, where it is not `plant` with its exact parameters: another plant (`Reality`), or an object
+            outside (`Foreign`). `plant` is then the model alone.
         name: of the problem in results; the problem of a file has the name of the file.
 
     Raises:
@@ -74,7 +76,7 @@ class Problem(Checked):
     measure_from: float = 0.0
     judged: Sequence[str] | None = None
     input_before: Mapping[str, float] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
-    reality: Reality | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    reality: Reality | Foreign | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
     name: str = field(default="", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
@@ -84,7 +86,7 @@ class Problem(Checked):
         plant = self.plant
         _check_input_before(self, mistakes)
         mistakes.unknown("judged: coordinate", self.judged or (), plant.coordinates)
-        disturbed = [*self.real_plant.inputs, *self.real_plant.coordinates]
+        disturbed = [*plant.inputs, *(() if self.foreign else self.real_plant.coordinates)]
         mistakes.unknown("disturbances: input or coordinate", self.disturbances, disturbed)
         instants, random = np.array([0.0, self.period]), np.random.default_rng(0)
         checks = (
@@ -93,7 +95,8 @@ class Problem(Checked):
             lambda: self.reference.function(plant),
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant),
-            lambda: self.reality.check(plant) if self.reality else None,
+            lambda: self.symbolic_reality.check(plant) if self.symbolic_reality else None,
+            lambda: self.foreign.check(plant, self.sensing.estimator.measures(plant)) if self.foreign else None,
         )
         for check in checks:
             try:
@@ -104,8 +107,8 @@ class Problem(Checked):
         check_stage(plant, self.cost, self.limits, mistakes)
         _check_inverse(self, mistakes)
         mistakes.raise_if_any()
-        if self.reality is not None:
-            self.reality.check_motion(self.real_start, self.inputs_before, self.real_integrator, self.period)
+        if self.symbolic_reality is not None:
+            self.symbolic_reality.check_motion(self.real_start, self.inputs_before, self.real_integrator, self.period)
 
     def __repr__(self) -> str:
         return line(self, *problem_facts(self))
@@ -137,12 +140,26 @@ class Problem(Checked):
     @property
     def sees_plant(self) -> bool:
         """Whether a controller receives the plant's own state and response, unchanged and without delay."""
-        return not self.dead_time.measurement and self.sensing.ideal and not (self.reality and self.reality.seen)
+        return (
+            not self.dead_time.measurement
+            and self.sensing.ideal
+            and not (self.symbolic_reality and self.symbolic_reality.seen)
+        )
+
+    @property
+    def symbolic_reality(self) -> Reality | None:
+        """The reality where it is a plant."""
+        return self.reality.symbolic if self.reality is not None else None
+
+    @property
+    def foreign(self) -> Foreign | None:
+        """The reality where it is an object outside."""
+        return self.reality.foreign if self.reality is not None else None
 
     @property
     def real_plant(self) -> Plant:
         """The plant that a run moves, with its exact parameters: the reality's, or the model's own."""
-        return self.plant if self.reality is None else self.reality.plant
+        return self.plant if self.symbolic_reality is None else self.symbolic_reality.plant
 
     @property
     def of_model(self) -> Problem:
@@ -156,7 +173,7 @@ class Problem(Checked):
     @property
     def real_integrator(self) -> Integrator:
         """Integrator of the plant that a run moves."""
-        return (self.reality.integrator if self.reality else None) or self.integrator
+        return (self.symbolic_reality.integrator if self.symbolic_reality else None) or self.integrator
 
     @cached_property
     def real_start(self) -> np.ndarray:
@@ -165,9 +182,9 @@ class Problem(Checked):
         Raises:
             InvalidProblem: a reality whose own states neither are given nor settle.
         """
-        if self.reality is None:
+        if self.symbolic_reality is None:
             return self.start_state
-        return self.reality.start_state(self.plant, self.start_state, self.inputs_before)
+        return self.symbolic_reality.start_state(self.plant, self.start_state, self.inputs_before)
 
     @cached_property
     def start_state(self) -> np.ndarray:

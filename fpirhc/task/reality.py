@@ -50,6 +50,15 @@ class Reality(Checked):
     integrator: Integrator | None = None
     seen: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def symbolic(self) -> Reality:
+        """Itself: a plant whose equations are known."""
+        return self
+
+    @property
+    def foreign(self) -> None:
+        """No object outside."""
+
     def with_exact(self, exact: np.ndarray) -> Reality:
         """Return the reality with other exact parameters, shape (np,).
 

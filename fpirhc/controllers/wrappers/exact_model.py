@@ -8,6 +8,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.deformation.base import Deformation
+from fpirhc.errors import NotSupported
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.task.problem import Problem
@@ -21,7 +22,7 @@ class ExactModel(Controller):
         controller: any controller that uses its model.
 
     Raises:
-        NotSupported: a reality whose inputs, coordinates or orders are not the model's, when the controller meets the problem.
+        NotSupported: a foreign reality, or one whose coordinates or orders are not the model's.
     """
 
     controller: Controller
@@ -44,8 +45,10 @@ class ExactModel(Controller):
 
     def model_plant(self, problem: Problem) -> Plant:
         """Return the plant that a run moves."""
-        if problem.reality is not None:
-            problem.reality.check_as_model(problem.plant)
+        if problem.foreign is not None:
+            raise NotSupported("a foreign reality has no equations that could be the exact model; leave ExactModel out")
+        if problem.symbolic_reality is not None:
+            problem.symbolic_reality.check_as_model(problem.plant)
         return problem.real_plant
 
     def linear_around(self, inner: Controller) -> Controller:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fpirhc.errors import NotSupported
 from fpirhc.plant.mismatch import drawn
 from fpirhc.plant.plant import Plant
 from fpirhc.task.problem import Problem
@@ -71,7 +72,12 @@ def with_exact(problem: Problem, exact: np.ndarray) -> Problem:
 
     Raises:
         InvalidProblem: the plant is not invertible at the start with them, or one of them leaves its bounds.
+        NotSupported: a foreign reality, whose parameters nobody can set.
     """
-    if problem.reality is not None:
-        return replace(problem, reality=problem.reality.with_exact(exact))
+    if problem.foreign is not None:
+        raise NotSupported(
+            "a foreign reality has no exact parameters that a study could draw; compare without scenarios"
+        )
+    if problem.symbolic_reality is not None:
+        return replace(problem, reality=problem.symbolic_reality.with_exact(exact))
     return replace(problem, plant=problem.plant.with_exact(exact))
