@@ -6,25 +6,27 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from fpirhc.simulation.ranges import ranges_of
 from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.layout import Layout
 from fpirhc.task.problem import Problem
 
 
 def run_foreign(
     problem: Problem,
     start: np.ndarray,
-    width: int,
+    trace: Layout,
     evaluator: Evaluator,
     seed: int,
     tables: Sequence[np.ndarray],
     progress: Callable[[int, int], None] | None,
 ) -> tuple[np.ndarray, str | None]:
-    """Return the log, shape (cycles, width), and the reason why the run ended early.
+    """Return the log, shape (cycles, trace.size), and the reason why the run ended early.
 
     Args:
         problem: with a foreign reality.
         start: first memory of the loop.
-        width: number of logged numbers per cycle.
+        trace: layout of the log.
         evaluator: of one cycle of the loop.
         seed: with which the reality is reset.
         tables: disturbances and the sensors' random series, one row per cycle.
@@ -37,7 +39,8 @@ def run_foreign(
     assert foreign is not None
     memory, *given = evaluator.arguments
     *random, answer, held = given
-    log, memory[:], held[0], bridged = np.empty((cycles, width)), start, 0.0, 0
+    log, ranges, bridged = np.empty((cycles, trace.size)), ranges_of(problem, trace), 0
+    memory[:], held[0] = start, 0.0
     answer[:] = foreign.first(seed)
     for k in range(cycles):
         for argument, table in zip(random, tables, strict=True):
@@ -45,13 +48,17 @@ def run_foreign(
         evaluator.evaluate()
         memory_next, row, sent = evaluator.results
         if not np.isfinite(row).all():
-            return log[:k], _stop(problem, k, "a signal of the loop is not finite")
+            column = trace.columns[int(np.argmin(np.isfinite(row)))]
+            return log[:k], stopped(problem, k, f"signal '{column}' is not finite")
+        outside = ranges.first_outside(row[None, :])
+        if outside is not None:
+            return log[:k], stopped(problem, k, outside[1])
         log[k] = row
         memory[:] = memory_next
         reading = foreign.read(k * problem.period, sent.copy())
         bridged = 0 if reading.values is not None else bridged + 1
         if bridged > foreign.holds and k + 1 < cycles:
-            return log[: k + 1], _stop(problem, k + 1, reading.mistake)
+            return log[: k + 1], stopped(problem, k + 1, reading.mistake)
         held[0] = float(reading.values is None)
         if reading.values is not None:
             answer[:] = reading.values
@@ -60,6 +67,7 @@ def run_foreign(
     return log, None
 
 
-def _stop(problem: Problem, cycle: int, why: str) -> str:
+def stopped(problem: Problem, cycle: int, what: str) -> str:
+    """Return the reason why a run ended before this cycle."""
     when = f"at t = {cycle * problem.period:g} {problem.time_unit} (cycle {cycle})"
-    return f"{why}, {when}; the run keeps the cycles before it"
+    return f"{what} {when}; the run keeps the cycles before it"

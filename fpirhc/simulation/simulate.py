@@ -16,8 +16,9 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.describe import describe
 from fpirhc.simulation.common_columns import with_common_columns
-from fpirhc.simulation.foreign_run import run_foreign
+from fpirhc.simulation.foreign_run import run_foreign, stopped
 from fpirhc.simulation.loop import close_loop, start_memory
+from fpirhc.simulation.ranges import ranges_of
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.run_signals import judgements
 from fpirhc.symbolic.block import Composite
@@ -133,7 +134,8 @@ def simulate(
 ) -> Run:
     """Run the closed loop of problem and controller and return every signal, also those that judge the run.
 
-    A signal that becomes NaN or infinite ends the run at that cycle. The run keeps its finite part, and `Run.stop` is the reason.
+    A signal that becomes NaN or infinite, or a state that leaves its physical range, ends the run at that cycle. The run keeps the cycles
+    before it, and `Run.stop` is the reason.
 
     Args:
         problem: the task.
@@ -194,7 +196,7 @@ def _run_chunks(
     cycles = problem.cycles
     padded = -(-cycles // CHUNK) * CHUNK
     tables = _tables(problem, seed, padded, disturbed)
-    log = np.empty((padded, trace.size))
+    log, ranges = np.empty((padded, trace.size)), ranges_of(problem, trace)
     evaluator.arguments[0][:] = start
     for at in range(0, cycles, CHUNK):
         for argument, table in zip(evaluator.arguments[1:], tables, strict=True):
@@ -209,6 +211,10 @@ def _run_chunks(
         if bad is not None:
             row, column = bad
             return log[: at + row].copy(), _why(trace, at + row, column, problem)
+        outside = ranges.first_outside(rows)
+        if outside is not None:
+            row, what = outside
+            return log[: at + row].copy(), stopped(problem, at + row, what)
         evaluator.arguments[0][:] = evaluator.results[0].reshape(CHUNK, start.size)[-1]
         if progress:
             progress(at + rows.shape[0], cycles)
@@ -226,7 +232,7 @@ def _run_foreign(
 ) -> tuple[np.ndarray, str | None]:
     tables = _tables(problem, seed, problem.cycles, disturbed)
     try:
-        return run_foreign(problem, start, trace.size, evaluator, seed, tables, progress)
+        return run_foreign(problem, start, trace, evaluator, seed, tables, progress)
     except SystemError as error:
         raise unwrapped(error) from None
 
@@ -251,7 +257,4 @@ def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:
 
 
 def _why(trace: Layout, cycle: int, column: int, problem: Problem) -> str:
-    return (
-        f"signal '{trace.columns[column]}' is not finite at t = {cycle * problem.period:g} {problem.time_unit} (cycle {cycle}); "
-        "the run keeps the cycles before it"
-    )
+    return stopped(problem, cycle, f"signal '{trace.columns[column]}' is not finite")

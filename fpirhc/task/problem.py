@@ -262,6 +262,10 @@ def _check_start(problem: Problem, mistakes: Mistakes) -> None:
     for name, value in problem.start.items():
         if not isinstance(value, int | float) or not math.isfinite(value):
             mistakes.add(f"start: '{name}' must be a finite number, got {value!r}")
+            continue
+        low, high = plant.ranges.get(name, (-math.inf, math.inf))
+        if not low <= value <= high:
+            mistakes.add(f"start: '{name}' is {value:g}, outside its physical range of {low:g} to {high:g}")
 
 
 def _check_input_before(problem: Problem, mistakes: Mistakes) -> None:
