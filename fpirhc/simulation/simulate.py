@@ -134,7 +134,7 @@ def simulate(
 ) -> Run:
     """Run the closed loop of problem and controller and return every signal, also those that judge the run.
 
-    A signal that becomes NaN or infinite, or a state that leaves its physical range, ends the run at that cycle. The run keeps the cycles
+    A signal that becomes NaN or infinite, or a state that leaves its physical range, ends the run there. The run keeps the cycles
     before it, and `Run.stop` is the reason.
 
     Args:

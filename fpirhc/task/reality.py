@@ -117,10 +117,7 @@ class Reality(Checked):
             InvalidProblem: states that are not named in `start` and have no equilibrium.
         """
         elements = self.plant.state.elements
-        names = dict(zip(model.names, self._names(model, seen=False), strict=True))
-        shared = {
-            names[e.rstrip("'")] + "'" * e.count("'"): v for e, v in zip(model.state.elements, start, strict=True)
-        }
+        shared = {elements[there]: start[own] for own, there in self.shared(model).items()}
         known = {**shared, **self.start}
         first = np.array([float(known.get(e, 0.0)) for e in elements])
         free = [k for k, e in enumerate(elements) if e not in known]
@@ -132,6 +129,19 @@ class Reality(Checked):
                 f"Reality(start={{'{elements[free[0]]}': ...}})"
             )
         return at_rest
+
+    def shared(self, model: Plant) -> dict[int, int]:
+        """Return the places of the states that both have: place in the model's state -> place in its own."""
+        elements, places = self.plant.state.elements, {}
+        for k, e in enumerate(model.state.elements):
+            own = self.true_name(e.rstrip("'")) + "'" * e.count("'")
+            if own in elements:
+                places[k] = elements.index(own)
+        return places
+
+    def true_name(self, coordinate: str) -> str:
+        """Return its coordinate at which a coordinate of the model is judged."""
+        return coordinate if coordinate in self.plant.coordinates else self.seen.get(coordinate, coordinate)
 
     def check_motion(self, start: np.ndarray, command: np.ndarray, integrator: Integrator, period: float) -> None:
         """Raise if the reality cannot move from its start, or the integrator cannot follow it there.
@@ -183,10 +193,9 @@ class Reality(Checked):
 
     def _names(self, model: Plant, *, seen: bool) -> tuple[str, ...]:
         """The reality's coordinate for each of the model's."""
-        own = self.plant.coordinates
         if seen:
             return tuple(self.seen.get(c, c) for c in model.names)
-        return tuple(c if c in own else self.seen.get(c, c) for c in model.names)
+        return tuple(self.true_name(c) for c in model.names)
 
 
 def _check_inputs(plant: Plant, model: Plant, mistakes: Mistakes) -> None:
