@@ -220,3 +220,17 @@ def test_lagged_body_is_the_lagged_reality():
     one = run(problem, controller)
     other = run(replace(problem, reality=fp.Foreign(Actuated(task()), MEASURES)), controller)
     assert np.abs(one["command"] - other["command"]).max() < 1e-6 * np.abs(one["command"]).max()
+
+
+def test_comparison_and_report_of_an_object_outside(tmp_path):
+    """The same table, verdict, null test and page as for a plant."""
+    shipped = fp.load_problem("two_mass")
+    pair = {name: CONTROLLERS[name] for name in ("computed torque", "plain form")}
+    file = replace(shipped, problem=outside(task()), controllers=pair, headline=tuple(pair))
+    comparison = fp.compare(file, seed=0, compiled=False)
+    errors = [entry.metrics.rms_error["y"] for entry in comparison.entries]
+    inside = [fp.measure(task(), run(task(), one)).rms_error["y"] for one in pair.values()]
+    assert errors == pytest.approx(inside, rel=1e-10)
+    assert comparison.null is not None
+    fp.write_report(comparison, tmp_path / "report.html")
+    assert "plain form" in (tmp_path / "report.html").read_text()

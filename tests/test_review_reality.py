@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -10,6 +11,7 @@ import pytest
 from test_reality import lagged, slow_sensor, task
 
 import fpirhc as fp
+from fpirhc.report.series import chart_data
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
 from fpirhc.review.questions.reality_lag import TEXT as LAG
@@ -72,14 +74,14 @@ def test_real_pair_of_the_same_plant_is_the_plant_itself():
 @pytest.mark.parametrize("order", [1, 2])
 def test_lag_rule_at_its_edge(order):
     """(n + 1) Lambda tau < 1: a fast iteration converges 3 % below the edge and not 3 % above it."""
-    real = {
+    real: dict[int, Any] = {
         1: lambda q, u, p: {"y": q.F, "F": (u.u - q.F) / p.tau},
         2: lambda q, v, u, p: {"y": q.F, "F": (u.u - q.F) / p.tau},
-    }[order]
-    law = {1: lambda q, u, p: {"y": p.b * u.u}, 2: lambda q, v, u, p: {"y": p.b * u.u}}[order]
+    }
+    law: dict[int, Any] = {1: lambda q, u, p: {"y": p.b * u.u}, 2: lambda q, v, u, p: {"y": p.b * u.u}}
     tau = {"tau": fp.Parameter(TAU, TAU, "s")}
-    plant = fp.Plant({"y": "m", "F": "N"}, {"u": "N"}, tau, real, order={"y": order, "F": 1})
-    model = fp.Plant({"y": "m"}, {"u": "N"}, {"b": fp.Parameter(1.0, 1.0, "1/kg")}, law, order=order)
+    plant = fp.Plant({"y": "m", "F": "N"}, {"u": "N"}, tau, real[order], order={"y": order, "F": 1})
+    model = fp.Plant({"y": "m"}, {"u": "N"}, {"b": fp.Parameter(1.0, 1.0, "1/kg")}, law[order], order=order)
     problem = task(plant=model, reality=fp.Reality(plant), cost=None, horizon=None, period=2e-4)
     edge = 1 / ((order + 1) * TAU)
     assert radius(problem, adapted(0.97 * edge, 1.0)) < 1 < radius(problem, adapted(1.03 * edge, 1.0))
@@ -132,3 +134,26 @@ def test_no_question_without_a_reality():
     """A problem as before is asked as before."""
     answers = fp.review(task(), {"it": adapted(6.0, 0.3)}, mismatch=0.0, seed=0).controllers["it"]
     assert not {LAG, LOOP, RESONANCE} & {a.question for a in answers}
+
+
+def test_review_names_an_exact_model_that_cannot_be():
+    """The refusal of a run is the answer of the review."""
+    answers = fp.review(quick(resonant(0.3)), {"it": fp.ExactModel(adapted(6.0, 0.01))}, mismatch=0.0, seed=0)
+    [only] = answers.controllers["it"]
+    assert "the coordinate f, which the controller is not given" in only.evidence
+
+
+def test_comparison_shows_belief_beside_reality():
+    """The page's charts have the force that the model does not know, and expected and real responses; not so without a reality."""
+    problem = task(reality=fp.Reality(lagged()))
+    pair = {"CTC": fp.ComputedTorque(fp.Exponential(rate=6.0)), "CTC+FPI": adapted(6.0, 0.1)}
+    titles = {}
+    for name, one in {"real": problem, "model": problem.of_model}.items():
+        shipped = fp.load_problem("two_mass")
+        file = replace(shipped, problem=one, controllers=pair, headline=("CTC", "CTC+FPI"))
+        comparison = fp.compare(file, seed=0, compiled=False)
+        titles[name] = [chart["title"] for chart in chart_data(comparison, ["#000"])["charts"]]
+        factor = comparison.entries[1].metrics.values["contraction.predicted"][""]
+        reached = 1 - np.exp(-1e-3 / 0.01) if name == "real" else 1.0
+        assert factor == pytest.approx(1 - 0.1 * 2.0 * reached, abs=1e-6)
+    assert {"reality: F", "CTC+FPI: response of y, belief and reality"} <= set(titles["real"]) - set(titles["model"])

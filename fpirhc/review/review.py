@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import resolved
+from fpirhc.controllers.contract import checked, resolved
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.review.answer import Answer, Review, Verdict
 from fpirhc.review.chatter import chatter_small
@@ -83,6 +83,8 @@ def predict(problem: Problem, controller: Controller) -> Answer:
 
 def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: NominalRuns) -> tuple[Answer, ...]:
     try:
+        if grid.real is not None:
+            checked(grid.real, controller)
         ready = resolved(grid.problem, controller)
         ready.check(grid.problem)
     except FpirhcError as error:

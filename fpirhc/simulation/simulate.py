@@ -86,7 +86,7 @@ class Simulator:
         step_limit = self.controller.deformation.largest_step()
         planner = self.controller.planner
         cost = (planner.cost or problem.cost) if planner else None
-        settings = {
+        settings: dict[str, object] = {
             "weighs_effort": cost is not None and cost.weighs_effort,
             "step_limit": step_limit if np.isfinite(step_limit) else None,
             "effective_gain": float(self.controller.deformation.effective_gain()),
@@ -96,6 +96,8 @@ class Simulator:
             "backend": "compiled C" if self.compiled else "CasADi virtual machine",
             "why not compiled": self.why_not_compiled,
         }
+        if problem.reality is not None:
+            settings["model is reality"] = self.controller.model_plant(problem) is not problem.plant
         title = name or type(self.controller).__name__
         return Run(problem.name, title, seed, problem.period, layout, log, stop, self.compiled, settings)
 
