@@ -21,7 +21,6 @@ from scipy.optimize import linear_sum_assignment
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import NotSupported
-from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.linear import LinearLoop, linear_parameters, linear_problem, matrices_of, response_slopes
@@ -34,6 +33,7 @@ from fpirhc.task.reality import Reality
 Settling: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray] | None]
 _STEPS = 60  # of Newton's method
 _POINTS = 5  # of the reference
+_SLOW = 0.05  # frequency of slow requests, as a share of the slowest of the poles that the model lacks
 _MOVES = 1e-9  # rate, as a share of the fastest, below which a pole is an integrator's
 
 
@@ -58,7 +58,8 @@ class Extra:
 
     Args:
         poles: that the settled reality does not have, per unit of time.
-        eigenvalues: of the settled response Jacobian, slow requests to responses, shape (n,).
+        eigenvalues: of the response Jacobian for requests that are slow beside these poles, shape (n,). What is behind a spring
+            moves along with the plant then, so this is no gain at rest.
     """
 
     poles: np.ndarray
@@ -100,7 +101,7 @@ def real_loops(grid: ReviewGrid, controller: Controller, points: Sequence[RealPo
     stand_in, plan = linear_stand_in(grid.problem, controller)
     linear = linear_problem(grid.problem, stand_in)
     plant = linear_reality(reality.plant)
-    integrator = RungeKutta4(8) if problem.real_integrator.opaque else problem.real_integrator
+    integrator = linear.integrator if problem.real_integrator.opaque else problem.real_integrator
     still = dict.fromkeys(plant.state.elements, 0.0)
     whole = replace(linear, reality=Reality(plant, start=still, integrator=integrator, seen=reality.seen))
     judged = tuple(plant.state.elements.index(reality.true_name(c)) for c in problem.judged_names)
@@ -116,7 +117,7 @@ def real_loops(grid: ReviewGrid, controller: Controller, points: Sequence[RealPo
 
 
 def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Extra:
-    """Return the poles of the reality that it has beyond the settled one, and the settled response Jacobian, at a point."""
+    """Return the poles of the reality that it has beyond the settled one, and its response Jacobian below them, at a point."""
     assert grid.real is not None
     reality, model = _reality(grid.real), grid.problem.plant
     plant, known = reality.plant, reality.shared(model)
@@ -131,12 +132,12 @@ def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Ext
     a, b, c, d = (np.asarray(m.full()) for m in values)
     settle = np.linalg.pinv(a[np.ix_(free, free)])
     reduced = a[np.ix_(outer, outer)] - a[np.ix_(outer, free)] @ settle @ a[np.ix_(free, outer)]
-    gain = d - c[:, free] @ settle @ b[free]
+    modes = _beyond(np.linalg.eigvals(a), np.linalg.eigvals(reduced))
+    slow = 1j * _SLOW * float(np.abs(modes).min(initial=np.inf))
+    gain = d + c @ np.linalg.solve(slow * np.eye(len(a)) - a, b) if modes.size else d
     of_model = response_slopes(model)(grid.states[point.place], point.command, believed)[1]
     assumed = np.asarray(of_model.full())[list(model.controlled_indices)]
-    return Extra(
-        _beyond(np.linalg.eigvals(a), np.linalg.eigvals(reduced)), np.linalg.eigvals(gain @ np.linalg.inv(assumed))
-    )
+    return Extra(modes, np.linalg.eigvals(gain @ np.linalg.inv(assumed)))
 
 
 def linear_reality(plant: Plant) -> Plant:
