@@ -102,8 +102,10 @@ from .studies.tuning.tune import Tuning, tune
 from .symbolic.functions import signed_power
 from .task.dead_time import DeadTime
 from .task.disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
+from .task.foreign import Foreign
 from .task.limits import Limits, PathConstraint
 from .task.problem import Problem
+from .task.reality import Reality
 from .task.reference import Table, Trajectory
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
@@ -144,6 +146,7 @@ __all__ = [
     "FixedSchedule",
     "Floquet",
     "ForceMRAC",
+    "Foreign",
     "Formula",
     "FpirhcError",
     "Fractional",
@@ -198,6 +201,7 @@ __all__ = [
     "RFPTVector",
     "RadauIIA",
     "Raster",
+    "Reality",
     "RecedingHorizon",
     "RecursiveLeastSquares",
     "ReducedGradient",

@@ -28,6 +28,8 @@ _OF_TIME = ("two_mass", "cart_pole", "van_der_pol", "chain_of_masses")
 @pytest.fixture(scope="module", params=_OF_TIME)
 def ocp(request) -> OptimalControl:
     p = fp.load_problem(request.param).problem
+    assert p.horizon is not None
+    assert p.cost is not None
     return transcribe(p.plant, p.reference, p.horizon, p.cost, p.limits)
 
 

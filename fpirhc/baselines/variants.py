@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fpirhc.simulation.simulate import disturbance_table, sensing_table
+from fpirhc.studies.scenarios.draws import with_exact
 from fpirhc.symbolic.native import find_compiler
 from fpirhc.task.problem import Problem
 
@@ -51,13 +52,14 @@ class Variant:
     def applied(self, problem: Problem) -> Problem:
         """Return the problem as it runs in this variant."""
         if self.nudge:
-            parameters = {
-                name: replace(p, exact=p.exact * (1 + self.nudge)) for name, p in problem.plant.parameters.items()
-            }
             start = {name: value * (1 + self.nudge) for name, value in problem.start.items()}
-            return replace(problem, plant=replace(problem.plant, parameters=parameters), start=start)
+            moved = replace(problem, start=start)
+            return moved if problem.foreign else with_exact(moved, problem.real_plant.exact * (1 + self.nudge))
         if self.finer > 1:
-            return replace(problem, integrator=problem.integrator.finer(self.finer) or problem.integrator)
+            finer = problem.real_integrator.finer(self.finer) or problem.real_integrator
+            if problem.symbolic_reality is not None:
+                return replace(problem, reality=replace(problem.symbolic_reality, integrator=finer))
+            return replace(problem, integrator=finer)
         return problem
 
 
@@ -77,7 +79,7 @@ def variants(problem: Problem, *, seed: int, seeds: int, compiled: bool) -> list
     all_variants.append(
         Variant(ROUNDING, f"start and exact parameters moved by {_NUDGE:g}", seed, compiled, nudge=_NUDGE)
     )
-    if problem.integrator.finer(2):
+    if not problem.foreign and problem.real_integrator.finer(2):
         all_variants.append(Variant(INTEGRATOR, "twice the integrator steps", seed, compiled, finer=2))
     return all_variants
 

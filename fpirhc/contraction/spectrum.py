@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TypeAlias
@@ -160,13 +160,28 @@ def contraction_along(
         InvalidShape: arrays that do not fit the plant or each other.
     """
     states, deformed = _checked_rows(plant, states, deformed)
-    rows = _thinned(len(states))
-    exact = np.repeat(plant.exact[None, :], len(rows), axis=0)
-    jacobians = response_jacobians(plant, states[rows], deformed[rows], exact, approximate)
+
+    def jacobians_at(rows: Array) -> Array:
+        exact = np.repeat(plant.exact[None, :], len(rows), axis=0)
+        return response_jacobians(plant, states[rows], deformed[rows], exact, approximate)
+
+    return factors_along(len(states), jacobians_at, effective_gain)
+
+
+def factors_along(cycles: int, jacobians_at: Callable[[Array], Array], effective_gain: float) -> Array:
+    """Return max|1 - a lambda| of every cycle from Jacobians at some cycles; see `contraction_along`.
+
+    Args:
+        cycles: number of cycles of the run.
+        jacobians_at: function of the numbers of some cycles -> their Jacobians, shape (cycles, n, n).
+        effective_gain: a of the deformation.
+    """
+    rows = _thinned(cycles)
+    jacobians = jacobians_at(rows)
     finite = np.isfinite(jacobians).all(axis=(1, 2))
     factors = np.ones(len(rows))
     factors[finite] = np.abs(1 - effective_gain * np.linalg.eigvals(jacobians[finite])).max(axis=1)
-    return factors[np.searchsorted(rows, np.arange(len(states)), side="right") - 1]
+    return factors[np.searchsorted(rows, np.arange(cycles), side="right") - 1]
 
 
 def response_jacobians(plant: Plant, states: Array, deformed: Array, exact: Array, approximate: Array | None) -> Array:

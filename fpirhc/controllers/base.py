@@ -35,7 +35,7 @@ def controller_reads(problem: Problem, controller: Controller) -> Layout:
     """Return what a controller reads in every cycle: time, state, realised response, parameters."""
     plant, response = problem.plant, controller.response(problem)
     realised = response.signal if response else plant.response_signal("realised")
-    return Layout((plant.time, plant.state, realised, plant.parameter))
+    return Layout((plant.time, plant.state, realised, controller.model_plant(problem).parameter))
 
 
 def compose_controller(problem: Problem, controller: Controller, *, ahead: bool = False) -> Composite:

@@ -134,6 +134,10 @@ class Controller(Checked, ABC):
         """Return the parameters of the controller's model, shape (np,): the approximate ones."""
         return plant.approximate if self.inner is None else self.inner.parameters(plant)
 
+    def model_plant(self, problem: Problem) -> Plant:
+        """Return the plant that is the controller's model: the problem's."""
+        return problem.plant if self.inner is None else self.inner.model_plant(problem)
+
     @property
     def learns(self) -> bool:
         """Whether its model or its gains change during a run."""
@@ -266,8 +270,8 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
         check_response_delay(problem, ready.deformation)
         return ready
     late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
-    if late or not problem.sensing.ideal:
-        what = "dead time" if late else "sensing"
+    if late or problem.reality or not problem.sensing.ideal:
+        what = "dead time" if late else "the reality" if problem.reality else "sensing"
         raise NotSupported(
             f"{type(ready).__name__} reads responses of its own, without delay and noise; leave {what} out of the problem"
         )

@@ -15,10 +15,13 @@ from functools import lru_cache
 import numpy as np
 
 from fpirhc.contraction import Spectrum, assess_gain, delayed_limit, leaking_limit, linear_limit, spectrum_over_run
+from fpirhc.contraction.sampled import sampled_jacobians
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotContractive
 from fpirhc.plant.plant import Plant
 from fpirhc.task.problem import Problem
+
+_NOTHING = 1e-12  # largest eigenvalue of a Jacobian that has no effect
 
 
 def check_gain_sign(problem: Problem, deformation: Deformation) -> None:
@@ -139,8 +142,21 @@ def _too_late(problem: Problem, deformation: Deformation, form: _Form, limit: fl
 
 
 def _at_start(problem: Problem) -> Spectrum | None:
-    """Eigenvalues of the response Jacobian at the start; None where the inverse response is singular there."""
-    return _spectrum(problem.plant, tuple(map(float, problem.start_state)))
+    """Eigenvalues of the response Jacobian at the start; None where the inverse response is singular there.
+
+    With a reality they are those of the response at the end of a cycle; None where the command has not reached it by then.
+    """
+    if problem.symbolic_reality is None:
+        return _spectrum(problem.plant, tuple(map(float, problem.start_state)))
+    plant, state = problem.plant, problem.start_state[None, :]
+    response = plant.controlled_response_function(problem.start_state, [0] * plant.input.size, plant.approximate)
+    try:
+        real = problem.real_start[None, :]
+        [jacobian] = sampled_jacobians(problem, real, state, response.full().T, plant.approximate)
+    except InvalidValue:
+        return None
+    spectrum = Spectrum(np.linalg.eigvals(jacobian)) if np.isfinite(jacobian).all() else None
+    return spectrum if spectrum is not None and np.abs(spectrum.eigenvalues).max() > _NOTHING else None
 
 
 @lru_cache(maxsize=8)  # a search checks many gains at the same start

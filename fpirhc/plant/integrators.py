@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
+import numpy as np
 
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Accuracy, Few
@@ -28,6 +29,13 @@ class Integrator(Checked, ABC):
 
     def finer(self, times: int) -> Integrator | None:  # noqa: ARG002
         """The same method with about `times` times the work; None where it has no such setting."""
+        return None
+
+    def growth(self, modes: np.ndarray) -> np.ndarray | None:  # noqa: ARG002
+        """Return |R(z)|, by which a cycle multiplies a mode whose pole times period is z, per mode.
+
+        None: no decaying mode ever grows, as in implicit methods and methods that control their error.
+        """
         return None
 
     @abstractmethod
@@ -52,6 +60,11 @@ class RungeKutta4(Integrator):
         """The same method with `times` times the sub-steps."""
         return RungeKutta4(self.substeps * times)
 
+    def growth(self, modes: np.ndarray) -> np.ndarray:
+        """|1 + z + z^2/2 + z^3/6 + z^4/24|^n at z/n, n sub-steps."""
+        z = np.asarray(modes) / self.substeps
+        return np.asarray(np.abs(1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))) ** self.substeps)
+
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period` seconds."""
         rate = plant.forced_derivative_function
@@ -75,6 +88,10 @@ class Euler(Integrator):
     """
 
     substeps: Few = 1
+
+    def growth(self, modes: np.ndarray) -> np.ndarray:
+        """|1 + z/n|^n, n sub-steps."""
+        return np.asarray(np.abs(1 + np.asarray(modes) / self.substeps) ** self.substeps)
 
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period` seconds."""

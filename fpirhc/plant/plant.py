@@ -27,7 +27,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called
 from fpirhc.plant.inverse import inverse_by_newton, inverse_by_user, inverse_of_affine
 from fpirhc.plant.parameter import Parameter, check_parameters
-from fpirhc.plant.plant_check import check_names, check_response
+from fpirhc.plant.plant_check import check_names, check_ranges, check_response
 from fpirhc.plant.plant_view import plant_facts, plant_table
 from fpirhc.plant.structural_order import structural_order
 from fpirhc.summary import line
@@ -52,6 +52,8 @@ class Plant(Checked):
         inverse: optional function of (q, q', ..., r, p) that returns {input: command} for wanted responses r of the
             controlled coordinates. None: the inverse is derived where the response is affine in the inputs, and computed by
             Newton's method otherwise.
+        ranges: physical range (lowest, highest) of states by name, such as {"level": (0.0, 2.0)}. A run whose plant leaves one ends
+            there, by name; it limits nothing (see `Limits`).
         time_unit: unit of time of the equations ('s', 'ms', 'day'), and so of every time and rate of the problem.
 
     Raises:
@@ -65,6 +67,9 @@ class Plant(Checked):
     order: int | Mapping[str, int] = 2
     controlled: Sequence[str] | None = None
     inverse: Callable[..., Mapping[str, Expression]] | None = None
+    ranges: Mapping[str, tuple[float, float]] = field(
+        default_factory=dict, kw_only=True, metadata={"setting": "where given"}
+    )
     time_unit: str = field(default="s", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
@@ -72,6 +77,7 @@ class Plant(Checked):
         check_names(self, mistakes)
         check_parameters(self.parameters, mistakes)
         mistakes.raise_if_any()
+        check_ranges(self, mistakes)
         check_response(self, mistakes)
         mistakes.raise_if_any()
 

@@ -44,6 +44,14 @@ def check_names(plant: Plant, mistakes: Mistakes) -> None:
             )
 
 
+def check_ranges(plant: Plant, mistakes: Mistakes) -> None:
+    """Add every mistake of the physical ranges to `mistakes`."""
+    mistakes.unknown("ranges: state", plant.ranges, plant.state.elements)
+    for name, (low, high) in plant.ranges.items():
+        if not low < high:
+            mistakes.add(f"ranges: '{name}' must be (lowest, highest), got {(low, high)!r}")
+
+
 def check_response(plant: Plant, mistakes: Mistakes) -> None:
     """Add every mistake of the response and of the orders to `mistakes`."""
     expected = max(plant.orders) + 2

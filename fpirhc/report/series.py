@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fpirhc.report.reality_series import reality_charts
+
 if TYPE_CHECKING:
     from fpirhc.simulation.run import Run
     from fpirhc.studies.comparison.compare import Comparison, Entry
@@ -40,6 +42,7 @@ def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]
             lines = [(signal, e.run, f"{signal}.{c}") for signal in _RESPONSES]
             chart = _chart(f"{e.name}: responses of {c}", e.run.unit(f"desired.{c}"), lines, edges)
             charts.append({**chart, "only": e.name})
+    charts += reality_charts(entries, lambda values: _extremes(values, edges))
     charts += [chart for e in entries for chart in _tubes(e, edges)]
     return {
         "controllers": [

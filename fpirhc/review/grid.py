@@ -44,6 +44,7 @@ class ReviewGrid:
         draws: exact parameters, shape (draws, np); the first row is the plant's own.
         inner: places of the simulated states.
         mismatch: range of the exact parameters and of the dead times, percent.
+        real: the problem with its reality, where it has one that is a plant; `problem` is then that of the model alone.
     """
 
     problem: Problem
@@ -53,6 +54,7 @@ class ReviewGrid:
     draws: np.ndarray
     inner: tuple[int, ...] = ()
     mismatch: float = 0.0
+    real: Problem | None = None
 
     @cached_property
     def drawn_states(self) -> np.ndarray:
@@ -116,6 +118,7 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
     Raises:
         NotInvertible: the inputs and the controlled coordinates differ in number.
     """
+    real, problem = problem if problem.symbolic_reality else None, problem.of_model
     plant = problem.plant
     function = problem.reference.function(plant)
     times = np.linspace(0.0, problem.duration, _POINTS)
@@ -131,7 +134,7 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
         inner = ()
     else:
         states[:, list(inner)] = own
-    return ReviewGrid(problem, times, states, responses[:, list(plant.controlled_indices)], rows, inner, mismatch)
+    return ReviewGrid(problem, times, states, responses[:, list(plant.controlled_indices)], rows, inner, mismatch, real)
 
 
 def parameter_box(problem: Problem, mismatch: float) -> dict[str, tuple[float, float]]:

@@ -191,23 +191,37 @@ def loop_matrices(problem: Problem, controller: Controller) -> LoopMatrices:
         FpirhcError: every error that the controller raises about a linear plant.
         NotSupported: a memory of too many entries.
     """
-    linear = _linear_problem(problem, controller)
+    judged = tuple(problem.plant.state.elements.index(c) for c in problem.judged_names)
+    return matrices_of(linear_problem(problem, controller), controller, judged)
+
+
+def matrices_of(linear: Problem, controller: Controller, judged: tuple[int, ...]) -> LoopMatrices:
+    """Return the loop of a problem whose plants are linear, around rest.
+
+    Args:
+        linear: from `linear_problem`, with a linear reality or without.
+        controller: the controller.
+        judged: numbers of the judged coordinates among the moving plant's states.
+
+    Raises:
+        FpirhcError: see `loop_matrices`.
+    """
     loop = close_loop(linear, controller)
     if loop.memory.size > LARGEST:
         raise NotSupported(f"the loop remembers {loop.memory.size} numbers, more than {LARGEST}")
     names = loop.trace.names
     arriving = loop.trace.slice("arriving" if "arriving" in names else "command")
-    z, w = ca.MX.sym("z", loop.memory.size), ca.MX.sym("w", len(problem.plant.inputs))
+    z, w = ca.MX.sym("z", loop.memory.size), ca.MX.sym("w", len(linear.plant.inputs))
     next_memory, trace = loop.function(z, w)
     results = [ca.jacobian(next_memory, z), ca.jacobian(next_memory, w), ca.jacobian(trace[arriving], z)]
     function = ca.Function("fpirhc_loop_matrices", [z, w], [ca.densify(r) for r in results])
     exact, believed, state = (loop.memory.slice(name) for name in ("_exact", "parameters", "_state_before"))
     rest = _at_rest(loop.function, loop.memory.start())
-    judged = tuple(problem.plant.state.elements.index(c) for c in problem.judged_names)
-    return LoopMatrices(function, rest, exact, believed, state, problem.period, judged)
+    return LoopMatrices(function, rest, exact, believed, state, linear.period, judged)
 
 
-def _linear_problem(problem: Problem, controller: Controller) -> Problem:
+def linear_problem(problem: Problem, controller: Controller) -> Problem:
+    """Return the problem of the linear plants, at rest."""
     plant = linear_plant(problem.plant, -1.0 if controller.deformation.effective_gain() < 0 else 1.0)
     integrator = RungeKutta4() if problem.integrator.opaque else problem.integrator
     return Problem(

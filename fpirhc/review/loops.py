@@ -70,7 +70,7 @@ def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
     if not usable:
         raise NotSupported("the inverse does not exist along the reference")
     places = _thinned(usable, int(_WORK / max(len(matrices.rest), 1) ** 3))
-    gains = dict(zip(places, _gains(grid, plan, [float(grid.times[k]) for k in places], believed), strict=True))
+    gains = dict(zip(places, plan_gains_at(grid, plan, [float(grid.times[k]) for k in places], believed), strict=True))
 
     slopes = response_slopes(plant)
 
@@ -97,7 +97,7 @@ def loops_at(grid: ReviewGrid, controller: Controller, places: Sequence[int]) ->
     problem, plant = grid.problem, grid.problem.plant
     believed = controller.parameters(plant)
     stand_in, plan = linear_stand_in(problem, controller)
-    feedbacks = _gains(grid, plan, [float(grid.times[k]) for k in places], believed)
+    feedbacks = plan_gains_at(grid, plan, [float(grid.times[k]) for k in places], believed)
     matrices, slopes = loop_matrices(problem, stand_in), response_slopes(plant)
     loops = []
     for k, feedback in zip(places, feedbacks, strict=True):
@@ -124,7 +124,7 @@ def ideal_loops(grid: ReviewGrid, controller: Controller, count: int) -> list[tu
     if not usable:
         raise NotSupported("the model's inverse does not exist along the reference")
     places = _thinned(usable, count)
-    feedbacks = _gains(grid, plan, [float(grid.times[k]) for k in places], believed)
+    feedbacks = plan_gains_at(grid, plan, [float(grid.times[k]) for k in places], believed)
     matrices = loop_matrices(problem, without_deformation(stand_in))
     slopes = response_slopes(plant)
     loops = []
@@ -156,7 +156,8 @@ def _thinned(places: list[int], most: int) -> list[int]:
     return [places[int(k)] for k in np.unique(np.linspace(0, len(places) - 1, count).astype(int))]
 
 
-def _gains(grid: ReviewGrid, plan: Planner | None, times: list[float], believed: np.ndarray) -> list[PlanGain]:
+def plan_gains_at(grid: ReviewGrid, plan: Planner | None, times: list[float], believed: np.ndarray) -> list[PlanGain]:
+    """Return the feedback of a plan at some times; no gain without a plan."""
     problem = grid.problem
     if plan is None:
         return [no_gain(problem.plant)] * len(times)

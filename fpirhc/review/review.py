@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import resolved
+from fpirhc.controllers.contract import checked, resolved
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.review.answer import Answer, Review, Verdict
 from fpirhc.review.chatter import chatter_small
@@ -59,7 +59,7 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
     reach = horizon_long_enough(grid)
     more = (question.ask(grid) for question in known_questions(ProblemQuestion))
     general += [answer for answer in (reach, discretisation_follows(grid), *more) if answer is not None]
-    runs = NominalRuns(problem)
+    runs = NominalRuns(grid.problem)
     answers = {name: _of(grid, one, general, runs) for name, one in controllers.items()}
     return Review(tuple(general), answers, mismatch)
 
@@ -73,16 +73,18 @@ def predict(problem: Problem, controller: Controller) -> Answer:
     """
     grid = review_grid(problem, 0.0, 0)
     own = replace(grid, draws=grid.draws[:1])  # the box does not matter
-    ready = resolved(problem, controller)
+    ready = resolved(own.problem, controller)
     general = [well_posed(own), inverse_exists(own), commands_inside(own)]
     loops = loops_along(own, ready)
-    case = Case(own, ready, loops, NominalRuns(problem))
+    case = Case(own, ready, loops, NominalRuns(own.problem))
     suited = [*_speed_and_range(own, ready, loops), *_doubtful(case), free_of_two_cycles(own, ready, loops)]
     return converges(own, ready, loops, _doubts([*general, *suited]))
 
 
 def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: NominalRuns) -> tuple[Answer, ...]:
     try:
+        if grid.real is not None:
+            checked(grid.real, controller)
         ready = resolved(grid.problem, controller)
         ready.check(grid.problem)
     except FpirhcError as error:

@@ -99,7 +99,7 @@ class Sensing(Checked):
         return np.column_stack(columns) if columns else np.zeros((times.size, 0))
 
     def blocks(
-        self, plant: Plant, period: float, start: Array, late: float, true: tuple[Signal, Signal], before: Array
+        self, plant: Plant, period: float, start: Array, late: float, true: tuple[Signal, Signal], resting: Array
     ) -> list[Block]:
         """Blocks from the true state and response to 'state' and 'realised'.
 
@@ -109,10 +109,10 @@ class Sensing(Checked):
             start: first state of the problem, shape (nx,).
             late: dead time of the measurement, cycles.
             true: signals of the true state and response.
-            before: inputs before the first cycle, shape (nu,).
+            resting: response at the start, shape (n,).
         """
         names = self.estimator.measures(plant)
-        first = _start(plant, start, names, before)
+        first = _start(plant, start, names, resting)
         measured = vector("measured", names, [_unit(plant, n) for n in names])
         sensors = self._sensor_block(plant, true, measured, first)
         if not late:
@@ -152,9 +152,8 @@ class Sensing(Checked):
         return Block("sensors", Layout((*true, *drawn)), Layout((measured,)), step, Layout(memory))
 
 
-def _start(plant: Plant, start: Array, names: tuple[str, ...], before: Array) -> Array:
-    """The quantities at the problem's start with the inputs before the first cycle."""
-    response = plant.controlled_response_function(start, before, plant.exact).full().ravel()
+def _start(plant: Plant, start: Array, names: tuple[str, ...], response: Array) -> Array:
+    """The measured quantities at the start."""
     known = dict(zip(plant.state.elements + response_names(plant), np.concatenate([start, response]), strict=True))
     return np.array([known[n] for n in names])
 

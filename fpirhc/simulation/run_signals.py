@@ -8,8 +8,12 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.contraction import contraction_along
+from fpirhc.contraction.identified import identified_factor
+from fpirhc.contraction.sampled import sampled_jacobians
+from fpirhc.contraction.spectrum import factors_along
 from fpirhc.controllers.base import Controller
 from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
+from fpirhc.simulation.loop import REALITY_STATE
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.task.problem import Problem
@@ -25,16 +29,36 @@ def judgements(problem: Problem, controller: Controller, layout: Layout, log: np
         judged.append(_costs(problem, layout, log))
     gain = controller.deformation.effective_gain()
     if gain != 0 and log.shape[0] and controller.response(problem) is None:
-        plant = problem.plant
-        states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]
-        factors = contraction_along(plant, states, deformed, gain, approximate=controller.parameters(plant))
-        judged.append((scalar("contraction"), factors[:, None]))
+        factors = _contraction(problem, controller, layout, log)
+        judged += [(scalar("contraction"), factors[:, None])] if np.isfinite(factors).all() else []
     return judged
+
+
+def _contraction(problem: Problem, controller: Controller, layout: Layout, log: np.ndarray) -> np.ndarray:
+    """Return the factor of every cycle: of the Jacobian at an instant, with a reality of the one over a cycle.
+
+    With a foreign reality it is the factor that the run shows, the same in every cycle, or NaN.
+    """
+    states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]
+    gain, plant = controller.deformation.effective_gain(), controller.model_plant(problem)
+    believed = controller.parameters(plant)
+    if problem.foreign is not None:
+        shown = (
+            np.nan if problem.response_delay else identified_factor(deformed, log[:, layout.slice("realised")], gain)
+        )
+        return np.full(len(log), shown)
+    if problem.symbolic_reality is None:
+        return contraction_along(plant, states, deformed, gain, approximate=believed)
+    real, modelled = log[:, layout.slice(REALITY_STATE)], replace(problem, plant=plant)
+    return factors_along(
+        len(log), lambda rows: sampled_jacobians(modelled, real[rows], states[rows], deformed[rows], believed), gain
+    )
 
 
 def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, np.ndarray]:
     """Return the stage cost of every cycle by term, at the actual state and command, with the exact parameters.
 
+    With a reality it is the model's cost at the states that really were, with the exact values of the model's own parameters.
     The same cost judges all controllers of a problem, whatever their models: effort relative to a feedforward is relative to the
     feedforward of the plant.
     """

@@ -17,7 +17,9 @@ from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_setting
 from fpirhc.describe import describe
 from fpirhc.simulation.changes import Changes, in_force
 from fpirhc.simulation.common_columns import with_common_columns
+from fpirhc.simulation.foreign_run import run_foreign, stopped
 from fpirhc.simulation.loop import close_loop, start_memory
+from fpirhc.simulation.ranges import ranges_of
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.run_signals import judgements
 from fpirhc.symbolic.block import Composite
@@ -91,9 +93,8 @@ class Simulator:
         force = in_force(self.live, self.loop, problem, settings or {}, changes or {})
         problem, controller = force.problem, force.controller
         start = start_memory(self.loop, problem, controller, force.numbers)
-        logged, stop = _run_chunks(
-            problem, start, self.loop.trace, self.evaluator, seed, disturbed, progress, force.patches
-        )
+        common = (problem, start, self.loop.trace, self.evaluator, seed, disturbed, progress)
+        logged, stop = _run_chunks(*common, force.patches) if problem.foreign is None else _run_foreign(*common)
         layout, log = with_common_columns(self.loop.trace, logged)
         log.setflags(write=False)
         step_limit = controller.deformation.largest_step()
@@ -103,7 +104,7 @@ class Simulator:
             "weighs_effort": cost is not None and cost.weighs_effort,
             "step_limit": step_limit if np.isfinite(step_limit) else None,
             "effective_gain": float(controller.deformation.effective_gain()),
-            "parameters": [float(v) for v in controller.parameters(problem.plant)],
+            "parameters": [float(v) for v in controller.parameters(controller.model_plant(problem))],
             "controller": describe(controller),
             "problem": describe(problem),
             "backend": "compiled C" if self.compiled else "CasADi virtual machine",
@@ -111,6 +112,8 @@ class Simulator:
         }
         if force.record:
             facts["live"] = [[time, dict(values)] for time, values in force.record]
+        if problem.reality is not None:
+            facts["model is reality"] = controller.model_plant(problem) is not problem.plant
         title = name or type(self.controller).__name__
         return Run(problem.name, title, seed, problem.period, layout, log, stop, self.compiled, facts)
 
@@ -141,7 +144,9 @@ def simulator(
     settings = live_settings(problem, controller, live)
     ready = settings.controller
     loop = close_loop(problem, ready, settings if live else None)
-    chunked = loop.function.mapaccum(f"{loop.function.name()}_run", CHUNK)
+    chunked = loop.function  # a foreign reality is called in every cycle
+    if problem.foreign is None:
+        chunked = loop.function.mapaccum(f"{loop.function.name()}_run", CHUNK)
     backend = native(chunked, flags, required=bool(live)) if compiled else None
     evaluator = Evaluator(backend.function if backend else chunked)
     reason = backend.reason if backend else SWITCHED_OFF
@@ -162,7 +167,8 @@ def simulate(
 ) -> Run:
     """Run the closed loop of problem and controller and return every signal, also those that judge the run.
 
-    A signal that becomes NaN or infinite ends the run at that cycle. The run keeps its finite part, and `Run.stop` is the reason.
+    A signal that becomes NaN or infinite, or a state that leaves its physical range, ends the run there. The run keeps the cycles
+    before it, and `Run.stop` is the reason.
 
     Args:
         problem: the task.
@@ -238,9 +244,8 @@ def _run_chunks(
 ) -> tuple[np.ndarray, str | None]:
     cycles = problem.cycles
     padded = (-(-cycles // CHUNK) + (1 if patches else 0)) * CHUNK
-    all_tables = float(disturbed) * disturbance_table(problem, seed, padded), sensing_table(problem, seed, padded)
-    tables = [table for table in all_tables if table.shape[1]]
-    log = np.empty((padded, trace.size))
+    tables = _tables(problem, seed, padded, disturbed)
+    log, ranges = np.empty((padded, trace.size)), ranges_of(problem, trace)
     evaluator.arguments[0][:] = start
     for at, end in _pieces(cycles, [cycle for cycle, _, _ in patches]):
         for cycle, places, values in patches:
@@ -257,6 +262,10 @@ def _run_chunks(
         if bad is not None:
             row, column = bad
             return log[: at + row].copy(), _why(trace, at + row, column, problem)
+        outside = ranges.first_outside(rows)
+        if outside is not None:
+            row, what = outside
+            return log[: at + row].copy(), stopped(problem, at + row, what)
         evaluator.arguments[0][:] = evaluator.results[0].reshape(CHUNK, start.size)[end - at - 1]
         if progress:
             progress(at + rows.shape[0], cycles)
@@ -271,6 +280,28 @@ def _pieces(cycles: int, cuts: Sequence[int]) -> list[tuple[int, int]]:
             pieces.append((at, min(at + CHUNK, end)))
             at = pieces[-1][1]
     return pieces
+
+
+def _run_foreign(
+    problem: Problem,
+    start: np.ndarray,
+    trace: Layout,
+    evaluator: Evaluator,
+    seed: int,
+    disturbed: bool,
+    progress: Progress | None,
+) -> tuple[np.ndarray, str | None]:
+    tables = _tables(problem, seed, problem.cycles, disturbed)
+    try:
+        return run_foreign(problem, start, trace, evaluator, seed, tables, progress)
+    except SystemError as error:
+        raise unwrapped(error) from None
+
+
+def _tables(problem: Problem, seed: int, cycles: int, disturbed: bool) -> list[np.ndarray]:
+    """Disturbances and the sensors' random series of every cycle, where there are any."""
+    both = float(disturbed) * disturbance_table(problem, seed, cycles), sensing_table(problem, seed, cycles)
+    return [table for table in both if table.shape[1]]
 
 
 def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:
@@ -305,7 +336,4 @@ def _failed(at: int, problem: Problem, why: str) -> str:
 
 
 def _why(trace: Layout, cycle: int, column: int, problem: Problem) -> str:
-    return (
-        f"signal '{trace.columns[column]}' is not finite at t = {cycle * problem.period:g} {problem.time_unit} (cycle {cycle}); "
-        "the run keeps the cycles before it"
-    )
+    return stopped(problem, cycle, f"signal '{trace.columns[column]}' is not finite")

@@ -102,7 +102,9 @@ class Stepper:
         self.why_failed = ""
         self._ages = max_age is not None
         self._may_fail = self._composite.opaque  # scalar code cannot fail
-        self._bind(backend.function if backend else self._composite.function, ready.parameters(problem.plant))
+        self._bind(
+            backend.function if backend else self._composite.function, ready.parameters(ready.model_plant(problem))
+        )
         self.refused, self.why_refused = 0, ""
         self.numbers: dict[str, float] = self._live.start
         self._force(self.numbers)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import casadi as ca
@@ -23,8 +23,10 @@ from fpirhc.summary import line
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.disturbance import Disturbance
+from fpirhc.task.foreign import Foreign
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem_view import problem_facts, problem_table
+from fpirhc.task.reality import Reality
 from fpirhc.task.reference import Reference
 
 MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
@@ -52,6 +54,8 @@ class Problem(Checked):
             else zero, moved into its limits.
         measure_from: time from which metrics count; the transient before it is left out.
         judged: coordinates whose errors are logged and measured; None: the controlled ones.
+        reality: what a run moves, where it is not `plant` with its exact parameters: another plant (`Reality`), or an object
+            outside (`Foreign`). `plant` is then the model alone.
         name: of the problem in results; the problem of a file has the name of the file.
 
     Raises:
@@ -73,6 +77,7 @@ class Problem(Checked):
     measure_from: float = 0.0
     judged: Sequence[str] | None = None
     input_before: Mapping[str, float] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
+    reality: Reality | Foreign | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
     name: str = field(default="", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
@@ -82,7 +87,8 @@ class Problem(Checked):
         plant = self.plant
         _check_input_before(self, mistakes)
         mistakes.unknown("judged: coordinate", self.judged or (), plant.coordinates)
-        mistakes.unknown("disturbances: input or coordinate", self.disturbances, [*plant.inputs, *plant.coordinates])
+        disturbed = [*plant.inputs, *(() if self.foreign else self.real_plant.coordinates)]
+        mistakes.unknown("disturbances: input or coordinate", self.disturbances, disturbed)
         instants, random = np.array([0.0, self.period]), np.random.default_rng(0)
         checks = (
             *((lambda one=one: one.values(instants, random)) for one in self.disturbances.values()),
@@ -90,6 +96,8 @@ class Problem(Checked):
             lambda: self.reference.function(plant),
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant),
+            lambda: self.symbolic_reality.check(plant) if self.symbolic_reality else None,
+            lambda: self.foreign.check(plant, self.sensing.estimator.measures(plant)) if self.foreign else None,
         )
         for check in checks:
             try:
@@ -100,6 +108,8 @@ class Problem(Checked):
         check_stage(plant, self.cost, self.limits, mistakes)
         _check_inverse(self, mistakes)
         mistakes.raise_if_any()
+        if self.symbolic_reality is not None:
+            self.symbolic_reality.check_motion(self.real_start, self.inputs_before, self.real_integrator, self.period)
 
     def __repr__(self) -> str:
         return line(self, *problem_facts(self))
@@ -131,7 +141,51 @@ class Problem(Checked):
     @property
     def sees_plant(self) -> bool:
         """Whether a controller receives the plant's own state and response, unchanged and without delay."""
-        return not self.dead_time.measurement and self.sensing.ideal
+        return (
+            not self.dead_time.measurement
+            and self.sensing.ideal
+            and not (self.symbolic_reality and self.symbolic_reality.seen)
+        )
+
+    @property
+    def symbolic_reality(self) -> Reality | None:
+        """The reality where it is a plant."""
+        return self.reality.symbolic if self.reality is not None else None
+
+    @property
+    def foreign(self) -> Foreign | None:
+        """The reality where it is an object outside."""
+        return self.reality.foreign if self.reality is not None else None
+
+    @property
+    def real_plant(self) -> Plant:
+        """The plant that a run moves, with its exact parameters: the reality's, or the model's own."""
+        return self.plant if self.symbolic_reality is None else self.symbolic_reality.plant
+
+    @property
+    def of_model(self) -> Problem:
+        """The problem without its reality: the model's own plant moves, and disturbances of what it does not have are left out."""
+        if self.reality is None:
+            return self
+        known = {*self.plant.inputs, *self.plant.coordinates}
+        disturbances = {name: one for name, one in self.disturbances.items() if name in known}
+        return replace(self, reality=None, disturbances=disturbances)
+
+    @property
+    def real_integrator(self) -> Integrator:
+        """Integrator of the plant that a run moves."""
+        return (self.symbolic_reality.integrator if self.symbolic_reality else None) or self.integrator
+
+    @cached_property
+    def real_start(self) -> np.ndarray:
+        """First state of the plant that a run moves.
+
+        Raises:
+            InvalidProblem: a reality whose own states neither are given nor settle.
+        """
+        if self.symbolic_reality is None:
+            return self.start_state
+        return self.symbolic_reality.start_state(self.plant, self.start_state, self.inputs_before)
 
     @cached_property
     def start_state(self) -> np.ndarray:
@@ -209,6 +263,10 @@ def _check_start(problem: Problem, mistakes: Mistakes) -> None:
     for name, value in problem.start.items():
         if not isinstance(value, int | float) or not math.isfinite(value):
             mistakes.add(f"start: '{name}' must be a finite number, got {value!r}")
+            continue
+        low, high = plant.ranges.get(name, (-math.inf, math.inf))
+        if not low <= value <= high:
+            mistakes.add(f"start: '{name}' is {value:g}, outside its physical range of {low:g} to {high:g}")
 
 
 def _check_input_before(problem: Problem, mistakes: Mistakes) -> None:
@@ -231,7 +289,8 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
     response = plant.controlled_response_function(x, u, p)
     gain_of = ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response])
     state = ", ".join(f"{e} = {v:g}" for e, v in zip(plant.state.elements, problem.start_state, strict=True))
-    for which, values in (("approximate", plant.approximate), ("exact", plant.exact)):
+    exact = () if problem.reality else (("exact", plant.exact),)  # with a reality these values move nothing
+    for which, values in (("approximate", plant.approximate), *exact):
         gain, free = (np.asarray(m.full()) for m in gain_of(problem.start_state, problem.inputs_before, values))
         if not np.all(np.isfinite(free)):
             name = plant.controlled_names[int(np.argmin(np.isfinite(free).ravel()))]

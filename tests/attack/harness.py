@@ -71,7 +71,7 @@ class Bench:
         self.stepper = fp.Stepper(problem, controller, compiled=False)
         self.limits = problem.limits.input_bounds(plant)
         self._advance = problem.integrator.step(plant, problem.period)
-        response = checked(problem, controller).response(problem) or _own_response(plant)
+        response = checked(problem, controller).response(problem) or _own_response(problem, seen=False)
         self._response = response.function
         self._calm = np.zeros(len(plant.names))
         self.lost = False  # whether the plant itself left its domain, such as a tank below its bottom

@@ -8,6 +8,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.deformation.base import Deformation
+from fpirhc.errors import NotSupported
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.task.problem import Problem
@@ -15,10 +16,13 @@ from fpirhc.task.problem import Problem
 
 @dataclass(frozen=True)
 class ExactModel(Controller):
-    """The wrapped controller with the plant's exact parameters in its model.
+    """The wrapped controller with the exact model: the plant's exact parameters, or the reality where the problem has one.
 
     Args:
         controller: any controller that uses its model.
+
+    Raises:
+        NotSupported: a foreign reality, or one whose coordinates or orders are not the model's.
     """
 
     controller: Controller
@@ -35,8 +39,17 @@ class ExactModel(Controller):
 
     def inner_problem(self, problem: Problem) -> Problem:
         """Return the problem with the exact parameters as approximate ones, so that work before a run uses them too."""
-        exact = {name: replace(p, approximate=p.exact) for name, p in problem.plant.parameters.items()}
-        return replace(problem, plant=replace(problem.plant, parameters=exact))
+        plant = self.model_plant(problem)
+        exact = {name: replace(p, approximate=p.exact) for name, p in plant.parameters.items()}
+        return replace(problem, plant=replace(plant, parameters=exact), reality=None)
+
+    def model_plant(self, problem: Problem) -> Plant:
+        """Return the plant that a run moves."""
+        if problem.foreign is not None:
+            raise NotSupported("a foreign reality has no equations that could be the exact model; leave ExactModel out")
+        if problem.symbolic_reality is not None:
+            problem.symbolic_reality.check_as_model(problem.plant)
+        return problem.real_plant
 
     def linear_around(self, inner: Controller) -> Controller:
         """Return the inner controller: `parameters` already gives the exact ones."""

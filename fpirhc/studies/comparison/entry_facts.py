@@ -40,10 +40,10 @@ def plan_every(problem: Problem, controller: Controller) -> int:
 
 def has_exact_model(problem: Problem, controller: Controller) -> bool:
     """Whether it is the bound of a controller with a wrong model: exact parameters, nothing adapted, nothing learned."""
-    plant, parameters = problem.plant, controller.parameters(problem.plant)
-    wrong = not np.array_equal(plant.approximate, plant.exact)
+    plant, real = controller.model_plant(problem), problem.real_plant
+    wrong = problem.reality is not None or not np.array_equal(plant.approximate, plant.exact)
     fixed = not controller.deformation.adapts and not controller.learns
-    return bool(wrong and fixed and np.array_equal(parameters, plant.exact))
+    return bool(wrong and fixed and plant is real and np.array_equal(controller.parameters(plant), real.exact))
 
 
 def no_bound_because(

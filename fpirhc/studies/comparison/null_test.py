@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from fpirhc.simulation.metrics.window import by_name
-from fpirhc.simulation.simulate import Simulator
+from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.studies.comparison.changes import ROUNDING, Change, major, outcome_of
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.task.problem import Problem
@@ -81,7 +81,10 @@ def null_test(
         seed: of the sensors' noise.
     """
     begin = time.perf_counter()
-    null = _null_problem(problem)
+    null = _null_problem(problem.of_model)
+    if problem.reality is not None:  # the loops of the comparison move the reality
+        without, adapting = (simulator(problem.of_model, one.controller, compiled=one.compiled) for one in loops)
+        loops = without, adapting
     before, after = (_errors(loop, null, seed) for loop in loops)
     changes = {n: Change(n, before[n], after[n], scales.get(n, 1.0)) for n in before if weighed is None or n in weighed}
     outcome = _outcome(changes)

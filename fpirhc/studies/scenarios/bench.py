@@ -88,7 +88,7 @@ class Bench:
     """
 
     def __init__(self, task: Task, conditions: Conditions, live: Mapping[str, Sequence[str]] | None = None) -> None:
-        exact_ranges(task.problem.plant, conditions.percent)
+        exact_ranges(task.problem.real_plant, conditions.percent)
         self._live = live or {}
         self._task, self._conditions = task, conditions
         self._ranges = ranges(task.problem)
@@ -124,7 +124,12 @@ class Bench:
         if self._drawn is None or self._drawn[0] != number:
             conditions, problem = self._conditions, self._task.problem
             scenario = draw(
-                problem.plant, seed=conditions.seed, use=conditions.use, number=number, percent=conditions.percent
+                problem.real_plant,
+                seed=conditions.seed,
+                use=conditions.use,
+                number=number,
+                percent=conditions.percent,
+                model=problem.plant,
             )
             self._drawn = (number, scenario, with_exact(problem, scenario.exact))
         return self._drawn[1:]

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fpirhc.errors import NotSupported
 from fpirhc.plant.mismatch import drawn
 from fpirhc.plant.plant import Plant
 from fpirhc.task.problem import Problem
@@ -34,21 +35,29 @@ class Scenario:
     mismatch: float
 
 
-def draw(plant: Plant, *, seed: int, use: int, number: int, percent: float) -> Scenario:
+def draw(plant: Plant, *, seed: int, use: int, number: int, percent: float, model: Plant | None = None) -> Scenario:
     """Return a scenario; its exact parameters lie in `exact_ranges(plant, percent)`.
 
     Args:
-        plant: the plant.
+        plant: the plant that a run moves.
         seed: seed of the study.
         use: `COMPARING` or `TUNING`.
         number: number of the scenario.
         percent: range of the exact parameters, percent.
+        model: the controllers' model, where it is another plant. The mismatch is then that of the parameters which both have.
     """
     parameters, noise = np.random.SeedSequence(seed, spawn_key=(use, number)).spawn(2)
     shares = np.random.default_rng(parameters).random(plant.exact.size)
     values = [drawn(p, percent, float(s)) for p, s in zip(plant.parameters.values(), shares, strict=True)]
     exact = np.array(values, dtype=float)
-    return Scenario(int(noise.generate_state(1)[0]), exact, mismatch_of(plant.approximate, exact))
+    believed = _believed(model or plant)
+    shared = [k for k, name in enumerate(plant.parameters) if name in believed]
+    assumed = np.array([believed[name] for name in plant.parameters if name in believed])
+    return Scenario(int(noise.generate_state(1)[0]), exact, mismatch_of(assumed, exact[shared]))
+
+
+def _believed(model: Plant) -> dict[str, float]:
+    return dict(zip(model.parameters, model.approximate, strict=True))
 
 
 def mismatch_of(approximate: np.ndarray, exact: np.ndarray) -> float:
@@ -59,9 +68,16 @@ def mismatch_of(approximate: np.ndarray, exact: np.ndarray) -> float:
 
 
 def with_exact(problem: Problem, exact: np.ndarray) -> Problem:
-    """Return the problem with other exact parameters, shape (np,).
+    """Return the problem with other exact parameters, shape (np,): those of the reality where it has one.
 
     Raises:
         InvalidProblem: the plant is not invertible at the start with them, or one of them leaves its bounds.
+        NotSupported: a foreign reality, whose parameters nobody can set.
     """
+    if problem.foreign is not None:
+        raise NotSupported(
+            "a foreign reality has no exact parameters that a study could draw; compare without scenarios"
+        )
+    if problem.symbolic_reality is not None:
+        return replace(problem, reality=problem.symbolic_reality.with_exact(exact))
     return replace(problem, plant=problem.plant.with_exact(exact))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from fpirhc.contraction import Spectrum, identified_factor, predicted_factor, spectrum_over_run
+from fpirhc.contraction.sampled import sampled_jacobians
 from fpirhc.simulation.metrics.base import Metric
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
@@ -14,8 +17,8 @@ _SAMPLES = 200  # cycles of a run whose eigenvalues are computed
 
 
 def predicted(problem: Problem, run: Run) -> float | None:
-    """Return the largest max|1 - a lambda| at sampled states of the run; see `fpirhc.contraction`."""
-    if not _adapts(run):
+    """Return the largest max|1 - a lambda| at sampled states of the run; None for a foreign reality. See `fpirhc.contraction`."""
+    if not _adapts(run) or problem.foreign is not None:
         return None
     return predicted_factor(sampled_spectrum(problem, run).eigenvalues, _gain(run))
 
@@ -34,10 +37,20 @@ def _gain(run: Run) -> float:
 
 
 def sampled_spectrum(problem: Problem, run: Run) -> Spectrum:
-    """Return the eigenvalues of the response Jacobian at sampled cycles of a run, with the parameters of its controller's model."""
+    """Return the eigenvalues of the response Jacobian at sampled cycles of a run, with the parameters of its controller's model.
+
+    With a reality that is a plant they are those over a whole cycle.
+
+    Raises:
+        InvalidValue: no eigenvalue is finite.
+    """
     rows = np.unique(np.linspace(1, run.cycles - 1, _SAMPLES).astype(int))
-    approximate = np.array(run.settings["parameters"])
-    return spectrum_over_run(problem.plant, run["state"][rows], run["deformed"][rows], approximate=approximate)
+    approximate, states, deformed = np.array(run.settings["parameters"]), run["state"][rows], run["deformed"][rows]
+    if problem.symbolic_reality is None:
+        return spectrum_over_run(problem.plant, states, deformed, approximate=approximate)
+    modelled = replace(problem, plant=problem.real_plant) if run.settings["model is reality"] else problem
+    jacobians = sampled_jacobians(modelled, run["reality_state"][rows], states, deformed, approximate)
+    return Spectrum(np.linalg.eigvals(jacobians[np.isfinite(jacobians).all(axis=(1, 2))]))
 
 
 def _adapts(run: Run) -> bool:

@@ -1,0 +1,61 @@
+"""Eigenvalues of the response Jacobian of a reality: what a request of this cycle has done to the response at the end of it.
+
+The response of a reality with a lag does not see the command at once, so its derivative at an instant is zero. Between two
+measurements, the command held, it is
+
+    J = dy^(r)(x(t + T; u), u)/du  du/dr,        u = inverse(state, request; approximate),
+
+differentiated through the integrator of the run. Without a lag and for short periods it is the Jacobian at an instant.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.symbolic.expression import kind
+from fpirhc.task.problem import Problem
+
+Array: TypeAlias = np.ndarray
+
+
+def sampled_jacobian(problem: Problem) -> ca.Function:
+    """Return the Function (reality's state, model's state, request, reality's parameters, model's parameters) -> J (n, n).
+
+    Raises:
+        NotInvertible: the inputs and the controlled coordinates differ in number.
+    """
+    model, plant, reality = problem.plant, problem.real_plant, problem.symbolic_reality
+    matrix = kind(model.inverse_opaque or problem.real_integrator.opaque)
+    x, state = matrix.sym("x", plant.state.size), matrix.sym("state", model.state.size)
+    r, u = matrix.sym("r", len(model.controlled_names)), matrix.sym("u", model.input.size)
+    exact, assumed = matrix.sym("exact", len(plant.parameters)), matrix.sym("assumed", len(model.parameters))
+    calm = ca.DM.zeros(len(plant.names))
+    after = problem.real_integrator.step(plant, problem.period)(x, u, exact, calm)
+    respond = reality.response_function(model, seen=True) if reality is not None else None
+    response = respond(after, u, exact, calm) if respond else model.controlled_response_function(after, u, exact)
+    gain = ca.Function("fpirhc_sampled_gain", [x, u, exact], [ca.densify(ca.jacobian(response, u))])
+    command = model.inverse_function(state, r, assumed)
+    jacobian = gain(x, command, exact) @ ca.jacobian(command, r)
+    names = ["reality", "state", "deformed", "exact", "approximate"]
+    arguments = [x, state, r, exact, assumed]
+    return ca.Function("fpirhc_sampled_jacobian", arguments, [ca.densify(jacobian)], names, ["jacobian"])
+
+
+def sampled_jacobians(problem: Problem, real: Array, states: Array, deformed: Array, believed: Array) -> Array:
+    """Return J of every row with the exact parameters of the reality, shape (rows, n, n).
+
+    Args:
+        problem: with a reality.
+        real: states of the reality, shape (rows, its nx).
+        states: states of the model, shape (rows, nx).
+        deformed: requests, shape (rows, n).
+        believed: parameters of the model, shape (np,).
+    """
+    count, n = len(real), deformed.shape[1]
+    exact = np.repeat(problem.real_plant.exact[:, None], count, axis=1)
+    assumed = np.repeat(np.asarray(believed, dtype=float)[:, None], count, axis=1)
+    stacked = sampled_jacobian(problem).map(count)(real.T, states.T, deformed.T, exact, assumed)
+    return np.asarray(stacked.full()).reshape((n, count, n)).transpose(1, 0, 2)

@@ -1,0 +1,54 @@
+"""Derivatives of a plant's coordinates as functions of its state: the Lie derivatives y, y', y'', ... along its motion.
+
+    y_0 = the coordinate,        y_{k+1} = dy_k/dx x'(x, u, p, w),
+
+with the input u and the forcing w held, as they are over a control cycle. A derivative that is a state or a response of the
+plant is that entry itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.layout import Expression
+
+
+def derivatives_function(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.Function:
+    """Return the Function (state, input, parameters, forcing) -> the wanted derivatives, in their order.
+
+    Args:
+        plant: the plant.
+        wanted: (coordinate, number of the derivative) of every entry.
+    """
+    x, u, p = plant.symbols()
+    w = ca.SX.sym("w", len(plant.names))
+    most = {name: max(k for n, k in wanted if n == name) for name, _ in wanted}
+    chains = {name: _chain(plant, name, count, (x, u, p, w)) for name, count in most.items()}
+    column = ca.vertcat(*(chains[name][k] for name, k in wanted))
+    return ca.Function("fpirhc_derivatives", [x, u, p, w], [ca.densify(column)])
+
+
+def input_reaches_at(plant: Plant, name: str, count: int) -> int | None:
+    """Return the first derivative of a coordinate that depends on an input at once; None where none up to `count` does."""
+    x, u, p = plant.symbols()
+    chain = _chain(plant, name, count, (x, u, p, ca.SX.sym("w", len(plant.names))))
+    return next((k for k, y in enumerate(chain) if ca.depends_on(y, u)), None)
+
+
+def _chain(plant: Plant, name: str, count: int, symbols: tuple[ca.SX, ...]) -> list[Expression]:
+    """The coordinate and its first `count` derivatives."""
+    x, u, p, w = symbols
+    elements, place = plant.state.elements, plant.names.index(name)
+    rate = plant.forced_derivative_function(x, u, p, w)
+    chain: list[Expression] = []
+    for k in range(count + 1):
+        if k < plant.orders[place]:
+            chain.append(x[elements.index(name + "'" * k)])
+        elif k == plant.orders[place]:
+            chain.append(plant.response_function(x, u, p)[place] + w[place])
+        else:
+            chain.append(ca.jtimes(chain[-1], x, rate))
+    return chain

@@ -1,0 +1,73 @@
+"""A run with a foreign reality: cycle by cycle, one call of the compiled step and one of the object outside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from fpirhc.simulation.ranges import ranges_of
+from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.layout import Layout
+from fpirhc.task.problem import Problem
+
+
+def run_foreign(
+    problem: Problem,
+    start: np.ndarray,
+    trace: Layout,
+    evaluator: Evaluator,
+    seed: int,
+    tables: Sequence[np.ndarray],
+    progress: Callable[[int, int], None] | None,
+) -> tuple[np.ndarray, str | None]:
+    """Return the log, shape (cycles, trace.size), and the reason why the run ended early.
+
+    Args:
+        problem: with a foreign reality.
+        start: first memory of the loop.
+        trace: layout of the log.
+        evaluator: of one cycle of the loop.
+        seed: with which the reality is reset.
+        tables: disturbances and the sensors' random series, one row per cycle.
+        progress: called with (cycles done, cycles in all).
+
+    Raises:
+        InvalidProblem: a bad first answer.
+    """
+    foreign, cycles = problem.foreign, problem.cycles
+    assert foreign is not None
+    memory, *given = evaluator.arguments
+    *random, answer, held = given
+    log, ranges, bridged = np.empty((cycles, trace.size)), ranges_of(problem, trace), 0
+    memory[:], held[0] = start, 0.0
+    answer[:] = foreign.first(seed)
+    for k in range(cycles):
+        for argument, table in zip(random, tables, strict=True):
+            argument[:] = table[k]
+        evaluator.evaluate()
+        memory_next, row, sent = evaluator.results
+        if not np.isfinite(row).all():
+            column = trace.columns[int(np.argmin(np.isfinite(row)))]
+            return log[:k], stopped(problem, k, f"signal '{column}' is not finite")
+        outside = ranges.first_outside(row[None, :])
+        if outside is not None:
+            return log[:k], stopped(problem, k, outside[1])
+        log[k] = row
+        memory[:] = memory_next
+        reading = foreign.read(k * problem.period, sent.copy())
+        bridged = 0 if reading.values is not None else bridged + 1
+        if bridged > foreign.holds and k + 1 < cycles:
+            return log[: k + 1], stopped(problem, k + 1, reading.mistake)
+        held[0] = float(reading.values is None)
+        if reading.values is not None:
+            answer[:] = reading.values
+        if progress:
+            progress(k + 1, cycles)
+    return log, None
+
+
+def stopped(problem: Problem, cycle: int, what: str) -> str:
+    """Return the reason why a run ended before this cycle."""
+    when = f"at t = {cycle * problem.period:g} {problem.time_unit} (cycle {cycle})"
+    return f"{what} {when}; the run keeps the cycles before it"

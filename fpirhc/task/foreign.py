@@ -1,0 +1,148 @@
+"""A foreign reality: hardware, another simulator, a physics engine. The loop is the same, its plant is an object outside.
+
+    measurements = body.reset(seed)                    at the start
+    measurements = body.step(time, command)            in every cycle: apply the command for one period, then measure
+
+The measurements are quantities of the model, in the order that `Foreign(measures=...)` says. A bad answer - an exception, another
+shape, a number that is not finite, an answer after the deadline - is held or ends the run. Nothing before it is lost.
+"""
+
+from __future__ import annotations
+
+import time as wall
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import CountOrZero
+from fpirhc.plant.plant import Plant
+
+
+class Body(Protocol):
+    """What a foreign reality must be able to do."""
+
+    def reset(self, seed: int) -> npt.ArrayLike:
+        """Go to the start of the problem and return the first measurements."""
+
+    def step(self, time: float, command: np.ndarray) -> npt.ArrayLike:
+        """Hold the command from `time` on for one period, and return the measurements at its end."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One answer of a body.
+
+    Args:
+        values: shape (number of quantities,); None where the answer is bad.
+        mistake: why it is bad; empty where it is not.
+    """
+
+    values: np.ndarray | None
+    mistake: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Foreign(Checked):
+    """A reality outside: `Problem(reality=Foreign(body, measures=...))`.
+
+    Args:
+        body: object with `reset(seed)` and `step(time, command)`, see `Body`.
+        measures: name -> unit of every measured quantity, in the order of its answers: elements of the model's state ("q1", "q1'"),
+            and, where the response is measured, highest derivatives of controlled coordinates ("q1''").
+        holds: consecutive bad answers that are bridged with the last good one; the next one ends the run. 0: the first ends it.
+        deadline: longest wall time of an answer, s; a later one is bad. None: the body may take its time, as a simulator does.
+        clock: function that returns the wall time, s.
+
+    Raises:
+        InvalidField: all wrong arguments together. `Problem` checks the quantities against the model and its sensing.
+    """
+
+    body: Body
+    measures: Mapping[str, str]
+    holds: CountOrZero = 0
+    deadline: float | None = None
+    clock: Callable[[], float] = field(default=wall.perf_counter, metadata={"setting": False})
+
+    def __post_init__(self) -> None:
+        for name in ("reset", "step"):
+            if not callable(getattr(self.body, name, None)):
+                raise InvalidValue(
+                    f"Foreign: its body {type(self.body).__name__} has no method {name}(...); it needs reset and step"
+                )
+
+    @property
+    def symbolic(self) -> None:
+        """No plant: nothing is known of it but its answers."""
+
+    @property
+    def foreign(self) -> Foreign:
+        """Itself."""
+        return self
+
+    def check(self, model: Plant, needed: tuple[str, ...]) -> None:
+        """Raise if it does not measure what the model's sensing needs.
+
+        Args:
+            model: the model.
+            needed: names of the quantities that sensors and estimator use.
+
+        Raises:
+            InvalidProblem: all mistakes together.
+        """
+        mistakes = Mistakes("reality")
+        units = quantities(model)
+        mistakes.unknown("measures: quantity", self.measures, units)
+        for name in needed:
+            if name not in self.measures:
+                mistakes.add(
+                    f"it does not measure {name} ({units[name]}), which the sensing of the problem needs; add it to measures, or "
+                    "choose an estimator that does without: Sensing(estimator=...)"
+                )
+        for name, unit in self.measures.items():
+            if units.get(name, unit) != unit:
+                mistakes.add(f"it measures {name} in {unit}, the model has it in {units[name]}; write both in one unit")
+        mistakes.raise_if_any()
+
+    def first(self, seed: int) -> np.ndarray:
+        """Return the first measurements.
+
+        Raises:
+            InvalidProblem: a bad answer.
+        """
+        reading = self._answer(lambda: self.body.reset(seed), "reset", timed=False)
+        if reading.values is None:
+            raise InvalidProblem(f"reality: {reading.mistake}")
+        return reading.values
+
+    def read(self, time: float, command: np.ndarray) -> Reading:
+        """Return the answer to a command."""
+        return self._answer(lambda: self.body.step(time, command), "step", timed=True)
+
+    def _answer(self, ask: Callable[[], npt.ArrayLike], method: str, *, timed: bool) -> Reading:
+        who, begin = f"{method} of {type(self.body).__name__}", self.clock()
+        try:
+            answer = np.asarray(ask(), dtype=float)
+        except Exception as error:  # noqa: BLE001  # whatever a stranger's object raises is a bad answer, which has a policy
+            return Reading(None, f"{who} raised {type(error).__name__}: {error}")
+        elapsed = self.clock() - begin
+        if answer.shape != (len(self.measures),):
+            expected = f"({len(self.measures)},) for {', '.join(self.measures)}"
+            return Reading(None, f"{who} returned the shape {answer.shape}, expected {expected}")
+        if not np.isfinite(answer).all():
+            place = int(np.argmin(np.isfinite(answer)))
+            return Reading(None, f"{who} returned {list(self.measures)[place]} = {answer[place]}")
+        if timed and self.deadline is not None and elapsed > self.deadline:
+            return Reading(None, f"{who} took {elapsed:.3g} s, and its deadline is {self.deadline:.3g} s")
+        return Reading(answer)
+
+
+def quantities(model: Plant) -> dict[str, str]:
+    """Return the unit of every quantity of a model that can be measured: state elements and controlled responses."""
+    states = dict(zip(model.state.elements, model.state.entry_units, strict=True))
+    responses = {model.names[k] + "'" * model.orders[k]: model.response_units[k] for k in model.controlled_indices}
+    return {**states, **responses}

@@ -1,0 +1,234 @@
+"""A reality that is not the model: another plant, with states of its own, moves in a run, and the controller keeps its model.
+
+    command -> reality x' = f(x, u, p) -> its coordinates of the model's names, with their derivatives -> sensing -> controller
+
+The derivatives that the controller is given are those of the moving plant (Lie derivatives), up to the model's relative order. What
+the model does not know - an actuator's lag, a motor behind a spring, bristles - are further coordinates of the reality.
+
+With a reality, "exact" means its parameters: studies draw them, their bounds and spreads count, and `ExactModel` takes the reality
+itself as its model. The exact values of the model's own parameters move nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
+from fpirhc.fields.checked import Checked
+from fpirhc.plant.chain import derivatives_function, input_reaches_at
+from fpirhc.plant.integrators import Integrator
+from fpirhc.plant.plant import Plant
+from fpirhc.plant.settling import settled
+from fpirhc.plant.stiffness import stiffness
+from fpirhc.plant.structural_order import structural_order
+
+
+@dataclass(frozen=True, eq=False)
+class Reality(Checked):
+    """The plant that a run moves, where it is not the model's.
+
+    Args:
+        plant: with the model's inputs, and a coordinate of the same name and unit for every coordinate of the model. Its exact
+            parameters act; the approximate ones are not used, unless it is the model of an `ExactModel`.
+        start: first values of states that the model does not have. Those that are not named settle: their rates are zero while
+            the model's states and the inputs before the first cycle are held.
+        integrator: of its motion; None: the problem's.
+        seen: coordinate of the model -> coordinate of the reality that is measured in its place, such as the output of a slow
+            sensor. Errors are judged at the coordinate of the same name where there is one.
+
+    Raises:
+        InvalidField: all wrong arguments together. `Problem` checks the reality against the model.
+    """
+
+    plant: Plant
+    start: Mapping[str, float] = field(default_factory=dict)
+    integrator: Integrator | None = None
+    seen: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def symbolic(self) -> Reality:
+        """Itself: a plant whose equations are known."""
+        return self
+
+    @property
+    def foreign(self) -> None:
+        """No object outside."""
+
+    def with_exact(self, exact: np.ndarray) -> Reality:
+        """Return the reality with other exact parameters, shape (np,).
+
+        Raises:
+            InvalidProblem: see `Plant.with_exact`.
+        """
+        return replace(self, plant=self.plant.with_exact(exact))
+
+    def check(self, model: Plant) -> None:
+        """Raise if the reality cannot stand for what the model describes.
+
+        Raises:
+            InvalidProblem: all mistakes together.
+        """
+        mistakes = Mistakes("reality")
+        _check_inputs(self.plant, model, mistakes)
+        mistakes.unknown("seen: coordinate of the model", self.seen, model.coordinates)
+        mistakes.unknown("seen: coordinate of the reality", self.seen.values(), self.plant.coordinates)
+        mistakes.unknown("start: state", self.start, self.plant.state.elements)
+        for name, value in self.start.items():
+            if not math.isfinite(value):
+                mistakes.add(f"start: '{name}' must be a finite number, got {value!r}")
+        if self.plant.time_unit != model.time_unit:
+            mistakes.add(
+                f"its time is in {self.plant.time_unit}, the model's in {model.time_unit}; write both in one unit"
+            )
+        for name, unit in model.coordinates.items():
+            _check_output(self, model, name, unit, mistakes)
+        mistakes.raise_if_any()
+
+    def state_function(self, model: Plant, *, seen: bool) -> ca.Function:
+        """Function (state, input, parameters, forcing) of the reality -> state in the model's coordinates, shape (nx,).
+
+        Args:
+            model: whose state is wanted.
+            seen: whether it is the measured one; else the judged one.
+        """
+        names = dict(zip(model.names, self._names(model, seen=seen), strict=True))
+        wanted = [(names[e.rstrip("'")], e.count("'")) for e in model.state.elements]
+        return derivatives_function(self.plant, wanted)
+
+    def response_function(self, model: Plant, *, seen: bool) -> ca.Function:
+        """Function (state, input, parameters, forcing) of the reality -> the model's controlled responses."""
+        names = self._names(model, seen=seen)
+        return derivatives_function(self.plant, [(names[k], model.orders[k]) for k in model.controlled_indices])
+
+    def start_state(self, model: Plant, start: np.ndarray, command: np.ndarray) -> np.ndarray:
+        """Return the first state of the reality, shape (its nx,).
+
+        Args:
+            model: of the problem.
+            start: first state of the model, shape (nx,).
+            command: inputs before the first cycle, shape (nu,).
+
+        Raises:
+            InvalidProblem: states that are not named in `start` and have no equilibrium.
+        """
+        elements = self.plant.state.elements
+        shared = {elements[there]: start[own] for own, there in self.shared(model).items()}
+        known = {**shared, **self.start}
+        first = np.array([float(known.get(e, 0.0)) for e in elements])
+        free = [k for k, e in enumerate(elements) if e not in known]
+        at_rest = settled(self.plant, first, command, self.plant.exact, free) if free else first
+        if at_rest is None:
+            missing = ", ".join(elements[k] for k in free)
+            raise InvalidProblem(
+                f"reality: its states {missing} have no equilibrium at the start of the model; give their first values: "
+                f"Reality(start={{'{elements[free[0]]}': ...}})"
+            )
+        return at_rest
+
+    def shared(self, model: Plant) -> dict[int, int]:
+        """Return the places of the states that both have: place in the model's state -> place in its own."""
+        elements, places = self.plant.state.elements, {}
+        for k, e in enumerate(model.state.elements):
+            own = self.true_name(e.rstrip("'")) + "'" * e.count("'")
+            if own in elements:
+                places[k] = elements.index(own)
+        return places
+
+    def true_name(self, coordinate: str) -> str:
+        """Return its coordinate at which a coordinate of the model is judged."""
+        return coordinate if coordinate in self.plant.coordinates else self.seen.get(coordinate, coordinate)
+
+    def check_motion(self, start: np.ndarray, command: np.ndarray, integrator: Integrator, period: float) -> None:
+        """Raise if the reality cannot move from its start, or the integrator cannot follow it there.
+
+        Args:
+            start: first state, shape (nx,).
+            command: inputs before the first cycle, shape (nu,).
+            integrator: of the motion.
+            period: of the control cycle.
+
+        Raises:
+            InvalidProblem: with the fastest pole, and the sub-steps that would do.
+        """
+        plant = self.plant
+        rates = np.asarray(plant.derivative_function(start, command, plant.exact).full()).ravel()
+        if not np.isfinite(rates).all():
+            wrong = plant.state.elements[int(np.argmin(np.isfinite(rates)))]
+            raise InvalidProblem(f"reality: the rate of its state '{wrong}' is not finite at the start")
+        stiff = stiffness(plant, integrator, period, start, command, plant.exact)
+        if stiff:
+            raise InvalidProblem(f"reality: {stiff}")
+
+    def check_as_model(self, model: Plant) -> None:
+        """Raise if a controller of the model cannot have this reality as its model: both need the same coordinates and orders.
+
+        Raises:
+            NotSupported: with what differs.
+        """
+        plant = self.plant
+        differences = [
+            f"the coordinate {c}, which the controller is not given" for c in plant.names if c not in model.names
+        ]
+        differences += [
+            f"the order {plant.orders[plant.names.index(c)]} of {c} in place of {order}"
+            for c, order in zip(model.names, model.orders, strict=True)
+            if c in plant.names and plant.orders[plant.names.index(c)] != order
+        ]
+        differences += [f"{own} measured in place of {c}" for c, own in self.seen.items()]
+        if not differences and plant.names != model.names:
+            differences = ["its coordinates in another order"]
+        if not differences and (plant.controlled or plant.names) != model.controlled_names:
+            differences = [
+                f"other controlled coordinates (write controlled={model.controlled_names!r} in its plant too)"
+            ]
+        if differences:
+            raise NotSupported(
+                f"the reality has {'; '.join(differences)}: it cannot be the exact model of this controller; leave ExactModel out"
+            )
+
+    def _names(self, model: Plant, *, seen: bool) -> tuple[str, ...]:
+        """The reality's coordinate for each of the model's."""
+        if seen:
+            return tuple(self.seen.get(c, c) for c in model.names)
+        return tuple(self.true_name(c) for c in model.names)
+
+
+def _check_inputs(plant: Plant, model: Plant, mistakes: Mistakes) -> None:
+    own, expected = ", ".join(plant.inputs), ", ".join(model.inputs)
+    if own != expected:
+        mistakes.add(
+            f"its inputs are {own}, the model's are {expected}; both take the same commands, so name them alike, in order"
+        )
+    for name, unit in plant.inputs.items():
+        other = model.inputs.get(name, unit)
+        if unit != other:
+            mistakes.add(f"its input '{name}' is in {unit}, the model's in {other}; write both in one unit")
+
+
+def _check_output(reality: Reality, model: Plant, name: str, unit: str, mistakes: Mistakes) -> None:
+    plant, own = reality.plant, reality.seen.get(name, name)
+    if own not in plant.coordinates:
+        if name not in reality.seen:
+            mistakes.add(
+                f"it has no coordinate '{name}', which the model has and the controller is given; add it, or name the one that is "
+                f"measured in its place: Reality(seen={{'{name}': ...}}). Its coordinates: {', '.join(plant.coordinates)}"
+            )
+        return
+    for one in sorted({own, name} & set(plant.coordinates)):
+        if plant.coordinates[one] != unit:
+            units = f"in {plant.coordinates[one]}, the model's '{name}' in {unit}"
+            mistakes.add(f"its coordinate '{one}' is {units}; write both in one unit")
+    order = model.orders[model.names.index(name)]
+    at_once = input_reaches_at(plant, own, order - 1)
+    if at_once is not None:
+        mistakes.add(
+            f"its derivative {own}{chr(39) * at_once} jumps with the command, but it is a state of the model, where '{name}' has "
+            f"the order {order}; give the model this order, or the reality a coordinate of its own"
+        )
+    elif name in (model.controlled or model.names) and structural_order(plant, own) is None:
+        mistakes.add(f"no input reaches its coordinate '{own}', however often it is differentiated")

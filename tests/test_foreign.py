@@ -1,0 +1,236 @@
+"""A foreign reality: an object outside, called once per cycle; what it may do wrong, and what a run then keeps."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from test_reality import CONTROLLERS, SENSING, TAU, lagged, run, task
+
+import fpirhc as fp
+from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
+from fpirhc.studies.scenarios.draws import with_exact
+
+MEASURES = {"y": "m", "y'": "m/s", "y''": "m/s^2"}
+
+
+class Wrapped:
+    """The problem's own plant behind reset and step, moved by a Runge-Kutta step of numpy's own."""
+
+    calls = 0
+
+    def __init__(self, problem: fp.Problem, measures=tuple(MEASURES)) -> None:
+        self.problem, self.measures = problem, measures
+
+    def reset(self, seed):
+        """The start of the problem."""
+        del seed
+        self.calls = 0
+        self.x = np.array(self.problem.start_state)
+        return self._answer(np.array(self.problem.inputs_before))
+
+    def step(self, time, command):
+        """One step of the classical Runge-Kutta method."""
+        self.calls, h = self.calls + 1, self.problem.period
+        assert time == pytest.approx((self.calls - 1) * h)
+        k1 = self._rate(self.x, command)
+        k2 = self._rate(self.x + h / 2 * k1, command)
+        k3 = self._rate(self.x + h / 2 * k2, command)
+        k4 = self._rate(self.x + h * k3, command)
+        self.x = self.x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return self._answer(command)
+
+    def _rate(self, x, u):
+        return np.array([x[1], 2.0 * u[0]])
+
+    def _answer(self, u):
+        every = {"y": self.x[0], "y'": self.x[1], "y''": self._rate(self.x, u)[1]}
+        return np.array([every[name] for name in self.measures])
+
+
+class Faulty(Wrapped):
+    """The same, with bad answers in some cycles."""
+
+    def __init__(self, problem, bad, at=range(100, 101)) -> None:
+        super().__init__(problem)
+        self.bad, self.at = bad, at
+
+    def step(self, time, command):
+        """The answer, or a bad one."""
+        good = super().step(time, command)
+        return self.bad(good) if self.calls in self.at else good
+
+
+def broken(answer):
+    """What a lost connection does."""
+    del answer
+    raise OSError("cable is out")
+
+
+BAD: dict[str, tuple[Any, str]] = {
+    "raises": (broken, "step of Faulty raised OSError: cable is out"),
+    "wrong shape": (lambda a: a[:2], r"returned the shape \(2,\), expected \(3,\) for y, y', y''"),
+    "no number": (lambda a: a * [1, np.nan, 1], "returned y' = nan"),
+    "text": (lambda _: "on", "raised ValueError"),
+}
+
+
+def outside(problem: fp.Problem, **settings) -> fp.Problem:
+    """The problem with its own plant outside."""
+    return replace(problem, reality=fp.Foreign(Wrapped(problem), measures=MEASURES, **settings))
+
+
+@pytest.mark.parametrize("sensing", ["ideal", "estimated", "noisy"])
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_wrapped_plant_runs_as_the_plant_itself(controller, sensing):
+    """Every signal that both runs have agrees, also behind an estimator and noisy sensors."""
+    problem = task(**SENSING[sensing], disturbances={"u": fp.Sine(1.0, 2.0)})
+    one, other = (run(p, CONTROLLERS[controller]) for p in (problem, outside(problem)))
+    assert other.stop is None
+    for name in set(one.layout.names) - {"contraction"}:
+        size = max(1.0, np.abs(one[name]).max())
+        assert np.abs(one[name] - other[name]).max() <= 1e-12 * size, name
+    assert set(other.layout.names) - set(one.layout.names) == {"foreign", "foreign_held"}
+
+
+def test_dead_times_stand_around_the_body():
+    """The problem's dead times of input and measurement are those of the loop, whatever the body does."""
+    problem = task(dead_time=fp.DeadTime(inputs={"u": 0.002}, measurement=0.001))
+    one, other = (run(p, CONTROLLERS["computed torque"]) for p in (problem, outside(problem)))
+    assert np.abs(one["plant_state"] - other["plant_state"]).max() < 1e-12
+
+
+def test_positions_alone_are_enough_for_an_estimator():
+    """A body that measures y only runs with an estimator; errors are then those of the estimate."""
+    problem = task(sensing=fp.Sensing(estimator=fp.PositionDifference()))
+    foreign = fp.Foreign(Wrapped(problem, ("y",)), measures={"y": "m"})
+    one, other = run(problem), run(replace(problem, reality=foreign))
+    assert np.abs(one["command"] - other["command"]).max() < 1e-9 * np.abs(one["command"]).max()
+    assert np.array_equal(other["foreign.y"], other["measured.y"])
+
+
+def test_compiled_step_agrees():
+    """The step of one cycle in C, called from Python, gives the commands of the virtual machine."""
+    problem = outside(task(duration=0.05))
+    results = [fp.simulate(problem, CONTROLLERS["plain form"], seed=0, compiled=c) for c in (True, False)]
+    assert np.abs(results[0]["command"] - results[1]["command"]).max() < 1e-10
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_answer_ends_the_run_and_loses_nothing(kind):
+    """A hundred good answers are kept; the reason names the method, what it did, and when."""
+    bad, message = BAD[kind]
+    problem = task()
+    result = run(replace(problem, reality=fp.Foreign(Faulty(problem, bad), MEASURES)))
+    assert result.stop is not None
+    assert re.search(message, result.stop)
+    assert "at t = 0.1 s (cycle 100)" in result.stop
+    assert result.cycles == 100
+    assert np.array_equal(result["command"], run(outside(problem))["command"][:100])
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_answers_are_held_as_stated(kind):
+    """Two bad answers are bridged with the last good one and marked; the third ends the run."""
+    problem = task()
+    bad = BAD[kind][0]
+    two = run(replace(problem, reality=fp.Foreign(Faulty(problem, bad, range(100, 102)), MEASURES, holds=2)))
+    assert two.stop is None
+    assert np.flatnonzero(two["foreign_held"]).tolist() == [100, 101]
+    assert np.array_equal(two["state"][100:102], two["state"][[99, 99]])
+    three = run(replace(problem, reality=fp.Foreign(Faulty(problem, bad, range(100, 103)), MEASURES, holds=2)))
+    assert three.cycles == 102
+    assert three.stop is not None
+
+
+def test_answer_after_the_deadline():
+    """A clock that jumps in the hundredth step stands for a body that is late."""
+    problem = task()
+    body = Wrapped(problem)
+    foreign = fp.Foreign(body, MEASURES, deadline=1e-3, clock=lambda: 0.01 * (body.calls >= 100))
+    result = run(replace(problem, reality=foreign))
+    assert result.cycles == 100
+    assert "took 0.01 s, and its deadline is 0.001 s" in str(result.stop)
+
+
+def test_bad_first_answer_is_an_error():
+    """There is nothing to keep before the first answer."""
+    problem = task()
+    body = Wrapped(problem, ("y",))
+    with pytest.raises(InvalidProblem, match="reset of Wrapped returned the shape"):
+        run(replace(problem, reality=fp.Foreign(body, MEASURES)))
+
+
+def test_mistakes_are_named():
+    """Quantities and units are compared with what the model and its sensing need, before a run."""
+    body = Wrapped(task())
+    with pytest.raises(InvalidProblem, match=r"does not measure y'' .* Sensing\(estimator=...\)"):
+        task(reality=fp.Foreign(body, {"y": "m", "y'": "m/s"}))
+    with pytest.raises(InvalidProblem, match="measures y in mm, the model has it in m"):
+        task(reality=fp.Foreign(body, {**MEASURES, "y": "mm"}))
+    with pytest.raises(InvalidProblem, match="'z' is unknown"):
+        task(reality=fp.Foreign(body, {**MEASURES, "z": "m"}))
+    with pytest.raises(InvalidProblem, match="disturbances"):
+        task(reality=fp.Foreign(body, MEASURES), disturbances={"y": fp.Step(0.0, 1.0)})
+    no_body: Any = object()
+    with pytest.raises(InvalidValue, match="no method reset"):
+        fp.Foreign(no_body, MEASURES)
+
+
+def test_nothing_is_drawn_and_no_model_is_exact():
+    """Parameters of an object outside are nobody's to set."""
+    problem = outside(task())
+    with pytest.raises(NotSupported, match="no exact parameters"):
+        with_exact(problem, np.array([1.0]))
+    with pytest.raises(NotSupported, match="no equations"):
+        run(problem, fp.ExactModel(CONTROLLERS["computed torque"]))
+
+
+def test_contraction_is_identified_where_the_response_is_measured():
+    """The run's own requests and responses give the factor 1 - a b / b^ without any equation of the body."""
+    controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Affine(gain=-0.5))
+    result = run(outside(task(start={"y": 0.3})), controller)
+    assert np.allclose(result["contraction"], 1 - controller.deformation.effective_gain() * 2.0, atol=0.02)
+
+
+def test_lagged_body_is_the_lagged_reality():
+    """An actuator outside is what an actuator in symbols is: two ways to the same run."""
+    problem = task(reality=fp.Reality(lagged(), integrator=fp.RungeKutta4(substeps=8)))
+
+    class Actuated(Wrapped):
+        """Y'' = 2 F, F exactly exponential within a cycle, y by the closed form."""
+
+        force = 0.0
+
+        def step(self, time, command):
+            """The closed form of one cycle."""
+            del time
+            h, gap = self.problem.period, self.force - command[0]
+            decay = np.exp(-h / TAU)
+            moved = TAU * gap * (1 - decay)
+            y = self.x[0] + h * self.x[1] + 2.0 * (command[0] * h**2 / 2 + TAU * (gap * h - moved))
+            self.x = np.array([y, self.x[1] + 2.0 * (command[0] * h + moved)])
+            self.force = command[0] + gap * decay
+            return self._answer(np.array([self.force]))
+
+    controller = CONTROLLERS["plain form"]
+    one = run(problem, controller)
+    other = run(replace(problem, reality=fp.Foreign(Actuated(task()), MEASURES)), controller)
+    assert np.abs(one["command"] - other["command"]).max() < 1e-6 * np.abs(one["command"]).max()
+
+
+def test_comparison_and_report_of_an_object_outside(tmp_path):
+    """The same table, verdict, null test and page as for a plant."""
+    shipped = fp.load_problem("two_mass")
+    pair = {name: CONTROLLERS[name] for name in ("computed torque", "plain form")}
+    file = replace(shipped, problem=outside(task()), controllers=pair, headline=("computed torque", "plain form"))
+    comparison = fp.compare(file, seed=0, compiled=False)
+    errors = [entry.metrics.rms_error["y"] for entry in comparison.entries]
+    inside = [fp.measure(task(), run(task(), one)).rms_error["y"] for one in pair.values()]
+    assert errors == pytest.approx(inside, rel=1e-10)
+    assert comparison.null is not None
+    fp.write_report(comparison, tmp_path / "report.html")
+    assert "plain form" in (tmp_path / "report.html").read_text()

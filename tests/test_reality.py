@@ -1,0 +1,267 @@
+"""A reality that is not the model: what moves, what the controller is given, and what "exact" then means."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from plants import linear, pendulum
+from scipy.linalg import expm
+
+import fpirhc as fp
+from fpirhc.controllers.contract import checked
+from fpirhc.describe import describe
+from fpirhc.errors import InvalidProblem, NotContractive, NotSupported
+from fpirhc.studies.comparison.entry_facts import has_exact_model
+from fpirhc.studies.scenarios.draws import COMPARING, draw, with_exact
+
+TRACK = fp.Exponential(rate=6.0)
+PERIOD = 1e-3  # s
+TAU = 0.01  # s, lag of the actuator
+FPI = fp.Sigmoid(gain=-0.5, scale=50.0)
+
+CONTROLLERS = {
+    "computed torque": fp.ComputedTorque(TRACK),
+    "plain form": fp.ComputedTorque(TRACK, FPI),
+    "model-referenced form": fp.ComputedTorque(TRACK, fp.ModelReferenced(FPI)),
+    "receding horizon": fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), FPI),
+}
+SENSING: dict[str, dict[str, Any]] = {
+    "ideal": {},
+    "estimated": {"sensing": fp.Sensing(estimator=fp.PositionDifference())},
+    "noisy": {"sensing": fp.Sensing(sensors={"y'": fp.Sensor(noise=fp.Noise(1e-4), dropout=0.1)})},
+    "late": {"dead_time": fp.DeadTime(measurement=2.5 * PERIOD), "disturbances": {"y": fp.Sine(0.1, 2.0)}},
+}
+
+
+def parameters(gain: float = 2.0) -> dict[str, fp.Parameter]:
+    """The gain of the linear plant; the model believes in 1."""
+    return {"b": fp.Parameter(approximate=1.0, exact=gain, unit="1/kg")}
+
+
+def lagged(tau: float = TAU, gain: float = 2.0) -> fp.Plant:
+    """Y'' = b F behind an actuator, tau F' = u - F."""
+    return fp.Plant(
+        coordinates={"y": "m", "F": "N"},
+        inputs={"u": "N"},
+        order={"y": 2, "F": 1},
+        parameters=parameters(gain) | {"tau": fp.Parameter(approximate=tau, exact=tau, unit="s")},
+        response=lambda q, v, u, p: {"y": p.b * q.F, "F": (u.u - q.F) / p.tau},
+    )
+
+
+def slow_sensor(tau: float = TAU) -> fp.Plant:
+    """Y'' = b u, measured through tau s' = y - s."""
+    return fp.Plant(
+        coordinates={"y": "m", "s": "m"},
+        inputs={"u": "N"},
+        order={"y": 2, "s": 1},
+        parameters=parameters(),
+        response=lambda q, v, u, p: {"y": p.b * u.u, "s": (q.y - q.s) / tau},
+    )
+
+
+def task(**changes) -> fp.Problem:
+    """The linear plant along a sine."""
+    settings: dict[str, Any] = {
+        "plant": linear(2.0, 1.0),
+        "reference": fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}),
+        "start": {"y": 0.1},
+        "period": PERIOD,
+        "duration": 0.3,
+        "limits": fp.Limits(inputs={"u": (-50.0, 50.0)}),
+        "horizon": fp.Horizon(stages=5, step=1e-2),
+        "cost": fp.Quadratic(states={"y": 1e3, "y'": 1.0}, effort={"u": 1e-3}),
+    }
+    return fp.Problem(**{**settings, **changes})
+
+
+def run(problem: fp.Problem, controller: Any = CONTROLLERS["computed torque"]) -> fp.Run:
+    """A run in the virtual machine."""
+    return fp.simulate(problem, controller, seed=0, compiled=False)
+
+
+# What moves
+
+
+@pytest.mark.parametrize("sensing", SENSING)
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_reality_equal_to_the_model_changes_no_bit(controller, sensing):
+    """A reality is the same plant under another name here, so every signal of the run is the same number."""
+    problem = task(**SENSING[sensing])
+    one = run(problem, CONTROLLERS[controller])
+    other = run(replace(problem, reality=fp.Reality(problem.plant)), CONTROLLERS[controller])
+    judged = {"contraction"}  # with a reality it is that of a whole cycle
+    for name in set(one.layout.names) - judged:
+        assert np.array_equal(one[name], other[name]), name
+    assert set(other.layout.names) == {*one.layout.names, "reality_state"}
+
+
+def test_no_reality_is_no_setting():
+    """A problem without one is described as before, so that its baselines stay valid."""
+    assert "reality" not in describe(task())
+    assert describe(task(reality=fp.Reality(lagged())))["reality"]["is"] == "Reality"
+
+
+def test_lagged_reality_moves_as_the_matrix_exponential_says():
+    """The commands of the run, held over each cycle, move the exact discretisation of y'' = b F, tau F' = u - F alike."""
+    reality = fp.Reality(lagged(), integrator=fp.RungeKutta4(substeps=4))
+    result = run(task(reality=reality), CONTROLLERS["plain form"])
+    a = np.array([[0, 1, 0], [0, 0, 2.0], [0, 0, -1 / TAU]])
+    whole = expm(np.block([[a, np.array([[0], [0], [1 / TAU]])], [np.zeros((1, 4))]]) * PERIOD)
+    x, states = np.array([0.1, 0.0, 0.0]), []
+    for u in np.asarray(result["command"]).ravel():
+        states.append(x)
+        x = whole[:3, :3] @ x + whole[:3, 3] * u
+    exact = np.array(states)[:, [0, 2, 1]]  # the reality's state is derivative-major: y, F, y'
+    assert result.layout["reality_state"].elements == ("y", "F", "y'")
+    assert np.abs(result["reality_state"] - exact).max() < 3e-9 * np.abs(exact).max()
+    assert np.array_equal(result["state"], result["reality_state"][:, [0, 2]])
+    assert np.allclose(result["realised.y"], 2.0 * result["reality_state.F"], rtol=1e-15)
+
+
+def test_slow_sensor_is_seen_and_the_true_coordinate_is_judged():
+    """The controller is given s, s' and s''; the error that counts is that of y."""
+    result = run(task(reality=fp.Reality(slow_sensor(), seen={"y": "s"})), CONTROLLERS["plain form"])
+    y, s, speed = (result[f"reality_state.{name}"] for name in ("y", "s", "y'"))
+    assert np.array_equal(result["state.y"], s)
+    assert np.allclose(result["state.y'"], (y - s) / TAU, rtol=1e-12, atol=1e-15)
+    assert np.allclose(result["realised.y"], (speed - (y - s) / TAU) / TAU, rtol=1e-12, atol=1e-12)
+    assert np.array_equal(result["plant_state.y"], y)
+    assert np.array_equal(result["true_error.y"], result["reference.y"] - y)
+
+
+def test_states_of_its_own_settle_or_are_given():
+    """An actuator begins at the input before the first cycle, a sensor at what it measures, and a named state where it is put."""
+    actuated = task(reality=fp.Reality(lagged()), input_before={"u": 3.0})
+    assert np.allclose(actuated.real_start, [0.1, 3.0, 0.0], atol=1e-12)
+    assert np.allclose(task(reality=fp.Reality(slow_sensor(), seen={"y": "s"})).real_start, [0.1, 0.1, 0.0], atol=1e-12)
+    assert np.allclose(task(reality=fp.Reality(lagged(), start={"F": -2.0})).real_start, [0.1, -2.0, 0.0])
+
+
+def test_disturbance_of_a_state_that_the_model_does_not_have():
+    """A push on the actuator's force is attached by the reality's name; the model's own plant leaves it out."""
+    problem = task(reality=fp.Reality(lagged()), disturbances={"F": fp.Step(0.0, 100.0)})
+    calm = replace(problem, disturbances={})
+    assert run(problem)["reality_state.F"][5] > run(calm)["reality_state.F"][5] + 0.3
+    assert problem.of_model.disturbances == {}
+    assert problem.of_model.reality is None
+
+
+# What "exact" means
+
+
+def test_draws_are_those_of_the_reality():
+    """Scenarios vary the reality's parameters; the mismatch counts those that the model has too."""
+    problem = task(reality=fp.Reality(lagged()))
+    scenario = draw(problem.real_plant, seed=1, use=COMPARING, number=0, percent=20.0, model=problem.plant)
+    variant = with_exact(problem, scenario.exact)
+    assert np.array_equal(variant.real_plant.exact, scenario.exact)
+    assert scenario.exact.size == 2
+    assert scenario.mismatch == pytest.approx(abs(1 - scenario.exact[0]) / max(1.0, scenario.exact[0]))
+    assert np.array_equal(variant.plant.exact, problem.plant.exact)
+
+
+def test_exact_model_is_the_reality():
+    """A reality with another friction and other parameters is the model of the exact controller, which then needs no adaptation."""
+    real = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "N"},
+        parameters={"gain": fp.Parameter(2.0, 2.5, "1/kg"), "friction": fp.Parameter(1.0, 3.0, "N s/m")},
+        response=lambda q, v, u, p: {"y": p.gain * (u.u - p.friction * ca.tanh(v.y))},
+    )
+    problem = task(reality=fp.Reality(real), start={"y": 0.0, "y'": 3.0}, duration=0.5)
+    bare = CONTROLLERS["computed torque"]
+    errors = [np.abs(run(problem, one)["error.y"]).max() for one in (bare, fp.ExactModel(bare))]
+    assert errors[1] < 0.02 * errors[0]
+    assert has_exact_model(problem, fp.ExactModel(bare))
+    assert not has_exact_model(problem, bare)
+
+
+def test_exact_model_is_refused_where_the_reality_has_other_coordinates():
+    """The controller is given y and y' only, so it cannot have a model with a force."""
+    with pytest.raises(NotSupported, match="the coordinate F, which the controller is not given"):
+        run(task(reality=fp.Reality(lagged())), fp.ExactModel(CONTROLLERS["computed torque"]))
+
+
+def test_contraction_is_that_of_a_whole_cycle():
+    """Behind the lag a request has done b / b^ (1 - exp(-T / tau)) to the response by the end of its cycle."""
+    result = run(task(reality=fp.Reality(lagged())), fp.ComputedTorque(TRACK, FPI))
+    expected = 1 - FPI.effective_gain() * 2.0 * (1 - np.exp(-PERIOD / TAU))
+    assert np.allclose(result["contraction"], expected, atol=1e-6)
+
+
+def test_gain_of_the_wrong_sign_is_refused_behind_a_lag():
+    """The command has no effect at once, but its sign is known at the end of the cycle."""
+    problem = task(reality=fp.Reality(lagged(gain=-2.0)))
+    with pytest.raises(NotContractive):
+        checked(problem, CONTROLLERS["plain form"])
+    checked(task(reality=fp.Reality(lagged())), CONTROLLERS["plain form"])
+
+
+# Mistakes
+
+
+def missing() -> fp.Plant:
+    """A plant without y."""
+    return replace(linear(2.0, 1.0), coordinates={"z": "m"}, response=lambda q, v, u, p: {"z": p.b * u.u})
+
+
+MISTAKES = {
+    "no output": (lambda: fp.Reality(missing()), "no coordinate 'y', which the model has"),
+    "other unit": (
+        lambda: fp.Reality(replace(linear(2.0, 1.0), coordinates={"y": "mm"})),
+        "in mm, the model's 'y' in m;",
+    ),
+    "other input": (
+        lambda: fp.Reality(replace(linear(2.0, 1.0), inputs={"F": "N"}, response=lambda q, v, u, p: {"y": p.b * u.F})),
+        "inputs are F, the model's are u",
+    ),
+    "other unit of an input": (lambda: fp.Reality(replace(linear(2.0, 1.0), inputs={"u": "kN"})), "'u' is in kN"),
+    "other time": (lambda: fp.Reality(replace(linear(2.0, 1.0), time_unit="ms")), "time is in ms, the model's in s"),
+    "lower order": (
+        lambda: fp.Reality(fp.Plant({"y": "m"}, {"u": "N"}, parameters(), lambda q, u, p: {"y": p.b * u.u}, order=1)),
+        "y' jumps with the command",
+    ),
+    "out of reach": (
+        lambda: fp.Reality(replace(lagged(), response=lambda q, v, u, p: {"y": -q.y, "F": (u.u - q.F) / p.tau})),
+        "no input reaches its coordinate 'y'",
+    ),
+    "unknown start": (
+        lambda: fp.Reality(lagged(), start={"force": 1.0}),
+        "start: state 'force' is unknown. Valid: y, F, y'",
+    ),
+    "unknown sensor": (lambda: fp.Reality(lagged(), seen={"y": "Y"}), "coordinate of the reality 'Y' is unknown"),
+    "no equilibrium": (
+        lambda: fp.Reality(
+            replace(lagged(), response=lambda q, v, u, p: {"y": p.b * q.F, "F": (1 + (u.u - q.F) ** 2) / p.tau})
+        ),
+        r"F have no equilibrium .* Reality\(start=\{'F': ...\}\)",
+    ),
+    "stiff": (lambda: fp.Reality(lagged(tau=1e-4)), r"pole -1e\+04 1/s, .* is 10, .*RungeKutta4\(substeps=5\)"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistakes_are_named(mistake):
+    """A reality that cannot stand for the model is refused with the names, the cause and the cure."""
+    make, message = MISTAKES[mistake]
+    with pytest.raises(InvalidProblem, match=f"(?s){message}"):
+        task(reality=make())
+
+
+def test_the_named_sub_steps_would_do():
+    """With five sub-steps the stiff lag moves as its exact discretisation, and the run is finite."""
+    reality = fp.Reality(lagged(tau=1e-4), integrator=fp.RungeKutta4(substeps=5))
+    result = run(task(reality=reality))
+    assert result.stop is None
+    assert np.allclose(result["reality_state.F"][1:], np.asarray(result["command"])[:-1, 0], rtol=1e-3, atol=1e-3)
+
+
+def test_plant_in_place_of_a_reality_is_named():
+    """`Problem(reality=plant)` is refused with the class that is expected."""
+    with pytest.raises(InvalidProblem, match="Reality"):
+        task(reality=pendulum())
