@@ -64,5 +64,5 @@ def test_noise_is_drawn_from_the_seed():
 def test_formula_must_be_finite():
     """An expression that is not finite says when."""
     np.testing.assert_allclose(_values(fp.Formula(lambda t: ca.exp(-t))), np.exp(-TIMES), equal_nan=False)
-    with pytest.raises(InvalidValue, match="t = 0 s"):
+    with pytest.raises(InvalidValue, match="not finite at t = 0"):
         _values(fp.Formula(lambda t: 1 / t))

@@ -107,11 +107,9 @@ MISTAKES = {
     "limits the wrong way round": Mistake(
         '"force": (-20.0, 20.0)', '"force": (20.0, -20.0)', "lower 20.0 above upper -20.0", "swap them"
     ),
-    "vanishing period": Mistake(
-        "period=1e-2", "period=1e-300", "Problem.period: expected a number of seconds from 1e-12 to 1e12"
-    ),
+    "vanishing period": Mistake("period=1e-2", "period=1e-300", "Problem.period: expected a number from 1e-12 to 1e12"),
     "endless duration": Mistake(
-        "duration=0.1", "duration=1e300", "Problem.duration: expected a number of seconds from 1e-12 to 1e12"
+        "duration=0.1", "duration=1e300", "Problem.duration: expected a number from 1e-12 to 1e12"
     ),
     "too many cycles": Mistake("duration=0.1", "duration=1e9", "more than 1e+09 cycles", "shorten it"),
     "number as a text": Mistake(

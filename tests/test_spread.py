@@ -107,7 +107,7 @@ def test_a_range_beyond_the_bounds_is_refused_with_the_largest_inside():
         (lambda: fp.LogNormal(factor=0.9), "a number above 1"),
         (lambda: plant(z=parameter(0.0, fp.Uniform(relative=0.3))), "parameter 'z': spread: it has the value 0"),
         (lambda: plant(z=parameter(0.0, fp.LogNormal(factor=2.0))), "use Uniform or Normal with absolute"),
-        (lambda: plant(z=fp.Parameter(1.0, 1.0, "1", spread=0.3)), "spread must be Uniform"),  # type: ignore[arg-type]
+        (lambda: plant(z=fp.Parameter(1.0, 1.0, "1", spread=0.3)), "expected a Spread or None, got 0.3"),  # type: ignore[arg-type]
     ],
 )
 def test_wrong_spreads_are_refused(make, message):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import stat
 import sys
 import tempfile
 from importlib.metadata import version
@@ -58,7 +57,7 @@ def c_compiler() -> tuple[Outcome, str, str]:
 
 
 def cache() -> tuple[Outcome, str, str]:
-    """Check the folder of compiled libraries: its place, its size, and who else may write to it."""
+    """Check the folder of compiled libraries: its place and its size. `cache_folder` closes it to other users."""
     folder = cache_folder()
     wished = os.environ.get("FPIRHC_CACHE") or os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     files = [f for f in folder.iterdir() if f.is_file()]
@@ -67,16 +66,6 @@ def cache() -> tuple[Outcome, str, str]:
     if not folder.is_relative_to(Path(wished).absolute()):
         remedy = f"make '{wished}' writable or name another folder by FPIRHC_CACHE; now every process compiles afresh"
         return Outcome.WARN, f"'{wished}' cannot be written, so a temporary folder is used: {folder}", remedy
-    facts = folder.stat()
-    foreign = hasattr(os, "getuid") and facts.st_uid != os.getuid()
-    # Libraries from this folder are run: a user who may write to it may run code as this user.
-    if foreign or facts.st_mode & stat.S_IWOTH:
-        whose = "belongs to another user" if foreign else "can be written by everybody"
-        return (
-            Outcome.FAIL,
-            f"{text}; it {whose}",
-            f"chmod 700 '{folder}', or name a folder of your own by FPIRHC_CACHE",
-        )
     remedy = f"remove old libraries from '{folder}'; they are compiled again when needed"
     return judged(size < _LARGE_CACHE, text, remedy, Outcome.WARN)
 

@@ -35,7 +35,9 @@ class Range:
 Finite: TypeAlias = Annotated[float, Range("a finite number", open_low=True, open_high=True)]
 Positive: TypeAlias = Annotated[float, Range("a finite number above 0", low=0.0, open_low=True, open_high=True)]
 NotNegative: TypeAlias = Annotated[float, Range("a finite number of at least 0", low=0.0, open_high=True)]
-Duration: TypeAlias = Annotated[float, Range("a number of seconds from 1e-12 to 1e12", low=1e-12, high=1e12)]
+Duration: TypeAlias = Annotated[
+    float, Range("a number from 1e-12 to 1e12 in the plant's unit of time", low=1e-12, high=1e12)
+]
 Accuracy: TypeAlias = Annotated[
     float, Range("a number above 0 and below 1", low=0.0, high=1.0, open_low=True, open_high=True)
 ]

@@ -177,7 +177,8 @@ class Plant(Checked):
             InvalidProblem: a parameter that is not finite or outside its bounds.
         """
         named = zip(self.parameters.items(), exact, strict=True)
-        parameters = {name: replace(parameter, exact=float(value)) for (name, parameter), value in named}
+        # A spread is around the value of the problem file, and not around another plant's.
+        parameters = {name: replace(one, exact=float(value), spread=None) for (name, one), value in named}
         mistakes = Mistakes("plant")
         check_parameters(parameters, mistakes)
         mistakes.raise_if_any()

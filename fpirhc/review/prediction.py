@@ -168,7 +168,8 @@ def _judge_block(plant: Plant) -> Block:
 
 def exactly(plant: Plant, values: np.ndarray) -> Plant:
     """Return the plant with these exact parameters."""
-    named = {n: replace(p, exact=float(v)) for (n, p), v in zip(plant.parameters.items(), values, strict=True)}
+    pairs = zip(plant.parameters.items(), values, strict=True)
+    named = {n: replace(p, exact=float(v), spread=None) for (n, p), v in pairs}
     return replace(plant, parameters=named)
 
 

@@ -58,7 +58,8 @@ def _largest_error(case: Case) -> float | None:
     if isinstance(nominal, str):
         return None
     both = [response_errors(nominal).error, errors_without_adaptation(nominal).error]
-    sizes = np.linalg.norm(np.vstack(both), axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):  # the errors of a diverging loop
+        sizes = np.linalg.norm(np.vstack(both), axis=1)
     jump = max((d.jump * effect(case.grid, name) for name, d in case.problem.disturbances.items()), default=0.0)
     return max(float(sizes.max()), jump) if np.isfinite(sizes).all() else None
 
