@@ -77,7 +77,7 @@ def test_tuner_recovers_from_a_number_that_is_none():
 @pytest.mark.parametrize("largest", [0.1, -1.0, float("inf"), float("nan")])
 def test_tuner_needs_a_bound(largest):
     """A tuner without a bound is refused, and told where one comes from."""
-    with pytest.raises(InvalidValue, match="sector_limit gives one|expected a number, got nan"):
+    with pytest.raises(InvalidValue, match=r"sector_limit gives one|expected a number, got nan"):
         fp.Tuned(fp.Affine(gain=-0.5), largest_gain=largest)
 
 

@@ -113,7 +113,7 @@ MISTAKES = {
     ),
     "too many cycles": Mistake("duration=0.1", "duration=1e9", "more than 1e+09 cycles", "shorten it"),
     "number as a text": Mistake(
-        "period=1e-2", 'period="1e-2"', "expected a number of seconds", "write 1e-2 without quotes"
+        "period=1e-2", 'period="1e-2"', "expected a number from 1e-12", "write 1e-2 without quotes"
     ),
     "comma behind a number": Mistake(
         "gain=-0.2, scale", "gain=(-0.2,), scale", "Sigmoid.gain: expected a number", "remove the comma"

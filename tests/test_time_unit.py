@@ -133,7 +133,7 @@ def test_messages_have_it(case):
     problem = task.problem
     with pytest.raises(InvalidProblem, match=rf"{problem.period * 1.3:g} {unit} does not divide .* {unit}"):
         replace(problem, period=problem.period * 1.3)
-    with pytest.raises(InvalidProblem, match="in the plant's unit of time, got -1.0"):
+    with pytest.raises(InvalidProblem, match=r"in the plant's unit of time, got -1\.0"):
         replace(problem, period=-1.0)
 
 
