@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import runpy
 from collections import Counter
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -10,9 +12,10 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.horizon.hessian_models import hessian_stage, linear_stage
-from fpirhc.horizon.problem import OptimalControl, transcribe
-from fpirhc.horizon.split_stage import split_hessian, split_stage
+from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
+from fpirhc.horizon.split_stage import linearise_stage, split_hessian, split_stage, stage_leaves
 from fpirhc.symbolic.chain_rule import chain_rule
+from fpirhc.symbolic.native import find_compiler, native
 
 X, P = ca.SX.sym("x", 3), ca.SX.sym("p", 2)
 EXPRESSIONS = {
@@ -31,6 +34,10 @@ def ocp(request) -> OptimalControl:
     assert p.horizon is not None
     assert p.cost is not None
     return transcribe(p.plant, p.reference, p.horizon, p.cost, p.limits)
+
+
+def in_parts(ocp: OptimalControl) -> dict[str, ca.Function]:
+    return {**split_stage(ocp), "linearise": linearise_stage(ocp)}
 
 
 def operations(function: ca.Function) -> Counter[int]:
@@ -62,7 +69,7 @@ def test_linear_results_have_no_partial_derivatives_to_compute():
 
 def test_a_stage_in_parts_is_the_linear_stage(ocp):
     """Next state, cost, Jacobians and gradients agree with CasADi's, and the adjoint with theirs."""
-    whole, parts, rng = linear_stage(ocp), split_stage(ocp), np.random.default_rng(5)
+    whole, parts, rng = linear_stage(ocp), in_parts(ocp), np.random.default_rng(5)
     states, inputs, data = ocp.nodes
     for _ in range(5):
         s = states[:, 0] + 0.1 * rng.normal(size=ocp.state.size)
@@ -80,7 +87,7 @@ def test_a_stage_in_parts_is_the_linear_stage(ocp):
 
 def test_nothing_is_computed_twice(ocp):
     """The second parts multiply and add only, and both together take less than CasADi's Jacobian."""
-    whole, parts = operations(linear_stage(ocp)), {k: operations(f) for k, f in split_stage(ocp).items()}
+    whole, parts = operations(linear_stage(ocp)), {k: operations(f) for k, f in in_parts(ocp).items()}
     plain = {ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, ca.OP_MUL, ca.OP_ADD, ca.OP_SUB, ca.OP_NEG, ca.OP_SQ, ca.OP_TWICE}
     assert parts["pull"].keys() <= plain
     assert parts["linearise"].keys() <= plain
@@ -105,3 +112,28 @@ def test_second_derivatives_in_parts_are_those_of_the_stage(ocp, hessian):
             np.testing.assert_allclose(mine.full(), theirs.full(), rtol=1e-11, atol=1e-12)
     counted = operations(parts["bend"]) + operations(parts["curve"])
     assert counted[ca.OP_DIV] <= operations(whole)[ca.OP_DIV]
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
+def test_the_directions_of_a_large_stage_run_side_by_side():
+    """Five masses have 24 directions: loops over all of them, in the plain iteration and with a wall, do what the graph does."""
+    p = runpy.run_path(str(fp.load_problem("chain_of_masses").path))["chain"](5)
+    for states in ({}, {"y1": (-0.2, 5.0)}):  # by Gauss-Newton, which compiles fast
+        limits = fp.Limits(inputs=p.limits.inputs, states=states)
+        ocp = transcribe(p.plant, p.reference, replace(p.horizon, stages=12), p.cost, limits)
+        assert "slopes" in stage_leaves(ocp, ())[0]
+        data = np.asarray(
+            stage_data(p.plant, p.reference, replace(p.horizon, stages=12), p.cost)(0.0, p.plant.approximate).full()
+        )
+        first = np.asarray(ocp.start(p.start_state, np.zeros(3)).full()).ravel()
+        optimiser = fp.FixedPoint(iterations=3, tolerance=1e-6, hessian=fp.GaussNewton())
+        graph = optimiser.step(ocp)
+        compiled = native(graph)
+        assert compiled.compiled
+        memory = optimiser.memory(ocp).start()
+        for _ in range(3):
+            arguments = first, data, ocp.input_lower, ocp.input_upper, memory
+            expected, results = ([np.asarray(v.full()) for v in f(*arguments)] for f in (graph, compiled.function))
+            np.testing.assert_allclose(results[0], expected[0], atol=1e-9)
+            np.testing.assert_array_equal(results[1][3:], expected[1][3:])
+            memory = expected[2].ravel()

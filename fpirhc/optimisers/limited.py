@@ -19,7 +19,7 @@ import numpy as np
 
 from fpirhc.horizon.hessian_models import ExactHessian, GaussNewton, hessian_end, hessian_stage
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.split_stage import split_hessian, split_stage
+from fpirhc.horizon.split_stage import partial_count, split_hessian, stage_leaves
 from fpirhc.horizon.sweep import PIVOT
 from fpirhc.optimisers import limited_settings as numbers
 from fpirhc.optimisers.base import FEASIBLE, shift
@@ -59,8 +59,9 @@ def shifted_limited(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
 
 def _driver(ocp: OptimalControl, settings: LimitedSettings) -> Driver:
     measures = scales(ocp)
+    stage, linearise = stage_leaves(ocp, ("evaluate",))
     leaves = {
-        **{name: split_stage(ocp)[name] for name in ("evaluate", "linearise")},
+        **stage,
         **split_hessian(ocp, settings.hessian or ExactHessian()),
         "plain": hessian_stage(ocp, GaussNewton()),
         "end": hessian_end(ocp),
@@ -69,7 +70,8 @@ def _driver(ocp: OptimalControl, settings: LimitedSettings) -> Driver:
     }
     folder = resources.files("fpirhc.optimisers")
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
-    sizes = {"NM": leaves["linearise"].numel_in(0), "NH": leaves["curve"].numel_in(0), **_sizes(ocp, measures)}
+    texts.insert(1, linearise)
+    sizes = {"NM": partial_count(ocp), "NH": leaves["curve"].numel_in(0), **_sizes(ocp, measures)}
     return Driver("\n".join(texts), leaves, {**sizes, **_constants(settings, measures)})
 
 

@@ -10,7 +10,7 @@ from fpirhc.horizon.hessian_models import hessian_end, hessian_stage
 from fpirhc.horizon.live_data import SCALE, STEEPEST
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import PIVOT, rounds
-from fpirhc.horizon.split_stage import split_stage
+from fpirhc.horizon.split_stage import partial_count, stage_leaves
 from fpirhc.optimisers.anchor import ARMIJO, DRAWN_IN, ROUNDING, SHARE, SHORTER, SHORTEST, UNTRIED
 from fpirhc.optimisers.base import shift
 from fpirhc.optimisers.plain_graph import plain_graph
@@ -44,14 +44,16 @@ def shifted_plain(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
 
 def plain_driver(ocp: OptimalControl, settings: PlainSettings) -> Driver:
     """Return the loops in C with what they call."""
+    stage, linearise = stage_leaves(ocp, ("evaluate", "pull"))
     leaves = {
-        **split_stage(ocp),
+        **stage,
         "hessian": hessian_stage(ocp, settings.hessian),
         "end": hessian_end(ocp),
         "deformed": deformed_move(settings.map, ocp.input.size * ocp.stages),
     }
     folder = resources.files("fpirhc.optimisers")
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
+    texts.insert(1, linearise)
     return Driver("\n".join(texts), leaves, {**_sizes(ocp), **_metric(ocp), **_constants(ocp, settings)})
 
 
@@ -60,7 +62,7 @@ def _sizes(ocp: OptimalControl) -> dict[str, object]:
         "NS": ocp.state.size,
         "NU": ocp.input.size,
         "NT": ocp.data.size,
-        "NM": split_stage(ocp)["pull"].numel_in(0),
+        "NM": partial_count(ocp),
         "N": ocp.stages,
         "MEMORY": plain_memory(ocp).size,
     }

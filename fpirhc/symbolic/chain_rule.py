@@ -15,7 +15,8 @@ Reference: A. Griewank, A. Walther, Evaluating Derivatives, SIAM 2008, chapters 
 
 from __future__ import annotations
 
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import casadi as ca
@@ -24,22 +25,53 @@ _OPERANDS = 2  # most operands of an elementary operation
 _Edges = list[dict[int, ca.SX]]  # for every result, its partial derivatives by the result that they are of
 
 
-class ChainRule(NamedTuple):
+class Graph(NamedTuple):
+    """What the chain rule runs over, after the eliminations that add no edge.
+
+    Args:
+        slopes: for every place, its partial derivatives (of the symbols of m) by the place that they are of.
+        between: the places that are left between variables and results, in the order of the computation.
+        variables: number of variables, which have the first places.
+        results: the places of the results, one after another at the end.
+    """
+
+    slopes: _Edges
+    between: list[int]
+    variables: int
+    results: range
+
+
+@dataclass(frozen=True, eq=False)
+class ChainRule:
     """The two parts of a derivative.
 
     Args:
         partials: m, a column of expressions of the variables and parameters.
         symbols: a column of as many symbols for m.
-        jacobian: J of the symbols.
         pulled: J' w of the symbols and of the symbols `weights`.
         weights: w, as long as the results.
+        graph: from which J is made.
     """
 
     partials: ca.SX
     symbols: ca.SX
-    jacobian: ca.SX
     pulled: ca.SX
     weights: ca.SX
+    graph: Graph
+
+    @cached_property
+    def jacobian(self) -> ca.SX:
+        """J of the symbols, by elimination of everything between the variables and the results."""
+        slopes, between, count, results = self.graph
+        back = [dict(by) for by in slopes]
+        ahead = _ahead(back)
+        for n in between:
+            _eliminate(n, back, ahead)
+        jacobian = ca.SX(len(results), count)
+        for row, n in enumerate(results):
+            for place, slope in back[n].items():
+                jacobian[row, place] = slope
+        return jacobian
 
 
 def chain_rule(results: ca.SX, variables: ca.SX, parameters: ca.SX) -> ChainRule:
@@ -55,7 +87,7 @@ def chain_rule(results: ca.SX, variables: ca.SX, parameters: ca.SX) -> ChainRule
     edges, ends, values = _graph(function, variables, parameters)
     partials, symbols = _named(edges, values)
     pulled = _pulled(edges, ends, weights, variables.numel())
-    return ChainRule(partials, symbols, _eliminated(edges, ends, variables.numel()), pulled, weights)
+    return ChainRule(partials, symbols, pulled, weights, _compressed(edges, ends, variables.numel()))
 
 
 def _graph(function: ca.Function, variables: ca.SX, parameters: ca.SX) -> tuple[_Edges, list[int], list[ca.SX]]:
@@ -131,26 +163,24 @@ def _pulled(edges: _Edges, ends: list[int], weights: ca.SX, count: int) -> ca.SX
     return ca.vertcat(*bars[:count])
 
 
-def _eliminated(edges: _Edges, ends: list[int], count: int) -> ca.SX:
-    """J, by elimination of everything between the variables and the results."""
+def _compressed(edges: _Edges, ends: list[int], count: int) -> Graph:
+    """The graph with the results at its end, and without what can be eliminated for nothing."""
     first = len(edges)
     back = [dict(by) for by in edges] + [{end: ca.SX(1)} if edges[end] or end < count else {} for end in ends]
+    ahead, between, left = _ahead(back), [n for n in range(count, first) if back[n]], 0
+    while len(between) != left:
+        left = len(between)
+        between = [n for n in between if _adds_edges(back[n], ahead[n]) or _eliminate(n, back, ahead)]
+    return Graph(back, between, count, range(first, first + len(ends)))
+
+
+def _ahead(back: _Edges) -> list[set[int]]:
+    """For every place, the places that depend on it."""
     ahead: list[set[int]] = [set() for _ in back]
     for n, by in enumerate(back):
         for place in by:
             ahead[place].add(n)
-    between = [n for n in range(count, first) if back[n]]
-    left = 0
-    while len(between) != left:
-        left = len(between)
-        between = [n for n in between if _adds_edges(back[n], ahead[n]) or _eliminate(n, back, ahead)]
-    for n in between:
-        _eliminate(n, back, ahead)
-    jacobian = ca.SX(len(ends), count)
-    for row in range(len(ends)):
-        for place, slope in back[first + row].items():
-            jacobian[row, place] = slope
-    return jacobian
+    return ahead
 
 
 def _adds_edges(by: dict[int, ca.SX], after: set[int]) -> bool:
