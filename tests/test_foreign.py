@@ -226,7 +226,7 @@ def test_comparison_and_report_of_an_object_outside(tmp_path):
     """The same table, verdict, null test and page as for a plant."""
     shipped = fp.load_problem("two_mass")
     pair = {name: CONTROLLERS[name] for name in ("computed torque", "plain form")}
-    file = replace(shipped, problem=outside(task()), controllers=pair, headline=tuple(pair))
+    file = replace(shipped, problem=outside(task()), controllers=pair, headline=("computed torque", "plain form"))
     comparison = fp.compare(file, seed=0, compiled=False)
     errors = [entry.metrics.rms_error["y"] for entry in comparison.entries]
     inside = [fp.measure(task(), run(task(), one)).rms_error["y"] for one in pair.values()]
