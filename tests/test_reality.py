@@ -106,6 +106,11 @@ def test_no_reality_is_no_setting():
     assert describe(task(reality=fp.Reality(lagged())))["reality"]["is"] == "Reality"
 
 
+def test_table_of_a_problem_names_the_reality():
+    """A reader of a notebook sees what moves."""
+    assert "y of order 2, F of order 1" in task(reality=fp.Reality(lagged()))._repr_html_()
+
+
 def test_lagged_reality_moves_as_the_matrix_exponential_says():
     """The commands of the run, held over each cycle, move the exact discretisation of y'' = b F, tau F' = u - F alike."""
     reality = fp.Reality(lagged(), integrator=fp.RungeKutta4(substeps=4))
