@@ -186,6 +186,26 @@ def test_exact_model_is_the_reality():
     assert not has_exact_model(problem, bare)
 
 
+def test_comparison_with_the_reality_as_exact_model():
+    """Plans of the exact model are judged by the reality's equations: none is above the optimum of its own horizon."""
+    real = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "N"},
+        parameters={"gain": fp.Parameter(2.0, 2.5, "1/kg"), "friction": fp.Parameter(1.0, 3.0, "N s/m")},
+        response=lambda q, v, u, p: {"y": p.gain * (u.u - p.friction * ca.tanh(v.y))},
+    )
+    problem = task(reality=fp.Reality(real))
+    plan = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-6))
+    file = replace(fp.load_problem("two_mass"), problem=problem, headline=None)
+    comparison = fp.compare(replace(file, controllers={"RHC": plan, "RHC exact": fp.ExactModel(plan)}), seed=0)
+    assert [entry.exact for entry in comparison.entries] == [False, True]
+    for entry in comparison.entries:
+        assert entry.optimality is not None
+        assert abs(entry.optimality.worst) < 1e-6
+    with pytest.raises(NotSupported, match=r"problem\.of_model"):
+        fp.predict_response(problem, CONTROLLERS["plain form"])
+
+
 def test_exact_model_is_refused_where_the_reality_has_other_coordinates():
     """The controller is given y and y' only, so it cannot have a model with a force."""
     with pytest.raises(NotSupported, match="the coordinate F, which the controller is not given"):
