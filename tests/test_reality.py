@@ -106,6 +106,11 @@ def test_no_reality_is_no_setting():
     assert describe(task(reality=fp.Reality(lagged())))["reality"]["is"] == "Reality"
 
 
+def test_table_of_a_problem_names_the_reality():
+    """A reader of a notebook sees what moves."""
+    assert "y of order 2, F of order 1" in task(reality=fp.Reality(lagged()))._repr_html_()
+
+
 def test_lagged_reality_moves_as_the_matrix_exponential_says():
     """The commands of the run, held over each cycle, move the exact discretisation of y'' = b F, tau F' = u - F alike."""
     reality = fp.Reality(lagged(), integrator=fp.RungeKutta4(substeps=4))
@@ -179,6 +184,26 @@ def test_exact_model_is_the_reality():
     assert errors[1] < 0.02 * errors[0]
     assert has_exact_model(problem, fp.ExactModel(bare))
     assert not has_exact_model(problem, bare)
+
+
+def test_comparison_with_the_reality_as_exact_model():
+    """Plans of the exact model are judged by the reality's equations: none is above the optimum of its own horizon."""
+    real = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "N"},
+        parameters={"gain": fp.Parameter(2.0, 2.5, "1/kg"), "friction": fp.Parameter(1.0, 3.0, "N s/m")},
+        response=lambda q, v, u, p: {"y": p.gain * (u.u - p.friction * ca.tanh(v.y))},
+    )
+    problem = task(reality=fp.Reality(real))
+    plan = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-6))
+    file = replace(fp.load_problem("two_mass"), problem=problem, headline=None)
+    comparison = fp.compare(replace(file, controllers={"RHC": plan, "RHC exact": fp.ExactModel(plan)}), seed=0)
+    assert [entry.exact for entry in comparison.entries] == [False, True]
+    for entry in comparison.entries:
+        assert entry.optimality is not None
+        assert abs(entry.optimality.worst) < 1e-6
+    with pytest.raises(NotSupported, match=r"problem\.of_model"):
+        fp.predict_response(problem, CONTROLLERS["plain form"])
 
 
 def test_exact_model_is_refused_where_the_reality_has_other_coordinates():

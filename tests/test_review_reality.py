@@ -172,3 +172,20 @@ def test_comparison_shows_belief_beside_reality():
         reached = 1 - np.exp(-1e-3 / 0.01) if name == "real" else 1.0
         assert factor == pytest.approx(1 - 0.1 * 2.0 * reached, abs=1e-6)
     assert {"reality: F", "CTC+FPI: response of y, belief and reality"} <= set(titles["real"]) - set(titles["model"])
+
+
+def test_pole_that_is_fast_away_from_the_start():
+    """An actuator whose lag shrinks with its force is followed at the start, not on the way, and then with the sub-steps named."""
+
+    def response(q, v, u, p):
+        return {"y": p.b * q.F, "F": (u.u - q.F) * (100 + 3000 * q.F**2)}
+
+    plant = replace(lagged(), response=response)
+    coarse = task(reality=fp.Reality(plant), start={"y": 0.0, "y'": 3.0})
+    [one] = [a for a in fp.review(coarse, {}, mismatch=0.0, seed=0).problem if "reality" in a.question]
+    assert one.verdict == "no"
+    assert "makes it grow" in one.evidence
+    substeps = int(one.change.split("substeps=")[1].split(")")[0])
+    fine = replace(coarse, reality=fp.Reality(plant, integrator=fp.RungeKutta4(substeps)))
+    [two] = [a for a in fp.review(fine, {}, mismatch=0.0, seed=0).problem if "reality" in a.question]
+    assert two.verdict == "yes"

@@ -79,8 +79,8 @@ def nominal_run(problem: Problem, controller: Controller, *, compiled: bool = Tr
     """Return the run of the controller without its deformation on its own model, without disturbances and noise.
 
     Raises:
-        NotSupported: dead time, estimated responses, a controller that does not track or plan with one model, a model that
-            does not stay finite.
+        NotSupported: a reality, dead time, estimated responses, a controller that does not track or plan with one model, a model
+            that does not stay finite.
         FpirhcError: every error that the controller raises about the problem.
     """
     _check(problem, controller)
@@ -179,6 +179,11 @@ def _check(problem: Problem, controller: Controller) -> None:
         raise NotSupported(
             f"no prediction for {type(controller).__name__}: it needs a controller that tracks or plans with one model and one "
             "map, and is given the measured state"
+        )
+    if problem.reality is not None:
+        raise NotSupported(
+            "no prediction beside a reality, whose response may not see the command at once; that of the model alone is that of "
+            "problem.of_model"
         )
     late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
     if late or problem.sensing.delay(problem.plant, problem.period):

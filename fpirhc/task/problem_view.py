@@ -55,6 +55,10 @@ def _others(problem: Problem) -> list[tuple[str, str]]:
     if late.measurement:
         rows.append(("dead time of the measurement", f"{late.measurement:g} {unit}"))
     rows += [(f"disturbance of {name}", type(one).__name__) for name, one in problem.disturbances.items()]
+    if problem.symbolic_reality is not None:
+        rows.append(("reality", "; ".join(plant_facts(problem.real_plant))))
+    if problem.foreign is not None:
+        rows.append(("reality", f"{type(problem.foreign.body).__name__}, outside"))
     if not problem.sensing.ideal:
         rows.append(("sensing", "with sensors or an estimator"))
     return rows

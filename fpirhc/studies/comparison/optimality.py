@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -52,7 +52,8 @@ def measure_optimality(
     if ready.learns or "parameters" in feeds:
         return None
     times, states = (run[feeds[n] if feeds.get(n) in run.layout.names else n] for n in ("time", "state"))
-    planned = planner.planned(problem)
+    model = ready.model_plant(problem)
+    planned = planner.planned(problem if model is problem.plant else replace(problem, plant=model, reality=None))
     assert planned.horizon is not None
     assert planned.cost is not None
     ocp = transcribe(planned.plant, planned.reference, planned.horizon, planned.cost, planned.limits)
@@ -64,7 +65,7 @@ def measure_optimality(
     stride = cycles_per_stage(problem.horizon, problem.period)
     plans = np.arange(stride, run.cycles, stride)
     rows = plans[np.unique(np.linspace(0, plans.size - 1, SAMPLES).astype(int))] if plans.size else plans
-    parameters, excess = controller.parameters(problem.plant), []
+    parameters, excess = ready.parameters(model), []
     for row in rows:
         shift = run["command_shift"][row - 1]
         first = ocp.start(states[row], run["command"][row - 1] - shift).full().ravel()
