@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -12,6 +13,9 @@ import fpirhc as fp
 from fpirhc.contraction import leaking_limit
 from fpirhc.controllers.base import Controller
 from fpirhc.deformation import Deformation
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.studies.scenarios.bench import Bench, Conditions
+from fpirhc.studies.scenarios.draws import COMPARING, TUNING
 
 PERIOD, RATE = 1e-3, 6.0  # s, 1/s
 MAP = fp.Affine(gain=-1.0)  # effective gain 0.5
@@ -167,3 +171,24 @@ def test_no_question_without_dead_time():
     problem = replace(mass(20), dead_time=fp.DeadTime())
     answers = asked(problem, fp.ComputedTorque(fp.Exponential(rate=RATE), MAP))
     assert not [q for q in answers if "wrong by a cycle" in q]
+
+
+def test_scenarios_draw_the_dead_time():
+    """With 5 % of 20 cycles the plant has 19, 20 or 21, and the controllers believe in 20: a sharp pairing fails in two thirds."""
+    problem = replace(mass(20), duration=1.5, measure_from=0.5)
+    controllers = {
+        "sharp": told(fp.Increment(MAP, cycles=20, uncertainty=0)),
+        "leaky": told(fp.Increment(MAP, cycles=20, uncertainty=5)),
+    }
+    task = Task("late", Path(__file__), "", "", problem, controllers)
+    bench = Bench(task, Conditions(seed=0, use=COMPARING, percent=5.0, compiled=False))
+    lateness = [bench._scenario(k)[0].lateness for k in range(8)]
+    assert set(lateness) == {-1, 0, 1}
+    for k in (lateness.index(-1), lateness.index(0), lateness.index(1)):
+        cycles = bench._scenario(k)[1].dead_time.inputs["u"] / PERIOD
+        assert cycles == pytest.approx(20 + lateness[k])
+        sharp, leaky = (bench.record(k, name)["error"] for name in controllers)
+        assert leaky < 0.1
+        assert (sharp is not None and sharp < 0.1) == (lateness[k] == 0)
+    tuning = Bench(task, Conditions(seed=0, use=TUNING, percent=5.0, compiled=False))
+    assert {tuning._scenario(k)[1].dead_time.inputs["u"] for k in range(8)} == {20 * PERIOD}

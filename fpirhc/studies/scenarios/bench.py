@@ -10,19 +10,21 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any
 
+from fpirhc.controllers.contract import resolved
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero
 from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.review.late import is_late, scaled
 from fpirhc.simulation.metrics import measure
 from fpirhc.simulation.simulate import Simulator, simulator
-from fpirhc.studies.scenarios.draws import Scenario, draw, with_exact
+from fpirhc.studies.scenarios.draws import COMPARING, Scenario, draw, with_exact
 from fpirhc.studies.scenarios.score import outcome, ranges, relative_error
 from fpirhc.task.problem import Problem
 
-FORMAT = 2  # of records
+FORMAT = 3  # of records
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ class Bench:
         self._live = live or {}
         self._task, self._conditions = task, conditions
         self._ranges = ranges(task.problem)
-        self._simulators: dict[str, Simulator | FpirhcError] = {}
+        self._simulators: dict[tuple[str, int], Simulator | FpirhcError] = {}
         self._drawn: tuple[int, Scenario, Problem] | None = None
 
     def record(self, number: int, name: str, settings: Mapping[str, float] | None = None) -> dict[str, Any]:
@@ -103,7 +105,8 @@ class Bench:
         """
         scenario, variant = self._scenario(number)
         try:
-            run = self._simulator(name).run(seed=scenario.seed, name=name, variant=variant, settings=settings)
+            ready = self._simulator(name, self._lateness(scenario))
+            run = ready.run(seed=scenario.seed, name=name, variant=variant, settings=settings)
         except FpirhcError as error:
             return {"controller": name, "skipped": str(error)}
         metrics = measure(variant, run, self._task.metrics)
@@ -131,28 +134,42 @@ class Bench:
                 percent=conditions.percent,
                 model=problem.plant,
             )
-            self._drawn = (number, scenario, with_exact(problem, scenario.exact))
+            late = self._late(self._lateness(scenario))
+            self._drawn = (number, scenario, with_exact(late, scenario.exact))
         return self._drawn[1:]
 
-    def _simulator(self, name: str) -> Simulator:
-        ready = self._simulators.get(name)
+    def _lateness(self, scenario: Scenario) -> int:
+        """Whether the plant's dead times are other ones than the controllers'; they are not in studies that tune."""
+        drawn = self._conditions.use == COMPARING and self._conditions.percent > 0 and is_late(self._task.problem)
+        return scenario.lateness if drawn else 0
+
+    def _late(self, lateness: int) -> Problem:
+        problem = self._task.problem
+        return scaled(problem, lateness * self._conditions.percent) if lateness else problem
+
+    def _simulator(self, name: str, lateness: int = 0) -> Simulator:
+        key = name, lateness
+        ready = self._simulators.get(key)
         if ready is None or (isinstance(ready, Simulator) and ready.remembers):
-            ready = self._simulators[name] = self._built(name)
+            ready = self._simulators[key] = self._built(name, lateness)
         if isinstance(ready, FpirhcError):
             raise ready
         return ready
 
     def changes(self, name: str) -> bool:
         """Whether the live settings of a controller can be changed: its loop can be built with them."""
-        if name not in self._simulators:
-            self._simulators[name] = self._built(name)
-        return isinstance(self._simulators[name], Simulator)
+        if (name, 0) not in self._simulators:
+            self._simulators[name, 0] = self._built(name, 0)
+        return isinstance(self._simulators[name, 0], Simulator)
 
-    def _built(self, name: str) -> Simulator | FpirhcError:
+    def _built(self, name: str, lateness: int) -> Simulator | FpirhcError:
+        """The loop; its controller has the automatic settings for the problem's own dead times, whatever the plant's are."""
         live, compiled = self._live.get(name, ()), self._conditions.compiled
         compile_it = compiled if compiled is not None else bool(live)
         try:
-            return simulator(self._task.problem, self._task.controllers[name], compiled=compile_it, live=live)
+            controller = self._task.controllers[name]
+            controller = resolved(self._task.problem, controller) if lateness else controller
+            return simulator(self._late(lateness), controller, compiled=compile_it, live=live)
         except FpirhcError as error:
             return error
 

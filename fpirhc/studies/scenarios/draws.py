@@ -3,7 +3,8 @@
 Scenario k of a seed is always the same: its numbers come from a stream of its own, `SeedSequence(seed, spawn_key=(use, k))`,
 whatever the number of scenarios, of processes and of controllers, and in whatever order they run. Every exact parameter
 is drawn from its range (see `fpirhc.plant.mismatch`): by its own spread, or without one multiplied by a factor of its own, the
-logarithm of which is uniform between log(1 - P/100) and log(1 + P/100).
+logarithm of which is uniform between log(1 - P/100) and log(1 + P/100). Dead times are those of the problem, or P percent shorter
+or longer, rounded away from it to whole cycles: another length of a queue is another loop, so there are three and no more.
 """
 
 from __future__ import annotations
@@ -28,11 +29,13 @@ class Scenario:
         seed: of the disturbances' noise.
         exact: exact parameters of the plant, shape (np,).
         mismatch: distance of the model from them, see `mismatch_of`.
+        lateness: -1, 0 or 1: dead times are shorter by the whole percentage, as in the problem, or longer by it.
     """
 
     seed: int
     exact: np.ndarray
     mismatch: float
+    lateness: int = 0
 
 
 def draw(plant: Plant, *, seed: int, use: int, number: int, percent: float, model: Plant | None = None) -> Scenario:
@@ -46,14 +49,15 @@ def draw(plant: Plant, *, seed: int, use: int, number: int, percent: float, mode
         percent: range of the exact parameters, percent.
         model: the controllers' model, where it is another plant. The mismatch is then that of the parameters which both have.
     """
-    parameters, noise = np.random.SeedSequence(seed, spawn_key=(use, number)).spawn(2)
+    parameters, noise, late = np.random.SeedSequence(seed, spawn_key=(use, number)).spawn(3)
     shares = np.random.default_rng(parameters).random(plant.exact.size)
     values = [drawn(p, percent, float(s)) for p, s in zip(plant.parameters.values(), shares, strict=True)]
     exact = np.array(values, dtype=float)
     believed = _believed(model or plant)
     shared = [k for k, name in enumerate(plant.parameters) if name in believed]
     assumed = np.array([believed[name] for name in plant.parameters if name in believed])
-    return Scenario(int(noise.generate_state(1)[0]), exact, mismatch_of(assumed, exact[shared]))
+    lateness = int(np.random.default_rng(late).integers(-1, 2))
+    return Scenario(int(noise.generate_state(1)[0]), exact, mismatch_of(assumed, exact[shared]), lateness)
 
 
 def _believed(model: Plant) -> dict[str, float]:
