@@ -42,7 +42,8 @@ def add_seed(parser: Parser, use: str) -> None:
 def add_mismatch(parser: Parser, default: float | None = 0.0) -> None:
     """--mismatch PERCENT, with the same meaning wherever it stands; see `fpirhc.plant.mismatch`."""
     text = (
-        "every exact parameter lies within PERCENT %% of its value in the problem file, or of its spread (default: 0)"
+        "every exact parameter lies within PERCENT %% of its value in the problem file, or of its spread, and dead times likewise "
+        "(default: 0)"
     )
     parser.add_argument("--mismatch", type=float, default=default, metavar="PERCENT", help=text)
 
