@@ -20,7 +20,9 @@ from judging import Judge, Judgement
 from table import write_table
 
 import fpirhc as fp
-from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.symbolic.native import native
 
 SOLVED, ROUGHLY = 1e-6, 1e-4

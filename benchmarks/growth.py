@@ -22,7 +22,8 @@ import numpy as np
 
 import fpirhc as fp
 from fpirhc.controllers.base import compose_controller
-from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import generate, native
 

@@ -23,8 +23,10 @@ import casadi as ca
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
+from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser, judge
 from fpirhc.optimisers.multiple_shooting import MultipleShooting
 from fpirhc.optimisers.shooting import interleave, program, separate, shift_dynamics, shift_variables, sizes

@@ -41,7 +41,7 @@ from .deformation.wrappers.tuned import Tuned
 from .errors import FpirhcError
 from .horizon.cost import CustomCost, LQRTerminal, Quadratic
 from .horizon.hessian_models import ExactHessian, GaussNewton
-from .horizon.problem import Horizon
+from .horizon.horizon import Horizon
 from .learning.estimators.disturbance_kalman import DisturbanceKalman
 from .learning.estimators.disturbed import disturbed
 from .learning.estimators.moving_horizon import MovingHorizon

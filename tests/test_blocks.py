@@ -11,8 +11,9 @@ from plants import known, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import InvalidValue
-from fpirhc.horizon.problem import stage_data, transcribe
 from fpirhc.horizon.rollout import rollout
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 
 PLANT, REFERENCE = pendulum(), fp.Trajectory(lambda t: {"angle": ca.sin(2 * t)})
 COST = fp.Quadratic(states={"angle": 10.0, "angle'": 0.1}, effort={"torque": 0.05})

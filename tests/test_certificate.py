@@ -9,7 +9,8 @@ import pytest
 from test_fixed_point import SWING, linear_problem, pendulum_problem
 
 import fpirhc as fp
-from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 
 PROBLEMS = ("two_mass", "van_der_pol", "cart_pole", "two_link_arm", "chain_of_masses")
 

@@ -15,7 +15,8 @@ from plants import known
 
 import fpirhc as fp
 from fpirhc.errors import NotSupported
-from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 
 REACTOR = fp.Plant(
     coordinates={"cA": "mol/l", "cB": "mol/l"},

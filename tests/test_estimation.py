@@ -96,7 +96,8 @@ def test_a_constant_disturbance_leaves_no_offset():
 
 def feedback(problem: fp.Problem) -> float:
     """K of u = -K y, from the plan's first input a little off the reference."""
-    from fpirhc.horizon.problem import stage_data, transcribe
+    from fpirhc.horizon.stage_data import stage_data
+    from fpirhc.horizon.transcription import transcribe
 
     assert problem.horizon is not None
     assert problem.cost is not None

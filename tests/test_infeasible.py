@@ -10,7 +10,8 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem
-from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 
 SLEDGE = fp.Plant(
     coordinates={"y": "m"},

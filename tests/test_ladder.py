@@ -11,7 +11,8 @@ from plants import pendulum
 
 import fpirhc as fp
 from fpirhc.conformance.optimiser import check_optimiser
-from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.symbolic.layout import Layout, Signal
 

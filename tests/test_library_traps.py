@@ -16,8 +16,9 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.errors import NotSupported
-from fpirhc.horizon.problem import OptimalControl, transcribe
+from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import status_of
 from fpirhc.optimisers.nlp import Ipopt, SequentialQuadratic
 from fpirhc.optimisers.quadratic_solvers import Osqp, quadratic_solver

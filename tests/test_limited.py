@@ -14,7 +14,8 @@ from judging import Judge
 from plants import known
 
 import fpirhc as fp
-from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.limited import limited_step
 from fpirhc.optimisers.scales import scales
 from fpirhc.symbolic.native import find_compiler, native

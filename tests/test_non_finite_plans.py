@@ -34,7 +34,8 @@ def exploding() -> fp.Problem:
 @pytest.fixture(scope="module")
 def plan() -> fp.Plan:
     """The first horizon, solved by the default optimiser."""
-    from fpirhc.horizon.problem import stage_data, transcribe
+    from fpirhc.horizon.stage_data import stage_data
+    from fpirhc.horizon.transcription import transcribe
 
     p = exploding()
     assert p.horizon is not None

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import render
 from fpirhc.report.terminal import progress_bars, show, show_run

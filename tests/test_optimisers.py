@@ -16,8 +16,9 @@ from plants import chain, known, pendulum
 import fpirhc as fp
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import InvalidValue, NotSupported
-from fpirhc.horizon.problem import stage_data, transcribe
 from fpirhc.horizon.rollout import rollout
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import judge
 from fpirhc.optimisers.quadratic_solvers import quadratic_solver
 from fpirhc.symbolic.native import generate, native

@@ -10,7 +10,8 @@ import pytest
 from test_certificate import PROBLEMS, first_horizon
 
 import fpirhc as fp
-from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 
 
 @pytest.mark.parametrize("name", PROBLEMS)

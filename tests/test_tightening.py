@@ -11,7 +11,8 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
-from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 
 LIMIT = 0.8
 

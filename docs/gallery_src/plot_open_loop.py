@@ -12,7 +12,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 
 task = fp.load_problem("cart_pole")
 problem = task.problem

@@ -15,7 +15,7 @@ from fpirhc.controllers.base import Controller, compose_controller
 from fpirhc.controllers.contract import checked, resolved
 from fpirhc.describe import describe
 from fpirhc.horizon.cost import Quadratic
-from fpirhc.horizon.problem import Horizon
+from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing

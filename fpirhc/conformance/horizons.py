@@ -13,7 +13,10 @@ from scipy.linalg import solve_discrete_are
 
 from fpirhc.errors import NotSupported
 from fpirhc.horizon.cost import LQRTerminal, Quadratic
-from fpirhc.horizon.problem import Horizon, OptimalControl, stage_data, transcribe
+from fpirhc.horizon.horizon import Horizon
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.status import Status

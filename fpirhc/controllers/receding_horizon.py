@@ -29,7 +29,9 @@ from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidProblem
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.live_data import SCALE, STEEPEST, live_signals
-from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.plant.plant import Plant

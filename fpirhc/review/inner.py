@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import FpirhcError
-from fpirhc.horizon.problem import transcribe
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.symbolic.expression import kind
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem import Problem

@@ -24,7 +24,9 @@ import numpy as np
 
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stage, linear_stage
-from fpirhc.horizon.problem import Horizon, stage_data, transcribe
+from fpirhc.horizon.horizon import Horizon
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals

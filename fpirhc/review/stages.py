@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import FpirhcError
-from fpirhc.horizon.problem import Horizon
+from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid

@@ -12,7 +12,9 @@ from fpirhc.contraction.identified import identified_factor
 from fpirhc.contraction.sampled import sampled_jacobians
 from fpirhc.contraction.spectrum import factors_along
 from fpirhc.controllers.base import Controller
-from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.simulation.loop import REALITY_STATE
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout, Signal, scalar

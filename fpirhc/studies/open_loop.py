@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidProblem, nearest
-from fpirhc.horizon.problem import stage_data, transcribe
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.certificate import Certificate, certify
 from fpirhc.optimisers.plan import Plan, solve
 from fpirhc.problem_files.problem_file import Task

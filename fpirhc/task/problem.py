@@ -14,7 +14,7 @@ from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Duration
 from fpirhc.horizon.cost import Cost
-from fpirhc.horizon.problem import Horizon
+from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.stage_check import check_stage
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.plant import Plant

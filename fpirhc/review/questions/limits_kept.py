@@ -11,7 +11,9 @@ from dataclasses import replace
 import numpy as np
 
 from fpirhc.errors import FpirhcError
-from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid, each
 from fpirhc.review.question import ProblemQuestion

@@ -9,7 +9,9 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
 from fpirhc.errors import FpirhcError
-from fpirhc.horizon.problem import OptimalControl, stage_data, transcribe
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status

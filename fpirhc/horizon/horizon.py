@@ -1,0 +1,57 @@
+"""The stages of a prediction: how many, how long, and what holds along them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import Count, Duration
+from fpirhc.plant.integrators import Integrator, RungeKutta4
+
+
+@dataclass(frozen=True)
+class Horizon(Checked):
+    """Length and stages of a controller's prediction.
+
+    Args:
+        stages: number of stages N.
+        step: length of one stage, s, over which the input is constant.
+        discretisation: integrator of the model over one stage: RungeKutta4(), Euler(), ImplicitMidpoint(), RadauIIA().
+        terminal: names of states that must meet the reference at the end of the horizon.
+        blocks: lengths of blocks of stages over which the inputs are held (move blocking); they add up to the stages. Empty: every
+            stage has inputs of its own.
+        margins: by name of a state, the distances by which a plan stays inside the state's limits after stages 1 ... N, in the
+            state's unit: room for what the model does not predict (`tightened` computes them). The problem's limits stay as they
+            are for the run and its metrics.
+
+    Raises:
+        InvalidValue: fewer than one stage, a step that is not positive, blocks that do not add up, or margins that are not one
+            finite number of at least 0 for every stage.
+        NotSupported: an integrator that is not made of plain expressions.
+    """
+
+    stages: Count
+    step: Duration
+    discretisation: Integrator = field(default_factory=RungeKutta4)
+    terminal: tuple[str, ...] = ()
+    blocks: tuple[int, ...] = ()
+    margins: Mapping[str, Sequence[float]] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        if self.blocks and (sum(self.blocks) != self.stages or min(self.blocks) < 1):
+            raise InvalidValue(
+                f"horizon: blocks {self.blocks} add up to {sum(self.blocks)}, expected {self.stages} stages"
+            )
+        for name, margin in self.margins.items():
+            if len(margin) != self.stages or not all(0 <= m < math.inf for m in margin):
+                raise InvalidValue(
+                    f"horizon: margins of '{name}' must be {self.stages} finite numbers of at least 0, one for every stage, got "
+                    f"{margin!r}"
+                )
+        if self.discretisation.opaque:
+            raise NotSupported(
+                "a horizon needs an integrator of plain expressions, such as RungeKutta4() or RadauIIA()"
+            )

@@ -1,0 +1,75 @@
+"""The data of the stages of one horizon: time, reference, feedforward, parameters, and what else its stages read."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.horizon.cost import Cost
+from fpirhc.horizon.horizon import Horizon
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.expression import kind
+from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.task.reference import Reference
+
+
+def data_layout(plant: Plant, horizon: Horizon) -> Layout:
+    """Layout of one stage's data.
+
+    A terminal equality adds whether the stage is the last, and the reference after it; blocks add whether the inputs are free.
+    """
+    free = (scalar("free"),) if horizon.blocks else ()
+    units = dict(zip(plant.state.elements, plant.state.units, strict=True))
+    names = tuple(horizon.margins)
+    margin = (Signal("margin", names, tuple(units[e] for e in names)),) if names else ()
+    signals = (
+        plant.time,
+        Signal("reference", plant.state.elements, plant.state.units),
+        Signal("feedforward", plant.input.elements, plant.input.units),
+        plant.parameter,
+        *free,
+        *margin,
+    )
+    if not horizon.terminal:
+        return Layout(signals)
+    return Layout((*signals, scalar("last"), Signal("target", plant.state.elements, plant.state.units)))
+
+
+def stage_data(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, live: int = 0) -> ca.Function:
+    """Function (time, parameters) -> data of all stages, shape (ntheta, N + 1).
+
+    With `live` rows of settings and what follows from them, (time, parameters, these rows) -> data that end with them.
+    """
+    matrix = kind(reference.opaque or plant.inverse_opaque)
+    t, p = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
+    state, response = reference.function(plant)(t)
+    if cost.uses_feedforward:
+        needed = plant.inverse_function(state, response[list(plant.controlled_indices)], p)
+    else:
+        needed = matrix.zeros(plant.input.size)
+    # The live rows come out of the same call where they follow these rows: joining tables would copy both.
+    joined = bool(live) and not (horizon.blocks or horizon.terminal or horizon.margins)
+    rows = [matrix.sym("live", live)] if joined else []
+    one = ca.Function("fpirhc_stage_data", [t, p, *rows], [ca.densify(ca.vertcat(t, state, needed, p, *rows))])
+    start, parameters = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
+    settings = [ca.MX.sym("live", live)] if live else []
+    nodes = horizon.stages + 1
+    times = start + ca.DM(np.arange(nodes) * horizon.step).T
+    repeated = [ca.repmat(v, 1, nodes) for v in (parameters, *(settings if joined else ()))]
+    table = one.map(nodes)(times, *repeated)
+    if horizon.blocks:
+        free = np.zeros((1, nodes))
+        free[0, [0, *np.cumsum(horizon.blocks)]] = 1.0
+        table = ca.vertcat(table, free)
+    if horizon.margins:
+        margins = np.array([[*horizon.margins[e], 0.0] for e in horizon.margins], dtype=float)
+        table = ca.vertcat(table, margins)
+    if horizon.terminal:
+        last, after = np.zeros((1, nodes)), [*range(1, nodes), nodes - 1]
+        last[0, nodes - 2] = 1.0
+        targets = table[data_layout(plant, horizon).slice("reference"), :][:, after]
+        table = ca.vertcat(table, last, targets)
+    if live and not joined:
+        table = ca.vertcat(table, ca.repmat(settings[0], 1, nodes))
+    names = ["t", "p", *(["live"] if live else [])]
+    return ca.Function("fpirhc_horizon_data", [start, parameters, *settings], [table], names, ["data"])

@@ -1,0 +1,296 @@
+"""From plant, reference, horizon, cost and limits to the optimal control problem in standard form."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import InvalidName, InvalidProblem, Mistakes
+from fpirhc.fields.user_code import scalar_expression
+from fpirhc.horizon.constraint_states import (
+    ConstraintState,
+    ends,
+    hard,
+    hard_state_bounds,
+    narrowed,
+    paths,
+    rates,
+    soft_names,
+    softened,
+    state_prices,
+)
+from fpirhc.horizon.cost import Cost, Linearisation, View
+from fpirhc.horizon.horizon import Horizon
+from fpirhc.horizon.live_data import live_signals, live_table, settings_in
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.reference_expansion import expand_along, input_curvature
+from fpirhc.horizon.stage_data import data_layout, stage_data
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.layout import Expression, Named, Signal
+from fpirhc.symbolic.live import PREFIX, live_numbers, nominal, settled
+from fpirhc.task.limits import Limits
+from fpirhc.task.reference import Reference
+
+
+def transcribe(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits) -> OptimalControl:
+    """Return the standard form of one horizon.
+
+    Raises:
+        InvalidProblem: mistakes in the cost or the limits, or a cost that is not finite at the reference (the term is named).
+    """
+    nominal(cost).check(plant)
+    limits.check(plant)
+    _check_names(plant, horizon, limits)
+    stage = _stage_expressions(plant, reference, horizon, cost, limits)
+    binding, free = stage.binding, stage.before.numel()
+    dynamics, stage_cost, terminal_cost = _stage_functions(stage, horizon.step)
+    nodes = _nodes(plant, reference, horizon, cost, (free, len(binding)))
+    settings = tuple(s.name().removeprefix(PREFIX) for s in stage.settings)
+    values = {path: number.value for path, number in live_numbers(cost, limits).items()}
+
+    def derive(numbers: Mapping[str, float]) -> dict[str, float]:
+        advance = _advance(plant, horizon)
+        return settled(cost, numbers).derived(plant, lambda: _linearise(plant, reference, horizon, advance))
+
+    values |= derive(values) if settings else {}
+    if settings:
+        # The scale and the largest eigenvalue follow from the expansion; until `at` they are ones.
+        ones, numbers = np.ones(plant.input.size), np.array([values[path] for path in settings])
+        nodes = (*nodes[:2], live_table(nodes[2], numbers, ones, 1.0))
+    _check_finite(tuple(stage.terms), stage_cost, terminal_cost, nodes, cost)
+    functions: dict[object, ca.Function] = {}
+    along = expand_along(dynamics, stage_cost, terminal_cost, nodes, functions)
+    lower, upper = hard_state_bounds(limits, plant, horizon.margins)
+    state = _stage_state(plant, bool(free), binding)
+    ocp = OptimalControl(
+        stages=horizon.stages,
+        step=horizon.step,
+        state=state,
+        input=plant.input,
+        data=data_layout(plant, horizon) + live_signals(settings, plant.input),
+        dynamics=dynamics,
+        stage_cost=stage_cost,
+        terminal_cost=terminal_cost,
+        terms=tuple(stage.terms),
+        start=_start(plant, free, len(binding)),
+        state_lower=np.concatenate([lower, np.full(free, -np.inf), [w.lower for w in binding]]),
+        state_upper=np.concatenate([upper, np.full(free, np.inf), [w.upper for w in binding]]),
+        input_lower=nominal(limits).input_bounds(plant)[0],
+        input_upper=nominal(limits).input_bounds(plant)[1],
+        curvature=input_curvature(along, horizon.step),
+        nodes=nodes,
+        along=along,
+        written=len(binding),
+        state_price=state_prices(limits, state, plant, horizon.step),
+        settings=settings,
+        live_bounds=tuple(live_numbers(limits.inputs)),
+        derive=derive,
+        functions=functions,
+    )
+    return ocp.at(values)
+
+
+@dataclass(frozen=True, eq=False)
+class _Stage:
+    """Symbols x, before, u, theta of one stage, and its expressions; `before` is empty unless the input is part of the state.
+
+    theta ends with the symbols of live `settings` and of what follows from them (see `live_data`).
+    """
+
+    x: Expression
+    before: Expression
+    u: Expression
+    applied: Expression
+    theta: Expression
+    x_next: Expression
+    terms: dict[str, Expression]
+    final: Expression
+    binding: list[ConstraintState]
+    settings: list[ca.SX]
+
+
+def _stage_expressions(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits) -> _Stage:
+    layout = data_layout(plant, horizon)
+    keeps_input = cost.uses_rate or bool(limits.rates) or bool(horizon.blocks)
+    x, before = ca.SX.sym("x", plant.state.size), ca.SX.sym("before", plant.input.size * keeps_input)
+    u, theta = ca.SX.sym("u", plant.input.size), ca.SX.sym("theta", layout.size)
+    data = layout.split(theta)
+    applied = data["free"] * u + (1 - data["free"]) * before if horizon.blocks else u
+    view = _view(plant, ca.vertcat(x, before), applied, data, cost, keeps_input)
+    try:
+        advance = _advance(plant, horizon)
+        x_next = advance(x, applied, view.parameters.vector)
+        written = _written(plant, horizon, limits, view, x_next, data)
+        soft = softened(written, limits, plant, x)
+        terms = {**_scalar_terms(cost.stage(view)), **soft}
+        if horizon.blocks:
+            # Inputs that have no effect are drawn to those that are held, so that a plan states what is applied.
+            terms["held"] = (1 - data["free"]) * ca.sumsqr((u - before) / _reach(limits, plant))
+        terminal = cost.terminal_cost(view, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.step)
+        end = sum((soft[f"soft {e}"] for e in limits.soft if e in limits.states), start=ca.SX(0))
+        final = _scalar_terms({"terminal": terminal})["terminal"] + horizon.step * end
+    except InvalidName as error:
+        raise InvalidProblem(f"cost: {error}") from None
+    binding = hard(written, soft_names(limits, plant))
+    settings = settings_in([x_next, *terms.values(), final, *(w.expression for w in binding)], theta)
+    if settings:
+        live = live_signals(tuple(s.name() for s in settings), plant.input)
+        theta = ca.vertcat(theta, *settings, ca.SX.sym("live", live.size - len(settings)))
+    return _Stage(x, before, u, applied, theta, x_next, terms, final, binding, settings)
+
+
+def _stage_functions(stage: _Stage, step: float) -> tuple[ca.Function, ca.Function, ca.Function]:
+    """Functions of the dynamics, the stage cost and the terminal cost."""
+    u, theta, binding = stage.u, stage.theta, stage.binding
+    s = ca.vertcat(stage.x, stage.before, ca.SX.sym("z", len(binding)))
+    s_next = ca.vertcat(
+        stage.x_next, *([stage.applied] if stage.before.numel() else []), *(w.expression for w in binding)
+    )
+    costs = step * ca.vertcat(*stage.terms.values())
+    return (
+        ca.Function("fpirhc_dynamics", [s, u, theta], [ca.densify(s_next)]),
+        ca.Function("fpirhc_stage_cost", [s, u, theta], [ca.sum1(costs), ca.densify(costs)]),
+        ca.Function("fpirhc_terminal_cost", [s, theta], [ca.densify(stage.final)]),
+    )
+
+
+def _reach(limits: Limits, plant: Plant) -> ca.DM:
+    """Half the range of every input, 1 where it is free."""
+    lower, upper = limits.input_bounds(plant)
+    half = 0.5 * (upper - lower)
+    return ca.DM(np.where(np.isfinite(half) & (half > 0), half, 1.0))
+
+
+def _check_names(plant: Plant, horizon: Horizon, limits: Limits) -> None:
+    mistakes = Mistakes("horizon")
+    mistakes.unknown("terminal: state", horizon.terminal, plant.state.elements)
+    mistakes.unknown("margins: limit of state", horizon.margins, list(limits.states))
+    for name in horizon.margins.keys() & limits.states.keys():
+        lower, upper = limits.states[name]
+        if 2 * max(horizon.margins[name]) >= upper - lower:
+            mistakes.add(
+                f"margins of '{name}' reach {max(horizon.margins[name]):.6g}, which leaves nothing between its limits "
+                f"{lower:g} and {upper:g}; widen the limits, or adapt faster"
+            )
+    mistakes.raise_if_any()
+
+
+def _stage_state(plant: Plant, keeps_input: bool, binding: list[ConstraintState]) -> Signal:
+    before = tuple(f"{i} before" for i in plant.input.elements) if keeps_input else ()
+    units = plant.input.units if keeps_input else ()
+    return Signal(
+        "state",
+        plant.state.elements + before + tuple(w.name for w in binding),
+        plant.state.units + units + tuple(w.unit for w in binding),
+    )
+
+
+def _start(plant: Plant, free: int, written: int) -> ca.Function:
+    x, u = ca.SX.sym("x", plant.state.size), ca.SX.sym("u", plant.input.size)
+    first = ca.vertcat(x, *([u] if free else []), ca.SX.zeros(written))
+    return ca.Function("fpirhc_stage_start", [x, u], [ca.densify(first)], ["x", "u"], ["s0"])
+
+
+def _written(
+    plant: Plant, horizon: Horizon, limits: Limits, view: View, x_next: Expression, data: Mapping[str, Expression]
+) -> list[ConstraintState]:
+    entries = [*rates(limits, plant, view, horizon.step), *paths(limits, view)]
+    for entry in entries:
+        if ca.SX(entry.expression).numel() != 1:
+            raise InvalidProblem(f"limits: path '{entry.name}' must be one scalar, got {entry.expression.shape}")
+    if horizon.margins:
+        margin = dict(zip(horizon.margins, ca.vertsplit(data["margin"]), strict=True))
+        entries += narrowed(limits, plant, x_next, margin)
+    if horizon.terminal:
+        entries += ends(horizon.terminal, plant, x_next, data["target"], data["last"])
+    return entries
+
+
+def _view(
+    plant: Plant, s: Expression, u: Expression, data: Mapping[str, Expression], cost: Cost, keeps_input: bool
+) -> View:
+    nx, inputs = plant.state.size, plant.input.elements
+    # What the cost does not declare is NaN, so that an undeclared use shows at once.
+    before = s[nx:] if keeps_input else ca.SX.nan(len(inputs))
+    feedforward = data["feedforward"] if cost.uses_feedforward else ca.SX.nan(len(inputs))
+    return View(
+        state=Named(plant.state.elements, s[:nx], "state"),
+        reference=Named(plant.state.elements, data["reference"], "state"),
+        input=Named(inputs, u, "input"),
+        input_before=Named(inputs, before, "input"),
+        feedforward=Named(inputs, feedforward, "input"),
+        parameters=Named(plant.parameter.elements, data["parameters"], "parameter"),
+        time=data["time"],
+    )
+
+
+def _advance(plant: Plant, horizon: Horizon) -> ca.Function:
+    """Function (x, u, p) -> x after one stage by the undisturbed model."""
+    step = horizon.discretisation.step(plant, horizon.step)
+    x, u, p = plant.symbols()
+    return ca.Function("fpirhc_advance", [x, u, p], [step(x, u, p, ca.SX.zeros(len(plant.names)))])
+
+
+def _linearise(plant: Plant, reference: Reference, horizon: Horizon, advance: ca.Function) -> Linearisation:
+    x, u, p = plant.symbols()
+    x_next = advance(x, u, p)
+    jacobians = ca.Function("fpirhc_linear", [x, u, p], [ca.jacobian(x_next, x), ca.jacobian(x_next, u)])
+    state, response = reference.function(plant)(0.0)
+    needed = plant.inverse_function(state, response[list(plant.controlled_indices)], plant.approximate)
+    a, b = jacobians(state, needed, plant.approximate)
+    return Linearisation(np.asarray(a.full()), np.asarray(b.full()), horizon.step)
+
+
+def _scalar_terms(expressions: Mapping[str, Expression]) -> dict[str, Expression]:
+    """Terms as scalar expressions.
+
+    Raises:
+        InvalidProblem: all mistakes together.
+    """
+    mistakes = Mistakes("cost")
+    if not isinstance(expressions, Mapping) or not expressions:
+        mistakes.add(f"the terms must be {{name: expression}} with at least one entry, got {expressions!r}")
+        mistakes.raise_if_any()
+    terms = {}
+    for name, value in expressions.items():
+        try:
+            terms[str(name)] = scalar_expression(f"term '{name}'", value, finite=False)
+        except InvalidProblem as error:
+            mistakes.add(f"{error}{'; sum its entries with ca.sum1' if 'shape' in str(error) else ''}")
+    mistakes.raise_if_any()
+    return terms
+
+
+def _nodes(
+    plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, extra: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States (the plant's, `extra` input and written entries), inputs and data along the reference from t = 0."""
+    table = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
+    data = np.asarray(table.full())
+    layout = data_layout(plant, horizon)
+    along = {name: data[layout.slice(name)] for name in ("reference", "feedforward")}
+    states = np.vstack([along["reference"], along["feedforward"][: extra[0]], np.zeros((extra[1], data.shape[1]))])
+    return states, along["feedforward"][:, : horizon.stages], data
+
+
+def _check_finite(
+    names: tuple[str, ...],
+    stage_cost: ca.Function,
+    terminal_cost: ca.Function,
+    nodes: tuple[np.ndarray, np.ndarray, np.ndarray],
+    cost: Cost,
+) -> None:
+    states, inputs, data = nodes
+    values = stage_cost(states[:, 0], inputs[:, 0], data[:, 0])[1].full().ravel()
+    final = float(terminal_cost(states[:, -1], data[:, -1]))
+    terms = [(name, value, "at t = 0") for name, value in zip(names, values, strict=True)]
+    mistakes = Mistakes("cost")
+    for name, value, where in [*terms, ("terminal", final, "at the end of the horizon")]:
+        if not np.isfinite(value):
+            hint = "" if cost.uses_rate else "; say CustomCost(rate=True) if it uses input_before"
+            hint += "" if cost.uses_feedforward else "; say CustomCost(feedforward=True) if it uses feedforward"
+            mistakes.add(f"term '{name}' is {value} on the reference {where}{hint}")
+    mistakes.raise_if_any()
