@@ -16,7 +16,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.describe import describe
 from fpirhc.simulation.common_columns import with_common_columns
-from fpirhc.simulation.foreign_run import run_foreign, stopped
+from fpirhc.simulation.foreign_run import Patch, run_foreign, stopped
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.ranges import ranges_of
 from fpirhc.simulation.run import Run
@@ -231,10 +231,11 @@ def _run_foreign(
     seed: int,
     disturbed: bool,
     progress: Progress | None,
+    patches: Sequence[Patch] = (),
 ) -> tuple[np.ndarray, str | None]:
     tables = _tables(problem, seed, problem.cycles, disturbed)
     try:
-        return run_foreign(problem, start, trace, evaluator, seed, tables, progress)
+        return run_foreign(problem, start, trace, evaluator, seed, tables, progress, patches)
     except SystemError as error:
         raise unwrapped(error) from None
 
