@@ -12,7 +12,7 @@ from test_reality import CONTROLLERS, SENSING, TAU, lagged, run, task
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
-from fpirhc.simulation.foreign_run import run_foreign
+from fpirhc.simulation.foreign_run import Patch, run_foreign
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.simulate import simulator
 from fpirhc.studies.scenarios.draws import with_exact
@@ -245,8 +245,10 @@ def test_memory_that_changes_during_the_run():
     ready = simulator(problem, CONTROLLERS["computed torque"], compiled=False)
     start = start_memory(ready.loop, problem, ready.controller)
     place = np.arange(start.size)[ready.loop.memory.slice("parameters")]
-    arguments: Any = (problem, start, ready.loop.trace, ready.evaluator, 0, [], None)
-    (before, _), (after, _) = (run_foreign(*arguments, p) for p in ((), [(50, place, np.array([2.0]))]))
+    patches: list[list[Patch]] = [[], [(50, place, np.array([2.0]))]]
+    before, after = (
+        run_foreign(problem, start, ready.loop.trace, ready.evaluator, 0, [], None, one)[0] for one in patches
+    )
     commands = [log[:, ready.loop.trace.slice("command")].ravel() for log in (before, after)]
     assert np.array_equal(commands[0][:50], commands[1][:50])
     assert commands[1][50] == pytest.approx(0.5 * commands[0][50], rel=1e-12)
