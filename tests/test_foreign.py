@@ -12,6 +12,9 @@ from test_reality import CONTROLLERS, SENSING, TAU, lagged, run, task
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
+from fpirhc.simulation.foreign_run import Patch, run_foreign
+from fpirhc.simulation.loop import start_memory
+from fpirhc.simulation.simulate import simulator
 from fpirhc.studies.scenarios.draws import with_exact
 
 MEASURES = {"y": "m", "y'": "m/s", "y''": "m/s^2"}
@@ -234,3 +237,45 @@ def test_comparison_and_report_of_an_object_outside(tmp_path):
     assert comparison.null is not None
     fp.write_report(comparison, tmp_path / "report.html")
     assert "plain form" in (tmp_path / "report.html").read_text()
+
+
+def test_memory_that_changes_during_the_run():
+    """A change of the believed mass before cycle 50 leaves the commands before it alone, and acts from that cycle on."""
+    problem = outside(task(duration=0.1))
+    ready = simulator(problem, CONTROLLERS["computed torque"], compiled=False)
+    start = start_memory(ready.loop, problem, ready.controller)
+    place = np.arange(start.size)[ready.loop.memory.slice("parameters")]
+    patches: list[list[Patch]] = [[], [(50, place, np.array([2.0]))]]
+    before, after = (
+        run_foreign(problem, start, ready.loop.trace, ready.evaluator, 0, [], None, one)[0] for one in patches
+    )
+    commands = [log[:, ready.loop.trace.slice("command")].ravel() for log in (before, after)]
+    assert np.array_equal(commands[0][:50], commands[1][:50])
+    assert commands[1][50] == pytest.approx(0.5 * commands[0][50], rel=1e-12)
+
+
+class FailingStep:
+    """An evaluator whose solver fails in the tenth cycle, as CasADi's do: with a RuntimeError."""
+
+    failed = False
+
+    def __init__(self, evaluator):
+        self.evaluator, self.arguments, self.results, self.count = evaluator, evaluator.arguments, evaluator.results, 0
+
+    def evaluate(self):
+        """Evaluate, or fail."""
+        self.count += 1
+        if self.count > 10:
+            raise RuntimeError("Error in Function::call\nsolver has no solution")
+        self.evaluator.evaluate()
+
+
+def test_solver_that_fails_ends_the_run():
+    """The reason is the solver's last line; the cycles before are kept."""
+    problem = outside(task(duration=0.1))
+    ready = simulator(problem, CONTROLLERS["computed torque"], compiled=False)
+    failing: Any = FailingStep(ready.evaluator)
+    start = start_memory(ready.loop, problem, ready.controller)
+    log, stop = run_foreign(problem, start, ready.loop.trace, failing, 0, [], None)
+    assert len(log) == 10
+    assert "a solver failed (solver has no solution) at t = 0.01 s (cycle 10)" in str(stop)

@@ -14,6 +14,7 @@ import fpirhc as fp
 from fpirhc.report.series import chart_data
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
+from fpirhc.review.null_runs import null_problem, null_runs
 from fpirhc.review.questions.reality_lag import TEXT as LAG
 from fpirhc.review.questions.reality_loop import TEXT as LOOP
 from fpirhc.review.questions.reality_resonance import TEXT as RESONANCE
@@ -189,3 +190,12 @@ def test_pole_that_is_fast_away_from_the_start():
     fine = replace(coarse, reality=fp.Reality(plant, integrator=fp.RungeKutta4(substeps)))
     [two] = [a for a in fp.review(fine, {}, mismatch=0.0, seed=0).problem if "reality" in a.question]
     assert two.verdict == "yes"
+
+
+def test_null_runs_are_those_of_the_model():
+    """Adaptation has nothing to do on the right model, whatever the reality is: the model-referenced form adds nothing."""
+    controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.ModelReferenced(fp.Affine(gain=-0.5)))
+    problem = task(reality=fp.Reality(lagged()), cost=None, horizon=None)
+    assert null_problem(problem, controller).reality is None
+    runs = null_runs(problem, controller)
+    assert runs.adapted["y"] == pytest.approx(runs.without["y"], rel=1e-9)

@@ -140,13 +140,15 @@ for name, numbers in zip(realities, errors, strict=True):
     print(f"{name:20s}" + "".join(f"{value:10.3g}" for value in numbers))
 
 # %%
-# The forms help behind every lag that is short beside the law, and behind bristles. They
-# lose behind a spring. Behind 30 ms the plan, which is faster than the law, loses
-# with every form. A slow sensor shows a delayed motion: its error is the delay, which no
-# adaptation of the model removes.
+# The forms help behind every lag that is short beside the law, behind bristles, and
+# behind a well damped spring. Behind a spring with little damping they lose. Behind
+# 30 ms the plan, which is faster than the law, loses with every form. A slow sensor shows
+# a delayed motion: its error is the delay, which no adaptation of the model removes.
 #
 # What the review says of the increment form, before any of these runs. Its loop is
-# that of the real pair; the lag and the resonance have their rules.
+# that of the real pair; the lag and the resonance have their rules. A plan counts as one
+# of every cycle: this one is made in every tenth, which spares the softest spring without
+# adaptation.
 
 for name, reality in realities.items():
     if reality is None:

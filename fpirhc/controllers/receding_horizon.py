@@ -64,7 +64,7 @@ class RecedingHorizon(Controller):
     replanning: Replanning = field(default_factory=FromMeasurement)
     on_failure: OnFailure = field(default_factory=HoldPlan)
     cost: Cost | None = None
-    margins: Mapping[str, Sequence[float]] | None = field(default=None, hash=False)
+    margins: Mapping[str, Sequence[float]] | None = field(default=None, hash=False, metadata={"setting": "where given"})
 
     @property
     def planner(self) -> Planner:

@@ -38,7 +38,9 @@ class Horizon(Checked):
     discretisation: Integrator = field(default_factory=RungeKutta4)
     terminal: tuple[str, ...] = ()
     blocks: tuple[int, ...] = ()
-    margins: Mapping[str, Sequence[float]] = field(default_factory=dict, hash=False)
+    margins: Mapping[str, Sequence[float]] = field(
+        default_factory=dict, hash=False, metadata={"setting": "where given"}
+    )
 
     def __post_init__(self) -> None:
         if self.blocks and (sum(self.blocks) != self.stages or min(self.blocks) < 1):

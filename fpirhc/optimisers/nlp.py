@@ -34,7 +34,7 @@ class Ipopt(MultipleShooting):
 
     accuracy: Accuracy = 1e-8
     iterations: Count = 200
-    time_limit: Positive | None = None
+    time_limit: Positive | None = field(default=None, metadata={"setting": "where given"})
 
     @property
     def unbounded(self) -> str:

@@ -111,7 +111,7 @@ def null_problem(problem: Problem, controller: Controller) -> Problem:
     """Return the problem whose plant is the controller's model, without disturbances and noise, shortened to `CYCLES` cycles."""
     believed = resolved(problem, controller).parameters(problem.plant)
     sensing = Sensing(estimator=problem.sensing.estimator)
-    model = replace(problem, plant=exactly(problem.plant, believed), disturbances={}, sensing=sensing)
+    model = replace(problem.of_model, plant=exactly(problem.plant, believed), disturbances={}, sensing=sensing)
     return shortened(model, CYCLES)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
@@ -10,6 +11,8 @@ from fpirhc.simulation.ranges import ranges_of
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout
 from fpirhc.task.problem import Problem
+
+Patch: TypeAlias = tuple[int, np.ndarray, np.ndarray]  # cycle, places in the memory, their values
 
 
 def run_foreign(
@@ -20,6 +23,7 @@ def run_foreign(
     seed: int,
     tables: Sequence[np.ndarray],
     progress: Callable[[int, int], None] | None,
+    patches: Sequence[Patch] = (),
 ) -> tuple[np.ndarray, str | None]:
     """Return the log, shape (cycles, trace.size), and the reason why the run ended early.
 
@@ -31,6 +35,7 @@ def run_foreign(
         seed: with which the reality is reset.
         tables: disturbances and the sensors' random series, one row per cycle.
         progress: called with (cycles done, cycles in all).
+        patches: changes of the memory before some cycles.
 
     Raises:
         InvalidProblem: a bad first answer.
@@ -45,7 +50,10 @@ def run_foreign(
     for k in range(cycles):
         for argument, table in zip(random, tables, strict=True):
             argument[:] = table[k]
-        evaluator.evaluate()
+        _patch(memory, k, patches)
+        failure = _failure(evaluator)
+        if failure:
+            return log[:k], stopped(problem, k, f"a solver failed ({failure})")
         memory_next, row, sent = evaluator.results
         if not np.isfinite(row).all():
             column = trace.columns[int(np.argmin(np.isfinite(row)))]
@@ -65,6 +73,21 @@ def run_foreign(
         if progress:
             progress(k + 1, cycles)
     return log, None
+
+
+def _patch(memory: np.ndarray, cycle: int, patches: Sequence[Patch]) -> None:
+    for at, places, values in patches:
+        if at == cycle:
+            memory[places] = values
+
+
+def _failure(evaluator: Evaluator) -> str:
+    """Evaluate; return why that failed, empty where it did not."""
+    try:
+        evaluator.evaluate()
+    except RuntimeError as error:  # CasADi's own, of a solver in the loop
+        return (str(error).strip().splitlines() or ["no reason"])[-1]
+    return "compiled code failed" if evaluator.failed else ""
 
 
 def stopped(problem: Problem, cycle: int, what: str) -> str:

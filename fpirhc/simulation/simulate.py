@@ -17,7 +17,7 @@ from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_setting
 from fpirhc.describe import describe
 from fpirhc.simulation.changes import Changes, in_force
 from fpirhc.simulation.common_columns import with_common_columns
-from fpirhc.simulation.foreign_run import run_foreign, stopped
+from fpirhc.simulation.foreign_run import Patch, run_foreign, stopped
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.ranges import ranges_of
 from fpirhc.simulation.run import Run
@@ -94,7 +94,7 @@ class Simulator:
         problem, controller = force.problem, force.controller
         start = start_memory(self.loop, problem, controller, force.numbers)
         common = (problem, start, self.loop.trace, self.evaluator, seed, disturbed, progress)
-        logged, stop = _run_chunks(*common, force.patches) if problem.foreign is None else _run_foreign(*common)
+        logged, stop = (_run_chunks if problem.foreign is None else _run_foreign)(*common, force.patches)
         layout, log = with_common_columns(self.loop.trace, logged)
         log.setflags(write=False)
         step_limit = controller.deformation.largest_step()
@@ -290,10 +290,11 @@ def _run_foreign(
     seed: int,
     disturbed: bool,
     progress: Progress | None,
+    patches: Sequence[Patch] = (),
 ) -> tuple[np.ndarray, str | None]:
     tables = _tables(problem, seed, problem.cycles, disturbed)
     try:
-        return run_foreign(problem, start, trace, evaluator, seed, tables, progress)
+        return run_foreign(problem, start, trace, evaluator, seed, tables, progress, patches)
     except SystemError as error:
         raise unwrapped(error) from None
 
