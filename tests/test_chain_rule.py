@@ -20,11 +20,13 @@ from fpirhc.symbolic.chain_rule import chain_rule
 from fpirhc.symbolic.native import find_compiler, native
 
 X, P = ca.SX.sym("x", 3), ca.SX.sym("p", 2)
+CALLED = ca.Function("called", [X], [ca.vertcat(ca.sin(X[0]) * X[1], X[2], 1 / (2 + X[0]))], {"never_inline": True})
 EXPRESSIONS = {
     "smooth": ca.vertcat(ca.sin(X[0]) * ca.exp(X[1] / P[0]), X[2] ** 3 / (1 + X[0] ** 2), ca.sqrt(2 + X[1])),
     "branches": ca.vertcat(ca.if_else(X[0] > P[1], X[1] * X[2], X[1] / 3), ca.fmin(X[0], X[2]) + ca.fabs(X[1])),
     "linear": ca.vertcat(2 * X[0] - X[1], X[2], X[2] - X[2]),
     "shared": ca.vertcat(X[0] * X[0], X[0], X[0], P[0] * P[1], 5),
+    "call": 2 * CALLED(X) + ca.vertcat(X[1] ** 2, 0, P[0] * X[2]),
     "power": ca.vertcat(ca.fabs(X[0]) ** P[0] * ca.sign(X[0]), ca.atan2(X[1], X[2]), ca.tanh(X[0] * X[1] * X[2])),
 }
 _OF_TIME = ("two_mass", "cart_pole", "van_der_pol", "chain_of_masses")

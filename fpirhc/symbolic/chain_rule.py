@@ -84,10 +84,19 @@ def chain_rule(results: ca.SX, variables: ca.SX, parameters: ca.SX) -> ChainRule
     """
     function = ca.Function("fpirhc_values", [variables, parameters], [results], {"cse": True})
     weights = ca.SX.sym("w", results.numel())
-    edges, ends, values = _graph(function, variables, parameters)
+    calls = any(function.instruction_id(k) == ca.OP_CALL for k in range(function.n_instructions()))
+    edges, ends, values = _direct(results, variables) if calls else _graph(function, variables, parameters)
     partials, symbols = _named(edges, values)
     pulled = _pulled(edges, ends, weights, variables.numel())
     return ChainRule(partials, symbols, pulled, weights, _compressed(edges, ends, variables.numel()))
+
+
+def _direct(results: ca.SX, variables: ca.SX) -> tuple[_Edges, list[int], list[ca.SX]]:
+    """The graph of a Function that calls others, which are not looked into: from the variables straight to the results."""
+    jacobian, count = ca.densify(ca.jacobian(results, variables)), variables.numel()
+    rows = [{k: jacobian[r, k] for k in range(count) if not jacobian[r, k].is_zero()} for r in range(results.numel())]
+    values = [*ca.vertsplit(variables), *ca.vertsplit(results)]
+    return [*({} for _ in range(count)), *rows], list(range(count, len(values))), values
 
 
 def _graph(function: ca.Function, variables: ca.SX, parameters: ca.SX) -> tuple[_Edges, list[int], list[ca.SX]]:

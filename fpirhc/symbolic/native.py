@@ -31,6 +31,7 @@ import casadi as ca
 from fpirhc.errors import CompileError, NotSupported
 from fpirhc.symbolic.driver import substitute
 from fpirhc.symbolic.private_folder import BUILDING, private_folder, read_own
+from fpirhc.symbolic.work_vector import with_less_work
 
 # -ffp-contract=off: no fused multiply-add, so that C and the virtual machine round alike.
 # -z defs: a missing symbol must fail here and not end the process at the first call.
@@ -118,6 +119,10 @@ def generate(function: ca.Function) -> tuple[str, ...]:
         raise NotSupported(f"CasADi cannot write it as C: {str(error).strip().splitlines()[-1]}") from None
     _check_self_contained(source)
     source, drivers = substitute(source)
+    if drivers:
+        # Of Functions with the same name the largest counts.
+        ordered = sorted(wrapped.find_functions(), key=lambda f: f.sz_w())
+        source = with_less_work(source, {f.name(): int(f.sz_w()) for f in ordered})
     return source, *drivers
 
 

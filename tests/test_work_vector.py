@@ -1,0 +1,79 @@
+"""The work vector of generated code holds what is used: the space of bodies that a driver replaces is not kept."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import subprocess
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.controllers.base import compose_controller
+from fpirhc.symbolic.native import find_compiler, generate
+from fpirhc.symbolic.work_vector import with_less_work
+
+REAL = ctypes.POINTER(ctypes.c_double)
+GUARD = -1.2345e-77
+
+
+def controller_of(name: str, controller: str):
+    task = fp.load_problem(name)
+    return compose_controller(task.problem, task.controllers[controller]), task
+
+
+def size_of(source: str) -> int:
+    sizes = re.findall(r"sz_w\) \*sz_w = (\d+)", source)
+    assert len(set(sizes)) == 1
+    return int(sizes[0])
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
+@pytest.mark.parametrize(("name", "most"), [("two_mass", 5100), ("cart_pole", 3400)])
+def test_a_controller_with_twenty_stages_needs_and_touches_no_more(name, most, tmp_path):
+    """13 105 doubles before for two_mass; nothing is written behind the vector's end, and the results are those of the graph."""
+    composite, task = controller_of(name, "RHC+FPI")
+    texts, files = generate(composite.function), []
+    size = size_of(texts[0])
+    assert size <= most
+    assert size < 0.5 * composite.function.sz_w()
+    for k, text in enumerate(texts):
+        files.append(tmp_path / f"part{k}.c")
+        files[-1].write_text(text)
+    library = tmp_path / "controller.so"
+    flags = ["-O1", "-ffp-contract=off", "-fPIC", "-shared"]
+    subprocess.run([str(find_compiler()), *flags, "-o", str(library), *map(str, files), "-lm"], check=True)
+    step = ctypes.CDLL(str(library)).fpirhc_native
+    problem, f = task.problem, composite.function
+    values = [composite.memory.start(), np.zeros(1), problem.start_state, np.zeros(f.size1_in(3))]
+    values = [np.array(v, dtype=float) for v in (*values, task.controllers["RHC+FPI"].parameters(problem.plant))]
+    results = [np.zeros(f.numel_out(k)) for k in range(f.n_out())]
+    pointers = [(REAL * 400)(*(v.ctypes.data_as(REAL) for v in arrays)) for arrays in (values, results)]
+    integers = np.zeros(max(f.sz_iw(), 1), dtype=np.int64)
+    for _ in range(25):
+        work = np.full(size + 2000, GUARD)
+        step(*pointers, integers.ctypes.data_as(ctypes.c_void_p), work.ctypes.data_as(REAL), 0)
+        assert (work[size:] == GUARD).all()
+        for mine, theirs in zip(results, f(*values), strict=True):
+            np.testing.assert_allclose(mine, theirs.full().ravel(), rtol=1e-9, atol=1e-9)
+        values[0][:] = results[0]
+
+
+def test_a_program_that_uses_the_begin_of_its_work_vector_stays_as_it_is():
+    """Only values behind calls move; a text in which something else uses the begin of w is not changed there."""
+    text = (
+        "/* inner:(i0)->(o0) */\n"
+        "static int casadi_f1(const double** arg, double** res, long* iw, double* w, int mem) {\n"
+        "  return inner_driver(arg, res, iw, w, mem);\n}\n"
+        "/* outer:(i0)->(o0) */\n"
+        "static int casadi_f0(const double** arg, double** res, long* iw, double* w, int mem) {\n"
+        "  double *w0=w+100, *w1=w+103;\n  MORE\n"
+        "  if (casadi_f1(arg, res, iw, w, 0)) return 1;\n}\n"
+        "CASADI_SYMBOL_EXPORT int outer_work(long *sz_w) {\n  if (sz_w) *sz_w = 107;\n}\n"
+    )
+    shorter = with_less_work(text, {"inner": 100, "outer": 107})
+    assert "*w0=w+0, *w1=w+3;" in shorter
+    assert "*sz_w = 7;" in shorter
+    used = text.replace("MORE", "casadi_mtimes(w0, w1, w);")
+    assert with_less_work(used, {"inner": 100, "outer": 107}) == used
