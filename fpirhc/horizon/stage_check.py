@@ -9,11 +9,13 @@ from fpirhc.fields.user_code import named_results, scalar_expression
 from fpirhc.horizon.cost import Cost, View
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Named
+from fpirhc.symbolic.live import nominal
 from fpirhc.task.limits import Limits
 
 
 def check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mistakes) -> None:
     """Add every mistake in the cost's names and weights, and in the user's functions of a stage."""
+    cost, limits = nominal(cost), nominal(limits)
     view = _view_of_symbols(plant)
     parts = (view.state, view.reference, view.input, view.input_before, view.feedforward, view.parameters)
     symbols = (*(part.vector for part in parts), view.time)
