@@ -20,9 +20,11 @@ from scipy import stats
 
 import fpirhc as fp
 from fpirhc.cli.main import main
+from fpirhc.controllers.contract import resolved
 from fpirhc.errors import InvalidProblem, InvalidValue, OutputError, WorkerDied
 from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.review.late import is_late, scaled
 from fpirhc.studies.scenarios.bench import Bench, Conditions
 from fpirhc.studies.scenarios.bootstrap import median_interval, middle
 from fpirhc.studies.scenarios.draws import COMPARING, TUNING, draw, mismatch_of, with_exact
@@ -155,8 +157,9 @@ def test_a_prepared_loop_runs_what_a_fresh_one_runs(dead_time, task):
     for name, number in (("CTC+FPI", 0), ("CTC exact", 2), ("CTC+FPI", 1), ("CTC exact", 1)):
         result = bench.record(number, name)
         scenario = draw(problem.plant, seed=5, use=COMPARING, number=number, percent=20.0)
-        variant = with_exact(problem, scenario.exact)
-        run = fp.simulate(variant, task.controllers[name], seed=scenario.seed, compiled=False)
+        late = scaled(problem, 20.0 * scenario.lateness) if is_late(problem) else problem
+        variant = with_exact(late, scenario.exact)
+        run = fp.simulate(variant, resolved(problem, task.controllers[name]), seed=scenario.seed, compiled=False)
         fresh = fp.measure(variant, run).values
         for metric, numbers in result["metrics"].items():
             assert numbers == {e: v if math.isfinite(v) else None for e, v in fresh[metric].items()}

@@ -55,7 +55,9 @@ def breaches(ocp: OptimalControl, states: np.ndarray) -> list[Breach]:
     violated = []
     for k in np.flatnonzero(ocp.hard).tolist():
         low, high = ocp.state_lower[k], ocp.state_upper[k]
-        for side, limit, over in (("above", high, states[k] - high), ("below", low, low - states[k])):
+        with np.errstate(invalid="ignore"):  # a plan that is not finite is beyond no limit
+            sides = ("above", high, states[k] - high), ("below", low, low - states[k])
+        for side, limit, over in sides:
             beyond = np.where(np.isfinite(over), np.maximum(over, 0), 0.0)
             if k >= ocp.state.size - ocp.written:
                 beyond[0] = 0
