@@ -34,7 +34,9 @@ def iterates(ocp, data, first, count):
         yield replace(best, inputs=inputs, states=best.states, cost=float(diagnostics.ravel()[0])), best
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "chain_of_masses" else n for n in PROBLEMS]
+)
 def test_no_bound_is_below_the_true_error(name):
     """On every iterate of every shipped problem: distance to the optimum, error of any input, and suboptimality."""
     from fpirhc.horizon.rollout import rollout

@@ -240,7 +240,7 @@ def test_a_dose_of_a_c_over_b_holds_the_tumour():
     assert np.exp(grown) == pytest.approx(4.43e5, rel=5e-3)
 
 
-@pytest.mark.parametrize("name", ["tumour", "tumour_daily"])
+@pytest.mark.parametrize("name", ["tumour", pytest.param("tumour_daily", marks=pytest.mark.slow)])
 def test_doses_are_never_negative(name):
     """Whatever the controller asks for; and the largest dose is used at the start."""
     for controller in task(name).controllers:

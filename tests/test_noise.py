@@ -89,7 +89,14 @@ def ran(ringing: float, noise: bool) -> tuple[fp.Suggestion, float, np.ndarray, 
     return suggestion, float(errors.mean()), np.std(np.diff(run["command"][3000:], axis=0), axis=0), errors
 
 
-@pytest.mark.parametrize(("ringing", "published"), [(0.0, 0.564e-3), (1.0, 0.341e-3), (4.0, 0.245e-3)])
+@pytest.mark.parametrize(
+    ("ringing", "published"),
+    [
+        pytest.param(0.0, 0.564e-3, marks=pytest.mark.slow),
+        pytest.param(1.0, 0.341e-3, marks=pytest.mark.slow),
+        (4.0, 0.245e-3),
+    ],
+)
 def test_filter_buys_tracking_at_the_same_chatter(ringing, published):
     """Two masses, accelerometers with 1 m/s^2: errors 0.56, 0.34, 0.24 mm, with the same steps of the commands each time."""
     suggestion, error, steps, _ = ran(ringing, True)

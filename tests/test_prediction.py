@@ -113,7 +113,7 @@ def contained(name: str, which: str, gain: float) -> None:
     assert predicted.half_width[problem.plant.names[0]] == half.max(axis=0)[0]
 
 
-@pytest.mark.parametrize("gain", [-0.5, -1.0, -1.5])
+@pytest.mark.parametrize("gain", [-0.5, pytest.param(-1.0, marks=pytest.mark.slow), -1.5])
 @pytest.mark.parametrize(
     ("name", "which"),
     [

@@ -326,7 +326,12 @@ def test_values_that_make_no_sense_are_refused():
             fp.review(mass(), {}, mismatch=wrong, seed=0)
 
 
-@pytest.mark.parametrize("name", shipped_problems())
+_LONG = ("chain_of_masses", "puma560", "three_link_arm", "planar_arm", "two_link_arm", "van_der_pol", "leaking_tanks")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in _LONG else n for n in shipped_problems()]
+)
 def test_every_shipped_problem_can_be_reviewed(name, capsys):
     """Through the command line: one JSON object, every answer with its facts, and the exit code that its verdicts ask for."""
     task = fp.load_problem(name)
