@@ -59,12 +59,12 @@ def main(folder: Path) -> int:
     """Print every such address with its page, and return the exit code."""
     pages = sorted(folder.rglob("*.html"))
     styles = sorted(folder.rglob("*.css"))
-    found = [(page, address) for page in pages for address in elsewhere(page.read_text(encoding="utf-8"))]
-    found += [(style, address) for style in styles for address in FETCHES.findall(style.read_text(encoding="utf-8"))]
-    for page, address in found:
+    fetched = [(page, address) for page in pages for address in elsewhere(page.read_text(encoding="utf-8"))]
+    fetched += [(style, address) for style in styles for address in FETCHES.findall(style.read_text(encoding="utf-8"))]
+    for page, address in fetched:
         print(f"{page.relative_to(folder)} loads {address}", file=sys.stderr)
-    print(f"{len(pages)} pages, {len(found)} parts from elsewhere")
-    return 1 if found or not pages else 0
+    print(f"{len(pages)} pages, {len(fetched)} parts from elsewhere")
+    return 1 if fetched or not pages else 0
 
 
 if __name__ == "__main__":

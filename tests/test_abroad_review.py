@@ -15,8 +15,8 @@ from fpirhc.review.forms import forms_of
 
 def asked(problem: fp.Problem, controller: Controller) -> dict[str, fp.Answer]:
     """Answers about the controller by question."""
-    found = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).controllers["it"]
-    return {a.question: a for a in found}
+    answers = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).controllers["it"]
+    return {a.question: a for a in answers}
 
 
 def about(answers: dict[str, fp.Answer], words: str) -> fp.Answer:

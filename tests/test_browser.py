@@ -137,11 +137,11 @@ def test_a_page_lies_well_at_first_load(name, width, scheme, reports, visit, pic
     one = visit(reports[name], width, scheme)
     one.page.screenshot(path=pictures / f"{name}-{width}-{scheme}.png")
     one.page.screenshot(path=pictures / f"{name}-{width}-{scheme}-whole.png", full_page=True)
-    found = one.page.evaluate(BOXES)
-    assert found["count"] > 8
-    assert (found["charts"] > 2) == (name != "scenarios")
-    assert found["overlaps"] == []
-    assert found["outside"] == []
+    boxes = one.page.evaluate(BOXES)
+    assert boxes["count"] > 8
+    assert (boxes["charts"] > 2) == (name != "scenarios")
+    assert boxes["overlaps"] == []
+    assert boxes["outside"] == []
     assert one.page.evaluate("document.documentElement.scrollWidth") <= width
     assert one.complaints == []
 

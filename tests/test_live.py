@@ -160,8 +160,8 @@ def test_a_stepper_that_changes_is_the_one_that_is_rebuilt(compiled):
     built = fp.Stepper(problem, controller, compiled=compiled)
     memories = live.start(), built.start()
     for k in range(60):
-        given = run.time[k], run["state"][k], run["realised"][k]
-        (one, first), (two, second) = (s.step(*given, m) for s, m in zip((live, built), memories, strict=True))
+        sample = run.time[k], run["state"][k], run["realised"][k]
+        (one, first), (two, second) = (s.step(*sample, m) for s, m in zip((live, built), memories, strict=True))
         memories = first, second
         assert equal_to_rounding(one[None, :], two[None, :]) if compiled else np.array_equal(one, two), k
 

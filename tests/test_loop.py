@@ -212,10 +212,10 @@ def test_run_stops_where_a_solver_fails(fails, monkeypatch):
     monkeypatch.setattr(ready.evaluator, "evaluate", broken)
     if fails != "raises":
         monkeypatch.setattr(Evaluator, "failed", property(lambda self: len(calls) > 2))
-    found = ready.run(seed=0)
-    assert found.cycles == 2 * CHUNK
-    assert found.stop is not None
-    assert ("OSQP failed" if fails == "raises" else "compiled code failed") in found.stop
+    run = ready.run(seed=0)
+    assert run.cycles == 2 * CHUNK
+    assert run.stop is not None
+    assert ("OSQP failed" if fails == "raises" else "compiled code failed") in run.stop
 
 
 def test_save_and_load(tmp_path):

@@ -274,8 +274,8 @@ def test_library_that_others_may_have_written_is_not_run(cache, monkeypatch, who
         stranger = os.geteuid() + 1
         monkeypatch.setattr(private_folder, "_is_own", lambda facts: facts.st_uid == stranger)
     assert not module._is_intact(path)
-    found = native(model(7.0))
-    np.testing.assert_array_equal(found.function(np.ones(3)).full(), model(7.0)(np.ones(3)).full())
+    result = native(model(7.0))
+    np.testing.assert_array_equal(result.function(np.ones(3)).full(), model(7.0)(np.ones(3)).full())
 
 
 @needs_posix

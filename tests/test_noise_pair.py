@@ -17,10 +17,10 @@ LIMITED = replace(NOISY, limits=fp.Limits(inputs={"u": (-20.0, 20.0)}))
 
 def test_the_pair_keeps_its_budget_in_a_run():
     """1 % of 40 N: the pair's rms step is 0.4 N, and the review is content with it. The tracking law damps a tenth."""
-    found = answer(LIMITED, fp.Affine(gain=-1.5), WORDS)
-    assert found.verdict == "unknown"
-    assert "Filtered(map, pole=" in found.change
-    gain, pole = found.numbers["recommended"], found.numbers["recommended_pole"]
+    advice = answer(LIMITED, fp.Affine(gain=-1.5), WORDS)
+    assert advice.verdict == "unknown"
+    assert "Filtered(map, pole=" in advice.change
+    gain, pole = advice.numbers["recommended"], advice.numbers["recommended_pole"]
     pair = fp.Filtered(fp.Affine(gain=-2 * gain), pole=pole)
     assert pair.effective_gain() == pytest.approx(gain)
     assert answer(LIMITED, pair, WORDS).verdict == "yes"
@@ -32,11 +32,11 @@ def test_the_pair_keeps_its_budget_in_a_run():
 
 def test_without_limits_the_price_stays():
     """No limits, no range: the pair has the chatter of the gain in use, and adapts faster by its filter."""
-    found = answer(NOISY, fp.Affine(gain=-0.2), WORDS)
-    pair = fp.Filtered(fp.Affine(gain=-2 * found.numbers["recommended"]), pole=found.numbers["recommended_pole"])
+    advice = answer(NOISY, fp.Affine(gain=-0.2), WORDS)
+    pair = fp.Filtered(fp.Affine(gain=-2 * advice.numbers["recommended"]), pole=advice.numbers["recommended_pole"])
     same = answer(NOISY, pair, "chatter").numbers["step_u"]
     assert same == pytest.approx(answer(NOISY, fp.Affine(gain=-0.2), "chatter").numbers["step_u"], rel=1e-3)
-    assert found.numbers["recommended"] > 2 * found.numbers["gain"]
+    assert advice.numbers["recommended"] > 2 * advice.numbers["gain"]
 
 
 def test_without_noise_nothing_is_asked():

@@ -143,18 +143,18 @@ def test_inputs_show_themselves_as_results_do(kind, inputs):
 
 def test_inputs_show_what_they_hold(inputs):
     """Units, parameters, times, limits, kinds of controllers, answers and medians, each in its table."""
-    found = {kind: read(value._repr_html_()).text for kind, value in inputs.items()}
+    texts = {kind: read(value._repr_html_()).text for kind, value in inputs.items()}
     for text in (UNIT, "coordinate, order 2", "1.6", "1/s^2", "Unit of time: s."):
-        assert text in found["plant"]
+        assert text in texts["plant"]
     for text in ("10 cycles of 0.005 s, 0.05 s in all", "-30 to 30 N<i>", "4 stages of 0.01 s", "y = 0.5, y' = 0"):
-        assert text in found["problem"]
+        assert text in texts["problem"]
     for text in (printable(HOSTILE), "ComputedTorque", "Sigmoid", "with adaptation", "10 cycles"):
-        assert text in found["task"]
+        assert text in texts["task"]
     for text in ("not ready", "change it", "1 yes, 2 no, 0 unknown"):
-        assert text in found["review"]
+        assert text in texts["review"]
     study = inputs["scenarios"]
     for text in ("baseline", percent(study.summaries[1].median), printable(study.verdict[0])):
-        assert text in found["scenarios"]
+        assert text in texts["scenarios"]
 
 
 KINDS = ("comparison", "run", "metrics", "contraction", "plan", "certificate")

@@ -22,14 +22,14 @@ def bill() -> Any:
 
 def test_bill_of_materials_names_what_is_needed():
     """Every direct dependency with its installed version, and no package of an extra; the graph closes; twice the same."""
-    found = bill()
-    assert (found["bomFormat"], found["specVersion"]) == ("CycloneDX", "1.6")
-    versions = {c["name"].lower().replace("_", "-"): c["version"] for c in found["components"]}
+    document = bill()
+    assert (document["bomFormat"], document["specVersion"]) == ("CycloneDX", "1.6")
+    versions = {c["name"].lower().replace("_", "-"): c["version"] for c in document["components"]}
     for name in ("casadi", "numpy", "scipy", "osqp", "control", "matplotlib", "pandas", "rich", "lazy-loader"):
         assert versions[name] == distribution(name).version
     assert "sphinx" not in versions
-    references = {c["bom-ref"] for c in (*found["components"], found["metadata"]["component"])}
-    assert len(references) == len(found["components"]) + 1
-    assert {d["ref"] for d in found["dependencies"]} == references
-    assert {n for d in found["dependencies"] for n in d["dependsOn"]} <= references
-    assert json.dumps(bill()) == json.dumps(found)
+    references = {c["bom-ref"] for c in (*document["components"], document["metadata"]["component"])}
+    assert len(references) == len(document["components"]) + 1
+    assert {d["ref"] for d in document["dependencies"]} == references
+    assert {n for d in document["dependencies"] for n in d["dependsOn"]} <= references
+    assert json.dumps(bill()) == json.dumps(document)

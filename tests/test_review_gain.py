@@ -19,8 +19,8 @@ PLANNED = "RHC+FPI, gentle"
 
 def asked(problem: fp.Problem, controller) -> dict[str, fp.Answer]:
     """Answers about the controller by question."""
-    found = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).controllers["it"]
-    return {a.question: a for a in found}
+    answers = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0).controllers["it"]
+    return {a.question: a for a in answers}
 
 
 def about(answers: dict[str, fp.Answer], words: str) -> fp.Answer:

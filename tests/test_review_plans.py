@@ -55,8 +55,8 @@ def rate_weighted_gain(weight: float = 0.5) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def answers(problem: fp.Problem, controller: Controller) -> dict[str, fp.Answer]:
-    found = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0)
-    return {a.question: a for a in found.answers}
+    report = fp.review(problem, {"it": controller}, mismatch=0.0, seed=0)
+    return {a.question: a for a in report.answers}
 
 
 def about(all_answers: dict[str, fp.Answer], words: str) -> fp.Answer:

@@ -393,14 +393,14 @@ def driven(gain_of_plant: float, deformation: Deformation, *, cycles: int, stuck
     stepper = fp.Stepper(
         problem, fp.ComputedTorque(TRACK, deformation), compiled=False, watch=fp.Watch(saturated_after=0.2, window=50)
     )
-    memory, x, u, found = stepper.start(), np.zeros(2), np.zeros(1), []
+    memory, x, u, statuses = stepper.start(), np.zeros(2), np.zeros(1), []
     for k in range(cycles):
         acting = 0.0 if stuck else gain_of_plant * float(u[0])
         u, memory = stepper.step(k * 1e-3, x, np.array([acting]), memory)
-        found.append(status(stepper))
+        statuses.append(status(stepper))
         acting = 0.0 if stuck else gain_of_plant * float(u[0])
         x = x + np.array([x[1] * 1e-3 + acting * 0.5e-6, acting * 1e-3])
-    return found
+    return statuses
 
 
 def test_healthy_loop_is_ok_in_every_cycle():
@@ -410,15 +410,15 @@ def test_healthy_loop_is_ok_in_every_cycle():
 
 def test_flipped_sign_does_not_contract():
     """With the opposite sign of the plant's gain the factor is 1 + a lambda; the status says so within two windows and a half."""
-    found = driven(-0.8, fp.Affine(gain=-0.5), cycles=200)
-    assert Status.NOT_CONTRACTING in found[:120]
+    statuses = driven(-0.8, fp.Affine(gain=-0.5), cycles=200)
+    assert Status.NOT_CONTRACTING in statuses[:120]
 
 
 def test_stuck_actuator_saturates():
     """Nothing moves, so the command goes to its limit and stays there."""
-    found = driven(0.8, fp.Affine(gain=-0.5), cycles=1500, stuck=True)
-    assert Status.SATURATED in found[:900]
-    assert found[0] == Status.OK
+    statuses = driven(0.8, fp.Affine(gain=-0.5), cycles=1500, stuck=True)
+    assert Status.SATURATED in statuses[:900]
+    assert statuses[0] == Status.OK
 
 
 def test_every_status_has_a_place_and_a_remedy():

@@ -114,6 +114,11 @@ def test_mistakes_are_named():
         fp.Horizon(stages=3, step=0.1, margins={"q": (0.1,)})
     with pytest.raises(InvalidProblem, match="margins: limit of state 'p'"):
         replace(adaptive(), margins={"p": (0.0,) * 20}).check(problem)
+    for limits in (replace(problem.limits, soft={"q": 10.0}), replace(problem.limits, prices={"q": 10.0})):
+        yielding = replace(problem, limits=limits)
+        assert set(fp.state_margins(yielding, adaptive())) == {"q'"}
+        with pytest.raises(InvalidProblem, match="margins of 'q': its limit is soft or has a price"):
+            replace(adaptive(), margins={"q": (0.01,) * 20}).check(yielding)
 
 
 @pytest.mark.parametrize("weights", [{"rate": {"F": 1.0}}, {}])

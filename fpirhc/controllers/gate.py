@@ -109,10 +109,10 @@ class Gate:
             before = getattr(s, DOUBTED) if self.plausible else expression(0.0)
             fits, held, seen_column, doubted = entry(ca.vertcat(*now), getattr(s, HELD), ca.vertcat(*good), before)
             seen = self.sample.split(seen_column)
-            given = [seen.get(r, getattr(s, r)) for r in self.inner.reads.names]
+            sample = [seen.get(r, getattr(s, r)) for r in self.inner.reads.names]
             memory = self.controller_memory.join({m: getattr(s, m) for m in self.controller_memory.names})
             usable = expression(1.0) if "memory" in self.trusted else finite(memory, opaque=self.inner.opaque)
-            memory_next, shown, command = choose(fits, usable, memory, given, held)
+            memory_next, shown, command = choose(fits, usable, memory, sample, held)
             values = trace.split(shown)
             if "status" in trace:
                 status = ca.if_else(usable, values["status"], int(Status.RESTARTED))
@@ -181,15 +181,15 @@ class Gate:
         return inside
 
     def _selected(
-        self, fits: Expression, usable: Expression, memory: Expression, given: Sequence[Expression], held: Expression
+        self, fits: Expression, usable: Expression, memory: Expression, sample: Sequence[Expression], held: Expression
     ) -> tuple[Expression, Expression, Expression]:
         """(memory, trace, command) of a step of scalar code: it is evaluated, and its results are selected."""
         remembered = ca.if_else(usable, memory, ca.DM(self.inner.memory.start()))
-        memory_next, trace, command = self.inner.function(remembered, *given)
+        memory_next, trace, command = self.inner.function(remembered, *sample)
         return ca.if_else(fits, memory_next, remembered), trace, ca.if_else(fits, command, held)
 
     def _switched(
-        self, fits: Expression, usable: Expression, memory: Expression, given: Sequence[Expression], held: Expression
+        self, fits: Expression, usable: Expression, memory: Expression, sample: Sequence[Expression], held: Expression
     ) -> tuple[Expression, Expression, Expression]:
         """The same of a graph: one of three branches is evaluated, so that a long memory is not selected entry by entry."""
         step = self.inner.function
@@ -203,5 +203,5 @@ class Gate:
             for name, results in (("skip", skip), ("run", run), ("restart", restart))
         )
         choice = ca.Function.conditional("fpirhc_gate_choice", [skipped, running], restarted)
-        memory_next, trace, command = choice(ca.if_else(fits, 2 - usable, 0), memory, *given, held)
+        memory_next, trace, command = choice(ca.if_else(fits, 2 - usable, 0), memory, *sample, held)
         return memory_next, trace, command

@@ -37,14 +37,14 @@ class LiveSettings:
 
     Args:
         problem: the problem with the numbers of the build.
-        given: the controller as it was given, with the numbers of the build.
+        unresolved: the controller with automatic settings still open, with the numbers of the build.
         controller: the same with its automatic settings chosen.
         paths: of all live numbers, intervals as their ends.
         automatic: paths of automatic settings, which follow from the others.
     """
 
     problem: Problem
-    given: Controller
+    unresolved: Controller
     controller: Controller
     paths: tuple[str, ...] = ()
     automatic: tuple[str, ...] = ()
@@ -122,14 +122,14 @@ class LiveSettings:
         """
         values = {path: value for path, value in self.start.items() if path in self.paths}
         values |= self.flat(numbers)
-        problem, given = self.problem, self.given
+        problem, unresolved = self.problem, self.unresolved
         for path, value in values.items():
             self._check_side(path, value)
             if self._in_problem(path):
                 problem = changed_at(problem, path, value)
             else:
-                given = changed_at(given, path, value)
-        controller = resolved(problem, given)
+                unresolved = changed_at(unresolved, path, value)
+        controller = resolved(problem, unresolved)
         for path in self.automatic:
             values[path] = float(cast(float, content_at(controller, path)))
         return problem, checked(problem, controller, numbers_only=True), values

@@ -168,6 +168,10 @@ def _check_names(plant: Plant, horizon: Horizon, limits: Limits) -> None:
     mistakes = Mistakes("horizon")
     mistakes.unknown("terminal: state", horizon.terminal, plant.state.elements)
     mistakes.unknown("margins: limit of state", horizon.margins, list(limits.states))
+    for name in sorted(horizon.margins.keys() & {*limits.soft, *limits.prices}):
+        mistakes.add(
+            f"margins of '{name}': its limit is soft or has a price, and a margin makes it hard; leave one of them out"
+        )
     for name in horizon.margins.keys() & limits.states.keys():
         lower, upper = limits.states[name]
         if 2 * max(horizon.margins[name]) >= upper - lower:

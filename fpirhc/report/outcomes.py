@@ -22,7 +22,7 @@ def css_class(outcome: Outcome | None) -> str:
 
 
 def sentences(comparison: Comparison) -> list[tuple[str, Outcome | None]]:
-    """Return what a reader is told, with outcomes: the verdict, and the null test behind it."""
-    told = [(finding.text, finding.outcome) for finding in comparison.findings]
+    """Return the sentences of the verdict with their outcomes, and the null test after them."""
+    pairs = [(finding.text, finding.outcome) for finding in comparison.findings]
     null = comparison.null
-    return told if null is None else [*told, (null.text, null.outcome if null.harmful else None)]
+    return pairs if null is None else [*pairs, (null.text, null.outcome if null.harmful else None)]

@@ -71,23 +71,23 @@ def chatter_of(grid: ReviewGrid, controller: Controller, gain: float, pole: floa
 def _deviations(problem: Problem, noise: Mapping[str, float] | None) -> np.ndarray:
     """Standard deviation of every controlled coordinate's measured response."""
     names = problem.plant.controlled_names
-    given = _of_sensors(problem) if noise is None else noise
-    for name, value in given.items():
+    spreads = _of_sensors(problem) if noise is None else noise
+    for name, value in spreads.items():
         if name not in names:
             raise InvalidName(f"suggest(noise=...): coordinate '{name}' is not controlled.{nearest(name, names)}")
         if not 0 <= value < math.inf:
             raise InvalidValue(
                 f"suggest(noise=...): {value!r} for '{name}'; expected a standard deviation of at least 0"
             )
-    found = np.array([float(given.get(name, 0.0)) for name in names])
-    if not found.any():
+    levels = np.array([float(spreads.get(name, 0.0)) for name in names])
+    if not levels.any():
         raise InvalidValue(
             "suggest: no response has noise, so no gain chatters; give noise={'"
             + names[0]
             + "': ...}, the standard deviation of "
             "the measured response"
         )
-    return found
+    return levels
 
 
 def _of_sensors(problem: Problem) -> dict[str, float]:

@@ -121,15 +121,15 @@ def _check(controller: Controller, ringing: float) -> None:
 
 def _budget(problem: Problem, chatter: float | Mapping[str, float]) -> np.ndarray:
     inputs = tuple(problem.plant.inputs)
-    given = chatter if isinstance(chatter, Mapping) else dict.fromkeys(inputs, chatter)
-    for name, value in given.items():
+    budgets = chatter if isinstance(chatter, Mapping) else dict.fromkeys(inputs, chatter)
+    for name, value in budgets.items():
         if name not in inputs:
             raise InvalidName(f"suggest(chatter=...): input '{name}' is unknown.{nearest(name, inputs)}")
         if not value > 0:
             raise InvalidValue(
                 f"suggest(chatter=...): {value!r} for '{name}'; expected a positive rms step per cycle, in the unit of the input"
             )
-    return np.array([float(given.get(name, math.inf)) for name in inputs])
+    return np.array([float(budgets.get(name, math.inf)) for name in inputs])
 
 
 def _largest_eigenvalue(jacobians: np.ndarray) -> tuple[float, float]:

@@ -66,7 +66,7 @@ def state_margins(
     if not 0 < widen < np.inf:
         raise InvalidValue(f"tightened(widen={widen!r}): expected a positive number")
     ready = resolved(problem, controller)
-    hard = [e for e in problem.limits.states if e not in problem.limits.soft]
+    hard = [e for e in problem.limits.states if e not in problem.limits.soft and e not in problem.limits.prices]
     if ready.planner is None or problem.horizon is None:
         raise NotSupported(f"{type(controller).__name__} does not plan over a horizon, so no plan can keep a margin")
     if not hard:
