@@ -53,7 +53,7 @@ def no_difference(**adaptive: Any) -> str:
     """What is said beside 'no clear difference'."""
     plain = adaptive.pop("plain", None) or entry("RHC")
     [sentence] = said(plain, entry("FPI", "RHC", **adaptive))
-    begin = "FPI makes no clear difference: the rms error of y from 1 to 1 m."
+    begin = "FPI makes no clear difference: it changes the rms error of y from 1 to 1 m."
     assert sentence.startswith(begin)
     return sentence.removeprefix(begin)
 

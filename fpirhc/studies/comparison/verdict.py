@@ -106,7 +106,7 @@ def _mixed(_: Entry, adaptive: Entry, changes: list[Change]) -> str:
 
 
 def _no_difference(_: Entry, adaptive: Entry, changes: list[Change]) -> str:
-    return f"{adaptive.name} makes no clear difference: the rms error of {_listed(adaptive, changes, factors=False)}."
+    return f"{adaptive.name} makes no clear difference: it changes the rms error of {_listed(adaptive, changes, factors=False)}."
 
 
 _SENTENCES = {
