@@ -83,7 +83,9 @@ def test_servo_does_not_change():
     """The mismatch is where the controlled response does not feel it: 5 % is no clear difference, and it is not called a gain."""
     servo = compared("flexible_servo", "RHC", "RHC+FPI", "RHC exact model")
     assert servo.outcome is Outcome.NO_DIFFERENCE
-    assert servo.findings[0].text.startswith("RHC+FPI makes no clear difference: it changes the rms error of load from 0.0066")
+    assert servo.findings[0].text.startswith(
+        "RHC+FPI makes no clear difference: it changes the rms error of load from 0.0066"
+    )
     assert terminal_style(servo.outcome) == ""
     assert servo["RHC exact model"].metrics.rms_error["load"] < 1e-4
 
