@@ -107,6 +107,7 @@ from .task.limits import Limits, PathConstraint
 from .task.problem import Problem
 from .task.reality import Reality
 from .task.reference import Table, Trajectory
+from .task.set_point import Setpoint
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
 
