@@ -40,6 +40,7 @@ from fpirhc.symbolic.block import Block, Delay, Derived, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import DERIVED, PREFIX, is_live, live_numbers, nominal, settled
+from fpirhc.task.outside import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_stage
 
 _SCALE, _STEEPEST, _NUMBERS = (f"{PREFIX}{DERIVED}plan.{name}" for name in (SCALE, STEEPEST, "numbers"))
@@ -117,7 +118,8 @@ class RecedingHorizon(Controller):
 def _optimal_control(problem: Problem) -> OptimalControl:
     assert problem.horizon is not None
     assert problem.cost is not None
-    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits)
+    ahead = previewed_values(problem.plant, problem.signals)
+    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits, ahead)
 
 
 def _due_block(cycles: int) -> Block:
@@ -137,7 +139,8 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     assert problem.cost is not None
     plant, ocp = problem.plant, _optimal_control(problem)
     count = live_signals(ocp.settings, plant.input).size
-    data_of = stage_data(plant, problem.reference, problem.horizon, problem.cost, count)
+    ahead = previewed_values(plant, problem.signals)
+    data_of = stage_data(plant, problem.reference, problem.horizon, problem.cost, count, ahead)
     start = nominal(problem)
     memory = optimiser.memory(ocp).starting_at(_first_memory(start, optimiser, ocp, data_of))
     solve = optimiser.step(ocp.opened())

@@ -35,13 +35,18 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
     return Layout((*signals, scalar("last"), Signal("target", plant.state.elements, plant.state.units)))
 
 
-def stage_data(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, live: int = 0) -> ca.Function:
+def stage_data(
+    plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, live: int = 0, signals: ca.Function | None = None
+) -> ca.Function:
     """Function (time, parameters) -> data of all stages, shape (ntheta, N + 1).
 
-    With `live` rows of settings and what follows from them, (time, parameters, these rows) -> data that end with them.
+    With `live` rows of settings and what follows from them, (time, parameters, these rows) -> data that end with them. With
+    `signals`, a Function (time, parameters) -> parameters, every stage has those of its middle.
     """
-    matrix = kind(reference.opaque or plant.inverse_opaque)
-    t, p = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
+    looked_up = signals is not None and not signals.is_a("SXFunction")
+    matrix = kind(reference.opaque or plant.inverse_opaque or looked_up)
+    t, given = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
+    p = given if signals is None else signals(t + horizon.step / 2, given)
     state, response = reference.function(plant)(t)
     if cost.uses_feedforward:
         needed = plant.inverse_function(state, response[list(plant.controlled_indices)], p)
@@ -50,7 +55,7 @@ def stage_data(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
     # The live rows come out of the same call where they follow these rows: joining tables would copy both.
     joined = bool(live) and not (horizon.blocks or horizon.terminal or horizon.margins)
     rows = [matrix.sym("live", live)] if joined else []
-    one = ca.Function("fpirhc_stage_data", [t, p, *rows], [ca.densify(ca.vertcat(t, state, needed, p, *rows))])
+    one = ca.Function("fpirhc_stage_data", [t, given, *rows], [ca.densify(ca.vertcat(t, state, needed, p, *rows))])
     start, parameters = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
     settings = [ca.MX.sym("live", live)] if live else []
     nodes = horizon.stages + 1

@@ -18,6 +18,7 @@ from fpirhc.controllers.gate import Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, measures_all, sending_block
+from fpirhc.simulation.outside_blocks import outside_blocks, real_name
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -49,7 +50,8 @@ def _closed(problem: Problem, controller: Controller, live: LiveSettings | None)
     acting = Gate(nominal(problem), compose_controller(problem, ready), trusted=("time", "memory"))
     disturbed = disturbance_signals(problem)
     seeing = _sense_blocks(problem, ready.response(problem), predicts="state_ahead" in acting.inner.trace)
-    around = [_clock_block(problem.plant.time, problem.period), *seeing, acting.block(), *_actuate(problem, disturbed)]
+    clock, outside = _clock_block(problem.plant.time, problem.period), outside_blocks(problem, ready)
+    around = [clock, *outside, *seeing, acting.block(), *_actuate(problem, disturbed)]
     constants = live.held(around) if live is not None else []
     reads = Layout((*disturbed, *problem.sensing.drawn, *foreign_signals(problem)))
     sent = () if problem.foreign is None else (SENT,)
@@ -99,7 +101,7 @@ def _plant_delays(problem: Problem, controller: Controller) -> list[Delay]:
         Delay(Signal("_acting_before", plant.input.elements, plant.input.units, acting), "_acting"),
         Delay(_forcing(plant, "_forcing_before"), "_forcing"),
         believed,
-        _held("_exact", plant, plant.exact),
+        replace(_held("_exact", plant, problem.real_parameters), source=real_name(problem)),
     ]
 
 
@@ -154,7 +156,7 @@ def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], tup
 def _late_blocks(problem: Problem, shown: tuple[Signal, Signal], response: ca.Function) -> list[Block]:
     """Blocks of sensors, their dead time and the estimator, from what the sensors see to what the controller is given."""
     plant, behind = problem.plant, problem.dead_time.measurement / problem.period
-    at = problem.real_start, problem.inputs_before, problem.real_plant.exact, np.zeros(len(problem.real_plant.names))
+    at = problem.real_start, problem.inputs_before, problem.real_parameters, np.zeros(len(problem.real_plant.names))
     resting, first = response(*at).full().ravel(), problem.start_state
     if problem.symbolic_reality is not None:
         first = problem.symbolic_reality.state_function(plant, seen=True)(*at).full().ravel()
@@ -256,7 +258,8 @@ def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Si
     state = plant.state if problem.sees_plant else like(plant.state, "plant_state")
     if problem.symbolic_reality is not None:
         state = like(plant.state, REALITY_STATE)
-    reads = (state, arriving, like(plant.parameter, "_exact"), *disturbed)
+    exact = like(plant.parameter, real_name(problem))
+    reads = (state, arriving, exact, *disturbed)
     writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
 
     def step(s: Signals) -> dict[str, Expression]:
@@ -265,6 +268,10 @@ def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Si
             added = dict(zip(problem.disturbances, ca.vertsplit(s.disturbance), strict=True))
             u = u + ca.vertcat(*(added.get(name, 0) for name in plant.inputs))
             w = ca.vertcat(*(added.get(name, 0) for name in plant.names))
-        return {"_state_after": advance(getattr(s, state.name), u, s._exact, w), "_acting": u, "_forcing": w}
+        return {
+            "_state_after": advance(getattr(s, state.name), u, getattr(s, exact.name), w),
+            "_acting": u,
+            "_forcing": w,
+        }
 
     return Block("advance", Layout(reads), Layout(writes), step, opaque=problem.real_integrator.opaque)
