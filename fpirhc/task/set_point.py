@@ -71,7 +71,9 @@ class Setpoint(Reference):
             NotSupported: always.
         """
         del t
-        raise NotSupported("the motion towards set-points depends on the orders of a plant; use Setpoint.function(plant)")
+        raise NotSupported(
+            "the motion towards set-points depends on the orders of a plant; use Setpoint.function(plant)"
+        )
 
     @property
     def set_points(self) -> Mapping[str, Steps]:
@@ -126,7 +128,9 @@ class Setpoint(Reference):
             Signal("setpoint", plant.names, tuple(plant.coordinates[name] for name in plant.names)),
             Signal("reference_response", plant.names, plant.response_units),
         )
-        return Block("set_points", Layout(given), Layout((*shown, *self.own(plant, stages))), step, Layout((remembered,)))
+        return Block(
+            "set_points", Layout(given), Layout((*shown, *self.own(plant, stages))), step, Layout((remembered,))
+        )
 
     def motion_now(self, plant: Plant, stages: int, ahead: float = 0.0) -> ca.Function:
         """Function (t, own signals) -> (state, response), now or after some time with the set-points held."""
@@ -189,7 +193,9 @@ class Setpoint(Reference):
                     jumps[time, name] = rate ** plant.orders[k] * abs(value - before)
                     before = value
         times = {time for time, _ in jumps}
-        return max((float(np.hypot.reduce([j for (t, _), j in jumps.items() if t == time])) for time in times), default=0.0)
+        return max(
+            (float(np.hypot.reduce([j for (t, _), j in jumps.items() if t == time])) for time in times), default=0.0
+        )
 
     def _first(self, name: str) -> float:
         return pairs(name, self.values[name])[0][1]
@@ -230,9 +236,7 @@ class Setpoint(Reference):
         column = ca.vertcat(*z)
         return ca.vertcat(column, highest(rate, column, held, order))
 
-    def _motion_of(
-        self, plant: Plant, arguments: list[Expression], chains: list[Expression], name: str
-    ) -> ca.Function:
+    def _motion_of(self, plant: Plant, arguments: list[Expression], chains: list[Expression], name: str) -> ca.Function:
         state, response = _arranged(plant, chains)
         results = [ca.densify(state), ca.densify(response)]
         names = ["t", "own"][: len(arguments)]
@@ -261,5 +265,3 @@ def _arranged(plant: Plant, chains: list[Expression]) -> tuple[Expression, Expre
     state = [by_name[e.rstrip("'")][e.count("'")] for e in plant.state.elements]
     response = [by_name[c][r] for c, r in zip(plant.names, plant.orders, strict=True)]
     return ca.vertcat(*state), ca.vertcat(*response)
-
-

@@ -194,7 +194,10 @@ class Predicted(Controller):
         if not own_signals(problem) or not self._cycles(problem):
             return notes
         late = f"{self._cycles(problem) * problem.period:g} {problem.time_unit}"
-        return (*notes, f"Predicted follows set-points {late} late: one that is not known ahead cannot act before the dead time is over")
+        return (
+            *notes,
+            f"Predicted follows set-points {late} late: one that is not known ahead cannot act before the dead time is over",
+        )
 
     def check(self, problem: Problem) -> None:
         """Raise if the wrapped controller, the predictor or the dead time does not fit the problem.
