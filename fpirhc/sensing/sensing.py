@@ -1,10 +1,13 @@
 """The way from the plant to the controller: sensors, their dead time, and an estimator of unmeasured quantities.
 
-    true plant -> sensors -> measurement dead time -> estimator -> controller
+    true plant -> sensors -> measurement dead time -> [estimator -> controller]
 
 Where sensing is not ideal, a run's `state` and `realised` are the estimates that the controller receives. The true signals are
-`plant_state` and `plant_realised`, the sensors' output is `measured`, and `true_error` counts in the metrics. Random series are
-drawn before the run, so the loop itself stays a function.
+`plant_state` and `plant_realised`, the sensors' output is `measured`, which reaches the estimator after the dead time as `arrived`,
+and `true_error` counts in the metrics. Random series are drawn before the run, so the loop itself stays a function.
+
+An estimator and the controller behind it are one step from raw measurements to the command (`fpirhc.controllers.seeing`): a
+controller on a machine is given what its sensors show.
 
 Before the run there are no samples, so the first estimates of the response are not measured ones. The deformation therefore waits
 for `warm_up_cycles`, until the estimator's window holds samples of this run alone; until then the deformed response is the desired
@@ -53,6 +56,15 @@ class Sensing(Checked):
         """Whether the controller receives the true state and response."""
         return not self.sensors and self.estimator.measures_all
 
+    @property
+    def estimates(self) -> bool:
+        """Whether state or response are estimated, so that a controller's step begins with raw measurements."""
+        return not self.estimator.measures_all
+
+    def measures(self, plant: Plant) -> tuple[str, ...]:
+        """Names of the measured quantities: state elements, and highest derivatives of controlled coordinates."""
+        return self.estimator.measures(plant)
+
     def check(self, plant: Plant) -> None:
         """Raise if a sensor's quantity is unknown or not measured, or the estimator cannot serve the plant.
 
@@ -60,7 +72,7 @@ class Sensing(Checked):
             InvalidProblem: all mistakes together.
         """
         mistakes = Mistakes("sensing")
-        measures, every = self.estimator.measures(plant), plant.state.elements + response_names(plant)
+        measures, every = self.measures(plant), plant.state.elements + response_names(plant)
         mistakes.unknown("sensors: quantity", self.sensors, every)
         for name in self.sensors:
             if name in every and name not in measures:
@@ -98,28 +110,35 @@ class Sensing(Checked):
             columns += [(lost.random(times.size) < sensor.dropout).astype(float)] if sensor.dropout else []
         return np.column_stack(columns) if columns else np.zeros((times.size, 0))
 
-    def blocks(
-        self, plant: Plant, period: float, start: Array, late: float, true: tuple[Signal, Signal], resting: Array
-    ) -> list[Block]:
-        """Blocks from the true state and response to 'state' and 'realised'.
+    def raw(self, plant: Plant, start: Array, late: float, resting: Array) -> Signal:
+        """Signal of the raw measurements as they arrive, with their values at the start.
 
         Args:
             plant: the plant that is measured.
-            period: control cycle, s.
+            start: first state of the problem, shape (nx,).
+            late: dead time of the measurement, cycles.
+            resting: response at the start, shape (n,).
+        """
+        names = self.measures(plant)
+        first = _start(plant, start, names, resting)
+        return vector("arrived" if late else "measured", names, [_unit(plant, n) for n in names], first.tolist())
+
+    def blocks(
+        self, plant: Plant, start: Array, late: float, true: tuple[Signal, Signal], resting: Array
+    ) -> list[Block]:
+        """Blocks from the true state and response to the raw measurements that arrive.
+
+        Args:
+            plant: the plant that is measured.
             start: first state of the problem, shape (nx,).
             late: dead time of the measurement, cycles.
             true: signals of the true state and response.
             resting: response at the start, shape (n,).
         """
-        names = self.estimator.measures(plant)
-        first = _start(plant, start, names, resting)
-        measured = vector("measured", names, [_unit(plant, n) for n in names])
-        sensors = self._sensor_block(plant, true, measured, first)
-        if not late:
-            return [sensors, self.estimator.block(plant, period, start, measured)]
-        arrived = replace(measured, name="_arrived", start=tuple(map(float, first)))
-        waiting = delay_block("see", measured, arrived, [late] * len(names))
-        return [sensors, waiting, self.estimator.block(plant, period, start, replace(arrived, start=()))]
+        arriving = self.raw(plant, start, late, resting)
+        measured = replace(arriving, name="measured", start=())
+        sensors = self._sensor_block(plant, true, measured, arriving.start_vector())
+        return [sensors, delay_block("see", measured, arriving, [late] * measured.size)] if late else [sensors]
 
     def _columns(self) -> tuple[str, ...]:
         noisy = [(n, "noise", s.noise is not None) for n, s in self.sensors.items()]

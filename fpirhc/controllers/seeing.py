@@ -1,0 +1,72 @@
+"""Sensing and controller as ONE step: from the raw measurements to the command.
+
+    raw measurements -> [estimator -> controller] -> command
+
+A sensor shows what it measures; velocities, filters and queues of samples are the controller's business. So the estimator is the
+first block of the composed step. A machine gives the step what its sensors show, and a skipped cycle leaves the estimator's memory
+as it was, like every other memory. Where state and response are both measured, there is nothing to estimate, and the step reads
+them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller, compose_controller, controller_reads
+from fpirhc.controllers.contract import checked
+from fpirhc.controllers.mirror import with_measured_state
+from fpirhc.symbolic.block import Block, Composite, compose
+from fpirhc.symbolic.layout import Layout, Signal
+from fpirhc.task.problem import Problem
+
+
+def compose_seeing(problem: Problem, controller: Controller) -> Composite:
+    """Return sensing and controller as one step: (memory, time, raw measurements, parameters) -> (memory, trace, command).
+
+    Where nothing is estimated it is `compose_controller`.
+
+    Args:
+        problem: that the controller is composed for.
+        controller: checked here against the problem.
+    """
+    raw = raw_signal(problem)
+    if raw is None:
+        return compose_controller(problem, controller)
+    ready = checked(problem, controller)
+    blocks, delays = ready.blocks(problem)
+    time, _, _, parameters = controller_reads(problem, ready).signals
+    every = [*seeing_blocks(problem), *with_measured_state(problem.plant, blocks)]
+    return compose("controller", Layout((time, raw, parameters)), every, delays, outputs=("command",))
+
+
+def raw_signal(problem: Problem) -> Signal | None:
+    """Return the signal of the raw measurements that a step begins with; None where state and response are both measured."""
+    if not problem.sensing.estimates:
+        return None
+    return problem.sensing.raw(problem.plant, *_first(problem))
+
+
+def seeing_blocks(problem: Problem) -> list[Block]:
+    """Return the blocks from the raw measurements to 'state' and 'realised'; none where both are measured."""
+    raw = raw_signal(problem)
+    if raw is None:
+        return []
+    start, _ = first_estimates(problem)
+    return [problem.sensing.estimator.block(problem.plant, problem.period, start, raw)]
+
+
+def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Return state and response that sensors without noise show at the start, shapes (nx,) and (n,)."""
+    plant, reality = problem.plant, problem.symbolic_reality
+    at = problem.real_start, problem.inputs_before, problem.real_plant.exact
+    if reality is None:
+        return problem.start_state, plant.controlled_response_function(*at).full().ravel()
+    calm = np.zeros(len(problem.real_plant.names))
+    state = reality.state_function(plant, seen=True)(*at, calm)
+    return state.full().ravel(), reality.response_function(plant, seen=True)(*at, calm).full().ravel()
+
+
+def _first(problem: Problem) -> tuple[np.ndarray, float, np.ndarray]:
+    """First state, dead time of the measurement in cycles, and first response."""
+    start, resting = first_estimates(problem)
+    return start, problem.dead_time.measurement / problem.period, resting
