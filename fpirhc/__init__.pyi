@@ -84,6 +84,8 @@ from .sensing import (
     StateVariableFilter,
     VelocityDifference,
 )
+from .sensing.beliefs.kalman_filter import KalmanFilter
+from .sensing.beliefs.model_states import ModelStates
 from .simulation.lyapunov_view import LyapunovView, lyapunov_view
 from .simulation.machine import Watch
 from .simulation.metrics import Metric, Metrics, measure
@@ -163,6 +165,7 @@ __all__ = [
     "ImplicitMidpoint",
     "Increment",
     "Ipopt",
+    "KalmanFilter",
     "LQRTerminal",
     "Ladder",
     "Limits",
@@ -176,6 +179,7 @@ __all__ = [
     "Metric",
     "Metrics",
     "ModelReferenced",
+    "ModelStates",
     "MovingHorizon",
     "Noise",
     "Normal",

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, controller_reads
+from fpirhc.controllers.believing import Believing, check_believed
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.mirror import with_measured_state
 from fpirhc.symbolic.block import Block, Composite, compose
@@ -35,8 +36,11 @@ def compose_seeing(problem: Problem, controller: Controller) -> Composite:
     ready = checked(problem, controller)
     blocks, delays = ready.blocks(problem)
     time, _, _, parameters = controller_reads(problem, ready).signals
+    check_believed(problem, ready)
+    believing = _believing(problem)
+    own = [believing.delay] if believing is not None else []
     every = [*seeing_blocks(problem), *with_measured_state(problem.plant, blocks)]
-    return compose("controller", Layout((time, raw, parameters)), every, delays, outputs=("command",))
+    return compose("controller", Layout((time, raw, parameters)), every, [*delays, *own], outputs=("command",))
 
 
 def raw_signal(problem: Problem) -> Signal | None:
@@ -51,7 +55,11 @@ def seeing_blocks(problem: Problem) -> list[Block]:
     raw = raw_signal(problem)
     if raw is None:
         return []
-    start, _ = first_estimates(problem)
+    believing, (start, _) = _believing(problem), first_estimates(problem)
+    if believing is not None:
+        return [believing.block]
+    if problem.sensing.measured is not None:
+        return _estimating_part(problem, raw, start)
     return [problem.sensing.estimator.block(problem.plant, problem.period, start, raw)]
 
 
@@ -64,6 +72,22 @@ def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     calm = np.zeros(len(problem.real_plant.names))
     state = reality.state_function(plant, seen=True)(*at, calm)
     return state.full().ravel(), reality.response_function(plant, seen=True)(*at, calm).full().ravel()
+
+
+def _believing(problem: Problem) -> Believing | None:
+    raw = raw_signal(problem)
+    if raw is None or problem.sensing.belief is None:
+        return None
+    return Believing(problem, raw, first_estimates(problem)[0])
+
+
+def _estimating_part(problem: Problem, raw: Signal, start: np.ndarray) -> list[Block]:
+    """The estimator behind a block that leaves out what it does not need."""
+    names = problem.sensing.estimator.measures(problem.plant)
+    places = [raw.elements.index(n) for n in names]
+    needed = Signal("_needed", names)
+    select = Block("select", Layout((raw,)), Layout((needed,)), lambda s: {needed.name: getattr(s, raw.name)[places]})
+    return [select, problem.sensing.estimator.block(problem.plant, problem.period, start, needed)]
 
 
 def _first(problem: Problem) -> tuple[np.ndarray, float, np.ndarray]:

@@ -15,7 +15,6 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved, without_deformation
 from fpirhc.review.nominal_runs import CYCLES, shortened
 from fpirhc.review.prediction import NominalRun, exactly
-from fpirhc.sensing.sensing import Sensing
 from fpirhc.simulation.simulate import simulate
 from fpirhc.task.problem import Problem
 
@@ -110,7 +109,7 @@ def with_form(runs: NullRuns, model: Problem, controller: Controller) -> NullRun
 def null_problem(problem: Problem, controller: Controller) -> Problem:
     """Return the problem whose plant is the controller's model, without disturbances and noise, shortened to `CYCLES` cycles."""
     believed = resolved(problem, controller).parameters(problem.plant)
-    sensing = Sensing(estimator=problem.sensing.estimator)
+    sensing = replace(problem.sensing, sensors={})
     model = replace(problem.of_model, plant=exactly(problem.plant, believed), disturbances={}, sensing=sensing)
     return shortened(model, CYCLES)
 
