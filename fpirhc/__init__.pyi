@@ -85,6 +85,8 @@ from .sensing import (
     StateVariableFilter,
     VelocityDifference,
 )
+from .sensing.beliefs.kalman_filter import KalmanFilter
+from .sensing.beliefs.model_states import ModelStates
 from .simulation.lyapunov_view import LyapunovView, lyapunov_view
 from .simulation.machine import Watch
 from .simulation.metrics import Metric, Metrics, measure
@@ -168,6 +170,7 @@ __all__ = [
     "ImplicitMidpoint",
     "Increment",
     "Ipopt",
+    "KalmanFilter",
     "Known",
     "LQRTerminal",
     "Ladder",
@@ -182,6 +185,7 @@ __all__ = [
     "Metric",
     "Metrics",
     "ModelReferenced",
+    "ModelStates",
     "MovingHorizon",
     "Noise",
     "Normal",

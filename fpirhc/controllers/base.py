@@ -56,13 +56,29 @@ def compose_controller(problem: Problem, controller: Controller, *, ahead: bool 
     reads, named = controller_reads(problem, ready), with_measured_state(problem.plant, blocks)
     if ahead and len(named) > len(blocks):
         reads, named = reads + Layout((measured_state(problem.plant),)), blocks
+    return compose_informed(problem, ready, reads, named, delays, ahead=ahead)
+
+
+def compose_informed(
+    problem: Problem, ready: Controller, reads: Layout, blocks: list[Block], delays: list[Delay], *, ahead: bool = False
+) -> Composite:
+    """Return blocks as one step to the command, behind a block of what the controller is told of signals from outside.
+
+    Args:
+        problem: that the controller is composed for.
+        ready: the controller, checked.
+        reads: what the step reads.
+        blocks: of the step.
+        delays: what the step remembers of its signals.
+        ahead: whether the time is the one at which the command will act.
+    """
     told = Told(ready.model_plant(problem), ready.told(problem), problem.period)
     compares = any(ACTED in block.reads for block in blocks)
     first = told.block(remembers=compares and not ahead)
     if first is None:
-        return compose("controller", reads, named, delays, outputs=("command",))
+        return compose("controller", reads, blocks, delays, outputs=("command",))
     needed = reads + Layout(told.reads if compares else ())
-    inner = compose("informed", needed, named, delays, outputs=("command",))
+    inner = compose("informed", needed, blocks, delays, outputs=("command",))
     block = embedded("informed", inner, {"parameters": like(told.plant.parameter, NOW)})
     return compose("controller", needed if ahead else reads, [first, block], outputs=("command",))
 
