@@ -218,6 +218,7 @@ __all__ = [
     "Sensing",
     "Sensor",
     "SequentialQuadratic",
+    "Setpoint",
     "Sigmoid",
     "Sine",
     "SlidingMode",

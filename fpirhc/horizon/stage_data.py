@@ -40,8 +40,8 @@ def stage_data(
 ) -> ca.Function:
     """Function (time, parameters) -> data of all stages, shape (ntheta, N + 1), along the nominal motion.
 
-    With `live` rows of settings and what follows from them, (time, parameters, these rows) -> data that end with them. Where they are
-    `previewed`, states (nx, N + 1) and responses (n, N + 1) of the reference follow the time as arguments.
+    With `live` rows of settings and what follows from them, (time, parameters, these rows) -> data that end with them. Where the
+    reference is `previewed`, its states (nx, N + 1) and responses (n, N + 1) follow the time as arguments.
     """
     matrix = kind(reference.opaque or plant.inverse_opaque)
     t, p = matrix.sym("t"), matrix.sym("p", plant.parameter.size)

@@ -180,9 +180,7 @@ def _truth_block(problem: Problem, state: Signal) -> Block:
     writes = Layout((error_signal(problem, "true_error"),))
     if own_signals(problem):
         reads = Layout((like(plant.state, "reference"), state))
-        return Block(
-            "truth", reads, writes, lambda s: {"true_error": (s.reference - getattr(s, state.name))[places]}
-        )
+        return Block("truth", reads, writes, lambda s: {"true_error": (s.reference - getattr(s, state.name))[places]})
     function = problem.reference.function(plant)
 
     def step(s: Signals) -> dict[str, Expression]:

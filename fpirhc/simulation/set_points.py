@@ -12,7 +12,9 @@ from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Steps
 from fpirhc.task.steps import check_values, in_force, pairs
 
-Setpoints = Mapping[str, Steps | Callable[[float], float]]  # by coordinate: a number, pairs (time, set-point), function of the time
+Setpoints = Mapping[
+    str, Steps | Callable[[float], float]
+]  # by coordinate: a number, pairs (time, set-point), function of the time
 SetpointsNow = Mapping[str, float | Sequence[float]]  # by coordinate: a number, or one per node of the horizon
 _FUNCTION = "a function of time"
 

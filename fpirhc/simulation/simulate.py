@@ -192,7 +192,9 @@ def simulate(
     """
     live = tuple(dict.fromkeys(path for numbers in (settings or {}, *(changes or {}).values()) for path in numbers))
     ready = simulator(problem, controller, compiled=compiled, flags=flags, live=live)
-    return judged_run(ready, seed=seed, name=name, progress=progress, settings=settings, changes=changes, setpoints=setpoints)
+    return judged_run(
+        ready, seed=seed, name=name, progress=progress, settings=settings, changes=changes, setpoints=setpoints
+    )
 
 
 def judged_run(
@@ -217,9 +219,7 @@ def judged_run(
         setpoints: by coordinate, in place of those of the reference.
     """
     title = name or ready.controller.task_name or type(ready.controller).__name__
-    run = ready.run(
-        seed=seed, name=title, progress=progress, settings=settings, changes=changes, setpoints=setpoints
-    )
+    run = ready.run(seed=seed, name=title, progress=progress, settings=settings, changes=changes, setpoints=setpoints)
     problem, controller = ready.problem, ready.controller
     if settings:
         problem, controller, _ = ready.live.changed(settings)
@@ -314,9 +314,7 @@ def _run_foreign(
         raise unwrapped(error) from None
 
 
-def _tables(
-    problem: Problem, seed: int, cycles: int, disturbed: bool, setpoints: Setpoints | None
-) -> list[np.ndarray]:
+def _tables(problem: Problem, seed: int, cycles: int, disturbed: bool, setpoints: Setpoints | None) -> list[np.ndarray]:
     """Disturbances, the sensors' random series, and set-points of every cycle, where there are any."""
     random = float(disturbed) * disturbance_table(problem, seed, cycles), sensing_table(problem, seed, cycles)
     return [table for table in (*random, set_point_table(problem, setpoints, cycles)) if table.shape[1]]

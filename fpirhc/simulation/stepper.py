@@ -222,7 +222,11 @@ class Stepper:
         """The set-points in force, by coordinate; where they are announced, one per node of the horizon."""
         names = self._live.problem.plant.names
         rows = self._setpoints.reshape(-1, len(names)).T
-        return {name: row.tolist() if row.size > 1 else float(row[0]) for name, row in zip(names, rows, strict=True) if row.size}
+        return {
+            name: row.tolist() if row.size > 1 else float(row[0])
+            for name, row in zip(names, rows, strict=True)
+            if row.size
+        }
 
     def _force(self, numbers: Mapping[str, float]) -> None:
         """Write the settings and what follows from them into the arguments; nothing is written where something is refused."""

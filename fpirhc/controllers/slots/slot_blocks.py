@@ -75,7 +75,9 @@ def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
     writes = [one.signal(n, elements) for n in ("state", "target")]
     writes += [one.signal(n) for n in ("nominal", "free", "gain", "good", "divisor")]
     reads = (plant.time, plant.state, plant.parameter, like(plant.input, "_command_before"), *own_signals(problem))
-    return Block(f"slot_state_{one.number}", Layout(reads), Layout(tuple(writes)), step, opaque=problem.reference.opaque)
+    return Block(
+        f"slot_state_{one.number}", Layout(reads), Layout(tuple(writes)), step, opaque=problem.reference.opaque
+    )
 
 
 def admissible_block(channels: Sequence[Channel]) -> Block:
