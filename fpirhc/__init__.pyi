@@ -61,6 +61,7 @@ from .optimisers.quadratic_solvers import Osqp, Qrqp
 from .optimisers.reduced_gradient import ReducedGradient
 from .plant.implicit import ImplicitMidpoint, RadauIIA
 from .plant.integrators import Cvodes, Euler, RungeKutta4
+from .plant.parameter import outside
 from .plant.plant import Parameter, Plant, structural_order
 from .plant.regressor import Combination, Regressor, linear_parameters
 from .plant.relative_order import OutputChain, output_chain
@@ -104,9 +105,11 @@ from .task.dead_time import DeadTime
 from .task.disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
 from .task.foreign import Foreign
 from .task.limits import Limits, PathConstraint
+from .task.outside import Believed, Known, Unknown
 from .task.problem import Problem
 from .task.reality import Reality
 from .task.reference import Table, Trajectory
+from .task.samples import Samples
 from .task.set_point import Setpoint
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
@@ -120,6 +123,7 @@ __all__ = [
     "Anderson",
     "Answer",
     "BacksteppingMRAC",
+    "Believed",
     "ByDesired",
     "ByError",
     "ByLookAhead",
@@ -164,6 +168,7 @@ __all__ = [
     "ImplicitMidpoint",
     "Increment",
     "Ipopt",
+    "Known",
     "LQRTerminal",
     "Ladder",
     "Limits",
@@ -212,6 +217,7 @@ __all__ = [
     "Rotation",
     "Run",
     "RungeKutta4",
+    "Samples",
     "SavitzkyGolay",
     "ScenarioComparison",
     "SelfPaired",
@@ -239,6 +245,7 @@ __all__ = [
     "Tuning",
     "Uncertain",
     "Uniform",
+    "Unknown",
     "VelocityDifference",
     "Watch",
     "accept",
@@ -266,6 +273,7 @@ __all__ = [
     "lyapunov_view",
     "measure",
     "output_chain",
+    "outside",
     "predict_response",
     "response_jacobian",
     "review",

@@ -21,6 +21,7 @@ from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.mirror import measured_state, mirror_blocks, with_measured_state
+from fpirhc.controllers.outside_block import ACTED, NOW, Told
 from fpirhc.controllers.own_reference import given_signals, motion_of, own_signals, own_values, with_reference
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.plant import Plant
@@ -46,8 +47,8 @@ def compose_controller(problem: Problem, controller: Controller, *, ahead: bool 
     Args:
         problem: that the controller is composed for.
         controller: checked here against the problem.
-        ahead: whether time and state are those at which the command will act. The step then also reads the measured state where a
-            block needs it.
+        ahead: whether time and state are those at which the command will act. The step then also reads the measured state, and the
+            signals of the last cycle, where a block needs them.
     """
     ready = checked(problem, controller)
     blocks, delays = ready.blocks(problem)
@@ -55,7 +56,15 @@ def compose_controller(problem: Problem, controller: Controller, *, ahead: bool 
     reads, named = controller_reads(problem, ready), with_measured_state(problem.plant, blocks)
     if ahead and len(named) > len(blocks):
         reads, named = reads + Layout((measured_state(problem.plant),)), blocks
-    return compose("controller", reads, named, delays, outputs=("command",))
+    told = Told(ready.model_plant(problem), ready.told(problem), problem.period)
+    compares = any(ACTED in block.reads for block in blocks)
+    first = told.block(remembers=compares and not ahead)
+    if first is None:
+        return compose("controller", reads, named, delays, outputs=("command",))
+    needed = reads + Layout(told.reads if compares else ())
+    inner = compose("informed", needed, named, delays, outputs=("command",))
+    block = embedded("informed", inner, {"parameters": like(told.plant.parameter, NOW)})
+    return compose("controller", needed if ahead else reads, [first, block], outputs=("command",))
 
 
 def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block:

@@ -40,6 +40,7 @@ from fpirhc.symbolic.block import Block, Delay, Derived, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import DERIVED, PREFIX, is_live, live_numbers, nominal, settled
+from fpirhc.task.outside import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_stage
 
 _SCALE, _STEEPEST, _NUMBERS = (f"{PREFIX}{DERIVED}plan.{name}" for name in (SCALE, STEEPEST, "numbers"))
@@ -117,7 +118,8 @@ class RecedingHorizon(Controller):
 def _optimal_control(problem: Problem) -> OptimalControl:
     assert problem.horizon is not None
     assert problem.cost is not None
-    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits)
+    ahead = previewed_values(problem.plant, problem.signals)
+    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits, ahead)
 
 
 def _due_block(cycles: int) -> Block:
@@ -204,7 +206,8 @@ def _check_reference(problem: Problem) -> None:
 def _stage_data(problem: Problem, live: int, *, previewed: bool = False) -> ca.Function:
     assert problem.horizon is not None
     assert problem.cost is not None
-    arguments = problem.plant, problem.reference, problem.horizon, problem.cost, live
+    ahead = previewed_values(problem.plant, problem.signals)
+    arguments = problem.plant, problem.reference, problem.horizon, problem.cost, live, ahead
     return stage_data(*arguments, previewed=previewed)
 
 

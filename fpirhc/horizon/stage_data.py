@@ -36,15 +36,25 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
 
 
 def stage_data(
-    plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, live: int = 0, *, previewed: bool = False
+    plant: Plant,
+    reference: Reference,
+    horizon: Horizon,
+    cost: Cost,
+    live: int = 0,
+    signals: ca.Function | None = None,
+    *,
+    previewed: bool = False,
 ) -> ca.Function:
     """Function (time, parameters) -> data of all stages, shape (ntheta, N + 1), along the nominal motion.
 
-    With `live` rows of settings and what follows from them, (time, parameters, these rows) -> data that end with them. Where the
-    reference is `previewed`, its states (nx, N + 1) and responses (n, N + 1) follow the time as arguments.
+    With `live` rows of settings and what follows from them, (time, parameters, these rows) -> data that end with them. With
+    `signals`, a Function (time, parameters) -> parameters, every stage has those of its middle. Where the reference is `previewed`, its
+    states (nx, N + 1) and responses (n, N + 1) follow the time as arguments.
     """
-    matrix = kind(reference.opaque or plant.inverse_opaque)
-    t, p = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
+    looked_up = signals is not None and not signals.is_a("SXFunction")
+    matrix = kind(reference.opaque or plant.inverse_opaque or looked_up)
+    t, given = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
+    p = given if signals is None else signals(t + horizon.step / 2, given)
     motion = [matrix.sym("x", plant.state.size), matrix.sym("r", len(plant.names))] if previewed else []
     state, response = motion or reference.function(plant)(t)
     if cost.uses_feedforward:
@@ -54,7 +64,8 @@ def stage_data(
     # The live rows come out of the same call where they follow these rows: joining tables would copy both.
     joined = bool(live) and not (horizon.blocks or horizon.terminal or horizon.margins)
     rows = [matrix.sym("live", live)] if joined else []
-    one = ca.Function("fpirhc_stage_data", [t, *motion, p, *rows], [ca.densify(ca.vertcat(t, state, needed, p, *rows))])
+    stage = ca.densify(ca.vertcat(t, state, needed, p, *rows))
+    one = ca.Function("fpirhc_stage_data", [t, *motion, given, *rows], [stage])
     start, parameters = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
     columns = dict(zip(("states", "responses"), motion, strict=False))
     tables = [ca.MX.sym(name, m.numel(), horizon.stages + 1) for name, m in columns.items()]

@@ -19,6 +19,7 @@ from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.own_reference import given_signals, own_signals
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, measures_all, sending_block
+from fpirhc.simulation.outside_blocks import outside_blocks, real_name
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -54,7 +55,7 @@ def _closed(problem: Problem, controller: Controller, live: LiveSettings | None)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
     seeing = [block for block in seeing if block not in judging]
     clock, actuating = _clock_block(problem.plant.time, problem.period), _actuate(problem, disturbed)
-    around = [clock, *seeing, acting.block(), *judging, *actuating]
+    around = [clock, *outside_blocks(problem, ready), *seeing, acting.block(), *judging, *actuating]
     constants = live.held(around) if live is not None else []
     reads = Layout((*disturbed, *problem.sensing.drawn, *given_signals(problem), *foreign_signals(problem)))
     sent = () if problem.foreign is None else (SENT,)
@@ -104,7 +105,7 @@ def _plant_delays(problem: Problem, controller: Controller) -> list[Delay]:
         Delay(Signal("_acting_before", plant.input.elements, plant.input.units, acting), "_acting"),
         Delay(_forcing(plant, "_forcing_before"), "_forcing"),
         believed,
-        _held("_exact", plant, plant.exact),
+        replace(_held("_exact", plant, problem.real_parameters), source=real_name(problem)),
     ]
 
 
@@ -159,7 +160,7 @@ def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], tup
 def _late_blocks(problem: Problem, shown: tuple[Signal, Signal], response: ca.Function) -> list[Block]:
     """Blocks of sensors, their dead time and the estimator, from what the sensors see to what the controller is given."""
     plant, behind = problem.plant, problem.dead_time.measurement / problem.period
-    at = problem.real_start, problem.inputs_before, problem.real_plant.exact, np.zeros(len(problem.real_plant.names))
+    at = problem.real_start, problem.inputs_before, problem.real_parameters, np.zeros(len(problem.real_plant.names))
     resting, first = response(*at).full().ravel(), problem.start_state
     if problem.symbolic_reality is not None:
         first = problem.symbolic_reality.state_function(plant, seen=True)(*at).full().ravel()
@@ -265,7 +266,8 @@ def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Si
     state = plant.state if problem.sees_plant else like(plant.state, "plant_state")
     if problem.symbolic_reality is not None:
         state = like(plant.state, REALITY_STATE)
-    reads = (state, arriving, like(plant.parameter, "_exact"), *disturbed)
+    exact = like(plant.parameter, real_name(problem))
+    reads = (state, arriving, exact, *disturbed)
     writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
 
     def step(s: Signals) -> dict[str, Expression]:
@@ -274,6 +276,10 @@ def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Si
             added = dict(zip(problem.disturbances, ca.vertsplit(s.disturbance), strict=True))
             u = u + ca.vertcat(*(added.get(name, 0) for name in plant.inputs))
             w = ca.vertcat(*(added.get(name, 0) for name in plant.names))
-        return {"_state_after": advance(getattr(s, state.name), u, s._exact, w), "_acting": u, "_forcing": w}
+        return {
+            "_state_after": advance(getattr(s, state.name), u, getattr(s, exact.name), w),
+            "_acting": u,
+            "_forcing": w,
+        }
 
     return Block("advance", Layout(reads), Layout(writes), step, opaque=problem.real_integrator.opaque)

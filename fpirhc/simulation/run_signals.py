@@ -10,7 +10,7 @@ import numpy as np
 from fpirhc.contraction import contraction_along
 from fpirhc.contraction.identified import identified_factor
 from fpirhc.contraction.sampled import sampled_jacobians
-from fpirhc.contraction.spectrum import factors_along
+from fpirhc.contraction.spectrum import factors_along, response_jacobians
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.own_reference import own_signals
 from fpirhc.horizon.problem import OptimalControl
@@ -19,6 +19,7 @@ from fpirhc.horizon.transcription import transcribe
 from fpirhc.simulation.loop import REALITY_STATE
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.task.outside import model_values, real_values, rows_of
 from fpirhc.task.problem import Problem
 
 _CHUNK = 500  # cycles whose costs are evaluated in one call
@@ -50,12 +51,32 @@ def _contraction(problem: Problem, controller: Controller, layout: Layout, log: 
             np.nan if problem.response_delay else identified_factor(deformed, log[:, layout.slice("realised")], gain)
         )
         return np.full(len(log), shown)
+    if problem.signals:
+        return _contraction_outside(problem, controller, layout, log)
     if problem.symbolic_reality is None:
         return contraction_along(plant, states, deformed, gain, approximate=believed)
     real, modelled = log[:, layout.slice(REALITY_STATE)], replace(problem, plant=plant)
     return factors_along(
         len(log), lambda rows: sampled_jacobians(modelled, real[rows], states[rows], deformed[rows], believed), gain
     )
+
+
+def _contraction_outside(problem: Problem, controller: Controller, layout: Layout, log: np.ndarray) -> np.ndarray:
+    """The factor of every cycle with signals from outside: plant and model have those of the cycle."""
+    states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]
+    plant, own = problem.real_plant, controller.model_plant(problem)
+    times = log[:, layout.slice("time")].ravel() + problem.period / 2
+    real = rows_of(real_values(plant, problem.signals), times, plant.exact)
+    told = rows_of(model_values(own, controller.told(problem)), times, controller.parameters(own))
+    modelled = problem if own is problem.plant else replace(problem, plant=own)
+
+    def jacobians(rows: np.ndarray) -> np.ndarray:
+        if problem.symbolic_reality is None:
+            return response_jacobians(own, states[rows], deformed[rows], real[rows], told[rows])
+        moved = log[rows][:, layout.slice(REALITY_STATE)]
+        return sampled_jacobians(modelled, moved, states[rows], deformed[rows], told[rows], real[rows])
+
+    return factors_along(len(log), jacobians, controller.deformation.effective_gain())
 
 
 def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, np.ndarray]:
@@ -70,8 +91,8 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
     plant = problem.plant
     one_cycle = replace(problem.horizon, stages=1, step=problem.period, terminal=(), blocks=(), margins={})
     ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits)
-    own = bool(own_signals(problem))
-    data_of = stage_data(plant, problem.reference, one_cycle, problem.cost, previewed=own)
+    own, outside = bool(own_signals(problem)), real_values(plant, problem.signals)
+    data_of = stage_data(plant, problem.reference, one_cycle, problem.cost, signals=outside, previewed=own)
     states = log[:, layout.slice("plant_state")]
     commands = log[:, layout.slice("command")]
     states = np.asarray(ocp.start(states.T, np.vstack([commands[:1], commands[:-1]]).T).full()).T
