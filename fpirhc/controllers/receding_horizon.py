@@ -198,8 +198,8 @@ def _check_reference(problem: Problem) -> None:
     moving = live_numbers(problem.reference)
     if moving and not problem.reference.rests(problem.horizon.stages * problem.horizon.step):
         raise NotSupported(
-            f"setting 'reference.{next(iter(moving)).removeprefix('reference.')}' cannot be live with a plan: the reference moves within "
-            "the first horizon, from which the optimiser's scale and the first plan are taken; let it rest there"
+            f"setting '{next(iter(moving))}' cannot be live with a plan: the reference moves within the first horizon, from which "
+            "the optimiser's scale and the first plan are taken; let it rest there"
         )
 
 
@@ -212,7 +212,7 @@ def _stage_data(problem: Problem, live: int, *, previewed: bool = False) -> ca.F
 
 
 def _plan_reads(problem: Problem, ocp: OptimalControl) -> Layout:
-    """Time, state from which the plan starts, parameters, command shift and command of the last cycle, derived numbers, reference."""
+    """Time, state from which the plan starts, parameters, last command and its shift, derived numbers, own signals."""
     plant = problem.plant
     last = like(plant.input, "_command_shift_last"), like(plant.input, "_command_before")
     own = own_signals(problem)
