@@ -102,7 +102,7 @@ def test_margins_for_a_box_of_parameters_are_at_least_those_of_the_plant():
 
 
 def test_predicted_margins_are_those_of_the_deviations_in_their_order():
-    """A single jump is counted once, and what comes after it as the loop carries it on; the same jump in every cycle, every time."""
+    """A single jump counts once, and what comes after it as the loop carries it on; one in every cycle counts every time."""
     dynamics = np.array([[0.9, 0.1], [-0.4, 0.7]])
     loop = LinearLoop(dynamics, np.zeros((2, 1)), np.zeros((1, 2)), np.arange(2), 0.01)
     once = np.zeros((40, 2))
@@ -139,7 +139,7 @@ def test_mistakes_are_named():
         fp.tightened(problem, adaptive(), widen=0)
     with pytest.raises(InvalidValue, match="passes=-1"):
         fp.tightened(problem, adaptive(), passes=-1)
-    with pytest.raises(NotSupported, match="after 1 runs the plant still passes its limits .'q' by"):
+    with pytest.raises(NotSupported, match=r"after 1 runs the plant still passes its limits \('q' by"):
         fp.tightened(replace(problem, duration=1.2), adaptive(), passes=1, widen=0.01)
     with pytest.raises(InvalidProblem, match="leaves nothing between its limits"):
         fp.tightened(problem, adaptive(), widen=1000.0)

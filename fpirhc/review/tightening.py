@@ -11,8 +11,8 @@ stages after a plan was made the plant is away from it by at most
     m_i = max over k of  sum over l < i n of |H_l d_(k-l)|,        n = cycles per stage,
 
 entry by entry, to first order, whatever the signs are. The run's first moments, up to `measure_from`, do not count: adaptation has
-not found the plant yet. A plan that keeps m_i from its limits after stage i leaves room for this, and also for the plans that follow
-it. These are the restricted constraints of robust MPC (L. Chisci, J. A. Rossiter, G. Zappa, Automatica 37(7), 2001), with the
+not found the plant yet. A plan that keeps m_i from its limits after stage i leaves room for this, and for the plans that follow it.
+These are the restricted constraints of robust MPC (L. Chisci, J. A. Rossiter, G. Zappa, Automatica 37(7), 2001), with the
 feedback of the loop itself and the deviations that adaptation leaves.
 
 The largest |d_k| are jumps of the desired response, five to seven times their root mean square. A bound that lets them return in
@@ -103,8 +103,8 @@ def state_margins(
         if k + 1 == passes:
             amounts = ", ".join(f"'{e}' by {v:.2g}" for e, v in passed.items())
             raise NotSupported(
-                f"no margins: after {passes} runs the plant still passes its limits ({amounts}); with tightened(passes=0) the plans "
-                "keep the predicted margins, and no run verifies them"
+                f"no margins: after {passes} runs the plant still passes its limits ({amounts}); with tightened(passes=0) the "
+                "plans keep the predicted margins, and no run verifies them"
             )
         margins = {e: tuple(v + max(widen, 1.0) * passed.get(e, 0.0) for v in m) for e, m in margins.items()}
     return margins
