@@ -111,6 +111,7 @@ from .task.problem import Problem
 from .task.reality import Reality
 from .task.reference import Table, Trajectory
 from .task.samples import Samples
+from .task.set_point import Setpoint
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
 

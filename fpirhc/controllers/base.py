@@ -22,6 +22,7 @@ from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.mirror import measured_state, mirror_blocks, with_measured_state
 from fpirhc.controllers.outside_block import ACTED, NOW, Told
+from fpirhc.controllers.own_reference import given_signals, motion_of, own_signals, own_values, with_reference
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
@@ -33,10 +34,11 @@ from fpirhc.task.problem import Problem
 
 
 def controller_reads(problem: Problem, controller: Controller) -> Layout:
-    """Return what a controller reads in every cycle: time, state, realised response, parameters."""
+    """Return what a controller reads in every cycle: time, state, realised response, parameters, and what a reference is given."""
     plant, response = problem.plant, controller.response(problem)
     realised = response.signal if response else plant.response_signal("realised")
-    return Layout((plant.time, plant.state, realised, controller.model_plant(problem).parameter))
+    parameters = controller.model_plant(problem).parameter
+    return Layout((plant.time, plant.state, realised, parameters, *given_signals(problem)))
 
 
 def compose_controller(problem: Problem, controller: Controller, *, ahead: bool = False) -> Composite:
@@ -50,6 +52,7 @@ def compose_controller(problem: Problem, controller: Controller, *, ahead: bool 
     """
     ready = checked(problem, controller)
     blocks, delays = ready.blocks(problem)
+    blocks = with_reference(problem, blocks)
     reads, named = controller_reads(problem, ready), with_measured_state(problem.plant, blocks)
     if ahead and len(named) > len(blocks):
         reads, named = reads + Layout((measured_state(problem.plant),)), blocks
@@ -94,19 +97,19 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
 def reference_block(problem: Problem) -> Block:
     """Block (time, state) -> (reference state, response of the controlled coordinates, error of the judged ones)."""
     plant = problem.plant
-    function = problem.reference.function(plant)
+    function = motion_of(problem)
     controlled = list(plant.controlled_indices)
     places = [plant.state.elements.index(c) for c in problem.judged_names]
 
     def step(s: Signals) -> dict[str, Expression]:
-        state, response = function(s.time)
+        state, response = function(s.time, *own_values(problem, s))
         return {
             "reference": state,
             "_reference_response": response[controlled],
             "error": state[places] - s.state[places],
         }
 
-    reads = Layout((plant.time, plant.state))
+    reads = Layout((plant.time, plant.state, *own_signals(problem)))
     writes = (
         like(plant.state, "reference"),
         plant.response_signal("_reference_response"),

@@ -16,6 +16,7 @@ from fpirhc.controllers.base import Controller, Response, compose_controller, er
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.gate import Gate
 from fpirhc.controllers.live_settings import LiveSettings
+from fpirhc.controllers.own_reference import given_signals, own_signals
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, measures_all, sending_block
 from fpirhc.simulation.outside_blocks import outside_blocks, real_name
@@ -30,12 +31,13 @@ REALITY_STATE = "reality_state"  # signal of the state of a reality, in its own 
 
 
 def close_loop(problem: Problem, controller: Controller, live: LiveSettings | None = None) -> Composite:
-    """Return the closed loop as one step: (memory, [disturbance], [sensing]) -> (memory, trace).
+    """Return the closed loop as one step: (memory, [disturbance], [sensing], [setpoints]) -> (memory, trace).
 
     With a foreign reality the step also reads its measurements, and returns the inputs that it is sent.
 
     Both parameter sets are part of the memory (constant), so that other values need no new Function; live settings likewise. The
-    disturbance input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples.
+    disturbance input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples,
+    `setpoints` only where the reference is given some.
 
     Raises:
         NotSupported: a live setting that this loop cannot keep open.
@@ -50,10 +52,12 @@ def _closed(problem: Problem, controller: Controller, live: LiveSettings | None)
     acting = Gate(nominal(problem), compose_controller(problem, ready), trusted=("time", "memory"))
     disturbed = disturbance_signals(problem)
     seeing = _sense_blocks(problem, ready.response(problem), predicts="state_ahead" in acting.inner.trace)
-    clock, outside = _clock_block(problem.plant.time, problem.period), outside_blocks(problem, ready)
-    around = [clock, *outside, *seeing, acting.block(), *_actuate(problem, disturbed)]
+    judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
+    seeing = [block for block in seeing if block not in judging]
+    clock, actuating = _clock_block(problem.plant.time, problem.period), _actuate(problem, disturbed)
+    around = [clock, *outside_blocks(problem, ready), *seeing, acting.block(), *judging, *actuating]
     constants = live.held(around) if live is not None else []
-    reads = Layout((*disturbed, *problem.sensing.drawn, *foreign_signals(problem)))
+    reads = Layout((*disturbed, *problem.sensing.drawn, *given_signals(problem), *foreign_signals(problem)))
     sent = () if problem.foreign is None else (SENT,)
     return compose("loop", reads, around, [*_plant_delays(problem, ready), *constants], outputs=sent)
 
@@ -172,9 +176,13 @@ def _late_blocks(problem: Problem, shown: tuple[Signal, Signal], response: ca.Fu
 
 def _truth_block(problem: Problem, state: Signal) -> Block:
     """Block (time, true state) -> true error of the judged coordinates."""
-    plant, function = problem.plant, problem.reference.function(problem.plant)
+    plant = problem.plant
     places = [plant.state.elements.index(c) for c in problem.judged_names]
     writes = Layout((error_signal(problem, "true_error"),))
+    if own_signals(problem):
+        reads = Layout((like(plant.state, "reference"), state))
+        return Block("truth", reads, writes, lambda s: {"true_error": (s.reference - getattr(s, state.name))[places]})
+    function = problem.reference.function(plant)
 
     def step(s: Signals) -> dict[str, Expression]:
         return {"true_error": (function(s.time)[0] - getattr(s, state.name))[places]}

@@ -12,6 +12,7 @@ from fpirhc.contraction.identified import identified_factor
 from fpirhc.contraction.sampled import sampled_jacobians
 from fpirhc.contraction.spectrum import factors_along, response_jacobians
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.own_reference import own_signals
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
@@ -90,18 +91,21 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
     plant = problem.plant
     one_cycle = replace(problem.horizon, stages=1, step=problem.period, terminal=(), blocks=(), margins={})
     ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits)
-    data_of = stage_data(plant, problem.reference, one_cycle, problem.cost, signals=real_values(plant, problem.signals))
+    own, outside = bool(own_signals(problem)), real_values(plant, problem.signals)
+    data_of = stage_data(plant, problem.reference, one_cycle, problem.cost, signals=outside, previewed=own)
     states = log[:, layout.slice("plant_state")]
     commands = log[:, layout.slice("command")]
     states = np.asarray(ocp.start(states.T, np.vstack([commands[:1], commands[:-1]]).T).full()).T
     times = log[:, layout.slice("time")]
+    # Along the reference that the run had, where it is no function of the time alone.
+    motion = [log[:, layout.slice(name)] for name in ("reference", "reference_response")] if own else []
     function = _cost_function(ocp, data_of, _CHUNK)
     evaluator = Evaluator(function)
     costs = np.empty((log.shape[0], len(ocp.terms)))
-    evaluator.arguments[3][:] = plant.exact
+    evaluator.arguments[-1][:] = plant.exact
     for at in range(0, log.shape[0], _CHUNK):
         size = min(_CHUNK, log.shape[0] - at)
-        for argument, source in zip(evaluator.arguments, (times, states, commands), strict=False):
+        for argument, source in zip(evaluator.arguments, (times, *motion, states, commands), strict=False):
             argument.reshape(_CHUNK, -1)[:size] = source[at : at + size]
         evaluator.evaluate()
         costs[at : at + size] = evaluator.results[0].reshape(_CHUNK, -1)[:size]
@@ -109,11 +113,14 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
 
 
 def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int) -> ca.Function:
-    """Function (times, states, inputs, parameters) -> cost terms of `count` cycles."""
+    """Function (times, [states and responses of the reference], states, inputs, parameters) -> cost terms of `count` cycles."""
     t, s = ca.MX.sym("t"), ca.MX.sym("s", ocp.state.size)
-    u, p = ca.MX.sym("u", ocp.input.size), ca.MX.sym("p", data_of.size1_in(1))
-    one = ca.Function("fpirhc_cost", [t, s, u, p], [ocp.stage_cost(s, u, data_of(t, p)[:, 0])[1]])
+    u, p = ca.MX.sym("u", ocp.input.size), ca.MX.sym("p", data_of.size1_in(data_of.n_in() - 1))
+    motion = [ca.MX.sym(data_of.name_in(k), data_of.size1_in(k)) for k in range(1, data_of.n_in() - 1)]
+    data = data_of(t, *(ca.repmat(m, 1, 2) for m in motion), p)[:, 0]
+    one = ca.Function("fpirhc_cost", [t, *motion, s, u, p], [ocp.stage_cost(s, u, data)[1]])
     times, states = ca.MX.sym("t", 1, count), ca.MX.sym("s", ocp.state.size, count)
     inputs = ca.MX.sym("u", ocp.input.size, count)
-    terms = one.map(count)(times, states, inputs, ca.repmat(p, 1, count))
-    return ca.Function("fpirhc_costs", [times, states, inputs, p], [terms])
+    moves = [ca.MX.sym(m.name(), m.size1(), count) for m in motion]
+    terms = one.map(count)(times, *moves, states, inputs, ca.repmat(p, 1, count))
+    return ca.Function("fpirhc_costs", [times, *moves, states, inputs, p], [terms])

@@ -30,6 +30,7 @@ from fpirhc.task.outside import External, check_signals, real_values, rows_of, s
 from fpirhc.task.problem_view import problem_facts, problem_table
 from fpirhc.task.reality import Reality
 from fpirhc.task.reference import Reference
+from fpirhc.task.steps import check_steps
 
 MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
 _INSTANTS = 101  # at which signals from outside are tried before a run
@@ -100,6 +101,7 @@ class Problem(Checked):
             *((lambda one=one: one.values(instants, random)) for one in self.disturbances.values()),
             lambda: self.limits.check(plant),
             lambda: self.reference.function(plant),
+            lambda: check_steps(plant, self.limits, self.reference.set_points),
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant),
             lambda: self.symbolic_reality.check(plant) if self.symbolic_reality else None,
