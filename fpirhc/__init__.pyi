@@ -61,6 +61,7 @@ from .optimisers.quadratic_solvers import Osqp, Qrqp
 from .optimisers.reduced_gradient import ReducedGradient
 from .plant.implicit import ImplicitMidpoint, RadauIIA
 from .plant.integrators import Cvodes, Euler, RungeKutta4
+from .plant.parameter import outside
 from .plant.plant import Parameter, Plant, structural_order
 from .plant.regressor import Combination, Regressor, linear_parameters
 from .plant.relative_order import OutputChain, output_chain
@@ -106,9 +107,12 @@ from .task.dead_time import DeadTime
 from .task.disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
 from .task.foreign import Foreign
 from .task.limits import Limits, PathConstraint
+from .task.outside import Believed, Known, Unknown
 from .task.problem import Problem
 from .task.reality import Reality
 from .task.reference import Table, Trajectory
+from .task.samples import Samples
+from .task.set_point import Setpoint
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
 
@@ -121,6 +125,7 @@ __all__ = [
     "Anderson",
     "Answer",
     "BacksteppingMRAC",
+    "Believed",
     "ByDesired",
     "ByError",
     "ByLookAhead",
@@ -166,6 +171,7 @@ __all__ = [
     "Increment",
     "Ipopt",
     "KalmanFilter",
+    "Known",
     "LQRTerminal",
     "Ladder",
     "Limits",
@@ -215,6 +221,7 @@ __all__ = [
     "Rotation",
     "Run",
     "RungeKutta4",
+    "Samples",
     "SavitzkyGolay",
     "ScenarioComparison",
     "SelfPaired",
@@ -241,6 +248,7 @@ __all__ = [
     "Tuning",
     "Uncertain",
     "Uniform",
+    "Unknown",
     "VelocityDifference",
     "Watch",
     "accept",
@@ -268,6 +276,7 @@ __all__ = [
     "lyapunov_view",
     "measure",
     "output_chain",
+    "outside",
     "predict_response",
     "response_jacobian",
     "review",

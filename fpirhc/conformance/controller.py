@@ -26,6 +26,7 @@ from fpirhc.simulation.stepper import Stepper
 from fpirhc.status import Status
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.task.limits import Limits
+from fpirhc.task.outside import really_known
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Trajectory
 
@@ -180,9 +181,12 @@ def exact_model_tracks(trial: _Trial, generator: np.random.Generator) -> None:  
 
 def _exact(problem: Problem) -> Problem:
     parameters = {
-        name: Parameter(approximate=p.exact, exact=p.exact, unit=p.unit) for name, p in problem.plant.parameters.items()
+        name: Parameter(approximate=p.exact, exact=p.exact, unit=p.unit, outside=p.outside)
+        for name, p in problem.plant.parameters.items()
     }
-    return replace(problem, plant=replace(problem.plant, parameters=parameters), disturbances={}, sensing=Sensing())
+    plant = replace(problem.plant, parameters=parameters)
+    signals = really_known(problem.signals)
+    return replace(problem, plant=plant, disturbances={}, sensing=Sensing(), signals=signals)
 
 
 def same_command_everywhere(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001

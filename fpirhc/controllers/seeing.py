@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from fpirhc.controllers.base import Controller, compose_controller, controller_reads
+from fpirhc.controllers.base import Controller, compose_controller, compose_informed, controller_reads
 from fpirhc.controllers.believing import Believing, check_believed
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.mirror import with_measured_state
-from fpirhc.symbolic.block import Block, Composite, compose
+from fpirhc.controllers.own_reference import with_reference
+from fpirhc.symbolic.block import Block, Composite
 from fpirhc.symbolic.layout import Layout, Signal
 from fpirhc.task.problem import Problem
 
@@ -35,12 +36,13 @@ def compose_seeing(problem: Problem, controller: Controller) -> Composite:
         return compose_controller(problem, controller)
     ready = checked(problem, controller)
     blocks, delays = ready.blocks(problem)
-    time, _, _, parameters = controller_reads(problem, ready).signals
+    blocks = with_reference(problem, blocks)
+    time, _, _, parameters, *given = controller_reads(problem, ready).signals
     check_believed(problem, ready)
     believing = _believing(problem)
     own = [believing.delay] if believing is not None else []
     every = [*seeing_blocks(problem), *with_measured_state(problem.plant, blocks)]
-    return compose("controller", Layout((time, raw, parameters)), every, [*delays, *own], outputs=("command",))
+    return compose_informed(problem, ready, Layout((time, raw, parameters, *given)), every, [*delays, *own])
 
 
 def raw_signal(problem: Problem) -> Signal | None:
@@ -66,7 +68,7 @@ def seeing_blocks(problem: Problem) -> list[Block]:
 def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Return state and response that sensors without noise show at the start, shapes (nx,) and (n,)."""
     plant, reality = problem.plant, problem.symbolic_reality
-    at = problem.real_start, problem.inputs_before, problem.real_plant.exact
+    at = problem.real_start, problem.inputs_before, problem.real_parameters
     if reality is None:
         return problem.start_state, plant.controlled_response_function(*at).full().ravel()
     calm = np.zeros(len(problem.real_plant.names))

@@ -16,9 +16,11 @@ from fpirhc.controllers.base import Controller, Response, error_signal, like
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
+from fpirhc.controllers.own_reference import given_signals, own_signals
 from fpirhc.controllers.seeing import compose_seeing, first_estimates, seeing_blocks
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, measures_all, sending_block
+from fpirhc.simulation.outside_blocks import outside_blocks, real_name
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -30,12 +32,13 @@ REALITY_STATE = "reality_state"  # signal of the state of a reality, in its own 
 
 
 def close_loop(problem: Problem, controller: Controller, live: LiveSettings | None = None) -> Composite:
-    """Return the closed loop as one step: (memory, [disturbance], [sensing]) -> (memory, trace).
+    """Return the closed loop as one step: (memory, [disturbance], [sensing], [setpoints]) -> (memory, trace).
 
     With a foreign reality the step also reads its measurements, and returns the inputs that it is sent.
 
     Both parameter sets are part of the memory (constant), so that other values need no new Function; live settings likewise. The
-    disturbance input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples.
+    disturbance input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples,
+    `setpoints` only where the reference is given some.
 
     Raises:
         NotSupported: a live setting that this loop cannot keep open.
@@ -50,9 +53,12 @@ def _closed(problem: Problem, controller: Controller, live: LiveSettings | None)
     acting = Gate(nominal(problem), compose_seeing(problem, ready), trusted=("time", "memory"))
     disturbed = disturbance_signals(problem)
     seeing = _sense_blocks(problem, ready.response(problem), predicts="state_ahead" in acting.inner.trace)
-    around = [_clock_block(problem.plant.time, problem.period), *seeing, acting.block(), *_actuate(problem, disturbed)]
+    judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
+    seeing = [block for block in seeing if block not in judging]
+    clock, actuating = _clock_block(problem.plant.time, problem.period), _actuate(problem, disturbed)
+    around = [clock, *outside_blocks(problem, ready), *seeing, acting.block(), *judging, *actuating]
     constants = live.held(around) if live is not None else []
-    reads = Layout((*disturbed, *problem.sensing.drawn, *foreign_signals(problem)))
+    reads = Layout((*disturbed, *problem.sensing.drawn, *given_signals(problem), *foreign_signals(problem)))
     sent = () if problem.foreign is None else (SENT,)
     return compose("loop", reads, around, [*_plant_delays(problem, ready), *constants], outputs=sent)
 
@@ -112,7 +118,7 @@ def _plant_delays(problem: Problem, controller: Controller) -> list[Delay]:
         Delay(Signal("_acting_before", plant.input.elements, plant.input.units, acting), "_acting"),
         Delay(_forcing(plant, "_forcing_before"), "_forcing"),
         believed,
-        _held("_exact", plant, plant.exact),
+        replace(_held("_exact", plant, problem.real_parameters), source=real_name(problem)),
     ]
 
 
@@ -184,9 +190,13 @@ def _late_blocks(problem: Problem, shown: tuple[Signal, Signal]) -> list[Block]:
 
 def _truth_block(problem: Problem, state: Signal) -> Block:
     """Block (time, true state) -> true error of the judged coordinates."""
-    plant, function = problem.plant, problem.reference.function(problem.plant)
+    plant = problem.plant
     places = [plant.state.elements.index(c) for c in problem.judged_names]
     writes = Layout((error_signal(problem, "true_error"),))
+    if own_signals(problem):
+        reads = Layout((like(plant.state, "reference"), state))
+        return Block("truth", reads, writes, lambda s: {"true_error": (s.reference - getattr(s, state.name))[places]})
+    function = problem.reference.function(plant)
 
     def step(s: Signals) -> dict[str, Expression]:
         return {"true_error": (function(s.time)[0] - getattr(s, state.name))[places]}
@@ -270,7 +280,8 @@ def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Si
     state = plant.state if problem.sees_plant else like(plant.state, "plant_state")
     if problem.symbolic_reality is not None:
         state = like(plant.state, REALITY_STATE)
-    reads = (state, arriving, like(plant.parameter, "_exact"), *disturbed)
+    exact = like(plant.parameter, real_name(problem))
+    reads = (state, arriving, exact, *disturbed)
     writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
 
     def step(s: Signals) -> dict[str, Expression]:
@@ -279,6 +290,10 @@ def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Si
             added = dict(zip(problem.disturbances, ca.vertsplit(s.disturbance), strict=True))
             u = u + ca.vertcat(*(added.get(name, 0) for name in plant.inputs))
             w = ca.vertcat(*(added.get(name, 0) for name in plant.names))
-        return {"_state_after": advance(getattr(s, state.name), u, s._exact, w), "_acting": u, "_forcing": w}
+        return {
+            "_state_after": advance(getattr(s, state.name), u, getattr(s, exact.name), w),
+            "_acting": u,
+            "_forcing": w,
+        }
 
     return Block("advance", Layout(reads), Layout(writes), step, opaque=problem.real_integrator.opaque)

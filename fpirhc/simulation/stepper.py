@@ -13,6 +13,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.gate import HELD, Gate
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
+from fpirhc.controllers.own_reference import given_signals
 from fpirhc.controllers.plausible import plausible_range
 from fpirhc.controllers.seeing import compose_seeing, raw_signal
 from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidName, InvalidShape, InvalidValue, NotSupported
@@ -20,6 +21,7 @@ from fpirhc.sensing.base import response_names
 from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, Watch, machine_step
 from fpirhc.simulation.sample import numbers as numbers_of
 from fpirhc.simulation.sample import one_number
+from fpirhc.simulation.set_points import SetpointsNow, set_points_now
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
@@ -131,6 +133,7 @@ class Stepper:
         *,
         taken: float | None = None,
         settings: Numbers | None = None,
+        setpoints: SetpointsNow | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return (command, memory for the next cycle).
 
@@ -143,11 +146,13 @@ class Stepper:
             taken: time stamp of the sample, s; None: it was taken at `time`. Read with `max_age` only.
             settings: numbers of live settings from this step on, by path. Checks and derived numbers are computed in Python before
                  the step, a tenth of a millisecond for gains and some tens for the weights of a horizon; see `change`.
+            setpoints: set-points from this step on, by coordinate: a number, or where they are announced one number per node of the
+                 horizon; see `aim`.
 
         Raises:
             InvalidShape: a wrong number of entries, named.
             InvalidValue: an argument that is not made of numbers, or the memory of another controller.
-            InvalidName: a setting that is not live.
+            InvalidName: a setting that is not live; a coordinate without set-point.
             ConcurrentUse: another thread is inside this stepper.
         """
         # Taking the only token out of a list is atomic, and five times as fast as a lock.
@@ -158,6 +163,8 @@ class Stepper:
         try:
             if settings:
                 self.change(settings)
+            if setpoints:
+                self.aim(setpoints)
             try:
                 # A view takes arrays of float64 of its own shape and nothing else; numpy's assignment broadcasts, and is slower.
                 self._time[0] = time
@@ -190,6 +197,7 @@ class Stepper:
         *,
         taken: float | None = None,
         settings: Numbers | None = None,
+        setpoints: SetpointsNow | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return (command, memory for the next cycle) from raw measurements.
 
@@ -199,15 +207,18 @@ class Stepper:
             memory: from `start` or from the step before.
             taken: time stamp of the sample, as in `step`.
             settings: numbers of live settings from this step on, as in `step`.
+            setpoints: as in `step`.
 
         Raises:
             FpirhcError: as in `step`.
         """
         if self.estimates:
-            return self.step(time, measured, _NOTHING, memory, taken=taken, settings=settings)
+            return self.step(time, measured, _NOTHING, memory, taken=taken, settings=settings, setpoints=setpoints)
         column = numbers_of("measured", measured, len(self.measures))
         size = len(self._state)
-        return self.step(time, column[:size], column[size:], memory, taken=taken, settings=settings)
+        return self.step(
+            time, column[:size], column[size:], memory, taken=taken, settings=settings, setpoints=setpoints
+        )
 
     def change(self, settings: Numbers) -> bool:
         """Put numbers of live settings in force from the next step on, by path, and return whether they were accepted.
@@ -226,6 +237,35 @@ class Stepper:
             return False
         self.numbers = numbers
         return True
+
+    def aim(self, setpoints: SetpointsNow) -> bool:
+        """Put set-points in force from the next step on, by coordinate, and return whether they were accepted.
+
+        A set-point that is not finite, or outside the range or the limits of its state, is refused with all others of the call: the
+        old ones stay, `refused` counts, and `why_refused` states the reason.
+
+        Raises:
+            InvalidName: a coordinate without set-point.
+            InvalidShape: neither one number nor one per node.
+        """
+        try:
+            row = set_points_now(self._live.problem, setpoints, self._setpoints)
+        except InvalidValue as error:
+            self.refused, self.why_refused = self.refused + 1, str(error)
+            return False
+        self._setpoints[:] = row
+        return True
+
+    @property
+    def setpoints(self) -> dict[str, float | list[float]]:
+        """The set-points in force, by coordinate; where they are announced, one per node of the horizon."""
+        names = self._live.problem.plant.names
+        rows = self._setpoints.reshape(-1, len(names)).T
+        return {
+            name: row.tolist() if row.size > 1 else float(row[0])
+            for name, row in zip(names, rows, strict=True)
+            if row.size
+        }
 
     def _force(self, numbers: Mapping[str, float]) -> None:
         """Write the settings and what follows from them into the arguments; nothing is written where something is refused."""
@@ -262,6 +302,10 @@ class Stepper:
         arguments["parameters"][:] = parameters
         places = {name: k + 1 for k, name in enumerate(self._composite.reads.names)}  # after the memory
         self._settings = {name: self._evaluator.arguments[places[name]] for name in self._composite.settings.names}
+        self._setpoints = np.zeros(0)
+        for signal in given_signals(self._live.problem):
+            self._setpoints = self._evaluator.arguments[places[signal.name]]
+            self._setpoints[:] = signal.start_vector()
         memory_next, self._trace, command = self._evaluator.results
         self._new_command, self._new_memory = command.copy, memory_next.copy
         raw = raw_signal(self._live.problem)
