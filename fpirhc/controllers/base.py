@@ -13,7 +13,7 @@ A command that is not finite never reaches the plant: the last command is held, 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import casadi as ca
 
@@ -27,7 +27,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
-from fpirhc.symbolic.expression import Signals, is_finite
+from fpirhc.symbolic.expression import Signals, Value, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem
@@ -108,6 +108,18 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
         opaque=composite.opaque,
         derived=composite.derived_if_any,
     )
+
+
+def fed(block: Block, name: str, source: Signal) -> Block:
+    """Return the block with `source` in place of the signal `name`; a block that does not read `name` stays as it is."""
+    if name not in block.reads:
+        return block
+    reads = tuple(source if s.name == name else s for s in block.reads.signals)
+
+    def step(s: Signals) -> Mapping[str, Value]:
+        return block.step(Signals({**vars(s), name: getattr(s, source.name)}))
+
+    return Block(block.name, Layout(reads), block.writes, step, block.memory, block.opaque, block.derived)
 
 
 def reference_block(problem: Problem) -> Block:

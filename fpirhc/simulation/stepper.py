@@ -197,6 +197,7 @@ class Stepper:
         *,
         taken: float | None = None,
         settings: Numbers | None = None,
+        setpoints: SetpointsNow | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return (command, memory for the next cycle) from raw measurements.
 
@@ -206,15 +207,18 @@ class Stepper:
             memory: from `start` or from the step before.
             taken: time stamp of the sample, as in `step`.
             settings: numbers of live settings from this step on, as in `step`.
+            setpoints: as in `step`.
 
         Raises:
             FpirhcError: as in `step`.
         """
         if self.estimates:
-            return self.step(time, measured, _NOTHING, memory, taken=taken, settings=settings)
+            return self.step(time, measured, _NOTHING, memory, taken=taken, settings=settings, setpoints=setpoints)
         column = numbers_of("measured", measured, len(self.measures))
         size = len(self._state)
-        return self.step(time, column[:size], column[size:], memory, taken=taken, settings=settings)
+        return self.step(
+            time, column[:size], column[size:], memory, taken=taken, settings=settings, setpoints=setpoints
+        )
 
     def change(self, settings: Numbers) -> bool:
         """Put numbers of live settings in force from the next step on, by path, and return whether they were accepted.
