@@ -16,6 +16,7 @@ from fpirhc.controllers.base import Controller, Response, compose_controller, er
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.gate import Gate
 from fpirhc.controllers.live_settings import LiveSettings
+from fpirhc.controllers.plausible import plausible_range
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, measures_all, sending_block
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
@@ -46,7 +47,10 @@ def close_loop(problem: Problem, controller: Controller, live: LiveSettings | No
 
 def _closed(problem: Problem, controller: Controller, live: LiveSettings | None) -> Composite:
     ready = checked(problem, controller)
-    acting = Gate(nominal(problem), compose_controller(problem, ready), trusted=("time", "memory"))
+    task = nominal(problem)
+    # What a body outside measures may be wrong; what the loop computes itself is a result, however far it goes.
+    plausible = plausible_range(task) if problem.foreign is not None else {}
+    acting = Gate(task, compose_controller(problem, ready), trusted=("time", "memory"), plausible=plausible)
     disturbed = disturbance_signals(problem)
     seeing = _sense_blocks(problem, ready.response(problem), predicts="state_ahead" in acting.inner.trace)
     around = [_clock_block(problem.plant.time, problem.period), *seeing, acting.block(), *_actuate(problem, disturbed)]

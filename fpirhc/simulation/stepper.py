@@ -150,6 +150,8 @@ class Stepper:
         try:
             if settings:
                 self.change(settings)
+            if time is True or time is False:
+                one_number("time", time)
             try:
                 # A view takes arrays of float64 of its own shape and nothing else; numpy's assignment broadcasts, and is slower.
                 self._time[0] = time
