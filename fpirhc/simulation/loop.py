@@ -17,6 +17,7 @@ from fpirhc.controllers.contract import checked
 from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.own_reference import given_signals, own_signals
+from fpirhc.controllers.plausible import plausible_range
 from fpirhc.controllers.seeing import compose_seeing, first_estimates, seeing_blocks
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, measures_all, sending_block
@@ -50,7 +51,10 @@ def close_loop(problem: Problem, controller: Controller, live: LiveSettings | No
 
 def _closed(problem: Problem, controller: Controller, live: LiveSettings | None) -> Composite:
     ready = checked(problem, controller)
-    acting = Gate(nominal(problem), compose_seeing(problem, ready), trusted=("time", "memory"))
+    task = nominal(problem)
+    # What a body outside measures may be wrong; what the loop computes itself is a result, however far it goes.
+    plausible = plausible_range(task) if problem.foreign is not None else {}
+    acting = Gate(task, compose_seeing(problem, ready), trusted=("time", "memory"), plausible=plausible)
     disturbed = disturbance_signals(problem)
     seeing = _sense_blocks(problem, ready.response(problem), predicts="state_ahead" in acting.inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had

@@ -161,10 +161,8 @@ class Stepper:
         except IndexError:
             _refuse_thread()
         try:
-            if settings:
-                self.change(settings)
-            if setpoints:
-                self.aim(setpoints)
+            if settings or setpoints or isinstance(time, bool):
+                self._take(time, settings, setpoints)
             try:
                 # A view takes arrays of float64 of its own shape and nothing else; numpy's assignment broadcasts, and is slower.
                 self._time[0] = time
@@ -317,6 +315,15 @@ class Stepper:
         self._taken = _view(arguments["taken"]) if self._ages else self._time
         self._command = _view(command)
         self._fingerprint = float(self.memory[FINGERPRINT].start[0])
+
+    def _take(self, time: object, settings: Numbers | None, setpoints: SetpointsNow | None) -> None:
+        """Put numbers in force, and refuse a truth value as time."""
+        if settings:
+            self.change(settings)
+        if setpoints:
+            self.aim(setpoints)
+        if isinstance(time, bool):
+            one_number("time", time)
 
     def _accept(self, time: object, state: object, realised: object, memory: object) -> None:
         """Take arguments that are no arrays of float64, or say what is wrong with them."""
