@@ -149,6 +149,11 @@ class Controller(Checked, ABC):
         return False if self.inner is None else self.inner.learns
 
     @property
+    def model_acts_at_once(self) -> bool:
+        """Whether a change of its model changes the command in every cycle; False where a plan holds its inputs."""
+        return self.planner is None if self.inner is None else self.inner.model_acts_at_once
+
+    @property
     def deforms_response(self) -> bool:
         """Whether its deformation acts on the desired response; False where it acts on another signal, such as a command."""
         return True if self.inner is None else self.inner.deforms_response

@@ -76,6 +76,11 @@ class RecedingHorizon(Controller):
         """Optimiser, cost, start and margins of the plans, and the tracking law between plans."""
         return Planner(self.optimiser, self.cost, self.replanning.restarts, self.replanning.law, self.margins)
 
+    @property
+    def model_acts_at_once(self) -> bool:
+        """Whether the inputs of a plan are corrected by what its model has learned since."""
+        return self.follows_model
+
     def following_its_model(self) -> RecedingHorizon:
         """Return the controller that corrects the plan's inputs between plans, by what its model has learned since."""
         return replace(self, follows_model=True)
