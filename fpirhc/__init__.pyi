@@ -89,6 +89,8 @@ from .sensing import (
     StateVariableFilter,
     VelocityDifference,
 )
+from .sensing.beliefs.kalman_filter import KalmanFilter
+from .sensing.beliefs.model_states import ModelStates
 from .simulation.lyapunov_view import LyapunovView, lyapunov_view
 from .simulation.machine import Watch
 from .simulation.metrics import Metric, Metrics, measure
@@ -175,6 +177,7 @@ __all__ = [
     "ImplicitMidpoint",
     "Increment",
     "Ipopt",
+    "KalmanFilter",
     "Known",
     "LQRTerminal",
     "Ladder",
@@ -189,6 +192,7 @@ __all__ = [
     "Metric",
     "Metrics",
     "ModelReferenced",
+    "ModelStates",
     "MovingHorizon",
     "Noise",
     "Normal",
@@ -231,6 +235,7 @@ __all__ = [
     "Sensing",
     "Sensor",
     "SequentialQuadratic",
+    "Setpoint",
     "Sigmoid",
     "Sine",
     "SlidingMode",

@@ -15,7 +15,6 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved, without_deformation
 from fpirhc.review.nominal_runs import CYCLES, shortened
 from fpirhc.review.prediction import NominalRun, exactly
-from fpirhc.sensing.sensing import Sensing
 from fpirhc.simulation.simulate import simulate
 from fpirhc.task.outside import as_told
 from fpirhc.task.problem import Problem
@@ -111,10 +110,9 @@ def with_form(runs: NullRuns, model: Problem, controller: Controller) -> NullRun
 def null_problem(problem: Problem, controller: Controller) -> Problem:
     """Return the problem whose plant is the controller's model, without disturbances and noise, shortened to `CYCLES` cycles."""
     ready = resolved(problem, controller)
-    believed = ready.parameters(problem.plant)
-    sensing = Sensing(estimator=problem.sensing.estimator)
+    plant = exactly(problem.plant, ready.parameters(problem.plant))
+    sensing = replace(problem.sensing, sensors={})
     signals = as_told(problem.plant, ready.told(problem))
-    plant = exactly(problem.plant, believed)
     model = replace(problem.of_model, plant=plant, disturbances={}, sensing=sensing, signals=signals)
     return shortened(model, CYCLES)
 

@@ -12,11 +12,13 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, Response, compose_controller, error_signal, like
+from fpirhc.controllers.base import Controller, Response, error_signal, like
 from fpirhc.controllers.contract import checked
-from fpirhc.controllers.gate import Gate
+from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.own_reference import given_signals, own_signals
+from fpirhc.controllers.plausible import plausible_range
+from fpirhc.controllers.seeing import compose_seeing, first_estimates, seeing_blocks
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, measures_all, sending_block
 from fpirhc.simulation.outside_blocks import outside_blocks, real_name
@@ -49,7 +51,10 @@ def close_loop(problem: Problem, controller: Controller, live: LiveSettings | No
 
 def _closed(problem: Problem, controller: Controller, live: LiveSettings | None) -> Composite:
     ready = checked(problem, controller)
-    acting = Gate(nominal(problem), compose_controller(problem, ready), trusted=("time", "memory"))
+    task = nominal(problem)
+    # What a body outside measures may be wrong; what the loop computes itself is a result, however far it goes.
+    plausible = plausible_range(task) if problem.foreign is not None else {}
+    acting = Gate(task, compose_seeing(problem, ready), trusted=("time", "memory"), plausible=plausible)
     disturbed = disturbance_signals(problem)
     seeing = _sense_blocks(problem, ready.response(problem), predicts="state_ahead" in acting.inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
@@ -83,7 +88,19 @@ def start_memory(
         derived = loop.derived(numbers)
         starts |= {PREFIX + path: np.array([value]) for path, value in numbers.items()}
         starts |= {**derived.signals, **derived.memory()}
-    return loop.memory.pack(starts)
+    return loop.memory.pack(starts | _first_estimates(loop, problem, starts))
+
+
+def _first_estimates(loop: Composite, problem: Problem, starts: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What the estimator remembers at the start of this problem; a graph has it inside the controller's one signal."""
+    own = [s for block in seeing_blocks(problem) for s in block.memory.signals]
+    if not own or own[0].name in loop.memory:
+        return {s.name: s.start_vector() for s in own}
+    whole = loop.memory[INNER]
+    start, places = starts.get(INNER, whole.start_vector()).copy(), {c: k for k, c in enumerate(whole.elements)}
+    for s in own:
+        start[[places[c] for c in s.columns]] = s.start_vector()
+    return {INNER: start}
 
 
 def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:
@@ -134,38 +151,39 @@ def _sense_blocks(problem: Problem, other: Response | None, *, predicts: bool) -
     if problem.sees_plant:
         sense = [_sense_block(problem, plant.state, response)]
         return [*sense, _truth_block(problem, plant.state)] if predicts or problem.dead_time.inputs else sense
-    true, shown, function = _true_blocks(problem, response)
+    true, shown = _true_blocks(problem, response)
     if problem.sensing.ideal and not problem.dead_time.measurement:
         return true  # with coordinates measured in place of others
-    return [*true, *_late_blocks(problem, shown, function)]
+    return [*true, *_late_blocks(problem, shown)]
 
 
-def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], tuple[Signal, Signal], ca.Function]:
-    """Blocks of the true state, response and error; the signals that sensors see; and the Function of the response among these."""
+def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], tuple[Signal, Signal]]:
+    """Blocks of the true state, response and error; and the signals that sensors see."""
     plant = problem.plant
     hidden = like(plant.state, "_seen_state"), like(response.signal, "_seen")
     if problem.foreign is not None and not measures_all(problem):
-        return [_sense_block(problem, hidden[0], Response(hidden[1], response.function))], hidden, response.function
+        return [_sense_block(problem, hidden[0], Response(hidden[1], response.function))], hidden
     true = like(plant.state, "plant_state"), like(response.signal, "plant_realised")
     sense = _sense_block(problem, true[0], Response(true[1], response.function))
     blocks = [sense, _truth_block(problem, true[0])]
     if problem.symbolic_reality is None or not problem.symbolic_reality.seen:
-        return blocks, true, response.function
+        return blocks, true
     direct = problem.sensing.ideal and not problem.dead_time.measurement
     shown = (plant.state, response.signal) if direct else hidden
     function = _own_response(problem, seen=True).function
-    return [*blocks, _seen_block(problem, shown, function)], shown, function
+    return [*blocks, _seen_block(problem, shown, function)], shown
 
 
-def _late_blocks(problem: Problem, shown: tuple[Signal, Signal], response: ca.Function) -> list[Block]:
-    """Blocks of sensors, their dead time and the estimator, from what the sensors see to what the controller is given."""
-    plant, behind = problem.plant, problem.dead_time.measurement / problem.period
-    at = problem.real_start, problem.inputs_before, problem.real_parameters, np.zeros(len(problem.real_plant.names))
-    resting, first = response(*at).full().ravel(), problem.start_state
-    if problem.symbolic_reality is not None:
-        first = problem.symbolic_reality.state_function(plant, seen=True)(*at).full().ravel()
-    if not problem.sensing.ideal:
-        return problem.sensing.blocks(plant, problem.period, first, behind, shown, resting)
+def _late_blocks(problem: Problem, shown: tuple[Signal, Signal]) -> list[Block]:
+    """Blocks of sensors and their dead time, from what the sensors see to what the controller is given."""
+    plant, behind, sensing = problem.plant, problem.dead_time.measurement / problem.period, problem.sensing
+    first, resting = first_estimates(problem)
+    if not sensing.ideal:
+        sensors = sensing.blocks(plant, first, behind, shown, resting)
+        if sensing.estimates:
+            return sensors
+        raw = sensing.raw(plant, first, behind, resting)
+        return [*sensors, sensing.estimator.block(plant, problem.period, first, raw)]
     state = replace(plant.state, start=tuple(map(float, first)))
     realised = replace(shown[1], name="realised", start=tuple(map(float, resting)))
     return [

@@ -105,7 +105,7 @@ class Problem(Checked):
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant),
             lambda: self.symbolic_reality.check(plant) if self.symbolic_reality else None,
-            lambda: self.foreign.check(plant, self.sensing.estimator.measures(plant)) if self.foreign else None,
+            lambda: self.foreign.check(plant, self.sensing.measures(plant)) if self.foreign else None,
         )
         for check in checks:
             try:
