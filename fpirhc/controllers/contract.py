@@ -159,6 +159,11 @@ class Controller(Checked, ABC):
         return True if self.inner is None else self.inner.deforms_response
 
     @property
+    def deforms_target(self) -> bool:
+        """Whether its deformation acts on the target of an inner controller, and the response is the output itself."""
+        return False if self.inner is None else self.inner.deforms_target
+
+    @property
     def law(self) -> Tracking | None:
         """The law with which the controller tracks the reference: its field `tracking`; None without this field."""
         return getattr(self, "tracking", None) if self.inner is None else self.inner.law
@@ -203,6 +208,11 @@ class Controller(Checked, ABC):
         if self.inner is not None:
             return self.around(self.inner.with_deformation(deformation))
         raise NotSupported(f"{type(self).__name__} has no deformation that can be replaced")
+
+    def stated(self, problem: Problem) -> Controller:
+        """Return the controller with every number of its own stated that it would take from the problem; itself without any."""
+        del problem
+        return self
 
     def following_its_model(self) -> Self:
         """Return the controller whose command follows a change of its model's parameters in every cycle, also between plans."""
@@ -249,6 +259,7 @@ def resolved(problem: Problem, controller: Controller) -> Controller:
     if controller.inner is not None:
         inner = resolved(controller.inner_problem(problem), controller.inner)
         controller = controller if inner is controller.inner else controller.around(inner)
+    controller = controller.stated(problem)
     deformation = controller.deformation
     demand = controller.demand(problem) if deformation.automatic else None
     return controller if demand is None else controller.with_deformation(deformation.suited(demand))
@@ -279,6 +290,8 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
     else:
         ready.check(problem)
     check_form(problem, ready)
+    if ready.deforms_target:
+        return ready  # its own check judges a gain that acts on targets
     if ready.response(problem) is None:
         check_gain_sign(problem, ready.deformation)
         check_response_delay(problem, ready.deformation)
