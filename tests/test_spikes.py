@@ -37,7 +37,7 @@ MAPS: dict[str, Deformation] = {
     "eq 3, vector": fp.RFPTVector(offset=1e5, sign=-1, gain=5e-6),
     "rotation": fp.Rotation(fraction=0.4, radius=1e3),
     "filtered": fp.Filtered(SHAPE, pole=0.5),
-    "filtered slowly": fp.Filtered(SHAPE, pole=0.9),
+    "filtered slowly": fp.Filtered(fp.Affine(gain=-0.5), pole=0.8),
     "tuned": fp.Tuned(SHAPE, largest_gain=1.0),
     "damped": fp.Damped(SHAPE),
     "guarded": fp.Guarded(SHAPE, largest_deformation=1e6),
