@@ -59,8 +59,10 @@ from .optimisers.nlp import Fatrop, Ipopt, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.quadratic_solvers import Osqp, Qrqp
 from .optimisers.reduced_gradient import ReducedGradient
+from .plant.algebraic import Algebraic
 from .plant.implicit import ImplicitMidpoint, RadauIIA
 from .plant.integrators import Cvodes, Euler, RungeKutta4
+from .plant.parameter import outside
 from .plant.plant import Parameter, Plant, structural_order
 from .plant.regressor import Combination, Regressor, linear_parameters
 from .plant.relative_order import OutputChain, output_chain
@@ -84,6 +86,8 @@ from .sensing import (
     StateVariableFilter,
     VelocityDifference,
 )
+from .sensing.beliefs.kalman_filter import KalmanFilter
+from .sensing.beliefs.model_states import ModelStates
 from .simulation.lyapunov_view import LyapunovView, lyapunov_view
 from .simulation.machine import Watch
 from .simulation.metrics import Metric, Metrics, measure
@@ -104,9 +108,12 @@ from .task.dead_time import DeadTime
 from .task.disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
 from .task.foreign import Foreign
 from .task.limits import Limits, PathConstraint
+from .task.outside import Believed, Known, Unknown
 from .task.problem import Problem
 from .task.reality import Reality
 from .task.reference import Table, Trajectory
+from .task.samples import Samples
+from .task.set_point import Setpoint
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
 
@@ -116,9 +123,11 @@ __all__ = [
     "AccelerationFeedback",
     "AdaptiveInverseDynamics",
     "Affine",
+    "Algebraic",
     "Anderson",
     "Answer",
     "BacksteppingMRAC",
+    "Believed",
     "ByDesired",
     "ByError",
     "ByLookAhead",
@@ -163,6 +172,8 @@ __all__ = [
     "ImplicitMidpoint",
     "Increment",
     "Ipopt",
+    "KalmanFilter",
+    "Known",
     "LQRTerminal",
     "Ladder",
     "Limits",
@@ -176,6 +187,7 @@ __all__ = [
     "Metric",
     "Metrics",
     "ModelReferenced",
+    "ModelStates",
     "MovingHorizon",
     "Noise",
     "Normal",
@@ -211,12 +223,14 @@ __all__ = [
     "Rotation",
     "Run",
     "RungeKutta4",
+    "Samples",
     "SavitzkyGolay",
     "ScenarioComparison",
     "SelfPaired",
     "Sensing",
     "Sensor",
     "SequentialQuadratic",
+    "Setpoint",
     "Sigmoid",
     "Sine",
     "SlidingMode",
@@ -237,6 +251,7 @@ __all__ = [
     "Tuning",
     "Uncertain",
     "Uniform",
+    "Unknown",
     "VelocityDifference",
     "Watch",
     "accept",
@@ -264,6 +279,7 @@ __all__ = [
     "lyapunov_view",
     "measure",
     "output_chain",
+    "outside",
     "predict_response",
     "response_jacobian",
     "review",

@@ -29,6 +29,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Signal
 from fpirhc.symbolic.live import is_live, nominal
+from fpirhc.task.outside import External
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -134,6 +135,10 @@ class Controller(Checked, ABC):
         """Return the parameters of the controller's model, shape (np,): the approximate ones."""
         return plant.approximate if self.inner is None else self.inner.parameters(plant)
 
+    def told(self, problem: Problem) -> Mapping[str, External]:
+        """Return the signals from outside with what the controller's model is told of them: those of the problem."""
+        return problem.signals if self.inner is None else self.inner.told(problem)
+
     def model_plant(self, problem: Problem) -> Plant:
         """Return the plant that is the controller's model: the problem's."""
         return problem.plant if self.inner is None else self.inner.model_plant(problem)
@@ -193,6 +198,10 @@ class Controller(Checked, ABC):
         if self.inner is not None:
             return self.around(self.inner.with_deformation(deformation))
         raise NotSupported(f"{type(self).__name__} has no deformation that can be replaced")
+
+    def following_its_model(self) -> Self:
+        """Return the controller whose command follows a change of its model's parameters in every cycle, also between plans."""
+        return self if self.inner is None else self.around(self.inner.following_its_model())
 
     def demand(self, problem: Problem) -> Demand | None:
         """Return how much the desired response changes; None where the deformation's automatic settings stay open."""

@@ -3,10 +3,10 @@
     sample fits:  the controller's step, unchanged
     otherwise:    the last command again, and every memory as it was
 
-A sample fits when time, state and response are finite and inside their plausible range. The results of a skipped cycle are dropped.
-What is remembered is selected, never blended: a product with NaN would be NaN. A graph of calls is only given samples that fit. In
-a skipped cycle it is given the last good one again, so that no solver inside meets a number that is not finite. Scalar code has no
-solver inside, and needs no sample in store.
+A sample fits when time, state and response - or the raw measurements that they are estimated from - are finite and inside their
+plausible range. The results of a skipped cycle are dropped. What is remembered is selected, never blended: a product with NaN would
+be NaN. A graph of calls is only given samples that fit. In a skipped cycle it is given the last good one again, so that no solver
+inside meets a number that is not finite. Scalar code has no solver inside, and needs no sample in store.
 
 An implausible sample is doubted, not refused for ever: after 20 of them in a row the plant is where it should not be, and the
 controller is given what is measured, up to 100 times the range. What is not finite is never believed.
@@ -37,10 +37,10 @@ from fpirhc.task.problem import Problem
 HELD = "held_command"  # in the memory: the command that a skipped cycle repeats
 DOUBTED = "doubted"  # in the memory: samples in a row that were finite but not plausible
 TAKEN = "taken"  # time stamp of a sample
-_SAMPLE = ("time", "state", "realised", TAKEN)
+_SAMPLE = ("time", "state", "realised", "measured", "arrived", TAKEN)
 _DOUBTED = 20  # samples in a row after which the plant, and not the sensor, is where it should not be
 _WIDER = 100.0  # factor of the range inside which such samples are believed
-_INNER = "controller_memory"
+INNER = "controller_memory"  # in the memory: that of a graph as one signal
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ class Gate:
         starts = {"state": tuple(float(v) for v in self.problem.start_state), TAKEN: (-FINITE,)}
         first = self.problem.inputs_before
         held = Signal(HELD, plant.input.elements, plant.input.units, tuple(float(v) for v in first))
-        good = [replace(s, name=f"good_{s.name}", start=starts.get(s.name, ())) for s in self.stored.signals]
+        good = [replace(s, name=f"good_{s.name}", start=starts.get(s.name, s.start)) for s in self.stored.signals]
         doubted = [scalar(DOUBTED)] if self.plausible else []
         return Layout((held, *good, *doubted)) + self.controller_memory
 
@@ -95,11 +95,11 @@ class Gate:
         memory = self.inner.memory
         if not self.inner.opaque:
             return memory
-        return Layout((Signal(_INNER, memory.columns, memory.units, tuple(float(v) for v in memory.start())),))
+        return Layout((Signal(INNER, memory.columns, memory.units, tuple(float(v) for v in memory.start())),))
 
     def named(self, memory: Layout) -> Layout:
         """Return a layout with the controller's memory under the names of its signals, where it is one signal there."""
-        whole = {_INNER: self.inner.memory.signals}
+        whole = {INNER: self.inner.memory.signals}
         return Layout(tuple(s for signal in memory.signals for s in whole.get(signal.name, (signal,))))
 
     def block(self) -> Block:
@@ -137,7 +137,7 @@ class Gate:
         inner = self.inner.derived(values)
         if not self.inner.opaque:
             return inner
-        return replace(inner, memory=lambda: {_INNER: self.inner.memory.pack(inner.memory())})
+        return replace(inner, memory=lambda: {INNER: self.inner.memory.pack(inner.memory())})
 
     def _entry(self) -> ca.Function:
         """Function (sample, held, stored, doubted) -> (whether the sample fits, held, to store, doubted).

@@ -9,8 +9,8 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
-from fpirhc.controllers.base import Controller, closing_blocks, like
-from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, fed, learning_delays
+from fpirhc.controllers.base import Controller, closing_blocks, fed, like
+from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
 from fpirhc.controllers.rivals.reference_model import companion
 from fpirhc.controllers.tracked import bounded, desired_blocks
 from fpirhc.deformation.base import Deformation
