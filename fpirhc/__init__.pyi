@@ -61,6 +61,7 @@ from .optimisers.quadratic_solvers import Osqp, Qrqp
 from .optimisers.reduced_gradient import ReducedGradient
 from .plant.implicit import ImplicitMidpoint, RadauIIA
 from .plant.integrators import Cvodes, Euler, RungeKutta4
+from .plant.outputs import Output
 from .plant.plant import Parameter, Plant, structural_order
 from .plant.regressor import Combination, Regressor, linear_parameters
 from .plant.relative_order import OutputChain, output_chain
@@ -180,6 +181,7 @@ __all__ = [
     "Noise",
     "Normal",
     "Osqp",
+    "Output",
     "OutputChain",
     "OverTime",
     "Paired",

@@ -20,6 +20,7 @@ import casadi as ca
 from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
+from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.mirror import measured_state, mirror_blocks, with_measured_state
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.plant import Plant
@@ -32,10 +33,10 @@ from fpirhc.task.problem import Problem
 
 
 def controller_reads(problem: Problem, controller: Controller) -> Layout:
-    """Return what a controller reads in every cycle: time, state, realised response, parameters."""
+    """Return what a controller reads in every cycle: time, state, outputs where there are some, realised response, parameters."""
     plant, response = problem.plant, controller.response(problem)
     realised = response.signal if response else plant.response_signal("realised")
-    return Layout((plant.time, plant.state, realised, controller.model_plant(problem).parameter))
+    return Layout((plant.time, *measured_signals(plant), realised, controller.model_plant(problem).parameter))
 
 
 def compose_controller(problem: Problem, controller: Controller, *, ahead: bool = False) -> Composite:
@@ -83,32 +84,28 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
 
 
 def reference_block(problem: Problem) -> Block:
-    """Block (time, state) -> (reference state, response of the controlled coordinates, error of the judged ones)."""
-    plant = problem.plant
+    """Block (time, state or outputs) -> (their reference, response of the controlled ones, error of the judged ones)."""
+    plant, seen = problem.plant, problem.plant.output
     function = problem.reference.function(plant)
-    controlled = list(plant.controlled_indices)
-    places = [plant.state.elements.index(c) for c in problem.judged_names]
+    controlled = list(plant.face.controlled_indices)
+    places = [seen.elements.index(c) for c in problem.judged_names]
 
     def step(s: Signals) -> dict[str, Expression]:
         state, response = function(s.time)
         return {
             "reference": state,
             "_reference_response": response[controlled],
-            "error": state[places] - s.state[places],
+            "error": state[places] - getattr(s, seen.name)[places],
         }
 
-    reads = Layout((plant.time, plant.state))
-    writes = (
-        like(plant.state, "reference"),
-        plant.response_signal("_reference_response"),
-        error_signal(problem, "error"),
-    )
+    reads = Layout((plant.time, seen))
+    writes = (like(seen, "reference"), plant.response_signal("_reference_response"), error_signal(problem, "error"))
     return Block("reference", reads, Layout(writes), step, opaque=problem.reference.opaque)
 
 
 def error_signal(problem: Problem, name: str) -> Signal:
     """Return a signal that holds an error of every judged coordinate."""
-    units = [problem.plant.coordinates[c] for c in problem.judged_names]
+    units = [problem.plant.face.coordinates[c] for c in problem.judged_names]
     return vector(name, problem.judged_names, units)
 
 

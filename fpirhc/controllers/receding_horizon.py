@@ -29,8 +29,9 @@ from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidProblem
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.live_data import SCALE, STEEPEST, live_signals
+from fpirhc.horizon.nominal import feedforward, known_on_reference
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.stage_data import shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.optimisers.fixed_point import FixedPoint
@@ -75,6 +76,16 @@ class RecedingHorizon(Controller):
         """Return the controller with another optimiser."""
         return replace(self, optimiser=optimiser)
 
+    def outputs_unusable(self, problem: Problem) -> str:
+        """Return why this way of replanning, or of failing, needs references of all states; empty where it does not."""
+        if self.replanning.law is not None:
+            return (
+                f"{type(self.replanning).__name__} tracks the planned motion of the model's states; use FromMeasurement"
+            )
+        if self.on_failure.uses_feedforward and not known_on_reference(problem.plant):
+            return f"{type(self.on_failure).__name__} needs references of states that no output gives; use HoldPlan"
+        return ""
+
     def check(self, problem: Problem) -> None:
         """Raise if the problem has no horizon or cost, or the optimiser does not support it.
 
@@ -117,7 +128,9 @@ class RecedingHorizon(Controller):
 def _optimal_control(problem: Problem) -> OptimalControl:
     assert problem.horizon is not None
     assert problem.cost is not None
-    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits)
+    return transcribe(
+        problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits, problem.start_state
+    )
 
 
 def _due_block(cycles: int) -> Block:
@@ -148,6 +161,8 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
 
     def step(s: Signals) -> dict[str, Value]:
         data = data_of(s.time, s.parameters, *_live_rows(problem, ocp, s))
+        if plant.outputs:
+            data = shifted_reference(plant, ocp.data, ocp.stages + 1)(data, s._plan_state, s.output, s.parameters)
         # The shift of the last cycle is added to the plan's inputs, so their rate counts from the last command without it.
         first = ocp.start(s._plan_state, s._command_before - s._command_shift_last)
         lower, upper = _minus(low, s._command_shift_last), _minus(high, s._command_shift_last)
@@ -182,9 +197,11 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
 
 
 def _plan_reads(plant: Plant, ocp: OptimalControl) -> Layout:
-    """Time, state from which the plan starts, parameters, command shift and command of the last cycle, and derived numbers."""
+    """Time, start of the plan, measured outputs, parameters, command shift and command of the last cycle, derived numbers."""
     last = like(plant.input, "_command_shift_last"), like(plant.input, "_command_before")
-    return Layout((plant.time, like(plant.state, "_plan_state"), plant.parameter, *last, *_derived_signals(ocp)))
+    outputs = (plant.output,) if plant.outputs else ()
+    start = like(plant.state, "_plan_state")
+    return Layout((plant.time, start, *outputs, plant.parameter, *last, *_derived_signals(ocp)))
 
 
 def _first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> np.ndarray:
@@ -238,14 +255,16 @@ def _minus(ends: Sequence[float], shift: Expression) -> Expression:
 
 
 def _feedforward(problem: Problem) -> ca.Function:
-    """Function (time, parameters) -> input that the model needs along the reference; zero for a model without inverse."""
+    """Function (time, parameters) -> input that the model needs along the reference.
+
+    It is zero for a model without inverse, or with states without a reference.
+    """
     plant = problem.plant
     t, p = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
     state, response = problem.reference.function(plant)(t)
-    if plant.controlled is None and len(plant.inputs) != len(plant.names):
-        needed = ca.MX.zeros(len(plant.inputs))
-    else:
-        needed = plant.inverse_function(state, response[list(plant.controlled_indices)], p)
+    invertible = plant.controlled is not None or len(plant.inputs) == len(plant.face.names)
+    known = invertible and known_on_reference(plant)
+    needed = feedforward(plant, state, response, p) if known else ca.MX.zeros(len(plant.inputs))
     return ca.Function("fpirhc_feedforward", [t, p], [needed])
 
 

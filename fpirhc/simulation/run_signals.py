@@ -68,7 +68,7 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
     assert problem.cost is not None
     plant = problem.plant
     one_cycle = replace(problem.horizon, stages=1, step=problem.period, terminal=(), blocks=(), margins={})
-    ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits)
+    ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits, problem.start_state)
     data_of = stage_data(plant, problem.reference, one_cycle, problem.cost)
     states = log[:, layout.slice("plant_state")]
     commands = log[:, layout.slice("command")]

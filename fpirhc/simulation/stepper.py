@@ -87,9 +87,14 @@ class Stepper:
         Raises:
             InvalidProblem: an unknown name or a wrong interval in `plausible`.
             InvalidName: a live setting that does not exist.
-            NotSupported: an optimiser without a bound of its time; a setting that cannot be live.
+            NotSupported: a plant with outputs; an optimiser without a bound of its time; a setting that cannot be live.
             CompileError: the compiler fails on a controller with live settings.
         """
+        if problem.plant.outputs:
+            raise NotSupported(
+                f"Stepper is given a state and a response, and not the outputs {', '.join(problem.plant.outputs)} of the plant; "
+                "write them as coordinates"
+            )
         self._live = live_settings(problem, controller, live)
         ready = checked(problem, self._live.controller)
         if bounded:

@@ -52,7 +52,7 @@ def solve_first(task: Task, names: Sequence[str], tolerance: float) -> list[Solv
     if unknown:
         raise InvalidName(f"optimiser '{unknown[0]}' is unknown.{nearest(unknown[0], [*choices, 'all'])}")
     plant = problem.plant
-    ocp = transcribe(plant, problem.reference, problem.horizon, problem.cost, problem.limits)
+    ocp = transcribe(plant, problem.reference, problem.horizon, problem.cost, problem.limits, problem.start_state)
     data = np.asarray(
         stage_data(plant, problem.reference, problem.horizon, problem.cost)(0.0, plant.approximate).full()
     )
