@@ -419,9 +419,21 @@ def test_a_controller_that_does_not_cover_outputs_says_so(name: str) -> None:
         simulated(planned(), make())
 
 
-def test_a_stepper_refuses_outputs_by_name() -> None:
-    with pytest.raises(NotSupported, match=r"Stepper .* outputs depth"):
-        fp.Stepper(sedated(hill(4.0)), fp.ComputedTorque(TRACK))
+def test_a_stepper_is_given_the_outputs_and_does_what_the_loop_does() -> None:
+    problem, controller = (
+        replace(sedated(hill(5.5)), duration=1.0, measure_from=0.0),
+        fp.ComputedTorque(TRACK, fp.Affine(-0.5)),
+    )
+    run = simulated(problem, controller)
+    stepper = fp.Stepper(problem, controller, compiled=False)
+    memory = stepper.start()
+    for k in range(run.cycles):
+        command, memory = stepper.step(
+            run.time[k], run["state"][k], run["realised"][k], memory, output=run["output"][k]
+        )
+        assert np.array_equal(command, run["command"][k])
+    with pytest.raises(FpirhcError, match="output"):
+        stepper.step(0.0, run["state"][0], run["realised"][0], memory)
 
 
 def test_a_deviation_needs_references_of_all_states() -> None:

@@ -25,7 +25,7 @@ _SAMPLES = 200  # instants at which the reference is looked at
 
 
 def plausible_range(problem: Problem, own: Mapping[str, Interval] | None = None) -> dict[str, Interval]:
-    """Return intervals by column of the sample, "state.q1", "state.q1'" or "realised.q1".
+    """Return intervals by column of the sample, "state.q1", "state.q1'" or "realised.q1"; "output.y" of a plant with outputs.
 
     Args:
         problem: the task.
@@ -34,8 +34,8 @@ def plausible_range(problem: Problem, own: Mapping[str, Interval] | None = None)
     Raises:
         InvalidProblem: an unknown name, or an interval that is none.
     """
-    plant, ranges = problem.plant, {}
-    columns = {e: f"state.{e}" for e in plant.state.elements}
+    plant, ranges, signal = problem.plant.face, {}, problem.plant.output.name
+    columns = {e: f"{signal}.{e}" for e in plant.state.elements}
     columns |= {n: f"realised.{c}" for n, c in zip(response_names(plant), plant.controlled_names, strict=True)}
     _check(own or {}, columns)
     values = _values(problem)
@@ -54,13 +54,13 @@ def plausible_range(problem: Problem, own: Mapping[str, Interval] | None = None)
 
 def _values(problem: Problem) -> dict[str, np.ndarray]:
     """Values of every coordinate that the problem names: reference, start, and finite limits."""
-    plant, function = problem.plant, problem.reference.function(problem.plant)
+    plant, function = problem.plant.face, problem.reference.function(problem.plant)
     times = np.linspace(0.0, problem.duration, _SAMPLES)
     reference = np.array([np.asarray(function(t)[0].full()).ravel() for t in times])
     values = {}
     for name in plant.names:
         at = plant.state.elements.index(name)
-        named = [*reference[:, at], problem.start_state[at], *problem.limits.states.get(name, ())]
+        named = [*reference[:, at], problem.start_output[at], *problem.limits.states.get(name, ())]
         values[name] = np.array([v for v in named if np.isfinite(v)])
     return values
 

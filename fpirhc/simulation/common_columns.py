@@ -37,8 +37,18 @@ def with_common_columns(layout: Layout, log: np.ndarray) -> tuple[Layout, np.nda
     return layout + Layout(tuple(signal for signal, _ in added)), np.hstack([log, *(values for _, values in added)])
 
 
+def judged_motion(layout: Layout) -> str:
+    """Return the name of the signal of the plant's own motion that is judged: its outputs, or its state."""
+    return next(name for name in _MOTION if name in layout)
+
+
+def shown_motion(layout: Layout) -> str:
+    """Return the name of the signal that the controller is given of what is judged: 'output' or 'state'."""
+    return "output" if "output" in layout else "state"
+
+
 def _true_error(layout: Layout, log: np.ndarray) -> np.ndarray:
-    state = layout[next(name for name in _MOTION if name in layout)]
+    state = layout[judged_motion(layout)]
     if "reference" not in layout:
         return log[:, layout.slice("error")]  # a controller of a user's own that logs its error alone
     places = [state.elements.index(name) for name in layout["error"].elements]

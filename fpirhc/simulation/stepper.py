@@ -87,14 +87,9 @@ class Stepper:
         Raises:
             InvalidProblem: an unknown name or a wrong interval in `plausible`.
             InvalidName: a live setting that does not exist.
-            NotSupported: a plant with outputs; an optimiser without a bound of its time; a setting that cannot be live.
+            NotSupported: an optimiser without a bound of its time; a setting that cannot be live.
             CompileError: the compiler fails on a controller with live settings.
         """
-        if problem.plant.outputs:
-            raise NotSupported(
-                f"Stepper is given a state and a response, and not the outputs {', '.join(problem.plant.outputs)} of the plant; "
-                "write them as coordinates"
-            )
         self._live = live_settings(problem, controller, live)
         ready = checked(problem, self._live.controller)
         if bounded:
@@ -126,6 +121,7 @@ class Stepper:
         realised: np.ndarray,
         memory: np.ndarray,
         *,
+        output: np.ndarray | None = None,
         taken: float | None = None,
         settings: Numbers | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -137,6 +133,7 @@ class Stepper:
             realised: the measured response of the controlled coordinates to the last command; any finite value in the first cycle,
                 and for a controller that does not adapt.
             memory: from `start` or from the step before.
+            output: the measured outputs and their derivatives of a plant that has outputs, as `Plant.output` lays them out.
             taken: time stamp of the sample, s; None: it was taken at `time`. Read with `max_age` only.
             settings: numbers of live settings from this step on, by path. Checks and derived numbers are computed in Python before
                  the step, a tenth of a millisecond for gains and some tens for the weights of a horizon; see `change`.
@@ -163,6 +160,8 @@ class Stepper:
                 self._memory[:] = memory
             except (TypeError, ValueError, NotImplementedError):
                 self._accept(time, state, realised, memory)
+            if self._output is not None:
+                self._output[:] = numbers_of("output", output, len(self._output))
             if self._memory[0] != self._fingerprint:
                 self._inspect()
             if self._ages:
@@ -237,6 +236,7 @@ class Stepper:
         self._memory, self._time, self._state, self._realised = (
             _view(arguments[n]) for n in ("memory", "time", "state", "realised")
         )
+        self._output = _view(arguments["output"]) if "output" in arguments else None
         self._memory_array = arguments["memory"]
         self._taken = _view(arguments["taken"]) if self._ages else self._time
         self._command = _view(command)

@@ -96,13 +96,15 @@ class _Replay:
     def __init__(self, stepper: Stepper, run: Run) -> None:
         self._step, self._memory, self._at = stepper.step, stepper.start(), 0
         self._signals = run.time, run["state"], run["realised"]
+        self._outputs = run["output"] if "output" in run.layout else None
 
     def micro(self, block: int) -> float:
         """The mean time of a cycle over the next block; the median would hide cycles that plan."""
         times, states, realised = (signal[self._at : self._at + block] for signal in self._signals)
         begin = time.perf_counter_ns()
         for k in range(block):
-            _, self._memory = self._step(times[k], states[k], realised[k], self._memory)
+            seen = None if self._outputs is None else self._outputs[self._at + k]
+            _, self._memory = self._step(times[k], states[k], realised[k], self._memory, output=seen)
         self._at += block
         return (time.perf_counter_ns() - begin) / 1e3 / block
 
@@ -120,9 +122,10 @@ def measure_cycle(problem: Problem, controller: Controller, run: Run, *, compile
     memory = stepper.start()
     taken = np.empty(cycles)
     times, states, realised = run.time[:cycles], run["state"][:cycles], run["realised"][:cycles]
+    outputs = run["output"] if "output" in run.layout else [None] * cycles
     for k in range(cycles):
         begin = time.perf_counter_ns()
-        _, memory = stepper.step(times[k], states[k], realised[k], memory)
+        _, memory = stepper.step(times[k], states[k], realised[k], memory, output=outputs[k])
         taken[k] = time.perf_counter_ns() - begin
     micro = taken / 1e3
     later = micro[1:]
