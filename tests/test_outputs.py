@@ -19,6 +19,8 @@ import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError, InvalidProblem, NotInvertible, NotSupported
+from fpirhc.review.grid import review_grid
+from fpirhc.review.loops import loops_along
 
 TRACK = fp.Exponential(rate=6.0)
 TWO_MASS = fp.load_problem("two_mass")
@@ -440,3 +442,41 @@ def test_a_deviation_needs_references_of_all_states() -> None:
     cost = fp.Quadratic(outputs={"depth": 1.0}, deviation={"u": 1e-3})
     with pytest.raises(FpirhcError, match="needs the states C, E"):
         simulated(planned(cost=cost), fp.RecedingHorizon(OPTIMISER))
+
+
+# Reviews
+
+
+def test_the_linear_loop_of_outputs_that_are_coordinates_is_that_of_the_coordinates() -> None:
+    """The reference is followed from the start, so that both are linearised at the same points."""
+    controller = TWO_MASS.controllers["CTC+FPI (eq 6)"]
+    plain = replace(TWO_MASS.problem, start={"q1": 2.2, "q2": 5.4, "q1'": 0.6, "q2'": 0.9})
+    grids = [review_grid(problem, 0.0, 0) for problem in (plain, on_outputs(plain))]
+    one, other = (loops_along(grid, controller) for grid in grids)
+    assert np.allclose(grids[0].states, grids[1].states, atol=1e-4)
+    assert np.allclose(one.radii, other.radii, atol=1e-6)
+    for k in (0, -1):
+        assert np.allclose(np.sort_complex(one.loops[k].poles), np.sort_complex(other.loops[k].poles), atol=1e-4)
+
+
+def test_the_linear_loop_of_an_output_is_that_of_the_plant_whose_coordinate_it_is() -> None:
+    controller = fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Affine(-0.6))
+    one, other = (loops_along(review_grid(sedated(p), 0.0, 0), controller) for p in (hill(4.0), by_hand(4.0)))
+    assert one.loops
+    assert np.allclose(one.radii, other.radii, atol=1e-4)
+
+
+@pytest.mark.parametrize(("gain", "verdict"), [(-1.5, "yes"), (-6.0, "no")])
+def test_the_verdict_on_an_output_is_what_a_run_does(gain: float, verdict: str) -> None:
+    problem, controller = sedated(hill(5.5)), fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Affine(gain))
+    answers = {a.question: a for a in fp.review(problem, {"one": controller}, mismatch=0.0, seed=0).controllers["one"]}
+    assert str(answers["Does the deformation converge?"].verdict) == verdict
+    chatter = np.ptp(np.diff(simulated(problem, controller)["command.u"][600:]))
+    assert (chatter > 1.0) == (verdict == "no")
+
+
+def test_a_review_names_what_it_does_not_cover() -> None:
+    review = fp.review(planned(), {"plan": fp.RecedingHorizon(OPTIMISER, fp.Affine(-1.0))}, mismatch=0.0, seed=0)
+    assert any("not covered for outputs" in a.evidence for a in review.problem)
+    assert any("plan is not covered for outputs" in a.evidence for a in review.controllers["plan"])
+    assert review.ready

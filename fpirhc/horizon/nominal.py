@@ -58,6 +58,26 @@ def feedforward(plant: Plant, outputs: Matrix, responses: Matrix, p: Matrix) -> 
     return plant.inverse_function(reference_state(plant, outputs), responses[list(plant.face.controlled_indices)], p)
 
 
+def output_feedback(plant: Plant, x: Matrix, outputs: Matrix, p: Matrix, rate: float) -> Matrix:
+    """Return sum_{k<r} C(r, k) rate^(r-k) e^(k) of every controlled output, with which its error decays at that rate.
+
+    Args:
+        plant: the plant.
+        x: its state.
+        outputs: nominal outputs and derivatives.
+        p: its parameters.
+        rate: per unit of time.
+    """
+    face, calm = plant.face, ca.DM.zeros(len(plant.names))
+    error = outputs - plant.output_function(x, ca.DM.zeros(plant.input.size), p, calm)
+    sums = []
+    for index in face.controlled_indices:
+        name, order = face.names[index], face.orders[index]
+        places = [face.state.elements.index(name + "'" * k) for k in range(order)]
+        sums.append(sum(math.comb(order, k) * rate ** (order - k) * error[place] for k, place in enumerate(places)))
+    return ca.vertcat(*sums)
+
+
 def nominal_motion(
     plant: Plant,
     reference: Reference,
@@ -83,25 +103,15 @@ def nominal_motion(
     entries = ca.vertsplit(x)
     for k, place in known:
         entries[k] = outputs[place]
-    at, p = ca.vertcat(*entries), ca.DM(plant.approximate)
-    needed = plant.inverse_function(at, r[list(plant.face.controlled_indices)] + _feedback(plant, at, outputs, rate), p)
+    at, p = ca.vertcat(*entries), ca.MX(ca.DM(plant.approximate))
+    needed = plant.inverse_function(
+        at, r[list(plant.face.controlled_indices)] + output_feedback(plant, at, outputs, p, rate), p
+    )
     command = ca.fmin(ca.fmax(needed, ca.DM(bounds[0])), ca.DM(bounds[1]))
     step = ca.Function("fpirhc_nominal", [x, outputs, r], [advance(at, command, p), at, command])
     outputs_at, responses_at = reference.function(plant).map(times.size)(times[None, :])
     _, states, inputs = step.mapaccum(times.size)(start, outputs_at, responses_at)
     return np.asarray(states.full()), np.asarray(inputs.full())
-
-
-def _feedback(plant: Plant, x: ca.MX, outputs: ca.MX, rate: float) -> ca.MX:
-    """sum_k C(r, k) rate^(r-k) e^(k) of every controlled output."""
-    face, calm = plant.face, ca.DM.zeros(len(plant.names))
-    error = outputs - plant.output_function(x, ca.DM.zeros(plant.input.size), plant.approximate, calm)
-    sums = []
-    for index in face.controlled_indices:
-        name, order = face.names[index], face.orders[index]
-        places = [face.state.elements.index(name + "'" * k) for k in range(order)]
-        sums.append(sum(math.comb(order, k) * rate ** (order - k) * error[place] for k, place in enumerate(places)))
-    return ca.vertcat(*sums)
 
 
 def _sizes(plant: Plant) -> dict[str, int]:
