@@ -62,6 +62,7 @@ from .optimisers.reduced_gradient import ReducedGradient
 from .plant.implicit import ImplicitMidpoint, RadauIIA
 from .plant.integrators import Cvodes, Euler, RungeKutta4
 from .plant.outputs import Output
+from .plant.parameter import outside
 from .plant.plant import Parameter, Plant, structural_order
 from .plant.regressor import Combination, Regressor, linear_parameters
 from .plant.relative_order import OutputChain, output_chain
@@ -85,6 +86,8 @@ from .sensing import (
     StateVariableFilter,
     VelocityDifference,
 )
+from .sensing.beliefs.kalman_filter import KalmanFilter
+from .sensing.beliefs.model_states import ModelStates
 from .simulation.lyapunov_view import LyapunovView, lyapunov_view
 from .simulation.machine import Watch
 from .simulation.metrics import Metric, Metrics, measure
@@ -105,9 +108,12 @@ from .task.dead_time import DeadTime
 from .task.disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
 from .task.foreign import Foreign
 from .task.limits import Limits, PathConstraint
+from .task.outside import Believed, Known, Unknown
 from .task.problem import Problem
 from .task.reality import Reality
 from .task.reference import Table, Trajectory
+from .task.samples import Samples
+from .task.set_point import Setpoint
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
 
@@ -120,6 +126,7 @@ __all__ = [
     "Anderson",
     "Answer",
     "BacksteppingMRAC",
+    "Believed",
     "ByDesired",
     "ByError",
     "ByLookAhead",
@@ -164,6 +171,8 @@ __all__ = [
     "ImplicitMidpoint",
     "Increment",
     "Ipopt",
+    "KalmanFilter",
+    "Known",
     "LQRTerminal",
     "Ladder",
     "Limits",
@@ -177,6 +186,7 @@ __all__ = [
     "Metric",
     "Metrics",
     "ModelReferenced",
+    "ModelStates",
     "MovingHorizon",
     "Noise",
     "Normal",
@@ -213,6 +223,7 @@ __all__ = [
     "Rotation",
     "Run",
     "RungeKutta4",
+    "Samples",
     "SavitzkyGolay",
     "ScenarioComparison",
     "SelfPaired",
@@ -239,6 +250,7 @@ __all__ = [
     "Tuning",
     "Uncertain",
     "Uniform",
+    "Unknown",
     "VelocityDifference",
     "Watch",
     "accept",
@@ -266,6 +278,7 @@ __all__ = [
     "lyapunov_view",
     "measure",
     "output_chain",
+    "outside",
     "predict_response",
     "response_jacobian",
     "review",

@@ -375,6 +375,10 @@ WRONG: dict[str, tuple[Callable[[], object], str]] = {
     "judged": (lambda: squared(lambda t: 1 + 0 * t, judged=("z",)), "judged: output 'z' is unknown"),
     "states in the cost": (lambda: squared(lambda t: 1 + 0 * t, cost=fp.Quadratic(states={"a": 1.0})), "have no reference"),
     "outputs in the cost": (lambda: replace(SHORT, cost=fp.Quadratic(outputs={"q1": 1.0})), "the plant has no outputs"),
+    "believed": (
+        lambda: squared(lambda t: 1 + 0 * t, sensing=fp.Sensing(measured=["y"], belief=fp.ModelStates())),
+        "believed states are not covered",
+    ),
     "reality": (lambda: replace(squared(lambda t: 1 + 0 * t), reality=fp.Reality(double({}))), "it has no output 'y'"),
 }  # fmt: skip
 
@@ -434,8 +438,25 @@ def test_a_stepper_is_given_the_outputs_and_does_what_the_loop_does() -> None:
             run.time[k], run["state"][k], run["realised"][k], memory, output=run["output"][k]
         )
         assert np.array_equal(command, run["command"][k])
+    command, _ = stepper.step_measured(
+        run.time[0], np.concatenate([run[n][0] for n in ("state", "output", "realised")]), stepper.start()
+    )
+    assert np.array_equal(command, run["command"][0])
     with pytest.raises(FpirhcError, match="output"):
         stepper.step(0.0, run["state"][0], run["realised"][0], memory)
+
+
+def test_set_points_of_an_output_are_filtered_and_followed() -> None:
+    problem = sedated(hill(5.5))
+    first = float(curve(1.5, 4.0))
+    aims = fp.Setpoint({"depth": [(0.0, first), (2.0, 50.0)]}, rate=1.0)
+    run = simulated(
+        replace(problem, reference=aims, duration=20.0), fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Affine(-1.5))
+    )
+    assert run["reference.depth"][-1] == pytest.approx(50.0, abs=1e-3)
+    assert np.abs(run["true_error.depth"]).max() < 1.0
+    planned_run = simulated(replace(planned(), reference=aims), fp.RecedingHorizon(OPTIMISER, fp.Affine(-1.5)))
+    assert abs(planned_run["output.depth"][-1] - 50.0) < 0.05
 
 
 def test_a_deviation_needs_references_of_all_states() -> None:

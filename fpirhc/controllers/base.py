@@ -22,6 +22,8 @@ from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.mirror import measured_state, mirror_blocks, with_measured_state
+from fpirhc.controllers.outside_block import ACTED, NOW, Told
+from fpirhc.controllers.own_reference import given_signals, motion_of, own_signals, own_values, with_reference
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
@@ -33,10 +35,11 @@ from fpirhc.task.problem import Problem
 
 
 def controller_reads(problem: Problem, controller: Controller) -> Layout:
-    """Return what a controller reads in every cycle: time, state, outputs where there are some, realised response, parameters."""
+    """Return what a controller reads in every cycle: time, motion, realised response, parameters, and what a reference is given."""
     plant, response = problem.plant, controller.response(problem)
     realised = response.signal if response else plant.response_signal("realised")
-    return Layout((plant.time, *measured_signals(plant), realised, controller.model_plant(problem).parameter))
+    parameters = controller.model_plant(problem).parameter
+    return Layout((plant.time, *measured_signals(plant), realised, parameters, *given_signals(problem)))
 
 
 def compose_controller(problem: Problem, controller: Controller, *, ahead: bool = False) -> Composite:
@@ -45,15 +48,40 @@ def compose_controller(problem: Problem, controller: Controller, *, ahead: bool 
     Args:
         problem: that the controller is composed for.
         controller: checked here against the problem.
-        ahead: whether time and state are those at which the command will act. The step then also reads the measured state where a
-            block needs it.
+        ahead: whether time and state are those at which the command will act. The step then also reads the measured state, and the
+            signals of the last cycle, where a block needs them.
     """
     ready = checked(problem, controller)
     blocks, delays = ready.blocks(problem)
+    blocks = with_reference(problem, blocks)
     reads, named = controller_reads(problem, ready), with_measured_state(problem.plant, blocks)
     if ahead and len(named) > len(blocks):
         reads, named = reads + Layout((measured_state(problem.plant),)), blocks
-    return compose("controller", reads, named, delays, outputs=("command",))
+    return compose_informed(problem, ready, reads, named, delays, ahead=ahead)
+
+
+def compose_informed(
+    problem: Problem, ready: Controller, reads: Layout, blocks: list[Block], delays: list[Delay], *, ahead: bool = False
+) -> Composite:
+    """Return blocks as one step to the command, behind a block of what the controller is told of signals from outside.
+
+    Args:
+        problem: that the controller is composed for.
+        ready: the controller, checked.
+        reads: what the step reads.
+        blocks: of the step.
+        delays: what the step remembers of its signals.
+        ahead: whether the time is the one at which the command will act.
+    """
+    told = Told(ready.model_plant(problem), ready.told(problem), problem.period)
+    compares = any(ACTED in block.reads for block in blocks)
+    first = told.block(remembers=compares and not ahead)
+    if first is None:
+        return compose("controller", reads, blocks, delays, outputs=("command",))
+    needed = reads + Layout(told.reads if compares else ())
+    inner = compose("informed", needed, blocks, delays, outputs=("command",))
+    block = embedded("informed", inner, {"parameters": like(told.plant.parameter, NOW)})
+    return compose("controller", needed if ahead else reads, [first, block], outputs=("command",))
 
 
 def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block:
@@ -86,19 +114,19 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
 def reference_block(problem: Problem) -> Block:
     """Block (time, state or outputs) -> (their reference, response of the controlled ones, error of the judged ones)."""
     plant, seen = problem.plant, problem.plant.output
-    function = problem.reference.function(plant)
+    function = motion_of(problem)
     controlled = list(plant.face.controlled_indices)
     places = [seen.elements.index(c) for c in problem.judged_names]
 
     def step(s: Signals) -> dict[str, Expression]:
-        state, response = function(s.time)
+        state, response = function(s.time, *own_values(problem, s))
         return {
             "reference": state,
             "_reference_response": response[controlled],
             "error": state[places] - getattr(s, seen.name)[places],
         }
 
-    reads = Layout((plant.time, seen))
+    reads = Layout((plant.time, seen, *own_signals(problem)))
     writes = (like(seen, "reference"), plant.response_signal("_reference_response"), error_signal(problem, "error"))
     return Block("reference", reads, Layout(writes), step, opaque=problem.reference.opaque)
 

@@ -29,6 +29,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Signal
 from fpirhc.symbolic.live import is_live, nominal
+from fpirhc.task.outside import External
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -133,6 +134,10 @@ class Controller(Checked, ABC):
     def parameters(self, plant: Plant) -> np.ndarray:
         """Return the parameters of the controller's model, shape (np,): the approximate ones."""
         return plant.approximate if self.inner is None else self.inner.parameters(plant)
+
+    def told(self, problem: Problem) -> Mapping[str, External]:
+        """Return the signals from outside with what the controller's model is told of them: those of the problem."""
+        return problem.signals if self.inner is None else self.inner.told(problem)
 
     def model_plant(self, problem: Problem) -> Plant:
         """Return the plant that is the controller's model: the problem's."""

@@ -24,10 +24,11 @@ _SAMPLES = 2000
 
 
 def reference_demand(problem: Problem, law: Tracking | None = None) -> Demand:
-    """Return the change period max|d/dt r^N| of the nominal response r^N, from cycle to cycle, with the recovery for `law`."""
+    """Return the change period max|d/dt r^N| of the nominal response r^N, or its largest jump, with the recovery for `law`."""
     t = ca.MX.sym("t")
     responses = problem.reference.function(problem.plant)(t)[1][list(problem.plant.face.controlled_indices)]
     change = problem.period * _slew(ca.Function("r", [t], [responses]), problem.duration)
+    change = max(change, problem.reference.largest_jump(problem.plant.face))
     return Demand(change, sudden=False, recovery=_recovery(problem, law))
 
 

@@ -22,11 +22,12 @@ import numpy as np
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
 from fpirhc.controllers.contract import Planner
 from fpirhc.controllers.on_failure import HoldPlan, OnFailure
+from fpirhc.controllers.own_reference import motion_of, own_signals, own_values, preview_of
 from fpirhc.controllers.replanning import FromMeasurement, Replanning
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.deformation.sigmoid import Sigmoid
-from fpirhc.errors import InvalidProblem
+from fpirhc.errors import InvalidProblem, NotSupported
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.live_data import SCALE, STEEPEST, live_signals
 from fpirhc.horizon.nominal import feedforward, known_on_reference
@@ -35,12 +36,12 @@ from fpirhc.horizon.stage_data import shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.optimisers.fixed_point import FixedPoint
-from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, Derived, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import DERIVED, PREFIX, is_live, live_numbers, nominal, settled
+from fpirhc.task.outside import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_stage
 
 _SCALE, _STEEPEST, _NUMBERS = (f"{PREFIX}{DERIVED}plan.{name}" for name in (SCALE, STEEPEST, "numbers"))
@@ -128,9 +129,9 @@ class RecedingHorizon(Controller):
 def _optimal_control(problem: Problem) -> OptimalControl:
     assert problem.horizon is not None
     assert problem.cost is not None
-    return transcribe(
-        problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits, problem.start_state
-    )
+    ahead = previewed_values(problem.plant, problem.signals)
+    limits, start = problem.limits, problem.start_state
+    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, limits, ahead, start)
 
 
 def _due_block(cycles: int) -> Block:
@@ -148,9 +149,12 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     """Block (time, plan state, parameters, shift and command of the last cycle) -> (planned input, solve statistics)."""
     assert problem.horizon is not None
     assert problem.cost is not None
+    _check_reference(problem)
     plant, ocp = problem.plant, _optimal_control(problem)
     count = live_signals(ocp.settings, plant.input).size
-    data_of = stage_data(plant, problem.reference, problem.horizon, problem.cost, count)
+    data_of = _stage_data(problem, count)
+    preview = preview_of(problem)
+    running_data = data_of if preview is None else _stage_data(problem, count, previewed=True)
     start = nominal(problem)
     memory = optimiser.memory(ocp).starting_at(_first_memory(start, optimiser, ocp, data_of))
     solve = optimiser.step(ocp.opened())
@@ -160,7 +164,9 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     writes = (like(plant.input, "planned"), Signal("solve", _SOLVE), scalar("_solve_status"), *logged)
 
     def step(s: Signals) -> dict[str, Value]:
-        data = data_of(s.time, s.parameters, *_live_rows(problem, ocp, s))
+        own = own_values(problem, s)
+        motion = () if preview is None else preview(*own)
+        data = running_data(s.time, *motion, s.parameters, *_live_rows(problem, ocp, s))
         if plant.outputs:
             data = shifted_reference(plant, ocp.data, ocp.stages + 1)(data, s._plan_state, s.output, s.parameters)
         # The shift of the last cycle is added to the plan's inputs, so their rate counts from the last command without it.
@@ -171,7 +177,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         inputs, diagnostics, next_memory = solve(first, data, lower, upper, remembered)
         status = diagnostics[_SOLVE.index("status")]
         failed = status > int(Status.NOT_CONVERGED) + 0.5
-        planned, judged = on_failure.choose(failed, inputs[:, 0], feedforward_of(s.time, s.parameters), status)
+        planned, judged = on_failure.choose(failed, inputs[:, 0], feedforward_of(s.time, *own, s.parameters), status)
         after = memory.split(next_memory)
         remembered_next = {f"{m}_next": v for m, v in after.items()}
         shown = {name: after[source] for name, source in optimiser.logged.items()}
@@ -193,15 +199,39 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
 
     own = memory + Layout((scalar("plan_begun"),))
     live = derived if is_live(problem) else None
-    return Block("plan", _plan_reads(plant, ocp), Layout(writes), step, own, opaque=True, derived=live)
+    return Block("plan", _plan_reads(problem, ocp), Layout(writes), step, own, opaque=True, derived=live)
 
 
-def _plan_reads(plant: Plant, ocp: OptimalControl) -> Layout:
-    """Time, start of the plan, measured outputs, parameters, command shift and command of the last cycle, derived numbers."""
+def _check_reference(problem: Problem) -> None:
+    """Raise where scale and first plan, which follow from the first horizon, would follow a live setting of the reference.
+
+    Raises:
+        NotSupported: the reference moves within the first horizon.
+    """
+    assert problem.horizon is not None
+    moving = live_numbers(problem.reference)
+    if moving and not problem.reference.rests(problem.horizon.stages * problem.horizon.step):
+        raise NotSupported(
+            f"setting 'reference.{next(iter(moving)).removeprefix('reference.')}' cannot be live with a plan: the reference moves within "
+            "the first horizon, from which the optimiser's scale and the first plan are taken; let it rest there"
+        )
+
+
+def _stage_data(problem: Problem, live: int, *, previewed: bool = False) -> ca.Function:
+    assert problem.horizon is not None
+    assert problem.cost is not None
+    ahead = previewed_values(problem.plant, problem.signals)
+    arguments = problem.plant, problem.reference, problem.horizon, problem.cost, live, ahead
+    return stage_data(*arguments, previewed=previewed)
+
+
+def _plan_reads(problem: Problem, ocp: OptimalControl) -> Layout:
+    """Time, start of the plan, parameters, shift and command of the last cycle, derived numbers, outputs, own signals."""
+    plant = problem.plant
     last = like(plant.input, "_command_shift_last"), like(plant.input, "_command_before")
-    outputs = (plant.output,) if plant.outputs else ()
+    own, outputs = own_signals(problem), (plant.output,) if plant.outputs else ()
     start = like(plant.state, "_plan_state")
-    return Layout((plant.time, start, *outputs, plant.parameter, *last, *_derived_signals(ocp)))
+    return Layout((plant.time, start, *outputs, plant.parameter, *last, *_derived_signals(ocp), *own))
 
 
 def _first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> np.ndarray:
@@ -255,17 +285,18 @@ def _minus(ends: Sequence[float], shift: Expression) -> Expression:
 
 
 def _feedforward(problem: Problem) -> ca.Function:
-    """Function (time, parameters) -> input that the model needs along the reference.
+    """Function (time, own signals of the reference, parameters) -> input that the model needs.
 
     It is zero for a model without inverse, or with states without a reference.
     """
     plant = problem.plant
     t, p = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
-    state, response = problem.reference.function(plant)(t)
+    own = [ca.MX.sym(signal.name, signal.size) for signal in own_signals(problem)]
+    state, response = motion_of(problem)(t, *own)
     invertible = plant.controlled is not None or len(plant.inputs) == len(plant.face.names)
     known = invertible and known_on_reference(plant)
     needed = feedforward(plant, state, response, p) if known else ca.MX.zeros(len(plant.inputs))
-    return ca.Function("fpirhc_feedforward", [t, p], [needed])
+    return ca.Function("fpirhc_feedforward", [t, *own, p], [needed])
 
 
 def _command_shift_block(problem: Problem, deformation: Deformation) -> Block:

@@ -37,7 +37,13 @@ from fpirhc.task.reference import Reference
 
 
 def transcribe(
-    plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits, start: np.ndarray | None = None
+    plant: Plant,
+    reference: Reference,
+    horizon: Horizon,
+    cost: Cost,
+    limits: Limits,
+    signals: ca.Function | None = None,
+    start: np.ndarray | None = None,
 ) -> OptimalControl:
     """Return the standard form of one horizon.
 
@@ -47,6 +53,7 @@ def transcribe(
         horizon: stages and step.
         cost: of a plan.
         limits: of a plan.
+        signals: from outside, as `stage_data` takes them.
         start: first state, shape (nx,), from which states without a reference are simulated to expand the cost along the reference;
             None: zero.
 
@@ -59,7 +66,8 @@ def transcribe(
     stage = _stage_expressions(plant, reference, horizon, cost, limits)
     binding, free = stage.binding, stage.before.numel()
     dynamics, stage_cost, terminal_cost = _stage_functions(stage, horizon.step)
-    nodes = _nodes(plant, reference, horizon, cost, (free, len(binding)), limits, start)
+    table = np.asarray(stage_data(plant, reference, horizon, cost, signals=signals)(0.0, plant.approximate).full())
+    nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
     settings = tuple(s.name().removeprefix(PREFIX) for s in stage.settings)
     values = {path: number.value for path, number in live_numbers(cost, limits).items()}
 
@@ -299,7 +307,7 @@ def _nodes(
     plant: Plant,
     reference: Reference,
     horizon: Horizon,
-    cost: Cost,
+    data: np.ndarray,
     extra: tuple[int, int],
     limits: Limits,
     start: np.ndarray | None,
@@ -308,8 +316,6 @@ def _nodes(
 
     States without a reference are simulated, with the inputs that the model needs for the nominal outputs.
     """
-    table = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
-    data = np.asarray(table.full())
     layout = data_layout(plant, horizon)
     along = {name: data[layout.slice(name)] for name in ("reference", "feedforward")}
     states, inputs = along["reference"], along["feedforward"]

@@ -44,7 +44,7 @@ class Plant(Checked):
     Args:
         coordinates: name -> unit of every coordinate.
         inputs: name -> unit of every input.
-        parameters: name -> Parameter(approximate, exact, unit).
+        parameters: name -> Parameter(approximate, exact, unit), or outside(nominal, unit) for a signal from outside.
         response: function of (q, q', ..., u, p) that returns {coordinate: its highest derivative}. It has one argument per
             derivative below the highest order, each with its entries by name (`q.q1`).
         order: relative order r, one number or {coordinate: number}.
@@ -175,6 +175,11 @@ class Plant(Checked):
     def parameter(self) -> Signal:
         """The parameters' signal."""
         return vector("parameters", tuple(self.parameters), tuple(p.unit for p in self.parameters.values()))
+
+    @cached_property
+    def signal_names(self) -> tuple[str, ...]:
+        """Names of the parameters that are signals from outside."""
+        return tuple(name for name, one in self.parameters.items() if one.outside)
 
     @cached_property
     def controlled_names(self) -> tuple[str, ...]:

@@ -33,9 +33,9 @@ def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]
         for c in names
     ]
     for c in names:
-        lines = [("reference", longest, f"reference.{c}")] + [
-            (e.name, e.run, f"{shown_motion(e.run.layout)}.{c}") for e in entries
-        ]
+        aims = [("set-point", longest, f"setpoint.{c}")] if "setpoint" in longest.layout else []
+        own = [(e.name, e.run, f"{shown_motion(e.run.layout)}.{c}") for e in entries]
+        lines = [*aims, ("reference", longest, f"reference.{c}"), *own]
         charts.append(_chart(c, first.unit(f"reference.{c}"), lines, edges))
     for i in first.layout["command"].elements:
         lines = [(e.name, e.run, f"command.{i}") for e in entries]

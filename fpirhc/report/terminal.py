@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from fpirhc.studies.comparison.compare import Progress as Report
     from fpirhc.studies.open_loop import Solved
 
+_MOST_STEPS = 6  # of the set-points of one coordinate in a text
+
 
 @contextmanager
 def progress_bars() -> Iterator[Report]:
@@ -71,7 +73,7 @@ def show(comparison: Comparison, report: Path) -> None:
 def show_run(run: Run, metrics: Metrics, saved: Path) -> None:
     """Print one run's metrics and the path of its file."""
     console = Console()
-    for text in settings_in_force(run):
+    for text in (*settings_in_force(run), *set_points_in_force(run)):
         say(console, text)
     for column in columns([metrics]):
         say(console, f"{column.heading}: {column.text(column.number(metrics), missing='-', none='none')}")
@@ -85,6 +87,19 @@ def settings_in_force(run: Run) -> list[str]:
     record = cast(list[tuple[float, dict[str, float]]], run.settings.get("live", []))
     lines = [(time, ", ".join(f"{path} = {value:g}" for path, value in numbers.items())) for time, numbers in record]
     return [f"settings from {time:g} s: {text}" for time, text in lines]
+
+
+def set_points_in_force(run: Run) -> list[str]:
+    """Return one line per coordinate with the set-points of the run and the times from which they were in force."""
+    record = cast(dict[str, list[list[float]] | str], run.settings.get("setpoints", {}))
+    return [f"set-points of {name}: {_steps_text(run, steps)}" for name, steps in record.items()]
+
+
+def _steps_text(run: Run, steps: list[list[float]] | str) -> str:
+    if isinstance(steps, str):
+        return steps
+    shown = [f"{value:g} from {time:g} {run.time_unit}" for time, value in steps[:_MOST_STEPS]]
+    return ", ".join(shown) + (f", and {len(steps) - _MOST_STEPS} more" if len(steps) > _MOST_STEPS else "")
 
 
 def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:

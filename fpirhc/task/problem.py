@@ -26,11 +26,14 @@ from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.foreign import Foreign
 from fpirhc.task.limits import Limits
+from fpirhc.task.outside import External, check_signals, real_values, rows_of, signals_of
 from fpirhc.task.problem_view import problem_facts, problem_table
 from fpirhc.task.reality import Reality
 from fpirhc.task.reference import Reference
+from fpirhc.task.steps import check_steps
 
 MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
+_INSTANTS = 101  # at which signals from outside are tried before a run
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +60,7 @@ class Problem(Checked):
         judged: coordinates, or outputs of a plant that has some, whose errors are logged and measured; None: the controlled ones.
         reality: what a run moves, where it is not `plant` with its exact parameters: another plant (`Reality`), or an object
             outside (`Foreign`). `plant` is then the model alone.
+        signals: values over time of every signal from outside that the plants declare, by name: `Known`, `Unknown` or `Believed`.
         name: of the problem in results; the problem of a file has the name of the file.
 
     Raises:
@@ -79,6 +83,7 @@ class Problem(Checked):
     judged: Sequence[str] | None = None
     input_before: Mapping[str, float] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
     reality: Reality | Foreign | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    signals: Mapping[str, External] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
     name: str = field(default="", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
@@ -93,14 +98,16 @@ class Problem(Checked):
         disturbed = [*plant.inputs, *(() if self.foreign else self.real_plant.coordinates)]
         mistakes.unknown("disturbances: input or coordinate", self.disturbances, disturbed)
         instants, random = np.array([0.0, self.period]), np.random.default_rng(0)
+        check_signals(self._plants, self.signals, np.linspace(0.0, self.duration, _INSTANTS), mistakes)
         checks = (
             *((lambda one=one: one.values(instants, random)) for one in self.disturbances.values()),
             lambda: self.limits.check(plant),
             lambda: self.reference.function(plant),
+            lambda: check_steps(plant.face, self.limits, self.reference.set_points),
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant.face),
             lambda: self.symbolic_reality.check(plant) if self.symbolic_reality else None,
-            lambda: self.foreign.check(plant, self.sensing.estimator.measures(plant)) if self.foreign else None,
+            lambda: self.foreign.check(plant, self.sensing.measures(plant)) if self.foreign else None,
         )
         for check in checks:
             try:
@@ -174,7 +181,8 @@ class Problem(Checked):
             return self
         known = {*self.plant.inputs, *self.plant.coordinates}
         disturbances = {name: one for name, one in self.disturbances.items() if name in known}
-        return replace(self, reality=None, disturbances=disturbances)
+        signals = signals_of(self.plant, self.signals)
+        return replace(self, reality=None, disturbances=disturbances, signals=signals)
 
     @property
     def real_integrator(self) -> Integrator:
@@ -191,6 +199,17 @@ class Problem(Checked):
         if self.symbolic_reality is None:
             return self.start_state
         return self.symbolic_reality.start_state(self.plant, self.start_state, self.inputs_before)
+
+    @property
+    def real_parameters(self) -> np.ndarray:
+        """Parameters of the plant that a run moves in its first cycle: the exact ones, with the real values of signals."""
+        plant = self.real_plant
+        return rows_of(real_values(plant, self.signals), np.array([self.period / 2]), plant.exact)[0]
+
+    @property
+    def _plants(self) -> tuple[Plant, ...]:
+        """The model, and another plant that moves."""
+        return (self.plant,) if self.symbolic_reality is None else (self.plant, self.real_plant)
 
     @cached_property
     def start_state(self) -> np.ndarray:
@@ -216,7 +235,7 @@ class Problem(Checked):
         else:
             function = self.plant.output_function
         calm = np.zeros(len(self.real_plant.names))
-        return np.asarray(function(self.real_start, self.inputs_before, self.real_plant.exact, calm).full()).ravel()
+        return np.asarray(function(self.real_start, self.inputs_before, self.real_parameters, calm).full()).ravel()
 
     @property
     def response_delay(self) -> float:
@@ -307,6 +326,13 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
             "reality: a foreign reality measures coordinates of the model, and a plant with outputs has more to measure; "
             "write the outputs as coordinates"
         )
+    if problem.signals:
+        mistakes.add(
+            f"signals: {', '.join(problem.signals)} from outside have derivatives of their own in those of outputs, which is not "
+            "covered; leave them out, or write the outputs as coordinates"
+        )
+    if problem.sensing.measured is not None or problem.sensing.belief is not None:
+        mistakes.add("sensing: believed states are not covered for outputs; leave measured and belief out")
     if len(plant.inputs) == len(plant.controlled or plant.outputs):
         bounds = nominal(problem.limits).input_bounds(plant)
         start, ends = (

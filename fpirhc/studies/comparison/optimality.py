@@ -17,6 +17,7 @@ from fpirhc.simulation.run import Run
 from fpirhc.status import Status
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import native
+from fpirhc.task.outside import model_values, previewed_values, rows_of, signals_of
 from fpirhc.task.problem import Problem, cycles_per_stage
 
 SAMPLES = 25  # plans of a run that are solved again
@@ -55,28 +56,36 @@ def measure_optimality(
         return None
     times, states = (run[feeds[n] if feeds.get(n) in run.layout.names else n] for n in ("time", "state"))
     model = ready.model_plant(problem)
-    planned = planner.planned(problem if model is problem.plant else replace(problem, plant=model, reality=None))
+    told = ready.told(problem)
+    other = (
+        replace(problem, plant=model, reality=None, signals=signals_of(model, told))
+        if model is not problem.plant
+        else problem
+    )
+    planned = planner.planned(other)
     assert planned.horizon is not None
     assert planned.cost is not None
-    ocp = transcribe(
-        planned.plant, planned.reference, planned.horizon, planned.cost, planned.limits, planned.start_state
-    )
+    ahead = previewed_values(model, told)
+    limits, start = planned.limits, planned.start_state
+    ocp = transcribe(planned.plant, planned.reference, planned.horizon, planned.cost, limits, ahead, start)
     try:
         solve = _Solver(ocp, compiled)
     except FpirhcError:
         return None
-    data_of = stage_data(planned.plant, planned.reference, planned.horizon, planned.cost)
+    data_of = stage_data(planned.plant, planned.reference, planned.horizon, planned.cost, signals=ahead)
     of_measured = shifted_reference(planned.plant, ocp.data, ocp.stages + 1) if planned.plant.outputs else None
     stride = cycles_per_stage(problem.horizon, problem.period)
     plans = np.arange(stride, run.cycles, stride)
     rows = plans[np.unique(np.linspace(0, plans.size - 1, SAMPLES).astype(int))] if plans.size else plans
-    parameters, excess = ready.parameters(model), []
+    times = np.ravel(times)
+    parameters = rows_of(model_values(model, told), times + problem.period / 2, ready.parameters(model))
+    excess = []
     for row in rows:
         shift = run["command_shift"][row - 1]
         first = ocp.start(states[row], run["command"][row - 1] - shift).full().ravel()
-        data = np.asarray(data_of(np.ravel(times)[row], parameters).full())
+        data = np.asarray(data_of(times[row], parameters[row]).full())
         if of_measured is not None:
-            data = np.asarray(of_measured(data, states[row], run["output"][row], parameters).full())
+            data = np.asarray(of_measured(data, states[row], run["output"][row], parameters[row]).full())
         best = solve(first, data, ocp.input_lower - shift, ocp.input_upper - shift)
         cost_of_plan = run["solve.cost"][row]
         if best is not None and run["status"][row] <= Status.NOT_CONVERGED:
