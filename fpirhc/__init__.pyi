@@ -59,6 +59,7 @@ from .optimisers.nlp import Fatrop, Ipopt, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.quadratic_solvers import Osqp, Qrqp
 from .optimisers.reduced_gradient import ReducedGradient
+from .plant.algebraic import Algebraic
 from .plant.implicit import ImplicitMidpoint, RadauIIA
 from .plant.integrators import Cvodes, Euler, RungeKutta4
 from .plant.outputs import Output
@@ -123,6 +124,7 @@ __all__ = [
     "AccelerationFeedback",
     "AdaptiveInverseDynamics",
     "Affine",
+    "Algebraic",
     "Anderson",
     "Answer",
     "BacksteppingMRAC",
@@ -230,6 +232,7 @@ __all__ = [
     "Sensing",
     "Sensor",
     "SequentialQuadratic",
+    "Setpoint",
     "Sigmoid",
     "Sine",
     "SlidingMode",

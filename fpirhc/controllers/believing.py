@@ -9,7 +9,7 @@ The state has each entry from where it is known best: believed entries from the 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
@@ -17,6 +17,7 @@ import numpy as np
 
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.observed import check_observed
+from fpirhc.controllers.outside_block import Told
 from fpirhc.deformation.queue import Queue
 from fpirhc.errors import NotSupported
 from fpirhc.plant.integrators import Integrator, RungeKutta4
@@ -25,6 +26,7 @@ from fpirhc.sensing.belief import Belief, Evidence, Model
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.task.outside import told_places
 from fpirhc.task.problem import Problem
 
 _COMMANDED, _COUNT, _QUEUE = "_commanded", "belief_cycles", "belief_commands"
@@ -49,7 +51,7 @@ class Believing:
     def block(self) -> Block:
         """Block (raw measurements, parameters, last command) -> (state, realised)."""
         plant = self.problem.plant
-        reads = Layout((self.raw, plant.parameter, self._commanded))
+        reads = Layout((self.raw, plant.parameter, self._commanded, *self._told.reads))
         writes = Layout((plant.state, plant.response_signal("realised")))
         own = Layout((scalar(_COUNT), *self._queued, *self.belief.memory(self.model).signals))
         return Block("believe", reads, writes, self._step, own + self._estimator.memory)
@@ -85,6 +87,11 @@ class Believing:
         return Signal(_COMMANDED, inputs.elements, inputs.units, tuple(map(float, self.problem.inputs_before)))
 
     @property
+    def _told(self) -> Told:
+        """Signals from outside: the model moves with those of the last cycle."""
+        return Told(self.problem.plant, self.problem.signals, self.problem.period)
+
+    @property
     def _late(self) -> int:
         return round(self.problem.dead_time.measurement / self.problem.period)
 
@@ -101,34 +108,36 @@ class Believing:
         return (Signal(_QUEUE, names, start=self._commanded.start * (length - 1)),) if length > 1 else ()
 
     def _step(self, s: Signals) -> dict[str, Expression]:
-        plant, late = self.problem.plant, self._late
-        sensing, queue = self.problem.sensing, self._queue
-        shown = dict(zip(self.raw.elements, ca.vertsplit(getattr(s, self.raw.name)), strict=True))
-        commands, newest, size = self._commands(s), getattr(s, _COMMANDED), plant.input.size
-        column = ca.vertcat(newest, commands) if queue.length > 1 else newest
+        plant, sensing, elements = self.problem.plant, self.problem.sensing, self.problem.plant.state.elements
+        told, results = self._evidence(s)
         memory = {m: getattr(s, m) for m in self.belief.memory(self.model).names}
-        count = getattr(s, _COUNT)
-        told = Evidence(shown, {}, queue.delayed(column, size), s.parameters, count > late + 0.5, count > late - 0.5)
         predicted = self.belief.predict(self.model)(told, memory)
-        response = plant.controlled_response_function(predicted, told.command, s.parameters)
+        response = plant.controlled_response_function(predicted, told.command, told.parameters)
         expected = ca.vertsplit(ca.vertcat(predicted, response))
-        seen = dict(zip(plant.state.elements + response_names(plant), expected, strict=True)) | shown
+        seen = {**dict(zip(elements + response_names(plant), expected, strict=True)), **told.measured}
         estimated, realised, *remembered = self._estimates(s, seen)
-        by_estimator = dict(zip(plant.state.elements, ca.vertsplit(estimated), strict=True))
+        by_estimator = dict(zip(elements, ca.vertsplit(estimated), strict=True))
         known = {e: by_estimator[e] for e in sensing.known(plant)}
         correct = self.belief.correct(self.model)
-        state, next_memory = correct(Evidence(**{**vars(told), "known": known}), memory, predicted)
-        believed = dict(zip(plant.state.elements, ca.vertsplit(state), strict=True))
-        chosen = by_estimator | {e: believed[e] for e in self.belief.believes(plant, sensing.known(plant))}
-        results = {"state": ca.vertcat(*(chosen[e] for e in plant.state.elements)), "realised": realised}
+        state, next_memory = correct(replace(told, known=known), memory, predicted)
+        believed = dict(zip(elements, ca.vertsplit(state), strict=True))
+        chosen = by_estimator | {e: believed[e] for e in sensing.believed(plant)}
+        results |= {"state": ca.vertcat(*(chosen[e] for e in elements)), "realised": realised}
         results |= {f"{m}_next": v for m, v in next_memory.items()}
-        results |= {f"{m.name}_next": v for m, v in zip(self._estimator.memory.signals, remembered, strict=True)}
-        if queue.length > 1:
-            results[f"{_QUEUE}_next"] = queue.pushed(commands, newest)[: size * (queue.length - 1)]
-        return {**results, f"{_COUNT}_next": ca.fmin(count + 1, late + 1)}
+        return results | {f"{m.name}_next": v for m, v in zip(self._estimator.memory.signals, remembered, strict=True)}
 
-    def _commands(self, s: Signals) -> Expression:
-        return getattr(s, _QUEUE) if self._queued else getattr(s, _COMMANDED)
+    def _evidence(self, s: Signals) -> tuple[Evidence, dict[str, Expression]]:
+        """What the belief is told, with no state known yet, and what is remembered for the next cycle."""
+        late, queue, newest, size = self._late, self._queue, getattr(s, _COMMANDED), self.problem.plant.input.size
+        shown = dict(zip(self.raw.elements, ca.vertsplit(getattr(s, self.raw.name)), strict=True))
+        column, count = newest, getattr(s, _COUNT)
+        remembered = {f"{_COUNT}_next": ca.fmin(count + 1, late + 1)}
+        if queue.length > 1:
+            column = ca.vertcat(newest, getattr(s, _QUEUE))
+            remembered[f"{_QUEUE}_next"] = column[: size * (queue.length - 1)]
+        parameters, _ = self._told.acted(s, 0)
+        command = queue.delayed(column, size)
+        return Evidence(shown, {}, command, parameters, count > late + 0.5, count > late - 0.5), remembered
 
     def _estimates(self, s: Signals, seen: Mapping[str, Expression]) -> tuple[Expression, ...]:
         """State, response and memory of the estimator."""
@@ -147,8 +156,9 @@ def check_believed(problem: Problem, controller: Controller) -> None:
     """Raise if a controller cannot be given believed states, or the belief cannot be right.
 
     Raises:
-        NotSupported: an adaptive controller whose response nobody measures; a measurement that is late by a fraction of a cycle;
-            a model with other parameters than the problem's; errors that are neither observed nor decay.
+        NotSupported: an adaptive controller whose response nobody measures; a measurement that is late by a fraction of a cycle,
+            or late beside signals from outside; a model with other parameters than the problem's; errors that are neither
+            observed nor decay.
     """
     sensing, plant = problem.sensing, problem.plant
     if sensing.belief is None:
@@ -165,6 +175,11 @@ def check_believed(problem: Problem, controller: Controller) -> None:
         raise NotSupported(
             f"believed states need a measurement that is late by whole cycles, and {problem.dead_time.measurement:g} "
             f"{problem.time_unit} are {late:.4g} cycles; use {round(late) * problem.period:g} {problem.time_unit}"
+        )
+    if late and told_places(plant, problem.signals):
+        raise NotSupported(
+            "believed states behind a late measurement would need the signals from outside of that time; leave out the dead time "
+            "of the measurement, or the belief"
         )
     model = controller.model_plant(problem)
     if model.parameter.elements != plant.parameter.elements:

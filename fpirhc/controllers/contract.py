@@ -199,6 +199,10 @@ class Controller(Checked, ABC):
             return self.around(self.inner.with_deformation(deformation))
         raise NotSupported(f"{type(self).__name__} has no deformation that can be replaced")
 
+    def following_its_model(self) -> Self:
+        """Return the controller whose command follows a change of its model's parameters in every cycle, also between plans."""
+        return self if self.inner is None else self.around(self.inner.following_its_model())
+
     def demand(self, problem: Problem) -> Demand | None:
         """Return how much the desired response changes; None where the deformation's automatic settings stay open."""
         if self.inner is not None:

@@ -5,7 +5,7 @@
 
 A sample fits when time, state and response - or the raw measurements that they are estimated from - are finite and inside their
 plausible range. The results of a skipped cycle are dropped. What is remembered is selected, never blended: a product with NaN would
-be NaN. A graph of calls is only given samples that fit: in a skipped cycle it is given the last good one again, so that no solver
+be NaN. A graph of calls is only given samples that fit. In a skipped cycle it is given the last good one again, so that no solver
 inside meets a number that is not finite. Scalar code has no solver inside, and needs no sample in store.
 
 An implausible sample is doubted, not refused for ever: after 20 of them in a row the plant is where it should not be, and the

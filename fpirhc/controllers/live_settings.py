@@ -2,9 +2,9 @@
 
     live = live_settings(problem, controller, ["deformation.gain", "cost.states.q1", "limits.inputs.Q1"])
 
-A path begins at the controller, or at the problem for its cost, limits and reference. The path of an interval stands for its finite ends,
-'limits.inputs.Q1.0' and '.1'. Automatic settings of the controller, such as the scale of a sigmoid, are recomputed from the
-others.
+A path begins at the controller, or at the problem for its cost, limits and reference. The path of an interval stands for its
+finite ends, 'limits.inputs.Q1.0' and '.1'. Automatic settings of the controller, such as the scale of a sigmoid, are recomputed
+from the others.
 """
 
 from __future__ import annotations

@@ -23,6 +23,7 @@ from fpirhc.controllers.base import Controller, closing_blocks, like, reference_
 from fpirhc.controllers.contract import Planner
 from fpirhc.controllers.on_failure import HoldPlan, OnFailure
 from fpirhc.controllers.own_reference import motion_of, own_signals, own_values, preview_of
+from fpirhc.controllers.planned_model import as_planned, held_model
 from fpirhc.controllers.replanning import FromMeasurement, Replanning
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
@@ -59,6 +60,8 @@ class RecedingHorizon(Controller):
         on_failure: what is applied when a solve fails (HoldPlan, Feedforward, StopRun).
         cost: of the plan; None: the problem's.
         margins: by name of a state, the distances that plans keep from the state's limits; see `Horizon`. None: the horizon's.
+        follows_model: whether the inputs of a plan are corrected in every cycle by what the model has learned since; see
+            `fpirhc.controllers.planned_model` and `Estimating(at_once=True)`. A model that does not learn changes nothing.
     """
 
     optimiser: Optimiser
@@ -67,11 +70,16 @@ class RecedingHorizon(Controller):
     on_failure: OnFailure = field(default_factory=HoldPlan)
     cost: Cost | None = None
     margins: Mapping[str, Sequence[float]] | None = field(default=None, hash=False, metadata={"setting": "where given"})
+    follows_model: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
 
     @property
     def planner(self) -> Planner:
         """Optimiser, cost, start and margins of the plans, and the tracking law between plans."""
         return Planner(self.optimiser, self.cost, self.replanning.restarts, self.replanning.law, self.margins)
+
+    def following_its_model(self) -> RecedingHorizon:
+        """Return the controller that corrects the plan's inputs between plans, by what its model has learned since."""
+        return replace(self, follows_model=True)
 
     def with_optimiser(self, optimiser: Optimiser) -> RecedingHorizon:
         """Return the controller with another optimiser."""
@@ -119,6 +127,9 @@ class RecedingHorizon(Controller):
         before, after, late, remembered = self.replanning.parts(problem)
         plan = every(_plan_block(problem, self.optimiser, self.on_failure), cycles)
         closing, delays = closing_blocks(problem, self.deformation, [scalar("_solve_status")])
+        if self.follows_model:
+            held, own = held_model(problem)
+            after, delays = [held, *(as_planned(block, problem) for block in after)], [*delays, own]
         blocks = [reference_block(problem), _due_block(cycles), *before, plan, *after, *closing, *late]
         delays = [*delays, *remembered]
         blocks.append(_command_shift_block(problem, self.deformation))
@@ -212,8 +223,8 @@ def _check_reference(problem: Problem) -> None:
     moving = live_numbers(problem.reference)
     if moving and not problem.reference.rests(problem.horizon.stages * problem.horizon.step):
         raise NotSupported(
-            f"setting 'reference.{next(iter(moving)).removeprefix('reference.')}' cannot be live with a plan: the reference moves within "
-            "the first horizon, from which the optimiser's scale and the first plan are taken; let it rest there"
+            f"setting '{next(iter(moving))}' cannot be live with a plan: the reference moves within the first horizon, from which "
+            "the optimiser's scale and the first plan are taken; let it rest there"
         )
 
 
@@ -226,7 +237,7 @@ def _stage_data(problem: Problem, live: int, *, previewed: bool = False) -> ca.F
 
 
 def _plan_reads(problem: Problem, ocp: OptimalControl) -> Layout:
-    """Time, start of the plan, parameters, shift and command of the last cycle, derived numbers, outputs, own signals."""
+    """Time, start of the plan, measured outputs, parameters, last command and its shift, derived numbers, own signals."""
     plant = problem.plant
     last = like(plant.input, "_command_shift_last"), like(plant.input, "_command_before")
     own, outputs = own_signals(problem), (plant.output,) if plant.outputs else ()

@@ -51,8 +51,8 @@ def stage_data(
     """Function (time, parameters) -> data of all stages, shape (ntheta, N + 1), along the nominal motion.
 
     With `live` rows of settings and what follows from them, (time, parameters, these rows) -> data that end with them. With
-    `signals`, a Function (time, parameters) -> parameters, every stage has those of its middle. Where they are `previewed`, states
-    (nx, N + 1) and responses (n, N + 1) of the reference follow the time as arguments.
+    `signals`, a Function (time, parameters) -> parameters, every stage has those of its middle. Where the reference is
+    `previewed`, its states (nx, N + 1) and responses (n, N + 1) follow the time as arguments.
     """
     looked_up = signals is not None and not signals.is_a("SXFunction")
     matrix = kind(reference.opaque or plant.inverse_opaque or looked_up)

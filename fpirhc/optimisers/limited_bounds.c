@@ -154,6 +154,22 @@ static void put_inside(const Limits* limits, const Point* p, Duals* y, casadi_re
   }
 }
 
+/* Descent: slacks and elastics that belong to the distances, t - e = d and mu / t + mu / e = rho; `anew`: the multipliers too. */
+static void put_on_path(const Limits* limits, const Point* p, Duals* y, casadi_real mu, int anew) {
+  int side, i, r, k;
+  EACH_LIMIT(limits) {
+    casadi_real d = distance(limits, p, side, i, r), rho = capacity(r), reached, least;
+    if (r < NU) {
+      y->t[side][k] = larger(d, 0.1 * HAIR * unit[r]);
+    } else {
+      reached = rho * fabs(d) + sqrt(rho * d * rho * d + 4 * mu * mu);
+      least = mu / rho + 2 * mu * mu / (rho * reached), reached = mu / rho + 0.5 * reached / rho;
+      y->t[side][k] = d > 0 ? reached : least, y->e[side][k] = d > 0 ? least : reached;
+    }
+    if (anew) y->z[side][k] = mu / y->t[side][k];
+  }
+}
+
 INLINE casadi_real kappa_of(casadi_real t, casadi_real z, casadi_real e, int r) {
   return 1 / (t / z + (r < NU ? 0 : e / (capacity(r) - z)));
 }

@@ -23,7 +23,7 @@ _SCALARS = (
     *("mu", "floor", "delta", "error", "alpha", "alpha_dual", "theta", "phi", "dphi"),
     *("last_error", "last_left", "last_violation", "last_broken"),
     *("phase", "place_of", "fresh", "again", "slacks", "misses", "steps", "halvings", "raises", "filtered", "start"),
-    *("use_exact", "stuck", "rolled", "accepted", "count", "ends"),
+    *("use_exact", "stuck", "rolled", "accepted", "count", "ends", "descends", "price"),
 )
 
 
@@ -131,7 +131,10 @@ def _results(call: Call, s: State, memory: ca.MX, posed: ca.MX) -> list[ca.MX]:
 def _last_plan(call: Call, s: State) -> tuple[Expansion, Certified, ca.MX]:
     """The last plan, rolled out where it is not; how far it is from the first-order conditions; and whether it is finite."""
     ocp, old = call.ocp, point(s)
-    again = Expansion(*expand(ocp)(old.inputs, old.states, s["gains"], 1, call.s0, call.data, call.lower, call.upper))
+    none = ca.MX.zeros(ocp.state.size, ocp.stages)
+    again = Expansion(
+        *expand(ocp)(old.inputs, old.states, s["gains"], 1, none, call.s0, call.data, call.lower, call.upper)
+    )
     needed = ca.logic_or(ca.logic_not(s["rolled"]), s["fresh"] > 0)
     usable = ca.logic_or(ca.logic_not(needed), is_usable(again))
     p = Expansion(*(ca.if_else(needed, a, b) for a, b in zip(again, old, strict=True)))

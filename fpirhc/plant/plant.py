@@ -25,6 +25,7 @@ import numpy as np
 from fpirhc.errors import Mistakes, NotInvertible, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called
+from fpirhc.plant.algebraic import Algebraic
 from fpirhc.plant.inverse import inverse_by_newton, inverse_by_user, inverse_of_affine
 from fpirhc.plant.outputs import Output, check_outputs, face_of, lie_derivatives, output_expression
 from fpirhc.plant.parameter import Parameter, check_parameters
@@ -57,6 +58,7 @@ class Plant(Checked):
             there, by name; it limits nothing (see `Limits`).
         outputs: name -> Output(unit, function of (q, q', ..., p)): the quantities that follow a reference, where these are not the
             coordinates themselves. Their relative orders are found from the symbols.
+        algebraic: quantities that equations tie to the state at every instant; the response has them as its last argument.
         time_unit: unit of time of the equations ('s', 'ms', 'day'), and so of every time and rate of the problem.
 
     Raises:
@@ -74,6 +76,7 @@ class Plant(Checked):
         default_factory=dict, kw_only=True, metadata={"setting": "where given"}
     )
     outputs: Mapping[str, Output] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
+    algebraic: Algebraic | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
     time_unit: str = field(default="s", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
@@ -99,6 +102,7 @@ class Plant(Checked):
         controlled: Sequence[str] | None = None,
         inverse: Callable[..., Mapping[str, Expression]] | None = None,
         ranges: Mapping[str, tuple[float, float]] | None = None,
+        algebraic: Algebraic | None = None,
         time_unit: str = "s",
     ) -> Plant:
         """Return the plant x' = f(x, u, p), y = h(x, p): every state is a coordinate of order one, and the outputs have references.
@@ -113,6 +117,7 @@ class Plant(Checked):
             inverse: optional function of (x, r, p) that returns {input: command} for wanted highest derivatives r of the controlled
                 outputs; see `Plant`.
             ranges: physical range (lowest, highest) of states by name.
+            algebraic: quantities that equations tie to the state at every instant; see `Plant`.
             time_unit: unit of time of the equations.
 
         Raises:
@@ -128,6 +133,7 @@ class Plant(Checked):
             inverse=inverse,
             ranges=ranges or {},
             outputs=outputs,
+            algebraic=algebraic,
             time_unit=time_unit,
         )
 
@@ -306,10 +312,25 @@ class Plant(Checked):
     def response_function(self) -> ca.Function:
         """Function (state, input, parameters) -> highest derivative of every coordinate (n)."""
         x, u, p = self.symbols()
-        views = (*self._derivatives(x), Named(self.input.elements, u, "input"), self._parameters(p))
+        views = self.views(x, u, p)
+        if self.algebraic is not None:
+            views = (*views, self.algebraic.view(self.algebraic_function(x, u, p)))
         responses = called(self.words[1], self.response, *views)
         column = ca.vertcat(*(ca.SX(responses[c]) for c in self.names))
         return ca.Function("fpirhc_response", [x, u, p], [ca.densify(column)], ["x", "u", "p"], ["r"])
+
+    def views(self, x: Expression, u: Expression, p: Expression) -> tuple[Named, ...]:
+        """Return the arguments of the response by name, without algebraic states: q, q', ..., u, p."""
+        return (*self._derivatives(x), Named(self.input.elements, u, "input"), self._parameters(p))
+
+    @cached_property
+    def algebraic_function(self) -> ca.Function:
+        """Function (state, input, parameters) -> algebraic states (nz); empty without any."""
+        x, u, p = self.symbols()
+        solution = ca.SX(0, 1)
+        if self.algebraic is not None:
+            solution = self.algebraic.solved(self.views(x, u, p), ca.vertcat(x, u, p))
+        return ca.Function("fpirhc_algebraic", [x, u, p], [ca.densify(solution)], ["x", "u", "p"], ["z"])
 
     @cached_property
     def controlled_response_function(self) -> ca.Function:

@@ -19,6 +19,7 @@ from fpirhc.controllers.face import measured_signals, on_face
 from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.own_reference import given_signals, own_signals
+from fpirhc.controllers.plausible import plausible_range
 from fpirhc.controllers.seeing import compose_seeing, first_estimates, seeing_blocks
 from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.plant import Plant
@@ -54,7 +55,10 @@ def close_loop(problem: Problem, controller: Controller, live: LiveSettings | No
 
 def _closed(problem: Problem, controller: Controller, live: LiveSettings | None) -> Composite:
     ready = checked(problem, controller)
-    acting = Gate(nominal(problem), compose_seeing(problem, ready), trusted=("time", "memory"))
+    task = nominal(problem)
+    # What a body outside measures may be wrong; what the loop computes itself is a result, however far it goes.
+    plausible = plausible_range(task) if problem.foreign is not None else {}
+    acting = Gate(task, compose_seeing(problem, ready), trusted=("time", "memory"), plausible=plausible)
     disturbed = disturbance_signals(problem)
     seeing = _sense_blocks(problem, ready.response(problem), predicts="state_ahead" in acting.inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had

@@ -168,10 +168,8 @@ class Stepper:
         except IndexError:
             _refuse_thread()
         try:
-            if settings:
-                self.change(settings)
-            if setpoints:
-                self.aim(setpoints)
+            if settings or setpoints or isinstance(time, bool):
+                self._take(time, settings, setpoints)
             try:
                 # A view takes arrays of float64 of its own shape and nothing else; numpy's assignment broadcasts, and is slower.
                 self._time[0] = time
@@ -204,6 +202,7 @@ class Stepper:
         *,
         taken: float | None = None,
         settings: Numbers | None = None,
+        setpoints: SetpointsNow | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return (command, memory for the next cycle) from raw measurements.
 
@@ -213,15 +212,18 @@ class Stepper:
             memory: from `start` or from the step before.
             taken: time stamp of the sample, as in `step`.
             settings: numbers of live settings from this step on, as in `step`.
+            setpoints: as in `step`.
 
         Raises:
             FpirhcError: as in `step`.
         """
         if self.estimates:
-            return self.step(time, measured, _NOTHING, memory, taken=taken, settings=settings)
+            return self.step(time, measured, _NOTHING, memory, taken=taken, settings=settings, setpoints=setpoints)
         column = numbers_of("measured", measured, len(self.measures))
         state, seen, realised = np.split(column, [len(self._state), len(self._state) + self.outputs])
-        return self.step(time, state, realised, memory, output=seen, taken=taken, settings=settings)
+        return self.step(
+            time, state, realised, memory, output=seen, taken=taken, settings=settings, setpoints=setpoints
+        )
 
     def change(self, settings: Numbers) -> bool:
         """Put numbers of live settings in force from the next step on, by path, and return whether they were accepted.
@@ -331,6 +333,15 @@ class Stepper:
             self._taken[0] = one_number("taken", time if taken is None else taken)
         if self.outputs:
             self._output[:] = numbers_of("output", output, self.outputs)
+
+    def _take(self, time: object, settings: Numbers | None, setpoints: SetpointsNow | None) -> None:
+        """Put numbers in force, and refuse a truth value as time."""
+        if settings:
+            self.change(settings)
+        if setpoints:
+            self.aim(setpoints)
+        if isinstance(time, bool):
+            one_number("time", time)
 
     def _accept(self, time: object, state: object, realised: object, memory: object) -> None:
         """Take arguments that are no arrays of float64, or say what is wrong with them."""

@@ -17,6 +17,7 @@ from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.regular_gain import singular_gain
 from fpirhc.horizon.stage_check import check_stage
+from fpirhc.plant.algebraic import unsolved
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
@@ -348,13 +349,17 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
 def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
     """Add a mistake where the response is not finite at the start, or cannot be solved for the inputs there."""
     plant = problem.plant
-    if plant.controlled is None and len(plant.inputs) != len(plant.face.coordinates):
+    exact = () if problem.reality else (("exact", plant.exact),)  # with a reality these values move nothing
+    for which, values in (("approximate", plant.approximate), *exact):
+        why = unsolved(plant, problem.start_state, problem.inputs_before, values)
+        if why:
+            mistakes.add(f"algebraic states at the start ({which} parameters): {why}")
+    if not mistakes.none or (plant.controlled is None and len(plant.inputs) != len(plant.face.coordinates)):
         return
     x, u, p = plant.symbols()
     response = plant.controlled_response_function(x, u, p)
     gain_of = ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response])
     state = ", ".join(f"{e} = {v:g}" for e, v in zip(plant.state.elements, problem.start_state, strict=True))
-    exact = () if problem.reality else (("exact", plant.exact),)  # with a reality these values move nothing
     for which, values in (("approximate", plant.approximate), *exact):
         gain, free = (np.asarray(m.full()) for m in gain_of(problem.start_state, problem.inputs_before, values))
         if not np.all(np.isfinite(free)):

@@ -4,9 +4,9 @@ Every reference gives one Function t -> (nominal state, nominal response): the c
 plant's state has, and the highest derivative of each. Derivatives come from automatic differentiation. Whatever is decided before a
 run (scales, reviews, first plans) uses this nominal motion.
 
-A reference may depend on more than the time: on values that a run is given, and on a memory. Such a reference has a block of its own
-in the controller's step. The block reads what is given from outside, and writes the reference's own signals, from which motion and
-preview follow in every cycle. Without own signals the motion is the nominal one.
+A reference may depend on more than the time: on values that a run is given, and on a memory. Such a reference has a block of its
+own in the controller's step. The block reads what is given from outside, and writes the reference's own signals, from which motion
+and preview follow in every cycle. Without own signals the motion is the nominal one.
 """
 
 from __future__ import annotations
@@ -85,6 +85,7 @@ class Reference(Checked, ABC):
     def block(self, plant: Plant, stages: int, period: float) -> Block | None:
         """Return the block from what is given to the own signals; None: there are no own signals."""
         del plant, stages, period
+        return None
 
     def motion_now(self, plant: Plant, stages: int, ahead: float = 0.0) -> ca.Function:
         """Function (t, own signals) -> (state, response) as far as it is known now.
@@ -107,8 +108,9 @@ class Reference(Checked, ABC):
         return self.derivatives(coordinate, order)
 
     def preview(self, plant: Plant, stages: int, step: float) -> ca.Function | None:
-        """Function (own signals) -> (states (nx, N + 1), responses (n, N + 1)) at the nodes of a horizon; None without own signals."""
+        """Function (own signals) -> (states (nx, N + 1), responses (n, N + 1)) at the nodes; None without own signals."""
         del plant, stages, step
+        return None
 
     def rests(self, until: float) -> bool:
         """Return whether the nominal motion is known to stand still up to some time, whatever the numbers of live settings are."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from numbers import Real
 
 import numpy as np
@@ -31,7 +32,7 @@ def pairs(name: str, steps: Steps) -> list[tuple[float, float]]:
             raise InvalidValue(f"{text}: expected finite numbers, got {value!r}")
     numbers = [(float(time), float(value)) for time, value in entries]
     times = [time for time, _ in numbers]
-    if times[0] != 0 or any(later <= time for time, later in zip(times[:-1], times[1:], strict=True)):
+    if times[0] != 0 or any(later <= time for time, later in pairwise(times)):
         raise InvalidValue(f"{text}: the times must begin at 0 and increase, got {times}")
     return numbers
 

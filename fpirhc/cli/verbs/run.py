@@ -27,7 +27,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_out(parser)
     add_seed(parser, "the noise")
     add_no_compile(parser)
-    text = "another number for a setting, such as deformation.gain=-1.2, limits.inputs.Q1=-50,20, or for a set-point: setpoints.q1=2.5"
+    text = "another number for a setting, such as deformation.gain=-1.2 or limits.inputs.Q1=-50,20; or a set-point, setpoints.q1=2"
     parser.add_argument("--set", action="append", default=[], dest="settings", metavar="PATH=NUMBER", help=text)
 
 

@@ -3,8 +3,8 @@
 With a dead time of the inputs the command of this cycle acts later, and with a dead time of the measurement the measured state is
 old. The wrapper integrates the measured state over both, with the commands that are on their way. The wrapped controller is given
 the resulting state and the time at which its command acts. So a receding horizon starts where its first input acts. A filtered
-set-point cannot be shifted in time: the state ahead is led along the reference of now, so that the plant follows it later by the dead
-time, and the errors of a run contain this delay.
+set-point cannot be shifted in time: the state ahead is led along the reference of now, so that the plant follows it later by the
+dead time, and the errors of a run contain this delay.
 
 There are two ways to predict:
 
