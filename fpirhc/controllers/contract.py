@@ -149,9 +149,19 @@ class Controller(Checked, ABC):
         return False if self.inner is None else self.inner.learns
 
     @property
+    def model_acts_at_once(self) -> bool:
+        """Whether a change of its model changes the command in every cycle; False where a plan holds its inputs."""
+        return self.planner is None if self.inner is None else self.inner.model_acts_at_once
+
+    @property
     def deforms_response(self) -> bool:
         """Whether its deformation acts on the desired response; False where it acts on another signal, such as a command."""
         return True if self.inner is None else self.inner.deforms_response
+
+    @property
+    def deforms_target(self) -> bool:
+        """Whether its deformation acts on the target of an inner controller, and the response is the output itself."""
+        return False if self.inner is None else self.inner.deforms_target
 
     @property
     def law(self) -> Tracking | None:
@@ -198,6 +208,11 @@ class Controller(Checked, ABC):
         if self.inner is not None:
             return self.around(self.inner.with_deformation(deformation))
         raise NotSupported(f"{type(self).__name__} has no deformation that can be replaced")
+
+    def stated(self, problem: Problem) -> Controller:
+        """Return the controller with every number of its own stated that it would take from the problem; itself without any."""
+        del problem
+        return self
 
     def following_its_model(self) -> Self:
         """Return the controller whose command follows a change of its model's parameters in every cycle, also between plans."""
@@ -251,6 +266,7 @@ def resolved(problem: Problem, controller: Controller) -> Controller:
     if controller.inner is not None:
         inner = resolved(controller.inner_problem(problem), controller.inner)
         controller = controller if inner is controller.inner else controller.around(inner)
+    controller = controller.stated(problem)
     deformation = controller.deformation
     demand = controller.demand(problem) if deformation.automatic else None
     return controller if demand is None else controller.with_deformation(deformation.suited(demand))
@@ -282,6 +298,8 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
     else:
         ready.check(problem)
     check_form(problem, ready)
+    if ready.deforms_target:
+        return ready  # its own check judges a gain that acts on targets
     if ready.response(problem) is None:
         check_gain_sign(problem, ready.deformation)
         check_response_delay(problem, ready.deformation)

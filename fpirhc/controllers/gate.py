@@ -132,7 +132,8 @@ class Gate:
             return {**values, "command": command, **{f"{m}_next": v for m, v in remembered.items()}}
 
         derived = self._derived if self.inner.derived_if_any else None
-        return Block("gate", self.reads, trace, step, self.memory, opaque=self.inner.opaque, derived=derived)
+        opaque, inside = self.inner.opaque, self.inner
+        return Block("gate", self.reads, trace, step, self.memory, opaque=opaque, derived=derived, inside=inside)
 
     def _derived(self, values: Values) -> Derived:
         """What follows from live settings, with the controller's memory as this block has it."""

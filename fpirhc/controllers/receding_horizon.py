@@ -77,6 +77,11 @@ class RecedingHorizon(Controller):
         """Optimiser, cost, start and margins of the plans, and the tracking law between plans."""
         return Planner(self.optimiser, self.cost, self.replanning.restarts, self.replanning.law, self.margins)
 
+    @property
+    def model_acts_at_once(self) -> bool:
+        """Whether the inputs of a plan are corrected by what its model has learned since."""
+        return self.follows_model
+
     def following_its_model(self) -> RecedingHorizon:
         """Return the controller that corrects the plan's inputs between plans, by what its model has learned since."""
         return replace(self, follows_model=True)
@@ -237,7 +242,7 @@ def _stage_data(problem: Problem, live: int, *, previewed: bool = False) -> ca.F
 
 
 def _plan_reads(problem: Problem, ocp: OptimalControl) -> Layout:
-    """Time, start of the plan, measured outputs, parameters, last command and its shift, derived numbers, own signals."""
+    """Time, start of the plan, parameters, last command and its shift, derived numbers, outputs, own signals."""
     plant = problem.plant
     last = like(plant.input, "_command_shift_last"), like(plant.input, "_command_before")
     own, outputs = own_signals(problem), (plant.output,) if plant.outputs else ()

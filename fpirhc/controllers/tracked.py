@@ -34,5 +34,5 @@ def tracked_blocks(problem: Problem, tracking: Tracking, deformation: Deformatio
     """Return the blocks reference, tracking, deform, invert, limit, judge, running, tracking update, and what they remember."""
     plant = problem.plant
     closing, delays = closing_blocks(problem, deformation)
-    updated = on_face(plant, bounded(problem, tracking).update(plant.face, problem.period))
-    return [*desired_blocks(problem, tracking), *closing, updated], [*delays, *tracking.delays(plant.face)]
+    update = on_face(plant, bounded(problem, tracking).update(plant.face, problem.period))
+    return [*desired_blocks(problem, tracking), *closing, update], [*delays, *tracking.delays(plant.face)]

@@ -56,9 +56,9 @@ class Plant(Checked):
             Newton's method otherwise.
         ranges: physical range (lowest, highest) of states by name, such as {"level": (0.0, 2.0)}. A run whose plant leaves one ends
             there, by name; it limits nothing (see `Limits`).
+        algebraic: quantities that equations tie to the state at every instant; the response has them as its last argument.
         outputs: name -> Output(unit, function of (q, q', ..., p)): the quantities that follow a reference, where these are not the
             coordinates themselves. Their relative orders are found from the symbols.
-        algebraic: quantities that equations tie to the state at every instant; the response has them as its last argument.
         time_unit: unit of time of the equations ('s', 'ms', 'day'), and so of every time and rate of the problem.
 
     Raises:
@@ -75,8 +75,8 @@ class Plant(Checked):
     ranges: Mapping[str, tuple[float, float]] = field(
         default_factory=dict, kw_only=True, metadata={"setting": "where given"}
     )
-    outputs: Mapping[str, Output] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
     algebraic: Algebraic | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    outputs: Mapping[str, Output] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
     time_unit: str = field(default="s", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:

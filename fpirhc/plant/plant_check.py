@@ -66,10 +66,9 @@ def check_ranges(plant: Plant, mistakes: Mistakes) -> None:
 
 def check_response(plant: Plant, mistakes: Mistakes) -> None:
     """Add every mistake of the response and of the orders to `mistakes`."""
-    quantity, function = plant.words
     x, u, p = plant.symbols()
     arguments_of_step, symbols = plant.views(x, u, p), [x, u, p]
-    algebraic = plant.algebraic
+    algebraic, (quantity, function) = plant.algebraic, plant.words
     if algebraic is not None:
         check_algebraic(plant, algebraic, arguments_of_step, mistakes)
         symbols.append(ca.SX.sym("z", max(1, len(algebraic.names))))

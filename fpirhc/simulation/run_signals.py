@@ -32,7 +32,8 @@ def judgements(problem: Problem, controller: Controller, layout: Layout, log: np
     if problem.cost is not None and problem.horizon is not None:
         judged.append(_costs(problem, layout, log))
     gain = controller.deformation.effective_gain()
-    if gain != 0 and log.shape[0] and controller.response(problem) is None:
+    of_responses = controller.response(problem) is None and not controller.deforms_target
+    if gain != 0 and log.shape[0] and of_responses:
         factors = _contraction(problem, controller, layout, log)
         judged += [(scalar("contraction"), factors[:, None])] if np.isfinite(factors).all() else []
     return judged

@@ -327,13 +327,6 @@ class Stepper:
         self._command = _view(command)
         self._fingerprint = float(self.memory[FINGERPRINT].start[0])
 
-    def _take_more(self, time: float, taken: float | None, output: np.ndarray | None) -> None:
-        """Take the time stamp of the sample, and measured outputs, where the step reads them."""
-        if self._ages:
-            self._taken[0] = one_number("taken", time if taken is None else taken)
-        if self.outputs:
-            self._output[:] = numbers_of("output", output, self.outputs)
-
     def _take(self, time: object, settings: Numbers | None, setpoints: SetpointsNow | None) -> None:
         """Put numbers in force, and refuse a truth value as time."""
         if settings:
@@ -342,6 +335,13 @@ class Stepper:
             self.aim(setpoints)
         if isinstance(time, bool):
             one_number("time", time)
+
+    def _take_more(self, time: float, taken: float | None, output: np.ndarray | None) -> None:
+        """Take the time stamp of the sample, and measured outputs, where the step reads them."""
+        if self._ages:
+            self._taken[0] = one_number("taken", time if taken is None else taken)
+        if self.outputs:
+            self._output[:] = numbers_of("output", output, self.outputs)
 
     def _accept(self, time: object, state: object, realised: object, memory: object) -> None:
         """Take arguments that are no arrays of float64, or say what is wrong with them."""

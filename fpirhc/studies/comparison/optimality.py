@@ -8,6 +8,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
+from fpirhc.controllers.own_reference import own_signals
 from fpirhc.errors import FpirhcError
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import shifted_reference, stage_data
@@ -44,15 +45,15 @@ def measure_optimality(
 ) -> Optimality | None:
     """Return the excess cost of sampled plans.
 
-    The result is None where plans do not start from a state in the run, where no plan was solved, and for a controller that
-    learns, because the models of its plans are not in the run. A negative excess is that of another local optimum, which the
-    controller reached and the solve from rest did not.
+    The result is None where plans do not start from a state in the run, where no plan was solved, for a controller that learns,
+    because the models of its plans are not in the run, and towards set-points, because what its plans knew of them is not either.
+    A negative excess is that of another local optimum, which the controller reached and the solve from rest did not.
     """
     ready = checked(problem, controller)
     planner, feeds = ready.planner, ready.feeds
     if planner is None or not planner.restarts or problem.horizon is None or run.cycles < 2:
         return None
-    if ready.learns or "parameters" in feeds:
+    if ready.learns or "parameters" in feeds or own_signals(problem):
         return None
     times, states = (run[feeds[n] if feeds.get(n) in run.layout.names else n] for n in ("time", "state"))
     model = ready.model_plant(problem)
