@@ -487,6 +487,26 @@ def test_a_deviation_needs_references_of_all_states() -> None:
         simulated(planned(cost=cost), fp.RecedingHorizon(OPTIMISER))
 
 
+@pytest.mark.parametrize(
+    ("name", "described"), [("CTC", 0.142), ("CTC+FPI", 0.0126), ("RHC", 0.108), ("RHC+FPI", 0.00684)]
+)
+def test_the_shipped_anaesthesia_does_what_its_description_says(name: str, described: float) -> None:
+    task = fp.load_problem("anaesthesia")
+    run = simulated(task.problem, task.controllers[name])
+    assert fp.measure(task.problem, run).rms_error["bis"] == pytest.approx(described, rel=0.02)
+
+
+def test_the_patients_kinetics_conserve_the_drug() -> None:
+    """What is infused is in the compartments or has been cleared: V1 C1 + V2 C2 + V3 C3 changes by u - CL C1."""
+    age, weight, height = 61.0, 77.0, 175.0
+    lean = 1.1 * weight - 128 * (weight / height) ** 2
+    clearance = 1.89 + 0.0456 * (weight - 77) - 0.0681 * (lean - 59) + 0.0264 * (height - 177)
+    volumes = np.array([4.27, 18.9 - 0.391 * (age - 53), 238.0])
+    plant, x = fp.load_problem("anaesthesia").problem.plant, np.array([3.0, 1.0, 0.4, 2.0])
+    rates = plant.derivative_function(x, 20.0, plant.exact).full().ravel()
+    assert volumes @ rates[:3] == pytest.approx(20.0 - clearance * x[0], rel=1e-12)
+
+
 # Reviews
 
 
