@@ -17,12 +17,15 @@ _SAMPLES = 100  # instants at which the reference is looked at
 
 
 def largest_response(problem: Problem) -> tuple[float, ...]:
-    """Return L of every controlled coordinate, by the limits of the build; infinite where an input has no finite limits."""
+    """Return L of every controlled coordinate, by the limits of the build; infinite where an input has no finite limits.
+
+    For outputs it is infinite too: the states that belong to their reference are not known before a run.
+    """
     task = nominal(problem)
     plant = task.plant
     lower, upper = task.limits.input_bounds(plant)
     free = (float("inf"),) * len(plant.controlled_names)
-    if not np.isfinite(upper - lower).all():
+    if plant.outputs or not np.isfinite(upper - lower).all():
         return free
     states, middle = _states(task), (lower + upper) / 2
     corners = [middle] + [_with(middle, k, v) for k in range(middle.size) for v in (lower[k], upper[k])]
