@@ -13,7 +13,6 @@ one.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -28,8 +27,9 @@ from fpirhc.sensing.measured import Measured
 from fpirhc.sensing.sensor import Sensor
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.functions import ceil
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
-from fpirhc.task.dead_time import delay_block
+from fpirhc.task.dead_time import Wait, delay_block
 
 _STREAM = 1  # separates the sensors' random series from the series of disturbances
 
@@ -76,11 +76,11 @@ class Sensing(Checked):
         """Delay of the estimated response in cycles beyond the ideal pair; the largest of the controlled coordinates."""
         return max(self.estimator.delay(plant.orders[k], period) for k in plant.controlled_indices)
 
-    def warm_up_cycles(self, plant: Plant, late: float) -> int:
+    def warm_up_cycles(self, plant: Plant, late: float) -> float:
         """Number of the first cycle whose response may be used; samples arrive `late` cycles after they were taken."""
         if self.estimator.measures_all:
             return 1
-        return math.ceil(late) + max(self.estimator.fills(plant.orders[k]) for k in plant.controlled_indices)
+        return ceil(late) + max(self.estimator.fills(plant.orders[k]) for k in plant.controlled_indices)
 
     @property
     def drawn(self) -> tuple[Signal, ...]:
@@ -99,7 +99,7 @@ class Sensing(Checked):
         return np.column_stack(columns) if columns else np.zeros((times.size, 0))
 
     def blocks(
-        self, plant: Plant, period: float, start: Array, late: float, true: tuple[Signal, Signal], resting: Array
+        self, plant: Plant, period: float, start: Array, late: Wait | None, true: tuple[Signal, Signal], resting: Array
     ) -> list[Block]:
         """Blocks from the true state and response to 'state' and 'realised'.
 
@@ -107,7 +107,7 @@ class Sensing(Checked):
             plant: the plant that is measured.
             period: control cycle, s.
             start: first state of the problem, shape (nx,).
-            late: dead time of the measurement, cycles.
+            late: dead time of the measurement; None: none.
             true: signals of the true state and response.
             resting: response at the start, shape (n,).
         """
@@ -115,7 +115,7 @@ class Sensing(Checked):
         first = _start(plant, start, names, resting)
         measured = vector("measured", names, [_unit(plant, n) for n in names])
         sensors = self._sensor_block(plant, true, measured, first)
-        if not late:
+        if late is None:
             return [sensors, self.estimator.block(plant, period, start, measured)]
         arrived = replace(measured, name="_arrived", start=tuple(map(float, first)))
         waiting = delay_block("see", measured, arrived, [late] * len(names))

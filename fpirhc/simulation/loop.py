@@ -22,7 +22,7 @@ from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX, nominal
-from fpirhc.task.dead_time import delay_block
+from fpirhc.task.dead_time import MEASUREMENT, delay_block
 from fpirhc.task.problem import Problem
 
 REALITY_STATE = "reality_state"  # signal of the state of a reality, in its own coordinates
@@ -129,7 +129,7 @@ def _sense_blocks(problem: Problem, other: Response | None, *, predicts: bool) -
         sense = [_sense_block(problem, plant.state, response)]
         return [*sense, _truth_block(problem, plant.state)] if predicts or problem.dead_time.inputs else sense
     true, shown, function = _true_blocks(problem, response)
-    if problem.sensing.ideal and not problem.dead_time.measurement:
+    if problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued:
         return true  # with coordinates measured in place of others
     return [*true, *_late_blocks(problem, shown, function)]
 
@@ -145,7 +145,7 @@ def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], tup
     blocks = [sense, _truth_block(problem, true[0])]
     if problem.symbolic_reality is None or not problem.symbolic_reality.seen:
         return blocks, true, response.function
-    direct = problem.sensing.ideal and not problem.dead_time.measurement
+    direct = problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued
     shown = (plant.state, response.signal) if direct else hidden
     function = _own_response(problem, seen=True).function
     return [*blocks, _seen_block(problem, shown, function)], shown, function
@@ -153,13 +153,14 @@ def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], tup
 
 def _late_blocks(problem: Problem, shown: tuple[Signal, Signal], response: ca.Function) -> list[Block]:
     """Blocks of sensors, their dead time and the estimator, from what the sensors see to what the controller is given."""
-    plant, behind = problem.plant, problem.dead_time.measurement / problem.period
+    plant, behind = problem.plant, problem.dead_time.wait(MEASUREMENT, problem.period)
     at = problem.real_start, problem.inputs_before, problem.real_plant.exact, np.zeros(len(problem.real_plant.names))
     resting, first = response(*at).full().ravel(), problem.start_state
     if problem.symbolic_reality is not None:
         first = problem.symbolic_reality.state_function(plant, seen=True)(*at).full().ravel()
     if not problem.sensing.ideal:
-        return problem.sensing.blocks(plant, problem.period, first, behind, shown, resting)
+        late = behind if MEASUREMENT in problem.dead_time.queued else None
+        return problem.sensing.blocks(plant, problem.period, first, late, shown, resting)
     state = replace(plant.state, start=tuple(map(float, first)))
     realised = replace(shown[1], name="realised", start=tuple(map(float, resting)))
     return [
@@ -236,13 +237,12 @@ def _seen_block(problem: Problem, shown: tuple[Signal, Signal], response: ca.Fun
 
 def _actuate(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:
     """Blocks of the command's way to the plant, and of the plant over one period."""
-    cycles = [problem.dead_time.inputs.get(name, 0.0) / problem.period for name in problem.plant.inputs]
-    if not any(cycles):
+    if not set(problem.plant.inputs) & set(problem.dead_time.queued):
         return [_advance_block(problem, disturbed, problem.plant.input)]
-    plant = problem.plant
+    plant, waits = problem.plant, [problem.dead_time.wait(name, problem.period) for name in problem.plant.inputs]
     arriving = Signal("arriving", plant.input.elements, plant.input.units, tuple(map(float, problem.inputs_before)))
     return [
-        delay_block("send_command", problem.plant.input, arriving, cycles),
+        delay_block("send_command", problem.plant.input, arriving, waits),
         _advance_block(problem, disturbed, arriving),
     ]
 
