@@ -39,7 +39,7 @@ from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, Derived, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import DERIVED, PREFIX, is_live, live_numbers, nominal, settled
+from fpirhc.symbolic.live import DERIVED, PREFIX, LiveNumber, is_live, live_numbers, nominal, settled
 from fpirhc.task.problem import Problem, cycles_per_stage
 
 _SCALE, _STEEPEST, _NUMBERS = (f"{PREFIX}{DERIVED}plan.{name}" for name in (SCALE, STEEPEST, "numbers"))
@@ -86,7 +86,7 @@ class RecedingHorizon(Controller):
             raise InvalidProblem("RecedingHorizon needs Problem(horizon=...), which this problem does not have")
         if self.cost is None and problem.cost is None:
             raise InvalidProblem("RecedingHorizon needs Problem(cost=...) or a cost of its own")
-        self.optimiser.check(_optimal_control(self.planner.planned(problem)))
+        self.optimiser.check(_optimal_control(self.planner.planned(problem), self.optimiser))
 
     def check_numbers(self, problem: Problem) -> None:
         """Raise if the weights of the cost are not valid; `derived` of the plan block checks the rest.
@@ -114,10 +114,16 @@ class RecedingHorizon(Controller):
         return blocks, delays
 
 
-def _optimal_control(problem: Problem) -> OptimalControl:
+def _optimal_control(problem: Problem, optimiser: Optimiser) -> OptimalControl:
     assert problem.horizon is not None
     assert problem.cost is not None
-    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits)
+    read = _read_from_data(optimiser)
+    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits, read)
+
+
+def _read_from_data(optimiser: Optimiser) -> dict[str, LiveNumber]:
+    """Live numbers of the optimiser that its code reads from the data of the stages."""
+    return live_numbers(*(getattr(optimiser, name) for name in optimiser.in_data))
 
 
 def _due_block(cycles: int) -> Block:
@@ -135,7 +141,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     """Block (time, plan state, parameters, shift and command of the last cycle) -> (planned input, solve statistics)."""
     assert problem.horizon is not None
     assert problem.cost is not None
-    plant, ocp = problem.plant, _optimal_control(problem)
+    plant, ocp = problem.plant, _optimal_control(problem, optimiser)
     count = live_signals(ocp.settings, plant.input).size
     data_of = stage_data(plant, problem.reference, problem.horizon, problem.cost, count)
     start = nominal(problem)
@@ -147,7 +153,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     writes = (like(plant.input, "planned"), Signal("solve", _SOLVE), scalar("_solve_status"), *logged)
 
     def step(s: Signals) -> dict[str, Value]:
-        data = data_of(s.time, s.parameters, *_live_rows(problem, ocp, s))
+        data = data_of(s.time, s.parameters, *_live_rows(problem, optimiser, ocp, s))
         # The shift of the last cycle is added to the plan's inputs, so their rate counts from the last command without it.
         first = ocp.start(s._plan_state, s._command_before - s._command_shift_last)
         lower, upper = _minus(low, s._command_shift_last), _minus(high, s._command_shift_last)
@@ -172,12 +178,12 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     def derived(values: Mapping[str, float]) -> Derived:
         lower, upper = settled(problem.limits, values).input_bounds(plant)
         ahead = replace(ocp.at(values), input_lower=lower, input_upper=upper)
-        optimiser.check(ahead)
+        settled(optimiser, values).check(ahead)
         signals = _derived_numbers(ahead) if ocp.settings else {}
         return Derived(signals, lambda: optimiser.memory(ocp).unpack(_first_memory(start, optimiser, ahead, data_of)))
 
     own = memory + Layout((scalar("plan_begun"),))
-    live = derived if is_live(problem) else None
+    live = derived if ocp.settings or is_live(problem.limits) else None
     return Block("plan", _plan_reads(plant, ocp), Layout(writes), step, own, opaque=True, derived=live)
 
 
@@ -219,11 +225,12 @@ def _derived_numbers(ocp: OptimalControl) -> dict[str, np.ndarray]:
     return {_SCALE: ocp.scale, _STEEPEST: np.array([ocp.steepest]), **numbers}
 
 
-def _live_rows(problem: Problem, ocp: OptimalControl, s: Signals) -> list[Expression]:
+def _live_rows(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, s: Signals) -> list[Expression]:
     """The live settings, and what follows from them, at the end of a stage's data; nothing without any."""
     if not ocp.settings:
         return []
-    numbers = {path: number.of(ca.MX) for path, number in live_numbers(problem.cost, problem.limits).items()}
+    live = live_numbers(problem.cost, problem.limits) | _read_from_data(optimiser)
+    numbers = {path: number.of(ca.MX) for path, number in live.items()}
     if _computed(ocp):
         numbers |= dict(zip(_computed(ocp), ca.vertsplit(getattr(s, _NUMBERS)), strict=True))
     settings = (numbers[path] for path in ocp.settings)
