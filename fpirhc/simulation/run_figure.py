@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from fpirhc.simulation.drawing import (
     PALETTE,
     draw_bands,
+    draw_changes,
     draw_legend,
     draw_line,
     draw_responses,
@@ -42,6 +43,7 @@ def run_figure(run: Run) -> Figure:
     )
     for axis, label in zip(axes, labels, strict=True):
         draw_bands(axis, run)
+        draw_changes(axis, run)
         axis.set_ylabel(label)
         draw_legend(axis)
     axes[3].set_xlabel(time_label(run))
