@@ -107,7 +107,8 @@ class Block:
         if not function.has_free():
             return function, self.reads
         open_symbols = ca.symvar(ca.veccat(*results)) if self.opaque else ca.symvar(ca.vertcat(*results))
-        settings = [v for v in open_symbols if v.name().startswith(SETTING) and v.name() not in symbols]
+        declared = {v.name() for v in ca.symvar(ca.vertcat(*columns))} if columns else set()
+        settings = [v for v in open_symbols if v.name().startswith(SETTING) and v.name() not in declared]
         inputs = self.reads + Layout(tuple(scalar(v.name()) for v in settings))
         at = len(self.reads.signals)
         columns[at:at], names = settings, [*self.reads.names, *_identifiers(settings), *self.memory.names]

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.following import Following
 from fpirhc.symbolic.layout import Expression, Layout
 from fpirhc.task.problem import Problem
 
@@ -26,6 +27,7 @@ class Seen:
         response: the measured response.
         parameters: those of the model without the estimator's change.
         valid: 0 in the first cycle, before the first command, and 1 from then on.
+        followed: what the estimator computes from its live settings; None without any.
     """
 
     state: Expression
@@ -33,6 +35,7 @@ class Seen:
     response: Expression
     parameters: Expression
     valid: Expression
+    followed: Expression | None = None
 
 
 Correct = Callable[[Seen, Mapping[str, Expression]], tuple[Expression, dict[str, Expression]]]
@@ -56,6 +59,10 @@ class Estimator(Checked, ABC):
     @abstractmethod
     def memory(self, problem: Problem) -> Layout:
         """Signals that are remembered from cycle to cycle."""
+
+    def following(self, problem: Problem) -> Following | None:  # noqa: ARG002
+        """Return the numbers that it computes from its live settings; None: none."""
+        return None
 
     @abstractmethod
     def step(self, problem: Problem) -> Correct:

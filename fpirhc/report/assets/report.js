@@ -91,7 +91,7 @@ function draw({ box, spec }) {
     scales: { x: { time: false } },
     axes: [{ ...axis, ...labelled, label: "t [" + DATA.timeUnit + "]" }, { ...axis, size: 62 }],
     cursor: { sync: { key: sync.key } },
-    hooks: { setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec), (chart) => changes(chart, spec)] },
+    hooks: { setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)], draw: [(chart) => changes(chart, spec)] },
   };
   const chart = new uPlot(options, [DATA.time, ...spec.series.map((s) => s.values)], box);
   plots.push({ chart, box, spec });
