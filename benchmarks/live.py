@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from table import write_table
 
 TASK = fp.load_problem("two_mass")
-REPEATS = 201
+REPEATS = 101
 STUDY = 10  # settings of a study
 COSTS = (
     ("CTC+FPI (eq 6)", ()),

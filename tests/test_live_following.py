@@ -56,3 +56,24 @@ def test_a_gain_that_changes_during_a_run_changes_the_estimate():
     assert after.max() > 1e-3 * abs(plain["estimate"]).max()
     with pytest.raises(InvalidValue, match="positive"):
         ready.run(seed=0, settings={"estimator.drift.a": -1.0})
+
+
+def test_every_derived_number_says_what_an_old_one_does():
+    """A device without Python needs to know; an empty text forbids the change there."""
+    arm, pendulum, two = (load_problem(name) for name in ("planar_arm", "mrac_pendulum", "two_mass"))
+    terminal = replace(two.problem.cost, terminal=fp.LQRTerminal())
+    planned = replace(two.problem, cost=terminal)
+    cases: list[tuple[Any, Any, list[str], set[bool]]] = [
+        (planned, two.controllers["RHC"], ["cost.states.q1"], {True}),
+        (two_masses(), KALMAN, ["estimator.drift.a"], {True}),
+        (pendulum.problem, pendulum.controllers["Lyapunov MRAC"], ["rate"], {False}),
+        (arm.problem, arm.controllers["AID"], ["tracking.rate"], {False}),
+    ]
+    for problem, controller, paths, safe in cases:
+        stepper = fp.Stepper(problem, controller, compiled=False, live=paths)
+        derived = {name for name in stepper._composite.settings.names if ".derived." in name}
+        assert derived
+        assert stepper.stale().keys() == derived
+        assert {bool(words) for words in stepper.stale().values()} == safe
+    plain = fp.Stepper(two.problem, two.controllers["CTC+FPI (eq 6)"], compiled=False, live=["deformation.gain"])
+    assert plain.stale() == {}

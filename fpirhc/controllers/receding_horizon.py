@@ -180,7 +180,8 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         ahead = replace(ocp.at(values), input_lower=lower, input_upper=upper)
         settled(optimiser, values).check(ahead)
         signals = _derived_numbers(ahead) if ocp.settings else {}
-        return Derived(signals, lambda: optimiser.memory(ocp).unpack(_first_memory(start, optimiser, ahead, data_of)))
+        first = lambda: optimiser.memory(ocp).unpack(_first_memory(start, optimiser, ahead, data_of))  # noqa: E731
+        return Derived(signals, first, {name: _STALE[name] for name in signals})
 
     own = memory + Layout((scalar("plan_begun"),))
     live = derived if ocp.settings or is_live(problem.limits) else None
@@ -210,6 +211,10 @@ def _derived_signals(ocp: OptimalControl) -> tuple[Signal, ...]:
     starts = {name: tuple(map(float, values)) for name, values in _derived_numbers(ocp).items()}
     elements = {_SCALE: ocp.input.elements, _STEEPEST: (), _NUMBERS: _computed(ocp)}
     return tuple(Signal(name, elements[name], (), start) for name, start in starts.items())
+
+
+_LONGER = "the line search shortens its steps; plans are the same where they converge, and need more calls"
+_STALE = {_SCALE: _LONGER, _STEEPEST: _LONGER, _NUMBERS: "the terminal cost is that of the old weights"}
 
 
 def _computed(ocp: OptimalControl) -> tuple[str, ...]:

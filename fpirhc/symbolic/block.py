@@ -40,10 +40,13 @@ class Derived:
         signals: values of signals 'setting.derived.NAME', by their names.
         memory: function that returns values of remembered signals at the start of a run, by their names; a change during a run
             does not need them.
+        stale: what becomes of a loop that goes on with the old number of a signal, by name, for a device without Python; '' where
+            it must not.
     """
 
     signals: Mapping[str, np.ndarray] = field(default_factory=dict)
     memory: Callable[[], Mapping[str, np.ndarray]] = dict
+    stale: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +161,8 @@ class Composite:
         """Return what follows from the numbers of all settings, by path."""
         parts = [b.derived(values) for b in self.blocks if b.derived is not None]
         signals = {name: value for part in parts for name, value in part.signals.items()}
-        return Derived(signals, lambda: {name: value for part in parts for name, value in part.memory().items()})
+        stale = {name: words for part in parts for name, words in part.stale.items()}
+        return Derived(signals, lambda: {name: value for part in parts for name, value in part.memory().items()}, stale)
 
     @property
     def opaque(self) -> bool:

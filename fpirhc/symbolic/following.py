@@ -26,11 +26,13 @@ class Following:
         signal: that the block reads, with the numbers of the build as its start.
         settings: from which it follows, by path.
         of: function of the numbers of all settings, by path, that returns the column.
+        stale: what becomes of a loop that goes on with the old column; '' where it must not, see `Derived`.
     """
 
     signal: Signal
     settings: Mapping[str, LiveNumber]
     of: Callable[[Values], np.ndarray]
+    stale: str
 
     @property
     def reads(self) -> Layout:
@@ -40,14 +42,16 @@ class Following:
 
     def derived(self, values: Values) -> Derived:
         """Return the column for these numbers of the settings."""
-        return Derived({self.signal.name: self.of(values)})
+        return Derived({self.signal.name: self.of(values)}, stale={self.signal.name: self.stale})
 
 
-def following(name: str, settings: Mapping[str, LiveNumber], of: Callable[[Values], np.ndarray]) -> Following | None:
+def following(
+    name: str, settings: Mapping[str, LiveNumber], of: Callable[[Values], np.ndarray], stale: str = ""
+) -> Following | None:
     """Return the column that `of` computes from live settings; None where there are none."""
     if not settings:
         return None
     start = of({path: number.value for path, number in settings.items()})
     elements = tuple(str(k) for k in range(start.size))
     signal = Signal(f"{PREFIX}{DERIVED}{next(iter(settings))}.{name}", elements, start=tuple(map(float, start)))
-    return Following(signal, settings, of)
+    return Following(signal, settings, of, stale)

@@ -37,6 +37,7 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import is_live, live_numbers, nominal, settled
 from fpirhc.task.problem import Problem
 
+_STALE = "the filter stays stable, and keeps the bandwidth of the old deviations"
 _SLOWEST = 1e-9  # decay per cycle below which a mode of the filter counts as undamped
 
 
@@ -136,7 +137,7 @@ class DisturbanceKalman(Estimator):
     def following(self, problem: Problem) -> Following | None:
         """The stationary gain, column by column."""
         fixed = nominal(problem)
-        return following("gain", live_numbers(self), lambda values: settled(self, values).gain(fixed).ravel(order="F"))
+        return following("gain", live_numbers(self), lambda v: settled(self, v).gain(fixed).ravel(order="F"), _STALE)
 
     def step(self, problem: Problem) -> Correct:
         """Prediction by the model, and the correction by the gain."""
