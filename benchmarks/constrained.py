@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from deadline import Solve, WithDeadline
 from foreign import FOREIGN, Foreign, first_states
 from judging import Judge, Judgement
 from table import write_table
@@ -28,8 +29,7 @@ from fpirhc.symbolic.native import native
 SOLVED, ROUGHLY = 1e-6, 1e-4
 WORSE = 1e-4  # IPOPT relaxes limits by 1e-8, which alone is worth up to 1e-5 of a cost
 NOISE = 1e-3  # of the limits' half ranges
-
-Solve = Callable[..., tuple[np.ndarray, float, np.ndarray]]
+DEADLINE = 2.0  # s; fatrop alone does not return from some horizons
 
 
 @dataclass(frozen=True)
@@ -119,10 +119,13 @@ def ways(ocp: OptimalControl) -> dict[str, Callable[[], Solve]]:
     from optimisers import JIT, follow, rival
 
     fixed, accuracy = fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp)), 1e-9
+    shape = ocp.input.size, ocp.stages
     return {
         "FixedPoint": lambda: follow(fixed, ocp, native(fixed.converging(ocp)).function),
         "IPOPT": lambda: rival(fp.Ipopt(accuracy=accuracy), ocp, {}),
-        "fatrop, functions compiled": lambda: rival(fp.Fatrop(accuracy=accuracy), ocp, JIT),
+        "fatrop, functions compiled": lambda: WithDeadline(
+            rival(fp.Fatrop(accuracy=accuracy), ocp, JIT), shape, DEADLINE
+        ),
         "SQP (Gauss-Newton) with qrqp": lambda: rival(fp.SequentialQuadratic(), ocp, {}),
     }
 

@@ -4,6 +4,7 @@ from .baselines.check import accept, bless, check_baseline
 from .conformance import check_controller, check_deformation, check_live, check_optimiser, check_plant, check_tracking
 from .contraction import assess_gain, check_gain, delayed_limit, response_jacobian, spectrum_over_box, spectrum_over_run
 from .controllers.computed_torque import ComputedTorque
+from .controllers.feedforward_only import FeedforwardOnly
 from .controllers.on_failure import Feedforward, HoldPlan, StopRun
 from .controllers.receding_horizon import RecedingHorizon
 from .controllers.replanning import FromMeasurement, FromMeasurementTracked, FromPlan
@@ -21,6 +22,8 @@ from .controllers.slots.floquet import Floquet, floquet_radius
 from .controllers.slots.schedules import FixedSchedule, Periodic
 from .controllers.slots.slot import Slot
 from .controllers.slots.slotted import Slotted
+from .controllers.target_pairing import ThroughModel
+from .controllers.wrappers.cascade import Cascade
 from .controllers.wrappers.estimating import Estimating
 from .controllers.wrappers.exact_model import ExactModel
 from .controllers.wrappers.predicted import ByDesired, ByModel, Predicted
@@ -59,8 +62,10 @@ from .optimisers.nlp import Fatrop, Ipopt, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.quadratic_solvers import Osqp, Qrqp
 from .optimisers.reduced_gradient import ReducedGradient
+from .plant.algebraic import Algebraic
 from .plant.implicit import ImplicitMidpoint, RadauIIA
 from .plant.integrators import Cvodes, Euler, RungeKutta4
+from .plant.parameter import outside
 from .plant.plant import Parameter, Plant, structural_order
 from .plant.regressor import Combination, Regressor, linear_parameters
 from .plant.relative_order import OutputChain, output_chain
@@ -84,6 +89,8 @@ from .sensing import (
     StateVariableFilter,
     VelocityDifference,
 )
+from .sensing.beliefs.kalman_filter import KalmanFilter
+from .sensing.beliefs.model_states import ModelStates
 from .simulation.lyapunov_view import LyapunovView, lyapunov_view
 from .simulation.machine import Watch
 from .simulation.metrics import Metric, Metrics, measure
@@ -104,9 +111,12 @@ from .task.dead_time import DeadTime
 from .task.disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
 from .task.foreign import Foreign
 from .task.limits import Limits, PathConstraint
+from .task.outside import Believed, Known, Unknown
 from .task.problem import Problem
 from .task.reality import Reality
 from .task.reference import Table, Trajectory
+from .task.samples import Samples
+from .task.set_point import Setpoint
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
 
@@ -116,13 +126,16 @@ __all__ = [
     "AccelerationFeedback",
     "AdaptiveInverseDynamics",
     "Affine",
+    "Algebraic",
     "Anderson",
     "Answer",
     "BacksteppingMRAC",
+    "Believed",
     "ByDesired",
     "ByError",
     "ByLookAhead",
     "ByModel",
+    "Cascade",
     "Certificate",
     "ColouredNoise",
     "Combination",
@@ -141,6 +154,7 @@ __all__ = [
     "Exponential",
     "Fatrop",
     "Feedforward",
+    "FeedforwardOnly",
     "Filtered",
     "FixedPoint",
     "FixedSchedule",
@@ -163,6 +177,8 @@ __all__ = [
     "ImplicitMidpoint",
     "Increment",
     "Ipopt",
+    "KalmanFilter",
+    "Known",
     "LQRTerminal",
     "Ladder",
     "Limits",
@@ -176,6 +192,7 @@ __all__ = [
     "Metric",
     "Metrics",
     "ModelReferenced",
+    "ModelStates",
     "MovingHorizon",
     "Noise",
     "Normal",
@@ -211,12 +228,14 @@ __all__ = [
     "Rotation",
     "Run",
     "RungeKutta4",
+    "Samples",
     "SavitzkyGolay",
     "ScenarioComparison",
     "SelfPaired",
     "Sensing",
     "Sensor",
     "SequentialQuadratic",
+    "Setpoint",
     "Sigmoid",
     "Sine",
     "SlidingMode",
@@ -232,11 +251,13 @@ __all__ = [
     "StopRun",
     "Suggestion",
     "Table",
+    "ThroughModel",
     "Trajectory",
     "Tuned",
     "Tuning",
     "Uncertain",
     "Uniform",
+    "Unknown",
     "VelocityDifference",
     "Watch",
     "accept",
@@ -264,6 +285,7 @@ __all__ = [
     "lyapunov_view",
     "measure",
     "output_chain",
+    "outside",
     "predict_response",
     "response_jacobian",
     "review",

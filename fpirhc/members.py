@@ -48,6 +48,7 @@ FAMILIES: Mapping[str, Family] = {
     "deformations": Family("fpirhc.deformation.base:Deformation", ("fpirhc.deformation",)),
     "tracking laws": Family("fpirhc.tracking.base:Tracking", ("fpirhc.tracking",)),
     "derivative estimators": Family("fpirhc.sensing.base:DerivativeEstimator", ("fpirhc.sensing",)),
+    "beliefs": Family("fpirhc.sensing.belief:Belief", ("fpirhc.sensing.beliefs",)),
     "optimisers": Family("fpirhc.optimisers.base:Optimiser", ("fpirhc.optimisers",)),
     "controllers": Family("fpirhc.controllers.base:Controller", ("fpirhc.controllers",)),
     "estimators": Family("fpirhc.learning.estimators.base:Estimator", ("fpirhc.learning.estimators",)),

@@ -350,10 +350,22 @@ TWO_TASK = fp.Problem(
             r"'k' is 20 in the model, outside \[0, 10\]",
         ),
         (
-            task(spring(), dead_time=fp.DeadTime(inputs={"u": PERIOD})),
+            task(spring(), sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["y"], belief=fp.ModelStates())),
             fp.RecursiveLeastSquares(SPRING, NOISE, 1.0),
             NotSupported,
-            "no dead time",
+            "RecursiveLeastSquares learns from the response, which needs y', and no sensor shows it",
+        ),
+        (
+            task(spring(), sensing=fp.Sensing(estimator=fp.PositionDifference())),
+            fp.DisturbanceKalman({"y": 1.0}, {"y": 1e-3, "y''": 1.0}),
+            NotSupported,
+            "y'' is estimated 0.5 cycles late",
+        ),
+        (
+            task(spring()),
+            fp.DisturbanceKalman({"y": 1.0}, {"y'''": 1.0}),
+            InvalidProblem,
+            "state or response.*Valid: y, y', y''",
         ),
     ],
 )

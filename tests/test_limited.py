@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import casadi as ca
@@ -221,6 +222,26 @@ def test_driver_and_graph_agree_with_limits(iterations, realtime):
         np.testing.assert_allclose(diagnostics.full()[:3], other_diagnostics.full()[:3], rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(one.full(), other.full(), atol=1e-5)
         memories = [r[2] for r in results]
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
+@pytest.mark.parametrize("number", [34, 38])
+def test_descents_solve_what_the_filter_gives_up(number):
+    """A reactor that already ignites, with limits of its coolant only: no first plan gets through the filter."""
+    case = FOREIGN["reactor"]()
+    reference = fp.Trajectory(lambda t: {"C": 0.5 + 0 * t, "T": 350 + 0 * t})
+    case = replace(case, limits=fp.Limits(inputs=case.limits.inputs), spread={"T": 20.0, "C": 0.4})
+    ocp = transcribe(case.plant, reference, case.horizon, case.cost, case.limits)
+    data = stage_data(case.plant, reference, case.horizon, case.cost)(0.0, case.plant.approximate)
+    first = case.first(ocp, first_states(case, 100, 1)[:, number])
+    graph = limited_step(ocp, fp.FixedPoint(1, tolerance_of(ocp))._limited(1000, realtime=False))
+    values = first, data, ocp.input_lower, ocp.input_upper, np.zeros(graph.size1_in(4))
+    (one, diagnostics, _), (other, other_diagnostics, _) = graph(*values), native(graph).function(*values)
+    assert int(diagnostics[4]) == fp.Status.OK
+    judgement = Judge(ocp)(np.asarray(other.full()), first, np.asarray(data.full()))
+    assert judgement.residual <= 1e-6
+    np.testing.assert_array_equal(diagnostics.full()[3:], other_diagnostics.full()[3:])
+    np.testing.assert_allclose(one.full(), other.full(), atol=1e-6)
 
 
 def test_a_horizon_that_cannot_be_kept_ends_with_the_least_violation():

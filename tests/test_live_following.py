@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -61,7 +61,7 @@ def test_a_gain_that_changes_during_a_run_changes_the_estimate():
 def test_every_derived_number_says_what_an_old_one_does():
     """A device without Python needs to know; an empty text forbids the change there."""
     arm, pendulum, two = (load_problem(name) for name in ("planar_arm", "mrac_pendulum", "two_mass"))
-    terminal = replace(two.problem.cost, terminal=fp.LQRTerminal())
+    terminal = replace(cast(Any, two.problem.cost), terminal=fp.LQRTerminal())
     planned = replace(two.problem, cost=terminal)
     cases: list[tuple[Any, Any, list[str], set[bool]]] = [
         (planned, two.controllers["RHC"], ["cost.states.q1"], {True}),

@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import fpirhc as fp
@@ -60,9 +61,9 @@ def test_pictures_mark_the_changes(comparison):
     """A vertical line at every change in every part of a run's picture, and none without changes."""
 
     def marks(run: fp.Run) -> list[list[float]]:
-        dotted = [[line.get_xdata() for line in axis.lines if line.get_linestyle() == ":"] for axis in run.plot().axes]
-        lines = [[times[0] for times in part if times[0] == times[-1]] for part in dotted]
-        return [[float(x) for x in part] for part in lines]
+        dotted = [[line for line in axis.lines if line.get_linestyle() == ":"] for axis in run.plot().axes]
+        times = [[np.asarray(line.get_xdata(), dtype=float) for line in part] for part in dotted]
+        return [[float(x[0]) for x in part if x[0] == x[-1]] for part in times]
 
     assert marks(comparison[NAME].run) == [[0.1, 0.2]] * 4
     assert marks(comparison["CTC"].run) == [[]] * 4

@@ -20,11 +20,13 @@ from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.simulation.run import Run
+from fpirhc.simulation.sample import raw_measurements
 from fpirhc.simulation.simulate import simulate
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.status import Status
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.task.limits import Limits
+from fpirhc.task.outside import really_known
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Trajectory
 
@@ -114,7 +116,9 @@ class _Trial:
 
 def _anything(problem: Problem) -> dict[str, tuple[float, float]]:
     """No sample of a simulated run is implausible, also not of one that diverges."""
-    return dict.fromkeys((*problem.plant.state.elements, *response_names(problem.plant)), (-np.inf, np.inf))
+    sensing, plant = problem.sensing, problem.plant
+    names = sensing.measures(plant) if sensing.estimates else (*plant.state.elements, *response_names(plant))
+    return dict.fromkeys(names, (-np.inf, np.inf))
 
 
 def frozen_value(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
@@ -177,9 +181,12 @@ def exact_model_tracks(trial: _Trial, generator: np.random.Generator) -> None:  
 
 def _exact(problem: Problem) -> Problem:
     parameters = {
-        name: Parameter(approximate=p.exact, exact=p.exact, unit=p.unit) for name, p in problem.plant.parameters.items()
+        name: Parameter(approximate=p.exact, exact=p.exact, unit=p.unit, outside=p.outside)
+        for name, p in problem.plant.parameters.items()
     }
-    return replace(problem, plant=replace(problem.plant, parameters=parameters), disturbances={}, sensing=Sensing())
+    plant = replace(problem.plant, parameters=parameters)
+    signals = really_known(problem.signals)
+    return replace(problem, plant=plant, disturbances={}, sensing=Sensing(), signals=signals)
 
 
 def same_command_everywhere(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
@@ -206,20 +213,20 @@ def same_command_everywhere(trial: _Trial, generator: np.random.Generator) -> No
 
 
 def _replayed(stepper: Stepper, run: Run) -> Array:
-    memory, commands = stepper.start(), np.empty_like(run["command"])
+    memory, commands, measured = stepper.start(), np.empty_like(run["command"]), raw_measurements(run)
     for k in range(run.cycles):
-        commands[k], memory = stepper.step(float(run.time[k]), run["state"][k], run["realised"][k], memory)
+        commands[k], memory = stepper.step_measured(float(run.time[k]), measured[k], memory)
     return commands
 
 
 def same_arguments_same_command(trial: _Trial, generator: np.random.Generator) -> None:
     """A cycle depends on its arguments alone: two calls with the same arguments give the same result."""
     run, stepper = trial.run, trial.stepper
-    memory = stepper.start()
+    memory, measured = stepper.start(), raw_measurements(run)
     for k in generator.integers(0, run.cycles, size=5):
-        arguments = float(run.time[k]), run["state"][k], run["realised"][k]
-        one, next_memory = stepper.step(*arguments, memory)
-        other, other_memory = stepper.step(*arguments, memory)
+        arguments = float(run.time[k]), measured[k]
+        one, next_memory = stepper.step_measured(*arguments, memory)
+        other, other_memory = stepper.step_measured(*arguments, memory)
         hold(
             np.array_equal(one, other, equal_nan=True) and np.array_equal(next_memory, other_memory, equal_nan=True),
             f"two calls with the same arguments give {one} and {other}",

@@ -44,7 +44,9 @@ def sampled_jacobian(problem: Problem) -> ca.Function:
     return ca.Function("fpirhc_sampled_jacobian", arguments, [ca.densify(jacobian)], names, ["jacobian"])
 
 
-def sampled_jacobians(problem: Problem, real: Array, states: Array, deformed: Array, believed: Array) -> Array:
+def sampled_jacobians(
+    problem: Problem, real: Array, states: Array, deformed: Array, believed: Array, exact: Array | None = None
+) -> Array:
     """Return J of every row with the exact parameters of the reality, shape (rows, n, n).
 
     Args:
@@ -52,10 +54,11 @@ def sampled_jacobians(problem: Problem, real: Array, states: Array, deformed: Ar
         real: states of the reality, shape (rows, its nx).
         states: states of the model, shape (rows, nx).
         deformed: requests, shape (rows, n).
-        believed: parameters of the model, shape (np,).
+        believed: parameters of the model, shape (np,), or one set per row.
+        exact: parameters of the reality, one set per row; None: its exact ones.
     """
     count, n = len(real), deformed.shape[1]
-    exact = np.repeat(problem.real_plant.exact[:, None], count, axis=1)
-    assumed = np.repeat(np.asarray(believed, dtype=float)[:, None], count, axis=1)
-    stacked = sampled_jacobian(problem).map(count)(real.T, states.T, deformed.T, exact, assumed)
+    true = np.asarray(problem.real_plant.exact if exact is None else exact, dtype=float)
+    rows = (np.broadcast_to(v, (count, v.shape[-1])).T for v in (true, np.asarray(believed, dtype=float)))
+    stacked = sampled_jacobian(problem).map(count)(real.T, states.T, deformed.T, *rows)
     return np.asarray(stacked.full()).reshape((n, count, n)).transpose(1, 0, 2)

@@ -192,12 +192,13 @@ def response_jacobians(plant: Plant, states: Array, deformed: Array, exact: Arra
         states: shape (rows, nx).
         deformed: requests, shape (rows, n).
         exact: parameters of the plant, one set per row, shape (rows, np).
-        approximate: parameters of the model, shape (np,); None: the plant's own.
+        approximate: parameters of the model, shape (np,), or one set per row; None: the plant's own.
     """
     model = plant.approximate if approximate is None else np.asarray(approximate, dtype=float)
     function, n = response_jacobian(plant), deformed.shape[1]
     count = len(states)
-    stacked = function.map(count)(states.T, deformed.T, exact.T, np.repeat(model[:, None], count, axis=1))
+    assumed = np.broadcast_to(model, (count, model.shape[-1]))
+    stacked = function.map(count)(states.T, deformed.T, exact.T, assumed.T)
     return np.asarray(stacked.full()).reshape((n, count, n)).transpose(1, 0, 2)
 
 

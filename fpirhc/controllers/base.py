@@ -13,29 +13,36 @@ A command that is not finite never reaches the plant: the last command is held, 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import reduce
 
 import casadi as ca
 
 from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
+from fpirhc.controllers.largest_response import largest_response
 from fpirhc.controllers.mirror import measured_state, mirror_blocks, with_measured_state
+from fpirhc.controllers.outside_block import ACTED, NOW, Told
+from fpirhc.controllers.own_reference import given_signals, motion_of, own_signals, own_values, with_reference
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
-from fpirhc.symbolic.expression import Signals, is_finite
+from fpirhc.symbolic.expression import Signals, Value, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem
 
+_ABSURD = 1e4  # times the largest response that limits allow; a loop that diverges stays far below
+
 
 def controller_reads(problem: Problem, controller: Controller) -> Layout:
-    """Return what a controller reads in every cycle: time, state, realised response, parameters."""
+    """Return what a controller reads in every cycle: time, state, realised response, parameters, and what a reference is given."""
     plant, response = problem.plant, controller.response(problem)
     realised = response.signal if response else plant.response_signal("realised")
-    return Layout((plant.time, plant.state, realised, controller.model_plant(problem).parameter))
+    parameters = controller.model_plant(problem).parameter
+    return Layout((plant.time, plant.state, realised, parameters, *given_signals(problem)))
 
 
 def compose_controller(problem: Problem, controller: Controller, *, ahead: bool = False) -> Composite:
@@ -44,15 +51,40 @@ def compose_controller(problem: Problem, controller: Controller, *, ahead: bool 
     Args:
         problem: that the controller is composed for.
         controller: checked here against the problem.
-        ahead: whether time and state are those at which the command will act. The step then also reads the measured state where a
-            block needs it.
+        ahead: whether time and state are those at which the command will act. The step then also reads the measured state, and the
+            signals of the last cycle, where a block needs them.
     """
     ready = checked(problem, controller)
     blocks, delays = ready.blocks(problem)
+    blocks = with_reference(problem, blocks)
     reads, named = controller_reads(problem, ready), with_measured_state(problem.plant, blocks)
     if ahead and len(named) > len(blocks):
         reads, named = reads + Layout((measured_state(problem.plant),)), blocks
-    return compose("controller", reads, named, delays, outputs=("command",))
+    return compose_informed(problem, ready, reads, named, delays, ahead=ahead)
+
+
+def compose_informed(
+    problem: Problem, ready: Controller, reads: Layout, blocks: list[Block], delays: list[Delay], *, ahead: bool = False
+) -> Composite:
+    """Return blocks as one step to the command, behind a block of what the controller is told of signals from outside.
+
+    Args:
+        problem: that the controller is composed for.
+        ready: the controller, checked.
+        reads: what the step reads.
+        blocks: of the step.
+        delays: what the step remembers of its signals.
+        ahead: whether the time is the one at which the command will act.
+    """
+    told = Told(ready.model_plant(problem), ready.told(problem), problem.period)
+    compares = any(ACTED in block.reads for block in blocks)
+    first = told.block(remembers=compares and not ahead)
+    if first is None:
+        return compose("controller", reads, blocks, delays, outputs=("command",))
+    needed = reads + Layout(told.reads if compares else ())
+    inner = compose("informed", needed, blocks, delays, outputs=("command",))
+    block = embedded("informed", inner, {"parameters": like(told.plant.parameter, NOW)})
+    return compose("controller", needed if ahead else reads, [first, block], outputs=("command",))
 
 
 def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block:
@@ -82,22 +114,34 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
     )
 
 
+def fed(block: Block, name: str, source: Signal) -> Block:
+    """Return the block with `source` in place of the signal `name`; a block that does not read `name` stays as it is."""
+    if name not in block.reads:
+        return block
+    reads = tuple(source if s.name == name else s for s in block.reads.signals)
+
+    def step(s: Signals) -> Mapping[str, Value]:
+        return block.step(Signals({**vars(s), name: getattr(s, source.name)}))
+
+    return Block(block.name, Layout(reads), block.writes, step, block.memory, block.opaque, block.derived)
+
+
 def reference_block(problem: Problem) -> Block:
     """Block (time, state) -> (reference state, response of the controlled coordinates, error of the judged ones)."""
     plant = problem.plant
-    function = problem.reference.function(plant)
+    function = motion_of(problem)
     controlled = list(plant.controlled_indices)
     places = [plant.state.elements.index(c) for c in problem.judged_names]
 
     def step(s: Signals) -> dict[str, Expression]:
-        state, response = function(s.time)
+        state, response = function(s.time, *own_values(problem, s))
         return {
             "reference": state,
             "_reference_response": response[controlled],
             "error": state[places] - s.state[places],
         }
 
-    reads = Layout((plant.time, plant.state))
+    reads = Layout((plant.time, plant.state, *own_signals(problem)))
     writes = (
         like(plant.state, "reference"),
         plant.response_signal("_reference_response"),
@@ -124,7 +168,13 @@ def closing_blocks(
     plant = problem.plant
     closing, delays = commanding_blocks(problem, judged)
     mirrors, mirror_delays = mirror_blocks(problem, deformation)
-    blocks = [*mirrors, deform_block(plant, deformation, problem.warm_up_cycles), invert_block(plant), *closing]
+    largest = largest_response(problem)
+    blocks = [
+        *mirrors,
+        deform_block(plant, deformation, problem.warm_up_cycles, largest),
+        invert_block(plant),
+        *closing,
+    ]
     before = [] if mirrors else [Delay(plant.response_signal("_deformed_last"), "deformed")]
     return blocks, [*delays, *mirror_delays, *before]
 
@@ -148,16 +198,22 @@ def _warm_up_block(warm_up_cycles: float) -> Block:
     return Block("running", Layout((scalar("warm_up"),)), Layout((scalar("_warm_up_now"),)), step)
 
 
-def deform_block(plant: Plant, deformation: Deformation, warm_up_cycles: float = 1) -> Block:
+def deform_block(
+    plant: Plant, deformation: Deformation, warm_up_cycles: float = 1, largest: Sequence[float] = ()
+) -> Block:
     """Block (request before, realised, desired) -> deformed request; without a valid pair it passes the desired response.
 
     A model-referenced deformation is given the model's response, '_modelled', in place of the request before.
+
+    A response error beyond 10 000 times the largest response that limits allow is a fault of the sample. A map that remembers
+    remembers nothing of it, and the request stays as it was; the others come back by themselves.
 
     Args:
         plant: whose responses are deformed.
         deformation: the map.
         warm_up_cycles: number of cycles, counted by 'warm_up', after which a pair is valid: one, or more where the response is
             estimated from more samples.
+        largest: response of every controlled coordinate that the limits of the inputs allow; empty: any.
     """
     memory = deformation.memory(plant.controlled_names)
     request_before = "_deformed_last" if deformation.mirror is None else "_modelled"
@@ -168,14 +224,28 @@ def deform_block(plant: Plant, deformation: Deformation, warm_up_cycles: float =
         remembered = {m: getattr(s, m) for m in memory.names}
         deformed, next_memory = deformation.step(getattr(s, request_before), s.realised, s.desired, remembered)
         valid = s.warm_up > warm_up_cycles - 0.5
-        next_values = {f"{m}_next": ca.if_else(valid, next_memory[m], remembered[m]) for m in memory.names}
+        sane = _sane(s.realised - s.desired, largest) if memory.names else None
+        learns = valid if sane is None else ca.logic_and(valid, sane)
+        next_values = {f"{m}_next": ca.if_else(learns, next_memory[m], remembered[m]) for m in memory.names}
         shown = {name: next_values[f"{source}_next"] for name, source in deformation.shown().items()}
-        next_request = ca.if_else(valid, deformed, s.desired)
+        if sane is not None and deformation.mirror is None:
+            deformed = ca.if_else(sane, deformed, s._deformed_last)
+            learns = valid
+        next_request = ca.if_else(learns, deformed, s.desired)
         return {"_deformed_unclipped": next_request, "_deformation": next_request - s.desired, **shown, **next_values}
 
     written = [plant.response_signal(name) for name in ("_deformed_unclipped", "_deformation")]
     logged = [scalar(name) for name in deformation.shown()]
     return Block("deform", Layout(reads), Layout((*written, *logged)), step, memory)
+
+
+def _sane(error: Expression, largest: Sequence[float]) -> Expression | None:
+    """Whether no response error is absurd; NaN is not, because it has to show. None where there are no limits."""
+    sizes = zip(ca.vertsplit(error), largest, strict=True) if largest else ()
+    absurd = [ca.fabs(one) > _ABSURD * size for one, size in sizes if math.isfinite(size)]
+    if not absurd:
+        return None
+    return ca.logic_not(reduce(ca.logic_or, absurd))
 
 
 def invert_block(plant: Plant) -> Block:

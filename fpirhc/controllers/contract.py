@@ -29,6 +29,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Signal
 from fpirhc.symbolic.live import is_live, nominal
+from fpirhc.task.outside import External
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -134,6 +135,10 @@ class Controller(Checked, ABC):
         """Return the parameters of the controller's model, shape (np,): the approximate ones."""
         return plant.approximate if self.inner is None else self.inner.parameters(plant)
 
+    def told(self, problem: Problem) -> Mapping[str, External]:
+        """Return the signals from outside with what the controller's model is told of them: those of the problem."""
+        return problem.signals if self.inner is None else self.inner.told(problem)
+
     def model_plant(self, problem: Problem) -> Plant:
         """Return the plant that is the controller's model: the problem's."""
         return problem.plant if self.inner is None else self.inner.model_plant(problem)
@@ -144,9 +149,19 @@ class Controller(Checked, ABC):
         return False if self.inner is None else self.inner.learns
 
     @property
+    def model_acts_at_once(self) -> bool:
+        """Whether a change of its model changes the command in every cycle; False where a plan holds its inputs."""
+        return self.planner is None if self.inner is None else self.inner.model_acts_at_once
+
+    @property
     def deforms_response(self) -> bool:
         """Whether its deformation acts on the desired response; False where it acts on another signal, such as a command."""
         return True if self.inner is None else self.inner.deforms_response
+
+    @property
+    def deforms_target(self) -> bool:
+        """Whether its deformation acts on the target of an inner controller, and the response is the output itself."""
+        return False if self.inner is None else self.inner.deforms_target
 
     @property
     def law(self) -> Tracking | None:
@@ -194,6 +209,15 @@ class Controller(Checked, ABC):
             return self.around(self.inner.with_deformation(deformation))
         raise NotSupported(f"{type(self).__name__} has no deformation that can be replaced")
 
+    def stated(self, problem: Problem) -> Controller:
+        """Return the controller with every number of its own stated that it would take from the problem; itself without any."""
+        del problem
+        return self
+
+    def following_its_model(self) -> Self:
+        """Return the controller whose command follows a change of its model's parameters in every cycle, also between plans."""
+        return self if self.inner is None else self.around(self.inner.following_its_model())
+
     def demand(self, problem: Problem) -> Demand | None:
         """Return how much the desired response changes; None where the deformation's automatic settings stay open."""
         if self.inner is not None:
@@ -235,6 +259,7 @@ def resolved(problem: Problem, controller: Controller) -> Controller:
     if controller.inner is not None:
         inner = resolved(controller.inner_problem(problem), controller.inner)
         controller = controller if inner is controller.inner else controller.around(inner)
+    controller = controller.stated(problem)
     deformation = controller.deformation
     demand = controller.demand(problem) if deformation.automatic else None
     return controller if demand is None else controller.with_deformation(deformation.suited(demand))
@@ -265,6 +290,8 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
     else:
         ready.check(problem)
     check_form(problem, ready)
+    if ready.deforms_target:
+        return ready  # its own check judges a gain that acts on targets
     if ready.response(problem) is None:
         check_gain_sign(problem, ready.deformation)
         check_response_delay(problem, ready.deformation)

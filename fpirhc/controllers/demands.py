@@ -24,10 +24,12 @@ _SAMPLES = 2000
 
 
 def reference_demand(problem: Problem, law: Tracking | None = None) -> Demand:
-    """Return the change period max|d/dt r^N| of the nominal response r^N, from cycle to cycle, with the recovery for `law`."""
+    """Return the change period max|d/dt r^N| of the nominal response r^N, or its largest jump, with the recovery for `law`."""
     t = ca.MX.sym("t")
     responses = problem.reference.function(problem.plant)(t)[1][list(problem.plant.controlled_indices)]
-    change = problem.period * _slew(ca.Function("r", [t], [responses]), problem.duration)
+    response_of, jump = ca.Function("r", [t], [responses]), problem.reference.largest_jump(problem.plant)
+    smooth = problem.period * _slew(response_of, problem.duration)
+    change = max(jump, _largest_change(response_of, problem)) if jump else smooth
     return Demand(change, sudden=False, recovery=_recovery(problem, law))
 
 
@@ -80,6 +82,13 @@ def _largest_error(problem: Problem) -> float:
     free = np.asarray(plant.controlled_response_function.map(_SAMPLES)(states, still, model).full())
     sizes = np.linalg.norm(responses[list(plant.controlled_indices)] - free, axis=0)
     return float(sizes[np.isfinite(sizes)].max(initial=0.0))
+
+
+def _largest_change(function: ca.Function, problem: Problem) -> float:
+    """Largest change of a Function of time over one cycle of the run, sampled."""
+    times = np.linspace(0.0, problem.duration - problem.period, _SAMPLES)
+    before, after = (np.asarray(function.map(_SAMPLES)(t[None, :]).full()) for t in (times, times + problem.period))
+    return float(np.max(np.linalg.norm(after - before, axis=0)))
 
 
 def _slew(function: ca.Function, duration: float) -> float:

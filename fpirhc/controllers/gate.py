@@ -3,9 +3,10 @@
     sample fits:  the controller's step, unchanged
     otherwise:    the last command again, and every memory as it was
 
-A sample fits when time, state and response are finite and inside their plausible range. The controller itself is only given samples
-that fit: in a skipped cycle it is given the last good one again, and its results are dropped. So no solver inside meets a number
-that is not finite. What is remembered is selected, never blended: a product with NaN would be NaN.
+A sample fits when time, state and response - or the raw measurements that they are estimated from - are finite and inside their
+plausible range. The results of a skipped cycle are dropped. What is remembered is selected, never blended: a product with NaN would
+be NaN. A graph of calls is only given samples that fit. In a skipped cycle it is given the last good one again, so that no solver
+inside meets a number that is not finite. Scalar code has no solver inside, and needs no sample in store.
 
 An implausible sample is doubted, not refused for ever: after 20 of them in a row the plant is where it should not be, and the
 controller is given what is measured, up to 100 times the range. What is not finite is never believed.
@@ -36,10 +37,10 @@ from fpirhc.task.problem import Problem
 HELD = "held_command"  # in the memory: the command that a skipped cycle repeats
 DOUBTED = "doubted"  # in the memory: samples in a row that were finite but not plausible
 TAKEN = "taken"  # time stamp of a sample
-_SAMPLE = ("time", "state", "realised", TAKEN)
+_SAMPLE = ("time", "state", "realised", "measured", "arrived", TAKEN)
 _DOUBTED = 20  # samples in a row after which the plant, and not the sensor, is where it should not be
 _WIDER = 100.0  # factor of the range inside which such samples are believed
-_INNER = "controller_memory"
+INNER = "controller_memory"  # in the memory: that of a graph as one signal
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +74,18 @@ class Gate:
         return Layout(tuple(s for s in self.reads.signals if s.name in _SAMPLE and s.name not in self.trusted))
 
     @property
+    def stored(self) -> Layout:
+        """The signals of the last good sample that are kept: all for a graph, and the time stamp that the next one must exceed."""
+        return Layout(tuple(s for s in self.sample.signals if self.inner.opaque or s.name == TAKEN))
+
+    @property
     def memory(self) -> Layout:
-        """The last command, the last good sample, the count of doubted ones, and the controller's memory."""
+        """The last command, what is kept of the last good sample, the count of doubted ones, and the controller's memory."""
         plant = self.problem.plant
         starts = {"state": tuple(float(v) for v in self.problem.start_state), TAKEN: (-FINITE,)}
         first = self.problem.inputs_before
         held = Signal(HELD, plant.input.elements, plant.input.units, tuple(float(v) for v in first))
-        good = [replace(s, name=f"good_{s.name}", start=starts.get(s.name, ())) for s in self.sample.signals]
+        good = [replace(s, name=f"good_{s.name}", start=starts.get(s.name, s.start)) for s in self.stored.signals]
         doubted = [scalar(DOUBTED)] if self.plausible else []
         return Layout((held, *good, *doubted)) + self.controller_memory
 
@@ -89,11 +95,11 @@ class Gate:
         memory = self.inner.memory
         if not self.inner.opaque:
             return memory
-        return Layout((Signal(_INNER, memory.columns, memory.units, tuple(float(v) for v in memory.start())),))
+        return Layout((Signal(INNER, memory.columns, memory.units, tuple(float(v) for v in memory.start())),))
 
     def named(self, memory: Layout) -> Layout:
         """Return a layout with the controller's memory under the names of its signals, where it is one signal there."""
-        whole = {_INNER: self.inner.memory.signals}
+        whole = {INNER: self.inner.memory.signals}
         return Layout(tuple(s for signal in memory.signals for s in whole.get(signal.name, (signal,))))
 
     def block(self) -> Block:
@@ -105,10 +111,11 @@ class Gate:
 
         def step(s: Signals) -> dict[str, Expression]:
             now = [getattr(s, n) for n in self.sample.names]
-            good = [getattr(s, f"good_{n}") for n in self.sample.names]
+            good = [getattr(s, f"good_{n}") for n in self.stored.names]
             before = getattr(s, DOUBTED) if self.plausible else expression(0.0)
-            fits, held, seen_column, doubted = entry(ca.vertcat(*now), getattr(s, HELD), ca.vertcat(*good), before)
-            seen = self.sample.split(seen_column)
+            fits, held, good_next, doubted = entry(ca.vertcat(*now), getattr(s, HELD), ca.vertcat(*good), before)
+            kept = self.stored.split(good_next)
+            seen = kept if self.inner.opaque else {}
             sample = [seen.get(r, getattr(s, r)) for r in self.inner.reads.names]
             memory = self.controller_memory.join({m: getattr(s, m) for m in self.controller_memory.names})
             usable = expression(1.0) if "memory" in self.trusted else finite(memory, opaque=self.inner.opaque)
@@ -118,42 +125,49 @@ class Gate:
                 status = ca.if_else(usable, values["status"], int(Status.RESTARTED))
                 values["status"] = ca.if_else(fits, status, int(Status.BAD_SAMPLE))
             remembered = {**self.controller_memory.split(memory_next), HELD: command}
-            remembered |= {f"good_{n}": v for n, v in seen.items()}
+            remembered |= {f"good_{n}": v for n, v in kept.items()}
             remembered |= {DOUBTED: doubted} if self.plausible else {}
             return {**values, "command": command, **{f"{m}_next": v for m, v in remembered.items()}}
 
         derived = self._derived if self.inner.derived_if_any else None
-        return Block("gate", self.reads, trace, step, self.memory, opaque=self.inner.opaque, derived=derived)
+        opaque, inside = self.inner.opaque, self.inner
+        return Block("gate", self.reads, trace, step, self.memory, opaque=opaque, derived=derived, inside=inside)
 
     def _derived(self, values: Values) -> Derived:
         """What follows from live settings, with the controller's memory as this block has it."""
         inner = self.inner.derived(values)
         if not self.inner.opaque:
             return inner
-        return replace(inner, memory=lambda: {_INNER: self.inner.memory.pack(inner.memory())})
+        return replace(inner, memory=lambda: {INNER: self.inner.memory.pack(inner.memory())})
 
     def _entry(self) -> ca.Function:
-        """Function (sample, held, last good sample, doubted) -> (whether the sample fits, held, sample to use, doubted).
+        """Function (sample, held, stored, doubted) -> (whether the sample fits, held, to store, doubted).
 
         It is scalar code: a graph would pass over these few numbers one operation after the other.
         """
-        size, inputs = self.sample.size, self.problem.plant.input.size
-        sample, good, held = ca.SX.sym("sample", size), ca.SX.sym("good", size), ca.SX.sym("held", inputs)
+        inputs, stored = self.problem.plant.input.size, self.stored
+        sample, good, held = (
+            ca.SX.sym("sample", self.sample.size),
+            ca.SX.sym("good", stored.size),
+            ca.SX.sym("held", inputs),
+        )
         doubted = ca.SX.sym("doubted")
         command, last, count = held, good, doubted
         if "memory" not in self.trusted:
-            names = (HELD, *(f"good_{n}" for n in self.sample.names))
+            names = (HELD, *(f"good_{n}" for n in stored.names))
             start = ca.DM([*np.concatenate([self.memory[n].start_vector() for n in names]), 0.0])
             column = ca.vertcat(held, good, doubted)
             column = ca.if_else(every_finite(column), column, start)
             command = clip(column[:inputs], *self.problem.limits.input_bounds(self.problem.plant))
             last, count = column[inputs:-1], column[-1]
-        possible, inside = self._possible(sample, last), self._inside(sample, 1.0)
+        possible = self._possible(sample, last)
+        inside = self._inside(sample, 1.0)
         believed = ca.logic_and(count > _DOUBTED - 0.5, self._inside(sample, _WIDER))
         fits = ca.logic_and(possible, ca.logic_or(inside, believed))
         strange = ca.logic_and(possible, ca.logic_not(inside))
-        count_next = ca.if_else(strange, ca.fmin(count + 1, _DOUBTED), ca.if_else(possible, 0, count))
-        results = [fits, command, ca.if_else(fits, sample, last), count_next]
+        count_next = ca.if_else(strange, count + (count < _DOUBTED - 0.5), ca.if_else(possible, 0, count))
+        now = ca.vertcat(*(sample[self.sample.slice(n)] for n in stored.names))
+        results = [fits, command, ca.if_else(fits, now, last), count_next]
         return ca.Function("fpirhc_gate_entry", [sample, held, good, doubted], [ca.densify(r) for r in results])
 
     def _possible(self, sample: Expression, good: Expression) -> Expression:
@@ -163,7 +177,7 @@ class Gate:
             return possible
         time, taken = (sample[self.sample.slice(n)] for n in ("time", TAKEN))
         fresh = ca.logic_and(
-            taken > good[self.sample.slice(TAKEN)], ca.logic_and(taken <= time, time - taken <= self.max_age)
+            taken > good[self.stored.slice(TAKEN)], ca.logic_and(taken <= time, time - taken <= self.max_age)
         )
         return ca.logic_and(possible, fresh)
 

@@ -2,9 +2,9 @@
 
     live = live_settings(problem, controller, ["deformation.gain", "cost.states.q1", "limits.inputs.Q1"])
 
-A path begins at the controller, or at the problem for its cost and limits. The path of an interval stands for its finite ends,
-'limits.inputs.Q1.0' and '.1'. Automatic settings of the controller, such as the scale of a sigmoid, are recomputed from the
-others.
+A path begins at the controller, or at the problem for its cost, limits and reference. The path of an interval stands for its
+finite ends, 'limits.inputs.Q1.0' and '.1'. Automatic settings of the controller, such as the scale of a sigmoid, are recomputed
+from the others.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from fpirhc.symbolic.live import PREFIX, copied, live_number
 from fpirhc.symbolic.paths import changed_at, content_at, names_in
 from fpirhc.task.problem import Problem
 
-_OF_PROBLEM = ("cost", "limits", "dead_time")
+_OF_PROBLEM = ("cost", "limits", "dead_time", "reference")
 _ALWAYS_DATA = "parameters (exact and approximate) and the start are data of every loop; they need no live setting"
 Numbers = Mapping[str, float | Sequence[float]]  # by path; a pair for an interval
 
@@ -224,7 +224,7 @@ def _is_whole(owner: object, path: str) -> bool:
 
 
 def _owner(problem: Problem, controller: Controller, path: str) -> Problem | Controller:
-    """The controller, or the problem for a cost or limits that the controller does not have."""
+    """The controller, or the problem for a cost, limits or a reference that the controller does not have."""
     first = path.partition(".")[0]
     if first in names_in(controller) and getattr(controller, first) is not None:
         return controller

@@ -64,7 +64,8 @@ def _instant_block(path: Path) -> Block:
 
     def step(s: Signals) -> dict[str, Expression]:
         end, _, remembered = path.acted(s)
-        return {"_modelled": response(getattr(s, MEASURED), end, s.parameters), **remembered}
+        parameters, signals = path.told.acted(s, path.late)
+        return {"_modelled": response(getattr(s, MEASURED), end, parameters), **remembered, **signals}
 
     writes = Layout((plant.response_signal("_modelled"),))
     return Block("mirror", Layout(path.reads), writes, step, Layout(path.memory))

@@ -1,4 +1,4 @@
-"""The plausible range of a measured sample: what no working sensor shows.
+"""The plausible range of a sample: what no working sensor shows.
 
 For a controlled coordinate the range follows from the values that the problem itself names, v = (reference over the run, start,
 limits of the state),
@@ -15,6 +15,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from fpirhc.controllers.seeing import raw_signal
 from fpirhc.errors import Mistakes
 from fpirhc.sensing.base import response_names
 from fpirhc.task.limits import Interval
@@ -25,18 +26,17 @@ _SAMPLES = 200  # instants at which the reference is looked at
 
 
 def plausible_range(problem: Problem, own: Mapping[str, Interval] | None = None) -> dict[str, Interval]:
-    """Return intervals by column of the sample, "state.q1", "state.q1'" or "realised.q1".
+    """Return intervals by column of the sample: "state.q1", "state.q1'" or "realised.q1"; of a raw one "measured.q1".
 
     Args:
         problem: the task.
         own: intervals by name, "q1", "q1'", or "q1''" for the response, that replace the automatic ones.
 
     Raises:
-        InvalidProblem: an unknown name, or an interval that is none.
+        InvalidProblem: a name that is unknown or not measured, or an interval that is none.
     """
     plant, ranges = problem.plant, {}
-    columns = {e: f"state.{e}" for e in plant.state.elements}
-    columns |= {n: f"realised.{c}" for n, c in zip(response_names(plant), plant.controlled_names, strict=True)}
+    columns = _columns(problem)
     _check(own or {}, columns)
     values = _values(problem)
     for k in plant.controlled_indices:
@@ -46,10 +46,20 @@ def plausible_range(problem: Problem, own: Mapping[str, Interval] | None = None)
         middle = (seen.max() + seen.min()) / 2
         for power in range(plant.orders[k] + 1):
             reach = float(_MARGIN * size * (2 / problem.period) ** power)
-            if 0 < reach < np.inf:
+            column = columns.get(name + "'" * power)
+            if column is not None and 0 < reach < np.inf:
                 centre = float(middle) if power == 0 else 0.0
-                ranges[columns[name + "'" * power]] = (centre - reach, centre + reach)
+                ranges[column] = (centre - reach, centre + reach)
     return ranges | {columns[name]: interval for name, interval in (own or {}).items()}
+
+
+def _columns(problem: Problem) -> dict[str, str]:
+    """Column of the sample by the name of the measured quantity."""
+    plant, raw = problem.plant, raw_signal(problem)
+    if raw is not None:
+        return dict(zip(raw.elements, raw.columns, strict=True))
+    columns = {e: f"state.{e}" for e in plant.state.elements}
+    return columns | {n: f"realised.{c}" for n, c in zip(response_names(plant), plant.controlled_names, strict=True)}
 
 
 def _values(problem: Problem) -> dict[str, np.ndarray]:
@@ -67,7 +77,7 @@ def _values(problem: Problem) -> dict[str, np.ndarray]:
 
 def _check(own: Mapping[str, Interval], columns: Mapping[str, str]) -> None:
     mistakes = Mistakes("plausible")
-    mistakes.unknown("state or response", own, columns)
+    mistakes.unknown("measured quantity", own, columns)
     for name, interval in own.items():
         try:
             lower, upper = (float(v) for v in interval)

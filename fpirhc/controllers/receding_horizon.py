@@ -22,11 +22,13 @@ import numpy as np
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
 from fpirhc.controllers.contract import Planner
 from fpirhc.controllers.on_failure import HoldPlan, OnFailure
+from fpirhc.controllers.own_reference import motion_of, own_signals, own_values, preview_of
+from fpirhc.controllers.planned_model import as_planned, held_model
 from fpirhc.controllers.replanning import FromMeasurement, Replanning
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.deformation.sigmoid import Sigmoid
-from fpirhc.errors import InvalidProblem
+from fpirhc.errors import InvalidProblem, NotSupported
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.live_data import SCALE, STEEPEST, live_signals
 from fpirhc.horizon.problem import OptimalControl
@@ -34,12 +36,12 @@ from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.optimisers.fixed_point import FixedPoint
-from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, Derived, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import DERIVED, PREFIX, LiveNumber, is_live, live_numbers, nominal, settled
+from fpirhc.task.outside import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_stage
 
 _SCALE, _STEEPEST, _NUMBERS = (f"{PREFIX}{DERIVED}plan.{name}" for name in (SCALE, STEEPEST, "numbers"))
@@ -57,6 +59,8 @@ class RecedingHorizon(Controller):
         on_failure: what is applied when a solve fails (HoldPlan, Feedforward, StopRun).
         cost: of the plan; None: the problem's.
         margins: by name of a state, the distances that plans keep from the state's limits; see `Horizon`. None: the horizon's.
+        follows_model: whether the inputs of a plan are corrected in every cycle by what the model has learned since; see
+            `fpirhc.controllers.planned_model` and `Estimating(at_once=True)`. A model that does not learn changes nothing.
     """
 
     optimiser: Optimiser
@@ -65,11 +69,21 @@ class RecedingHorizon(Controller):
     on_failure: OnFailure = field(default_factory=HoldPlan)
     cost: Cost | None = None
     margins: Mapping[str, Sequence[float]] | None = field(default=None, hash=False, metadata={"setting": "where given"})
+    follows_model: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
 
     @property
     def planner(self) -> Planner:
         """Optimiser, cost, start and margins of the plans, and the tracking law between plans."""
         return Planner(self.optimiser, self.cost, self.replanning.restarts, self.replanning.law, self.margins)
+
+    @property
+    def model_acts_at_once(self) -> bool:
+        """Whether the inputs of a plan are corrected by what its model has learned since."""
+        return self.follows_model
+
+    def following_its_model(self) -> RecedingHorizon:
+        """Return the controller that corrects the plan's inputs between plans, by what its model has learned since."""
+        return replace(self, follows_model=True)
 
     def with_optimiser(self, optimiser: Optimiser) -> RecedingHorizon:
         """Return the controller with another optimiser."""
@@ -107,6 +121,9 @@ class RecedingHorizon(Controller):
         before, after, late, remembered = self.replanning.parts(problem)
         plan = every(_plan_block(problem, self.optimiser, self.on_failure), cycles)
         closing, delays = closing_blocks(problem, self.deformation, [scalar("_solve_status")])
+        if self.follows_model:
+            held, own = held_model(problem)
+            after, delays = [held, *(as_planned(block, problem) for block in after)], [*delays, own]
         blocks = [reference_block(problem), _due_block(cycles), *before, plan, *after, *closing, *late]
         delays = [*delays, *remembered]
         blocks.append(_command_shift_block(problem, self.deformation))
@@ -117,8 +134,8 @@ class RecedingHorizon(Controller):
 def _optimal_control(problem: Problem, optimiser: Optimiser) -> OptimalControl:
     assert problem.horizon is not None
     assert problem.cost is not None
-    read = _read_from_data(optimiser)
-    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits, read)
+    ahead, read = previewed_values(problem.plant, problem.signals), _read_from_data(optimiser)
+    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits, ahead, read)
 
 
 def _read_from_data(optimiser: Optimiser) -> dict[str, LiveNumber]:
@@ -141,9 +158,12 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     """Block (time, plan state, parameters, shift and command of the last cycle) -> (planned input, solve statistics)."""
     assert problem.horizon is not None
     assert problem.cost is not None
+    _check_reference(problem)
     plant, ocp = problem.plant, _optimal_control(problem, optimiser)
     count = live_signals(ocp.settings, plant.input).size
-    data_of = stage_data(plant, problem.reference, problem.horizon, problem.cost, count)
+    data_of = _stage_data(problem, count)
+    preview = preview_of(problem)
+    running_data = data_of if preview is None else _stage_data(problem, count, previewed=True)
     start = nominal(problem)
     memory = optimiser.memory(ocp).starting_at(_first_memory(start, optimiser, ocp, data_of))
     solve = optimiser.step(ocp.opened())
@@ -153,7 +173,9 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     writes = (like(plant.input, "planned"), Signal("solve", _SOLVE), scalar("_solve_status"), *logged)
 
     def step(s: Signals) -> dict[str, Value]:
-        data = data_of(s.time, s.parameters, *_live_rows(problem, optimiser, ocp, s))
+        own = own_values(problem, s)
+        motion = () if preview is None else preview(*own)
+        data = running_data(s.time, *motion, s.parameters, *_live_rows(problem, optimiser, ocp, s))
         # The shift of the last cycle is added to the plan's inputs, so their rate counts from the last command without it.
         first = ocp.start(s._plan_state, s._command_before - s._command_shift_last)
         lower, upper = _minus(low, s._command_shift_last), _minus(high, s._command_shift_last)
@@ -162,7 +184,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         inputs, diagnostics, next_memory = solve(first, data, lower, upper, remembered)
         status = diagnostics[_SOLVE.index("status")]
         failed = status > int(Status.NOT_CONVERGED) + 0.5
-        planned, judged = on_failure.choose(failed, inputs[:, 0], feedforward_of(s.time, s.parameters), status)
+        planned, judged = on_failure.choose(failed, inputs[:, 0], feedforward_of(s.time, *own, s.parameters), status)
         after = memory.split(next_memory)
         remembered_next = {f"{m}_next": v for m, v in after.items()}
         shown = {name: after[source] for name, source in optimiser.logged.items()}
@@ -185,13 +207,38 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
 
     own = memory + Layout((scalar("plan_begun"),))
     live = derived if ocp.settings or is_live(problem.limits) else None
-    return Block("plan", _plan_reads(plant, ocp), Layout(writes), step, own, opaque=True, derived=live)
+    return Block("plan", _plan_reads(problem, ocp), Layout(writes), step, own, opaque=True, derived=live)
 
 
-def _plan_reads(plant: Plant, ocp: OptimalControl) -> Layout:
-    """Time, state from which the plan starts, parameters, command shift and command of the last cycle, and derived numbers."""
+def _check_reference(problem: Problem) -> None:
+    """Raise where scale and first plan, which follow from the first horizon, would follow a live setting of the reference.
+
+    Raises:
+        NotSupported: the reference moves within the first horizon.
+    """
+    assert problem.horizon is not None
+    moving = live_numbers(problem.reference)
+    if moving and not problem.reference.rests(problem.horizon.stages * problem.horizon.step):
+        raise NotSupported(
+            f"setting '{next(iter(moving))}' cannot be live with a plan: the reference moves within the first horizon, from which "
+            "the optimiser's scale and the first plan are taken; let it rest there"
+        )
+
+
+def _stage_data(problem: Problem, live: int, *, previewed: bool = False) -> ca.Function:
+    assert problem.horizon is not None
+    assert problem.cost is not None
+    ahead = previewed_values(problem.plant, problem.signals)
+    arguments = problem.plant, problem.reference, problem.horizon, problem.cost, live, ahead
+    return stage_data(*arguments, previewed=previewed)
+
+
+def _plan_reads(problem: Problem, ocp: OptimalControl) -> Layout:
+    """Time, state from which the plan starts, parameters, last command and its shift, derived numbers, own signals."""
+    plant = problem.plant
     last = like(plant.input, "_command_shift_last"), like(plant.input, "_command_before")
-    return Layout((plant.time, like(plant.state, "_plan_state"), plant.parameter, *last, *_derived_signals(ocp)))
+    own = own_signals(problem)
+    return Layout((plant.time, like(plant.state, "_plan_state"), plant.parameter, *last, *_derived_signals(ocp), *own))
 
 
 def _first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> np.ndarray:
@@ -250,15 +297,16 @@ def _minus(ends: Sequence[float], shift: Expression) -> Expression:
 
 
 def _feedforward(problem: Problem) -> ca.Function:
-    """Function (time, parameters) -> input that the model needs along the reference; zero for a model without inverse."""
+    """Function (time, own signals of the reference, parameters) -> input that the model needs; zero for a model without inverse."""
     plant = problem.plant
     t, p = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
-    state, response = problem.reference.function(plant)(t)
+    own = [ca.MX.sym(signal.name, signal.size) for signal in own_signals(problem)]
+    state, response = motion_of(problem)(t, *own)
     if plant.controlled is None and len(plant.inputs) != len(plant.names):
         needed = ca.MX.zeros(len(plant.inputs))
     else:
         needed = plant.inverse_function(state, response[list(plant.controlled_indices)], p)
-    return ca.Function("fpirhc_feedforward", [t, p], [needed])
+    return ca.Function("fpirhc_feedforward", [t, *own, p], [needed])
 
 
 def _command_shift_block(problem: Problem, deformation: Deformation) -> Block:

@@ -6,10 +6,16 @@ q^Des = q^(r),N + feedback of the tracking law;   u = inverse model of the defor
 from __future__ import annotations
 
 from fpirhc.controllers.base import closing_blocks, like, reference_block, rename
+from fpirhc.controllers.largest_response import largest_response
 from fpirhc.deformation.base import Deformation
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
+
+
+def bounded(problem: Problem, tracking: Tracking) -> Tracking:
+    """Return the law with its memory bounded by what the problem's limits can need."""
+    return tracking.within(largest_response(problem))
 
 
 def desired_blocks(problem: Problem, tracking: Tracking) -> list[Block]:
@@ -19,7 +25,7 @@ def desired_blocks(problem: Problem, tracking: Tracking) -> list[Block]:
         reference_block(problem),
         rename("target", like(plant.state, "reference"), like(plant.state, "_target")),
         rename("nominal", plant.response_signal("_reference_response"), plant.response_signal("nominal")),
-        tracking.law(plant, problem.period),
+        bounded(problem, tracking).law(plant, problem.period),
     ]
 
 
@@ -27,5 +33,5 @@ def tracked_blocks(problem: Problem, tracking: Tracking, deformation: Deformatio
     """Return the blocks reference, tracking, deform, invert, limit, judge, running, tracking update, and what they remember."""
     plant = problem.plant
     closing, delays = closing_blocks(problem, deformation)
-    blocks = [*desired_blocks(problem, tracking), *closing, tracking.update(plant, problem.period)]
+    blocks = [*desired_blocks(problem, tracking), *closing, bounded(problem, tracking).update(plant, problem.period)]
     return blocks, [*delays, *tracking.delays(plant)]

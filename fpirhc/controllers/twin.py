@@ -46,16 +46,17 @@ def twin_block(path: Path) -> Block:
 
     def step(s: Signals) -> dict[str, Expression]:
         end, mean, remembered = path.acted(s)
+        parameters, signals = path.told.acted(s, path.late)
         acting, answered, next_deformations = past.seen(s)
         waits = s.mirror_cycles < path.late + 0.5  # the samples still show the start
-        at = ca.if_else(waits, s.mirror_state, advance(s.mirror_state, mean, s.parameters, -acting))
-        sample = seen(at, end, s.parameters, -acting)
+        at = ca.if_else(waits, s.mirror_state, advance(s.mirror_state, mean, parameters, -acting))
+        sample = seen(at, end, parameters, -acting)
         arrived = (1 - path.fraction) * sample + path.fraction * s.mirror_sample if late else sample
         state, response, *memories = estimate.function(arrived, *(getattr(s, m.name) for m in own))
         away = getattr(s, MEASURED) - state
         # What is not finite must not be remembered.
         move = ca.if_else(is_finite(away), away, 0)
-        remembered |= {"mirror_state_next": at + moves.state @ move, **next_deformations}
+        remembered |= {"mirror_state_next": at + moves.state @ move, **next_deformations, **signals}
         if late:
             remembered["mirror_sample_next"] = sample + moves.sample @ move
         for signal, value, matrix in zip(own, memories, moves.memory, strict=True):

@@ -30,6 +30,7 @@ from fpirhc.task.problem import Problem
 
 _DIVERGES = 1.05  # measured factor from which a cycle counts
 _FLOOR = 1e-18  # square of a change that is no change, in units of the response
+_KEPT = ("watch_saturated", "watch_cycles", "watch_growing", "watch_requests")  # what reaches the next cycle by itself
 _SMALL = 1e-3  # change of the request, as a share of it, that has a slope
 
 
@@ -56,19 +57,23 @@ def watch_block(problem: Problem, controller: Controller, status: str, *, longes
 
     def step(s: Signals) -> dict[str, Expression]:
         before = getattr(s, status)
-        past = parts.split(ca.if_else(every_finite(s.watch), s.watch, 0))
+        usable = every_finite(s.watch)
+        past = parts.split(s.watch)
+        past |= {name: ca.if_else(usable, past[name], 0) for name in _KEPT if name in past}
         at_limit = _any(
             [s.command[k] <= v for k, v in enumerate(lower) if np.isfinite(v)]
             + [s.command[k] >= v for k, v in enumerate(upper) if np.isfinite(v)]
         )
-        now = {"watch_saturated": ca.if_else(at_limit, ca.fmin(past["watch_saturated"] + 1, longest + 1), 0)}
+        now = {"watch_saturated": ca.if_else(at_limit, _counted(past["watch_saturated"], longest + 1), 0)}
         worse = ca.if_else(now["watch_saturated"] > longest + 0.5, int(Status.SATURATED), before)
         if watched:
             now |= _fit(past, s.deformed, s.realised, gain, window)
             worse = ca.if_else(now["watch_growing"] > window - 0.5, int(Status.NOT_CONTRACTING), worse)
         fine = before < int(Status.NOT_CONVERGED) + 0.5
         counts = before != int(Status.BAD_SAMPLE)  # a skipped cycle is no evidence
-        remembered = ca.if_else(counts, parts.join(now), parts.join(past))
+        stays = ca.logic_and(ca.logic_not(counts), usable)
+        # The two are never both other than zero, and NaN in the one that is dropped does no harm.
+        remembered = ca.if_else(counts, parts.join(now), 0) + ca.if_else(stays, s.watch, 0)
         return {"status": ca.if_else(fine, worse, before), "watch_next": remembered}
 
     return Block("watch", reads, Layout((scalar("status"),)), step, Layout((memory,)))
@@ -100,18 +105,24 @@ def _fit(
     size, forget = request.numel(), math.exp(-1 / window)
     last, older = past["watch_requests"][:size], past["watch_requests"][size:]
     change, answer = last - older, response - past["watch_response"]
-    new = ca.if_else(past["watch_cycles"] > 2.5, ca.vertcat(ca.dot(change, answer), ca.dot(change, change)), 0)
-    sums = forget * past["watch_sums"] + new
+    # Before three cycles have been counted there is no pair of changes, and what is remembered of them may be anything.
+    summed = forget * past["watch_sums"] + ca.vertcat(ca.dot(change, answer), ca.dot(change, change))
+    sums = ca.if_else(past["watch_cycles"] > 2.5, summed, 0)
     enough = sums[1] > window * _SMALL**2 * ca.dot(last, last) + _FLOOR
-    factor = ca.fabs(1 - gain * sums[0] / ca.fmax(sums[1], _FLOOR))
-    growing = ca.if_else(ca.logic_and(enough, factor > _DIVERGES), ca.fmin(past["watch_growing"] + 1, window), 0)
+    grows = ca.fabs(sums[1] - gain * sums[0]) > _DIVERGES * sums[1]
+    growing = ca.if_else(ca.logic_and(enough, grows), _counted(past["watch_growing"], window), 0)
     return {
         "watch_requests": ca.vertcat(request, last),
         "watch_response": response,
         "watch_sums": sums,
-        "watch_cycles": ca.fmin(past["watch_cycles"] + 1, 3),
+        "watch_cycles": _counted(past["watch_cycles"], 3),
         "watch_growing": growing,
     }
+
+
+def _counted(count: Expression, most: int) -> Expression:
+    """One more, up to `most`; a comparison, because fmin is a call in C."""
+    return count + (count < most - 0.5)
 
 
 def _any(conditions: list[Expression]) -> Expression | float:

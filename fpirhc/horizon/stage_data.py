@@ -35,14 +35,28 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
     return Layout((*signals, scalar("last"), Signal("target", plant.state.elements, plant.state.units)))
 
 
-def stage_data(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, live: int = 0) -> ca.Function:
-    """Function (time, parameters) -> data of all stages, shape (ntheta, N + 1).
+def stage_data(
+    plant: Plant,
+    reference: Reference,
+    horizon: Horizon,
+    cost: Cost,
+    live: int = 0,
+    signals: ca.Function | None = None,
+    *,
+    previewed: bool = False,
+) -> ca.Function:
+    """Function (time, parameters) -> data of all stages, shape (ntheta, N + 1), along the nominal motion.
 
-    With `live` rows of settings and what follows from them, (time, parameters, these rows) -> data that end with them.
+    With `live` rows of settings and what follows from them, (time, parameters, these rows) -> data that end with them. With
+    `signals`, a Function (time, parameters) -> parameters, every stage has those of its middle. Where the reference is
+    `previewed`, its states (nx, N + 1) and responses (n, N + 1) follow the time as arguments.
     """
-    matrix = kind(reference.opaque or plant.inverse_opaque)
-    t, p = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
-    state, response = reference.function(plant)(t)
+    looked_up = signals is not None and not signals.is_a("SXFunction")
+    matrix = kind(reference.opaque or plant.inverse_opaque or looked_up)
+    t, given = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
+    p = given if signals is None else signals(t + horizon.step / 2, given)
+    motion = [matrix.sym("x", plant.state.size), matrix.sym("r", len(plant.names))] if previewed else []
+    state, response = motion or reference.function(plant)(t)
     if cost.uses_feedforward:
         needed = plant.inverse_function(state, response[list(plant.controlled_indices)], p)
     else:
@@ -50,13 +64,16 @@ def stage_data(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
     # The live rows come out of the same call where they follow these rows: joining tables would copy both.
     joined = bool(live) and not (horizon.blocks or horizon.terminal or horizon.margins)
     rows = [matrix.sym("live", live)] if joined else []
-    one = ca.Function("fpirhc_stage_data", [t, p, *rows], [ca.densify(ca.vertcat(t, state, needed, p, *rows))])
+    stage = ca.densify(ca.vertcat(t, state, needed, p, *rows))
+    one = ca.Function("fpirhc_stage_data", [t, *motion, given, *rows], [stage])
     start, parameters = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
+    columns = dict(zip(("states", "responses"), motion, strict=False))
+    tables = [ca.MX.sym(name, m.numel(), horizon.stages + 1) for name, m in columns.items()]
     settings = [ca.MX.sym("live", live)] if live else []
     nodes = horizon.stages + 1
     times = start + ca.DM(np.arange(nodes) * horizon.step).T
     repeated = [ca.repmat(v, 1, nodes) for v in (parameters, *(settings if joined else ()))]
-    table = one.map(nodes)(times, *repeated)
+    table = one.map(nodes)(times, *tables, *repeated)
     if horizon.blocks:
         free = np.zeros((1, nodes))
         free[0, [0, *np.cumsum(horizon.blocks)]] = 1.0
@@ -71,5 +88,5 @@ def stage_data(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost,
         table = ca.vertcat(table, last, targets)
     if live and not joined:
         table = ca.vertcat(table, ca.repmat(settings[0], 1, nodes))
-    names = ["t", "p", *(["live"] if live else [])]
-    return ca.Function("fpirhc_horizon_data", [start, parameters, *settings], [table], names, ["data"])
+    names = ["t", *columns, "p", *(["live"] if live else [])]
+    return ca.Function("fpirhc_horizon_data", [start, *tables, parameters, *settings], [table], names, ["data"])

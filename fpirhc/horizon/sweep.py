@@ -50,30 +50,31 @@ def expansion_shapes(ocp: OptimalControl) -> tuple[tuple[int, int], ...]:
 
 
 def expand(ocp: OptimalControl) -> ca.Function:
-    """Function (U, X, K (nu, ns N), rolled, s0, data, lower, upper) -> the parts of `Expansion`.
+    """Function (U, X, K (nu, ns N), rolled, gaps (ns, N), s0, data, lower, upper) -> the parts of `Expansion`.
 
-    The plan is expanded at its own nodes after s_0; where `rolled`, at the states of a rollout with u = clip(U + K (x - X)).
+    The plan is expanded at its own nodes after s_0; where `rolled`, at the states of a rollout with u = clip(U + K (x - X)) and
+    x+ = F(x, u) - gap.
     """
     n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
     node, _, theta = stage_symbols(ocp)
     at, u, gain, rolled = ca.SX.sym("at", ns), ca.SX.sym("u", nu), ca.SX.sym("K", nu, ns), ca.SX.sym("rolled")
-    low, high = ca.SX.sym("low", nu), ca.SX.sym("high", nu)
+    low, high, gap = ca.SX.sym("low", nu), ca.SX.sym("high", nu), ca.SX.sym("gap", ns)
     x = ca.if_else(rolled, at, node)
     used = ca.if_else(rolled, ca.fmin(ca.fmax(u + gain @ (at - node), low), high), u)
     next_state, cost, a, b, by_state, by_input = linear_stage(ocp)(x, used, theta)
-    results = [next_state, x, used, cost, a, b, by_state, by_input]
-    stage = ca.Function("fpirhc_expand_stage", [at, node, u, gain, theta, low, high, rolled], results)
+    results = [next_state - gap, x, used, cost, next_state, a, b, by_state, by_input]
+    stage = ca.Function("fpirhc_expand_stage", [at, node, u, gain, theta, gap, low, high, rolled], results)
     inputs, states, gains = ca.MX.sym("U", nu, n), ca.MX.sym("X", ns, n + 1), ca.MX.sym("K", nu, ns * n)
     flag, s0, data = ca.MX.sym("rolled"), ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
-    lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
+    lower, upper, gaps = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu), ca.MX.sym("gaps", ns, n)
     nodes = ca.horzcat(s0, states[:, 1:n]) if n > 1 else s0
     repeated = [ca.repmat(v, 1, n) for v in (lower, upper, flag)]
-    made = stage.mapaccum("fpirhc_expand_stages", n)(s0, nodes, inputs, gains, data[:, :n], *repeated)
+    made = stage.mapaccum("fpirhc_expand_stages", n)(s0, nodes, inputs, gains, data[:, :n], gaps, *repeated)
     after, before, used_inputs, costs, *rest = made
     last = ca.if_else(flag, after[:, n - 1], states[:, n])
     final, tail, end_hessian = hessian_end(ocp)(last, data[:, n])
-    parts = [used_inputs, ca.horzcat(before, last), after, *rest, tail, end_hessian, ca.sum2(costs) + final]
-    return ca.Function("fpirhc_expand", [inputs, states, gains, flag, s0, data, lower, upper], parts)
+    parts = [used_inputs, ca.horzcat(before, last), *rest, tail, end_hessian, ca.sum2(costs) + final]
+    return ca.Function("fpirhc_expand", [inputs, states, gains, flag, gaps, s0, data, lower, upper], parts)
 
 
 def sweep(

@@ -42,6 +42,7 @@ def transcribe(
     horizon: Horizon,
     cost: Cost,
     limits: Limits,
+    signals: ca.Function | None = None,
     others: Mapping[str, LiveNumber] = MappingProxyType({}),
 ) -> OptimalControl:
     """Return the standard form of one horizon.
@@ -52,6 +53,7 @@ def transcribe(
         horizon: number and length of the stages.
         cost: stage and terminal cost.
         limits: of inputs, states, rates and paths.
+        signals: those of `stage_data`.
         others: live settings by path that the optimiser reads from the data of the stages beside those of cost and limits.
 
     Raises:
@@ -65,7 +67,8 @@ def transcribe(
     )
     binding, free = stage.binding, stage.before.numel()
     dynamics, stage_cost, terminal_cost = _stage_functions(stage, horizon.step)
-    nodes = _nodes(plant, reference, horizon, cost, (free, len(binding)))
+    table = np.asarray(stage_data(plant, reference, horizon, cost, signals=signals)(0.0, plant.approximate).full())
+    nodes = _nodes(plant, horizon, table, (free, len(binding)))
     settings = tuple(s.name().removeprefix(PREFIX) for s in stage.settings)
     values = {path: number.value for path, number in {**live_numbers(cost, limits), **others}.items()}
 
@@ -289,11 +292,9 @@ def _scalar_terms(expressions: Mapping[str, Expression]) -> dict[str, Expression
 
 
 def _nodes(
-    plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, extra: tuple[int, int]
+    plant: Plant, horizon: Horizon, data: np.ndarray, extra: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States (the plant's, `extra` input and written entries), inputs and data along the reference from t = 0."""
-    table = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
-    data = np.asarray(table.full())
     layout = data_layout(plant, horizon)
     along = {name: data[layout.slice(name)] for name in ("reference", "feedforward")}
     states = np.vstack([along["reference"], along["feedforward"][: extra[0]], np.zeros((extra[1], data.shape[1]))])

@@ -29,6 +29,7 @@ ENOUGH = 0.99  # share of the largest multiplier from which a limit counts as gi
 STIFF = 1e8  # weight of an equality, in units of 1 / gamma
 BOUNDARY = 0.99  # largest share of the distance to the boundary in one step
 CLOSED = 1e-6  # scaled gap below which a plan counts as a trajectory
+HAIR = 1e-8  # of the unit: how far inside the limits of inputs descents stay
 _NONE = 10 * FINITE
 
 
@@ -86,6 +87,10 @@ class Limited:
         """Return d; 1 where there is no limit."""
         return ca.if_else(self.present, self.sign * (self.entries(p.inputs, p.states) - self._at), 1)
 
+    def outside(self, p: Expansion) -> ca.MX:
+        """Return the largest violation of a hard limit, as a share of its unit."""
+        return ca.fmax(ca.mmax(-self.distance(p) * self.hard / self.unit), 0)
+
     def both(self, values: ca.MX) -> ca.MX:
         """Return the sum of the lower and the upper side, (rows, N), where there is a limit."""
         present_values = ca.if_else(self.present, values, 0)
@@ -133,6 +138,16 @@ class Limited:
         e = ca.if_else(self.of_states, e, 0)
         t, z = ca.if_else(none, 1, t), ca.if_else(none, 0, ca.if_else(self.of_states, held, z))
         return Interior(t, ca.if_else(none, 0, e), z)
+
+    def path(self, p: Expansion, mu: ca.MX) -> tuple[ca.MX, ca.MX]:
+        """Return slacks and elastics that belong to the distances: t - e = d and mu / t + mu / e = rho."""
+        d = self.distance(p)
+        reached = self.rho * ca.fabs(d) + ca.sqrt((self.rho * d) ** 2 + 4 * mu * mu)
+        least = mu / self.rho + 2 * mu * mu / (self.rho * reached)
+        most = mu / self.rho + 0.5 * reached / self.rho
+        t, e = (ca.if_else(d > 0, *pair) for pair in ((most, least), (least, most)))
+        t = ca.if_else(self.of_states, t, ca.fmax(d, 0.1 * HAIR * self.unit))
+        return ca.if_else(self.present, t, 1), ca.if_else(ca.logic_and(self.present, self.of_states), e, 0)
 
     def interior(self, p: Expansion, y: Interior, mu: ca.MX) -> tuple[ca.MX, ca.MX]:
         """Return (weights, gradients) of the barrier."""

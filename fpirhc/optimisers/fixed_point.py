@@ -59,7 +59,7 @@ from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.live import settled
 
 _DIGITS = 1e-15  # relative rounding of a number
-_MOST_LIMITED = 300  # iterations of one converging call with limits of states
+_MOST_LIMITED = 1000  # iterations of one converging call with limits of states
 _FIRST_CALLS = 5  # of `converging`, before a run
 _CONVEX = 1e-6  # relative eigenvalue below zero that is taken for rounding
 

@@ -15,22 +15,37 @@ typedef struct {
   Limits limits;
   casadi_real next_z[2][COUNT], best_u[N * NU], best_x[(N + 1) * NS], best_z[2][COUNT];
   casadi_real weight[COUNT], lean[COUNT], costates[(N + 1) * NS], g[N * NU], filter[FILTER][2];
-  casadi_real mu, floor, delta, error, alpha, alpha_dual, theta, phi, dphi;
+  casadi_real inside[2][NU], gaps[N * NS], price, mu, floor, delta, error, alpha, alpha_dual, theta, phi, dphi;
   Certificate last;
   int phase, place_of, fresh, again, slacks, misses, steps, halvings, raises, filtered, start, use_exact, stuck, rolled, ahead;
+  int descends; /* whether interior plans are rollouts with gaps that lower phi, because the filter gave up */
   Scratch scratch;
 } Machine;
 
+static casadi_real sum_of_gaps(const Point* p) {
+  int k;
+  casadi_real sum = 0;
+  for (k = 0; k < N * NS; ++k) sum += fabs(p->f[k] - p->x[k + NS]) / spread[k % NS];
+  return sum;
+}
+
 static void log_terms(const Machine* m, const Point* p, const Duals* y, casadi_real* theta, casadi_real* phi) {
   int side, i, r, k;
-  *theta = 0, *phi = p->value;
-  for (k = 0; k < N * NS; ++k) *theta += fabs(p->f[k] - p->x[k + NS]) / spread[k % NS];
+  *theta = sum_of_gaps(p), *phi = p->value;
   EACH_LIMIT(&m->limits) {
     casadi_real t = y->t[side][k], e = y->e[side][k];
     *theta += fabs(distance(&m->limits, p, side, i, r) - t + e) / unit[r];
     *phi -= m->mu * log(t);
     if (r >= NU) *phi += capacity(r) * e - m->mu * log(e);
   }
+}
+
+/* The price of gaps with which phi + price |gaps| falls along every sweep: above the costates. It rises by a factor, or not at all. */
+static casadi_real gap_price(const Machine* m) {
+  int k;
+  casadi_real largest = 0;
+  for (k = 0; k < N * NS; ++k) largest = larger(largest, fabs(m->move.costates[k + NS]) * spread[k % NS]);
+  return m->price >= NEARLY * largest ? m->price : ABOVE * largest;
 }
 
 /* Change of phi along the move, to first order. */
@@ -44,6 +59,14 @@ static casadi_real log_slope(const Machine* m, const Point* p) {
     sum -= m->mu * m->by.t[side][k] / m->y.t[side][k];
     if (r >= NU) sum += (capacity(r) - m->mu / m->y.e[side][k]) * m->by.e[side][k];
   }
+  return sum;
+}
+
+/* The move of the inputs squared, in the unit of cost in which delta damps it. */
+static casadi_real squared_move(const Machine* m) {
+  int k;
+  casadi_real sum = 0;
+  for (k = 0; k < N * NU; ++k) sum += curvature[k % NU] * m->move.du[k] * m->move.du[k];
   return sum;
 }
 
@@ -94,7 +117,7 @@ static void begin_cold(Machine* m, Point* p, In s0, In data, In lower, In upper,
     Out res[8];
     arg[0] = data + i * NT, res[0] = x, res[1] = u;
     guess(arg, res, m->scratch.iw, m->scratch.w, 0);
-    for (j = 0; j < NS; ++j) p->x[i * NS + j] = m->start == REFERENCE ? x[j] : s0[j];
+    for (j = 0; j < NS; ++j) p->x[i * NS + j] = m->start == REFERENCE || m->start == DESCENT ? x[j] : s0[j];
     for (l = 0; l < NU && i < N; ++l) {
       casadi_real hair = smaller(0.01 * unit[l], 0.25 * (upper[l] - lower[l]));
       p->u[i * NU + l] = between(inputs && m->start == 0 ? inputs[i * NU + l] : u[l], lower[l] + hair, upper[l] - hair);
@@ -103,13 +126,23 @@ static void begin_cold(Machine* m, Point* p, In s0, In data, In lower, In upper,
   for (j = 0; j < N * NU * NS; ++j) m->move.k[j] = 0;
   for (j = 0; j < (N + 1) * NS; ++j) m->costates[j] = 0;
   m->phase = INTERIOR, m->slacks = COLD, m->fresh = 1, m->use_exact = 0;
-  m->mu = COST, m->floor = MU_END * COST, m->delta = 0;
+  m->descends = m->start >= DESCENT, m->price = COST;
+  m->mu = COST, m->floor = MU_END * COST, m->delta = m->descends ? LEAST_DAMPING : 0;
   m->filtered = m->raises = m->halvings = 0;
 }
 
 static void restart(Machine* m, Point* p, In s0, In data, In lower, In upper) {
-  if (++m->start > REFERENCE) m->stuck = 1;
+  if (++m->start > LAST_START) m->stuck = 1;
   else begin_cold(m, p, s0, data, lower, upper, 0);
+}
+
+/* Limits of the inputs of a rollout: a hair inside for descents, whose barrier they must not touch. */
+static In box(Machine* m, int side, In limit, In other) {
+  int l;
+  if (!m->descends || m->phase != INTERIOR) return limit;
+  for (l = 0; l < NU; ++l)
+    m->inside[side][l] = limit[l] + SIGN(side) * smaller(HAIR * unit[l], 0.25 * fabs(other[l] - limit[l]));
+  return m->inside[side];
 }
 
 static void keep(Machine* m, const Point* p) {
@@ -170,11 +203,19 @@ static int passes(Machine* m, casadi_real theta, casadi_real phi) {
   return falls;
 }
 
-static void trial_duals(const Machine* m, Duals* y) {
+/* A descent must lower phi by a share of its slope, and by a share of the move itself: the exact Hessian may be nearly singular. */
+static int falls_enough(const Machine* m, casadi_real phi) {
+  return phi <= m->phi + 1e-4 * m->alpha * m->dphi + 1e-12 * (COST + fabs(m->phi));
+}
+
+static void trial_duals(const Machine* m, const Point* p, Duals* y) {
   int side, i, r, k;
+  if (m->descends) put_on_path(&m->limits, p, y, m->mu, 0);
   EACH_LIMIT(&m->limits) {
-    y->t[side][k] = m->y.t[side][k] + m->alpha * m->by.t[side][k];
-    y->e[side][k] = m->y.e[side][k] + m->alpha * m->by.e[side][k];
+    if (!m->descends) {
+      y->t[side][k] = m->y.t[side][k] + m->alpha * m->by.t[side][k];
+      y->e[side][k] = m->y.e[side][k] + m->alpha * m->by.e[side][k];
+    }
     y->z[side][k] = m->y.z[side][k] + m->alpha_dual * m->by.z[side][k];
     y->z[side][k] = between(y->z[side][k], m->mu / (1e8 * y->t[side][k]), 1e8 * m->mu / y->t[side][k]);
     (void)i, (void)r;
@@ -230,9 +271,10 @@ static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, I
   }
   y = m->y;
   if (ok) {
-    trial_duals(m, &y);
+    trial_duals(m, p, &y);
     log_terms(m, p, &y, &theta, &phi);
-    ok = fabs(phi) <= FINITE && fabs(theta) <= FINITE && (REALTIME || passes(m, theta, phi));
+    phi += m->descends ? m->price * sum_of_gaps(p) : 0;
+    ok = fabs(phi) <= FINITE && fabs(theta) <= FINITE && (REALTIME || (m->descends ? falls_enough(m, phi) : passes(m, theta, phi)));
   }
   if (ok) {
     adopt_costates(m, m->alpha);
@@ -245,6 +287,7 @@ static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, I
       return 1;
     }
     m->delta = m->halvings >= 3 ? larger(4 * m->delta, 1e-4) : m->halvings ? m->delta : m->delta > 5e-7 ? m->delta / 5 : 0;
+    if (m->descends) m->delta = larger(m->delta, LEAST_DAMPING);
     m->halvings = m->raises = 0;
     advance_interior(m, p);
     return 1;
@@ -253,17 +296,19 @@ static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, I
   m->halvings = m->filtered = 0;
   m->delta = larger(10 * m->delta, 1e-3);
   if (++m->raises > MOST_RAISES || m->delta > 1e8 || REALTIME) { restart(m, old, s0, data, lower, upper); return 0; }
+  if (m->descends) m->use_exact = 0;
   m->again = 1; /* the same plan, a shorter step */
   return 0;
 }
 
 /* One sweep for the next plan: pure, or interior with the largest step that stays inside. */
-static void direct(Machine* m, Point* p, In data) {
+static void direct(Machine* m, Point* p, In s0, In data, In lower, In upper) {
   int ok;
   if (m->phase == PURE) {
     pure_terms(&m->limits, p, &m->y, m->g, m->weight, m->lean);
   } else {
     if (m->slacks != KEPT) put_inside(&m->limits, p, &m->y, m->mu, m->slacks == WARM);
+    if (m->descends) put_on_path(&m->limits, p, &m->y, m->mu, m->slacks == COLD);
     interior_terms(&m->limits, p, &m->y, m->mu, m->weight, m->lean);
     m->slacks = KEPT;
   }
@@ -272,14 +317,20 @@ static void direct(Machine* m, Point* p, In data) {
   m->use_exact |= m->phase == INTERIOR || !ok;
   if (!ok) {
     m->delta = larger(10 * m->delta, 1e-6);
-    m->stuck |= m->delta > 1e8;
     m->fresh = 2; /* try again from the same plan */
+    if (m->delta > 1e8 && REALTIME) m->stuck = 1;
+    else if (m->delta > 1e8) restart(m, p, s0, data, lower, upper);
   } else if (m->phase == PURE) {
     pure_multipliers(&m->limits, p, &m->y, &m->move, m->next_z);
   } else {
     interior_moves(&m->limits, p, &m->y, &m->by, &m->move, m->mu, &m->alpha, &m->alpha_dual);
     log_terms(m, p, &m->y, &m->theta, &m->phi);
     m->dphi = log_slope(m, p);
+    if (m->descends) {
+      casadi_real apart = sum_of_gaps(p);
+      m->price = gap_price(m), m->phi += m->price * apart;
+      m->dphi = smaller(m->dphi - m->price * apart, -LEAST_DAMPING * squared_move(m));
+    }
   }
 }
 
@@ -287,8 +338,8 @@ static void begin(Machine* m, Point* p, In memory, In s0, In data, In lower, In 
   int k, known = all_finite(memory, MEMORY) && memory[MEMORY - 2] > 0, has_guess = 0;
   In z = memory + N * NU + 2 * N * NS + N * NU * NS;
   set_limits(&m->limits, lower, upper);
-  m->stuck = m->again = m->rolled = m->filtered = m->raises = m->halvings = m->misses = m->steps = 0;
-  m->alpha = m->alpha_dual = m->dphi = m->theta = m->phi = m->error = 0;
+  m->stuck = m->again = m->rolled = m->descends = m->filtered = m->raises = m->halvings = m->misses = m->steps = 0;
+  m->price = m->alpha = m->alpha_dual = m->dphi = m->theta = m->phi = m->error = 0;
   m->last.error = m->last.left = m->last.violation = m->last.broken = 10 * FINITE;
   for (k = 0; k < COUNT; ++k) m->y.z[0][k] = known ? z[k] : 0, m->y.z[1][k] = known ? z[COUNT + k] : 0;
   for (k = 0; k < COUNT; ++k) m->y.t[0][k] = m->y.t[1][k] = 1, m->y.e[0][k] = m->y.e[1][k] = 0;
@@ -320,10 +371,11 @@ static void remember(const Machine* m, const Point* p, Out memory) {
 
 /* The next plan to expand stands in p; returns whether it is rolled out. */
 static int next_plan(Machine* m, const Point* best, Point* p, int final) {
-  int k, pure = !m->fresh && m->phase == PURE;
+  int k, pure = !m->fresh && m->phase == PURE, descends = m->phase == INTERIOR && m->descends;
   casadi_real share = m->fresh || pure ? 0 : m->alpha;
-  for (k = 0; k < N * NU; ++k) p->u[k] = best->u[k] + (share > 0 ? share * m->move.du[k] : 0);
-  for (k = 0; k < (N + 1) * NS; ++k) p->x[k] = best->x[k] + (share > 0 ? share * m->move.dx[k] : 0);
+  In du = descends ? m->move.v : m->move.du;
+  for (k = 0; k < N * NU; ++k) p->u[k] = best->u[k] + (share > 0 ? share * du[k] : 0);
+  for (k = 0; k < (N + 1) * NS; ++k) p->x[k] = best->x[k] + (share > 0 && !descends ? share * m->move.dx[k] : 0);
   if (pure) {
     casadi_real made[N * NU];
     In arg[8];
@@ -332,6 +384,8 @@ static int next_plan(Machine* m, const Point* best, Point* p, int final) {
     deformed(arg, res, m->scratch.iw, m->scratch.w, 0);
     for (k = 0; k < N * NU; ++k) p->u[k] += made[k];
   }
+  for (k = 0; k < N * NS; ++k) m->gaps[k] = (1 - share) * (best->f[k] - best->x[k + NS]);
+  if (descends && !m->fresh) return 1;
   return m->fresh ? m->fresh == 1 && m->slacks == COLD && m->start == ROLLED : pure || (REALTIME && final);
 }
 
@@ -349,16 +403,16 @@ int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_rea
   for (; posed; ++count) {
     int final = count == ITERATIONS, rolled = next_plan(&m, best, p, final), accepted;
     m.ahead = ITERATIONS - count;
-    ok = expand(p, m.move.k, rolled, s0, data, lower, upper, &m.scratch);
+    ok = expand(p, m.move.k, rolled, m.descends && m.phase == INTERIOR ? m.gaps : 0, s0, data, box(&m, 0, lower, upper), box(&m, 1, upper, lower), &m.scratch);
     accepted = judged(&m, best, p, ok, rolled, s0, data, lower, upper);
-    if (accepted) other = best, best = p, p = other, m.rolled = rolled;
+    if (accepted) other = best, best = p, p = other, m.rolled = rolled && !m.descends;
     if (final || m.stuck || (!m.fresh && m.phase == PURE && is_done(&m.last))) break;
-    if (!m.fresh && (accepted || m.again)) m.again = 0, direct(&m, best, data);
+    if (!m.fresh && (accepted || m.again)) m.again = 0, direct(&m, best, s0, data, lower, upper);
   }
   ok = posed;
   if (posed && (!m.rolled || m.fresh)) {
     *p = *best;
-    ok = expand(p, m.move.k, 1, s0, data, lower, upper, &m.scratch);
+    ok = expand(p, m.move.k, 1, 0, s0, data, lower, upper, &m.scratch);
     if (ok) best = p;
   }
   if (ok) {
@@ -371,7 +425,8 @@ int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_rea
     ok = c.error < FINITE;
   }
   /* A call of few iterations may still get inside; one that has tried everything has not. */
-  status = c.violation > NEAR_LIMIT && (is_done(&c) || !REALTIME) ? INFEASIBLE : is_done(&c) ? CONVERGED : NOT_CONVERGED;
+  if (is_done(&c)) status = ok && outside(&m.limits, best) > KEPT_SHARE ? INFEASIBLE : CONVERGED;
+  else status = c.violation > NEAR_LIMIT && !REALTIME ? INFEASIBLE : NOT_CONVERGED;
   status = empty ? INFEASIBLE : !ok ? NON_FINITE : status;
   if (res[0])
     for (i = 0; i < N * NU; ++i)

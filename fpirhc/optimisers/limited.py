@@ -22,8 +22,8 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.split_stage import partial_count, split_hessian, stage_leaves
 from fpirhc.horizon.sweep import PIVOT
 from fpirhc.optimisers import limited_settings as numbers
-from fpirhc.optimisers.base import FEASIBLE, shift
-from fpirhc.optimisers.bounds import BOUNDARY, ENOUGH, STIFF
+from fpirhc.optimisers.base import FEASIBLE, KEPT, shift
+from fpirhc.optimisers.bounds import BOUNDARY, ENOUGH, HAIR, STIFF
 from fpirhc.optimisers.guess import guess
 from fpirhc.optimisers.limited_graph import limited_graph
 from fpirhc.optimisers.limited_memory import limited_memory
@@ -109,21 +109,31 @@ def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]
         "MU_LEAST",
         "MU_ROUNDS",
         "FILTER",
+        "MOST_RAISES",
+        "LEAST_DAMPING",
+        "NEARLY",
+        "ABOVE",
+        "ROLLED",
+        "REFERENCE",
+        "DESCENT",
+        "LAST_START",
     )
     statuses = {
         "CONVERGED": Status.OK,
         **{s.name: s for s in (Status.NOT_CONVERGED, Status.INFEASIBLE, Status.NON_FINITE)},
     }
     return {
-        **{name: getattr(numbers, name) for name in (*names, "MOST_RAISES", "ROLLED", "REFERENCE")},
+        **{name: getattr(numbers, name) for name in names},
         **{name: int(status) for name, status in statuses.items()},
         "COST": repr(float(measures.cost)),
         "ENOUGH": ENOUGH,
         "STIFF": STIFF,
         "BOUNDARY": BOUNDARY,
+        "HAIR": HAIR,
         "PIVOT": PIVOT,
         "FINITE": FINITE,
         "NEAR_LIMIT": FEASIBLE,
+        "KEPT_SHARE": KEPT,
         "DAMPING": repr(float(settings.damping)),
         "TOLERANCE": repr(float(settings.tolerance)),
         "FEASIBLE": repr(float(settings.feasible)),

@@ -111,6 +111,15 @@ static Certificate certified(const Limits* limits, const Point* p, casadi_real z
   return c;
 }
 
+/* The largest violation of a hard limit, as a share of its unit. */
+static casadi_real outside(const Limits* limits, const Point* p) {
+  int side, i, r, k;
+  casadi_real worst = 0;
+  EACH_LIMIT(limits)
+    if (r >= NU) worst = larger(worst, -distance(limits, p, side, i, r) * hard[r - NU] / unit[r]);
+  return worst;
+}
+
 /* Pure: limits that are active by the sign of gamma z - d are equalities, the others are not there. */
 static void pure_terms(const Limits* limits, const Point* p, Duals* y, In g, Out weight, Out lean) {
   int side, i, r, k, closed = largest_gap(p) < 1e-6;
@@ -151,6 +160,22 @@ static void put_inside(const Limits* limits, const Point* p, Duals* y, casadi_re
       z = larger(smaller(z, rho - mu / e), 0.5 * smaller(z, rho));
     }
     y->t[side][k] = t, y->z[side][k] = z, y->e[side][k] = e;
+  }
+}
+
+/* Descent: slacks and elastics that belong to the distances, t - e = d and mu / t + mu / e = rho; `anew`: the multipliers too. */
+static void put_on_path(const Limits* limits, const Point* p, Duals* y, casadi_real mu, int anew) {
+  int side, i, r, k;
+  EACH_LIMIT(limits) {
+    casadi_real d = distance(limits, p, side, i, r), rho = capacity(r), reached, least;
+    if (r < NU) {
+      y->t[side][k] = larger(d, 0.1 * HAIR * unit[r]);
+    } else {
+      reached = rho * fabs(d) + sqrt(rho * d * rho * d + 4 * mu * mu);
+      least = mu / rho + 2 * mu * mu / (rho * reached), reached = mu / rho + 0.5 * reached / rho;
+      y->t[side][k] = d > 0 ? reached : least, y->e[side][k] = d > 0 ? least : reached;
+    }
+    if (anew) y->z[side][k] = mu / y->t[side][k];
   }
 }
 

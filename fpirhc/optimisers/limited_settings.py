@@ -23,7 +23,13 @@ MU_END, MU_LEAST = 1e-5, 1e-15
 MU_ROUNDS = 8  # reductions after one accepted plan
 FILTER = 64  # pairs that the filter holds
 MOST_RAISES = 12  # of the Levenberg-Marquardt term before another first plan is tried
+LEAST_DAMPING = 1e-7  # of the Levenberg-Marquardt term of descents, and of the fall that a plan of theirs must bring
+NEARLY, ABOVE = (
+    1.1,
+    2.0,
+)  # the price of gaps of a descent, in units of the largest costate: at least, and where it must rise
 ROLLED, REFERENCE = 1, 2  # first plans after the state held: the inputs rolled out, and the reference
+DESCENT, LAST_START = 3, 4  # and for descents, where all of these failed: the reference, and the state held
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,9 @@ static const int place[NB + 1] = PLACES;
 static const casadi_real curvature[NU] = CURVATURE; /* step times curvature of the cost rate */
 static const casadi_real unit[NU + NB + 1] = UNITS, spread[NS] = SPREADS;
 
-/* Expand the plan at its own nodes, or (rolled) at the states that follow from s_0 with u = clip(U + K (x - X)); 0 when not finite. */
-static int expand(Point* p, In k, int rolled, In s0, In data, In lower, In upper, Scratch* s) {
+/* Expand the plan at its own nodes, or (rolled) at the states that follow from s_0 with u = clip(U + K (x - X)), less the gaps that
+   the plan is to have, if any; 0 when not finite. */
+static int expand(Point* p, In k, int rolled, In gaps, In s0, In data, In lower, In upper, Scratch* s) {
   int i, j, l, ok;
   In arg[8];
   Out res[8];
@@ -48,7 +49,7 @@ static int expand(Point* p, In k, int rolled, In s0, In data, In lower, In upper
     res[0] = p->a + i * NS * NS, res[1] = p->b + i * NS * NU, res[2] = p->ls + i * NS, res[3] = p->lu + i * NU;
     if (linearise(arg, res, s->iw, s->w, 0)) return 0;
     p->value += cost;
-    for (j = 0; j < NS; ++j) at[j] = p->f[i * NS + j];
+    for (j = 0; j < NS; ++j) at[j] = p->f[i * NS + j] - (gaps ? gaps[i * NS + j] : 0);
   }
   for (j = 0; j < NS && rolled; ++j) p->x[N * NS + j] = at[j];
   arg[0] = p->x + N * NS, arg[1] = data + N * NT;

@@ -46,7 +46,7 @@ def check_mismatch(plant: Plant, mismatch: float) -> None:
     Raises:
         InvalidValue: see `exact_ranges`.
     """
-    all_spread = bool(plant.parameters) and all(p.spread is not None for p in plant.parameters.values())
+    all_spread = bool(plant.parameters) and all(p.spread is not None or p.outside for p in plant.parameters.values())
     if not 0 <= mismatch < (math.inf if all_spread else 100):
         raise InvalidValue(
             f"mismatch {mismatch!r}: expected percent of at least 0 and below 100; a parameter keeps its sign"
@@ -59,6 +59,8 @@ def drawn(parameter: Parameter, mismatch: float, share: float) -> float:
 
     Without a spread the factor is log-uniform between 1 - P/100 and 1 + P/100.
     """
+    if parameter.outside:
+        return parameter.exact
     if parameter.spread is not None:
         return parameter.spread.quantile(parameter.exact, mismatch / 100, share)
     low, high = math.log1p(-mismatch / 100), math.log1p(mismatch / 100)
@@ -66,6 +68,8 @@ def drawn(parameter: Parameter, mismatch: float, share: float) -> float:
 
 
 def _range(parameter: Parameter, mismatch: float) -> tuple[float, float]:
+    if parameter.outside:  # its values are those of the problem
+        return parameter.exact, parameter.exact
     if parameter.spread is not None:
         return parameter.spread.interval(parameter.exact, mismatch / 100)
     width = mismatch / 100 * abs(parameter.exact)

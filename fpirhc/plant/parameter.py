@@ -22,6 +22,7 @@ class Parameter(Checked):
         bounds: least and largest physically possible value, in the same unit.
         spread: distribution of the exact value in scenarios, and its range in reviews; None: a percentage of the exact value. A run
             does not depend on it.
+        outside: whether it is a signal from outside, whose values over time are those of the problem; see `outside`.
     """
 
     approximate: float
@@ -29,6 +30,21 @@ class Parameter(Checked):
     unit: str
     bounds: tuple[float, float] = (-math.inf, math.inf)
     spread: Spread | None = field(default=None, metadata={"setting": False})
+    outside: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
+
+
+def outside(nominal: float, unit: str, bounds: tuple[float, float] = (-math.inf, math.inf)) -> Parameter:
+    """Return a signal from outside, which is declared among the parameters of a plant.
+
+    The response reads it as any other: `p.ambient` where `parameters={"ambient": outside(nominal=293.0, unit="K")}`.
+    `Problem(signals=...)` says how it changes over time.
+
+    Args:
+        nominal: value at which the plant is reviewed, and which the model has where it is told nothing.
+        unit: of the signal.
+        bounds: least and largest physically possible value.
+    """
+    return Parameter(nominal, nominal, unit, bounds, outside=True)
 
 
 def check_parameters(parameters: Mapping[str, Parameter], mistakes: Mistakes) -> None:

@@ -25,6 +25,7 @@ import numpy as np
 from fpirhc.errors import Mistakes, NotInvertible
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called
+from fpirhc.plant.algebraic import Algebraic
 from fpirhc.plant.inverse import inverse_by_newton, inverse_by_user, inverse_of_affine
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_ranges, check_response
@@ -43,7 +44,7 @@ class Plant(Checked):
     Args:
         coordinates: name -> unit of every coordinate.
         inputs: name -> unit of every input.
-        parameters: name -> Parameter(approximate, exact, unit).
+        parameters: name -> Parameter(approximate, exact, unit), or outside(nominal, unit) for a signal from outside.
         response: function of (q, q', ..., u, p) that returns {coordinate: its highest derivative}. It has one argument per
             derivative below the highest order, each with its entries by name (`q.q1`).
         order: relative order r, one number or {coordinate: number}.
@@ -54,6 +55,7 @@ class Plant(Checked):
             Newton's method otherwise.
         ranges: physical range (lowest, highest) of states by name, such as {"level": (0.0, 2.0)}. A run whose plant leaves one ends
             there, by name; it limits nothing (see `Limits`).
+        algebraic: quantities that equations tie to the state at every instant; the response has them as its last argument.
         time_unit: unit of time of the equations ('s', 'ms', 'day'), and so of every time and rate of the problem.
 
     Raises:
@@ -70,6 +72,7 @@ class Plant(Checked):
     ranges: Mapping[str, tuple[float, float]] = field(
         default_factory=dict, kw_only=True, metadata={"setting": "where given"}
     )
+    algebraic: Algebraic | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
     time_unit: str = field(default="s", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
@@ -119,6 +122,11 @@ class Plant(Checked):
     def parameter(self) -> Signal:
         """The parameters' signal."""
         return vector("parameters", tuple(self.parameters), tuple(p.unit for p in self.parameters.values()))
+
+    @cached_property
+    def signal_names(self) -> tuple[str, ...]:
+        """Names of the parameters that are signals from outside."""
+        return tuple(name for name, one in self.parameters.items() if one.outside)
 
     @cached_property
     def controlled_names(self) -> tuple[str, ...]:
@@ -201,10 +209,25 @@ class Plant(Checked):
     def response_function(self) -> ca.Function:
         """Function (state, input, parameters) -> highest derivative of every coordinate (n)."""
         x, u, p = self.symbols()
-        views = (*self._derivatives(x), Named(self.input.elements, u, "input"), self._parameters(p))
+        views = self.views(x, u, p)
+        if self.algebraic is not None:
+            views = (*views, self.algebraic.view(self.algebraic_function(x, u, p)))
         responses = called("response", self.response, *views)
         column = ca.vertcat(*(ca.SX(responses[c]) for c in self.names))
         return ca.Function("fpirhc_response", [x, u, p], [ca.densify(column)], ["x", "u", "p"], ["r"])
+
+    def views(self, x: Expression, u: Expression, p: Expression) -> tuple[Named, ...]:
+        """Return the arguments of the response by name, without algebraic states: q, q', ..., u, p."""
+        return (*self._derivatives(x), Named(self.input.elements, u, "input"), self._parameters(p))
+
+    @cached_property
+    def algebraic_function(self) -> ca.Function:
+        """Function (state, input, parameters) -> algebraic states (nz); empty without any."""
+        x, u, p = self.symbols()
+        solution = ca.SX(0, 1)
+        if self.algebraic is not None:
+            solution = self.algebraic.solved(self.views(x, u, p), ca.vertcat(x, u, p))
+        return ca.Function("fpirhc_algebraic", [x, u, p], [ca.densify(solution)], ["x", "u", "p"], ["z"])
 
     @cached_property
     def controlled_response_function(self) -> ca.Function:

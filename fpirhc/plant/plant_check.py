@@ -6,12 +6,15 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
+import casadi as ca
+
 from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.expected import takes
 from fpirhc.fields.user_code import called, named_results, scalar_expression
+from fpirhc.plant.algebraic import check_algebraic
 from fpirhc.plant.inverse import inverse_by_user
 from fpirhc.plant.structural_order import structural_order
-from fpirhc.symbolic.layout import Expression, Named
+from fpirhc.symbolic.layout import Expression
 
 if TYPE_CHECKING:
     from fpirhc.plant.plant import Plant
@@ -54,17 +57,22 @@ def check_ranges(plant: Plant, mistakes: Mistakes) -> None:
 
 def check_response(plant: Plant, mistakes: Mistakes) -> None:
     """Add every mistake of the response and of the orders to `mistakes`."""
-    expected = max(plant.orders) + 2
+    x, u, p = plant.symbols()
+    arguments_of_step, symbols = plant.views(x, u, p), [x, u, p]
+    algebraic = plant.algebraic
+    if algebraic is not None:
+        check_algebraic(plant, algebraic, arguments_of_step, mistakes)
+        symbols.append(ca.SX.sym("z", max(1, len(algebraic.names))))
+        arguments_of_step = (*arguments_of_step, algebraic.view(symbols[-1]))
+    expected = len(arguments_of_step)
     if not takes(plant.response, expected):
         arguments = len(inspect.signature(plant.response).parameters)
         lower = ["q", "v", "a"] + [f"d{k}" for k in range(3, 12)]
         mistakes.add(
             f"response takes {arguments} argument(s); with order {max(plant.orders)} it is called as "
-            f"response({', '.join([*lower[: expected - 2], 'u', 'p'])})"
+            f"response({', '.join([*lower[: max(plant.orders)], 'u', 'p', *(['z'] if algebraic else [])])})"
         )
         return
-    x, u, p = plant.symbols()
-    arguments_of_step = (*plant._derivatives(x), Named(plant.input.elements, u, "input"), plant._parameters(p))
     try:
         response = named_results("response", called("response", plant.response, *arguments_of_step))
     except FpirhcError as error:
@@ -76,7 +84,7 @@ def check_response(plant: Plant, mistakes: Mistakes) -> None:
             mistakes.add(f"response does not give the derivative {c}{chr(39) * r} of coordinate '{c}'; return it too")
             continue
         try:
-            scalar_expression(f"response of '{c}'", response[c], of=plant.response, symbols=(x, u, p))
+            scalar_expression(f"response of '{c}'", response[c], of=plant.response, symbols=symbols)
         except FpirhcError as error:
             mistakes.add(str(error))
     if mistakes.none:

@@ -24,7 +24,13 @@ def plant_table(plant: Plant) -> str:
     ]
     rows += [(name, "input", unit, "", "") for name, unit in plant.inputs.items()]
     rows += [
-        (name, "parameter", one.unit, number(one.approximate), number(one.exact))
+        (
+            name,
+            "signal from outside" if one.outside else "parameter",
+            one.unit,
+            number(one.approximate),
+            number(one.exact),
+        )
         for name, one in plant.parameters.items()
     ]
     notes = [f"Unit of time: {plant.time_unit}."]

@@ -32,7 +32,8 @@ def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]
         for c in names
     ]
     for c in names:
-        lines = [("reference", longest, f"reference.{c}")] + [(e.name, e.run, f"state.{c}") for e in entries]
+        aims = [("set-point", longest, f"setpoint.{c}")] if "setpoint" in longest.layout else []
+        lines = [*aims, ("reference", longest, f"reference.{c}")] + [(e.name, e.run, f"state.{c}") for e in entries]
         charts.append(_chart(c, first.unit(f"state.{c}"), lines, edges))
     for i in first.layout["command"].elements:
         lines = [(e.name, e.run, f"command.{i}") for e in entries]

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from fpirhc.studies.comparison.compare import Comparison, Entry
     from fpirhc.studies.comparison.compare import Progress as Report
     from fpirhc.studies.open_loop import Solved
+
+_MOST_STEPS = 6  # of the set-points of one coordinate in a text
 
 
 @contextmanager
@@ -60,6 +62,8 @@ def show(comparison: Comparison, report: Path) -> None:
     _table(comparison).show(console)
     if sum(e.optimality is not None for e in comparison.entries) > 1:
         _plans(comparison).show(console)
+    for line in comparison.information:
+        say(console, line)
     for entry in comparison.entries:
         for note in entry.notes:
             say(console, f"{entry.name}: {note}")
@@ -71,7 +75,7 @@ def show(comparison: Comparison, report: Path) -> None:
 def show_run(run: Run, metrics: Metrics, saved: Path) -> None:
     """Print one run's metrics and the path of its file."""
     console = Console()
-    for text in settings_in_force(run):
+    for text in (*settings_in_force(run), *set_points_in_force(run)):
         say(console, text)
     for column in columns([metrics]):
         say(console, f"{column.heading}: {column.text(column.number(metrics), missing='-', none='none')}")
@@ -86,6 +90,19 @@ def settings_in_force(run: Run) -> list[str]:
         (time, ", ".join(f"{path} = {value:g}" for path, value in numbers.items())) for time, numbers in run.in_force
     ]
     return [f"settings from {time:g} {run.time_unit}: {text}" for time, text in lines]
+
+
+def set_points_in_force(run: Run) -> list[str]:
+    """Return one line per coordinate with the set-points of the run and the times from which they were in force."""
+    record = cast(dict[str, list[list[float]] | str], run.settings.get("setpoints", {}))
+    return [f"set-points of {name}: {_steps_text(run, steps)}" for name, steps in record.items()]
+
+
+def _steps_text(run: Run, steps: list[list[float]] | str) -> str:
+    if isinstance(steps, str):
+        return steps
+    shown = [f"{value:g} from {time:g} {run.time_unit}" for time, value in steps[:_MOST_STEPS]]
+    return ", ".join(shown) + (f", and {len(steps) - _MOST_STEPS} more" if len(steps) > _MOST_STEPS else "")
 
 
 def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:

@@ -69,7 +69,7 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
     if growth.max() > -_SURE:
         where = f"between {radii.min():.6g} and {worst:.6g} along the reference"
         return Answer(QUESTION, Verdict.UNKNOWN, f"{text} ({where})", _mend(grid, controller, loops), numbers)
-    against = [*_steep(grid, controller), *doubts]
+    against = [*([] if controller.deforms_target else _steep(grid, controller)), *doubts]
     if against:
         return Answer(
             QUESTION, Verdict.UNKNOWN, f"{text}, but {'; '.join(against)}", "See the questions named.", numbers

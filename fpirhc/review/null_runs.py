@@ -15,8 +15,8 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved, without_deformation
 from fpirhc.review.nominal_runs import CYCLES, shortened
 from fpirhc.review.prediction import NominalRun, exactly
-from fpirhc.sensing.sensing import Sensing
 from fpirhc.simulation.simulate import simulate
+from fpirhc.task.outside import as_told
 from fpirhc.task.problem import Problem
 
 WORSE, MUCH_WORSE, FAR_WORSE = 1.2, 2.0, 10.0  # ratio of the errors
@@ -109,9 +109,11 @@ def with_form(runs: NullRuns, model: Problem, controller: Controller) -> NullRun
 
 def null_problem(problem: Problem, controller: Controller) -> Problem:
     """Return the problem whose plant is the controller's model, without disturbances and noise, shortened to `CYCLES` cycles."""
-    believed = resolved(problem, controller).parameters(problem.plant)
-    sensing = Sensing(estimator=problem.sensing.estimator)
-    model = replace(problem.of_model, plant=exactly(problem.plant, believed), disturbances={}, sensing=sensing)
+    ready = resolved(problem, controller)
+    plant = exactly(problem.plant, ready.parameters(problem.plant))
+    sensing = replace(problem.sensing, sensors={})
+    signals = as_told(problem.plant, ready.told(problem))
+    model = replace(problem.of_model, plant=plant, disturbances={}, sensing=sensing, signals=signals)
     return shortened(model, CYCLES)
 
 

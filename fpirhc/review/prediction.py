@@ -185,6 +185,8 @@ def _check(problem: Problem, controller: Controller) -> None:
             "no prediction beside a reality, whose response may not see the command at once; that of the model alone is that of "
             "problem.of_model"
         )
+    if problem.signals:
+        raise NotSupported("no prediction with signals from outside, which change along the run; simulate it")
     late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
     if late or problem.sensing.delay(problem.plant, problem.period):
         what = "dead time" if late else "an estimated response"

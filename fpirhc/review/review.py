@@ -77,6 +77,8 @@ def predict(problem: Problem, controller: Controller) -> Answer:
     general = [well_posed(own), inverse_exists(own), commands_inside(own)]
     loops = loops_along(own, ready)
     case = Case(own, ready, loops, NominalRuns(own.problem))
+    if ready.deforms_target:
+        return converges(own, ready, loops, _doubts(_doubtful(case)))
     suited = [*_speed_and_range(own, ready, loops), *_doubtful(case), free_of_two_cycles(own, ready, loops)]
     return converges(own, ready, loops, _doubts([*general, *suited]))
 
@@ -96,21 +98,42 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: N
     still = zero_dynamics(grid.problem, zero_dynamics_rate(grid), is_planned(ready), loops)
     outer = [rates_inside(grid, ready, loops), still]
     case = Case(grid, ready, loops, runs)
-    inner = [] if not ready.deformation.adapts else _of_map(case, general)
+    of_map = _of_target if ready.deforms_target else _of_map
+    inner = of_map(case, general) if ready.deformation.adapts else []
     return (*inner, *outer, margins_enough(grid.problem, loops, adapts=ready.deformation.adapts), *_more(case))
 
 
 def _more(case: Case) -> list[Answer]:
     """Answers to the questions that are found by discovery."""
-    asked = (q for q in known_questions(ControllerQuestion) if case.controller.deformation.adapts or not q.adaptive)
+    asked = (q for q in known_questions(ControllerQuestion) if _concerns(q, case.controller))
     answers = (question.ask(case) for question in asked if not question.doubts)
     return [answer for answer in answers if answer is not None]
 
 
 def _doubtful(case: Case) -> list[Answer]:
     """Answers whose no speaks against convergence."""
-    answers = (q.ask(case) for q in known_questions(ControllerQuestion) if q.doubts)
+    answers = (q.ask(case) for q in known_questions(ControllerQuestion) if q.doubts and _concerns(q, case.controller))
     return [answer for answer in answers if answer is not None]
+
+
+def _concerns(question: ControllerQuestion, controller: Controller) -> bool:
+    """Whether a question is asked about a controller."""
+    adapts = controller.deformation.adapts
+    return not question.adaptive or (adapts and (question.of_targets or not controller.deforms_target))
+
+
+def _of_target(case: Case, general: list[Answer]) -> list[Answer]:
+    """Answers about a map on targets: those of its linear loop. The gains of other questions are those of responses."""
+    del general
+    covered = Answer(
+        "Is the map's gain admissible?",
+        Verdict.UNKNOWN,
+        "not covered: the map acts on targets, and its limit depends on the slopes of the settled plant; the linear loop has those "
+        "at the reference",
+    )
+    doubtful = _doubtful(case)
+    verdict = converges(case.grid, case.controller, case.loops, _doubts(doubtful))
+    return [verdict, box_converges(case.loops), covered, *doubtful]
 
 
 def _of_map(case: Case, general: list[Answer]) -> list[Answer]:

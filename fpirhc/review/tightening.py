@@ -8,17 +8,23 @@ along the nominal run, where u_k is the command with the deformation and u^_k th
 plant = model without deformation carries this deviation on: H_l is its response after l cycles to a deviation of the state. So i
 stages after a plan was made the plant is away from it by at most
 
-    m_i = sum over l < i n of |H_l| d,        d = the largest |d_k| of the run,        n = cycles per stage,
+    m_i = max over k of  sum over l < i n of |H_l d_(k-l)|,        n = cycles per stage,
 
-entry by entry, to first order. The run's first moments, up to `measure_from`, do not count: adaptation has not found the plant yet.
-A plan that keeps m_i from its limits after stage i leaves room for this, and also for the plans that follow it. These are the
-restricted constraints of robust MPC (L. Chisci, J. A. Rossiter, G. Zappa, Automatica 37(7), 2001), with the feedback of the loop
-itself and the deviations that adaptation leaves.
+entry by entry, to first order, whatever the signs are. The run's first moments, up to `measure_from`, do not count: adaptation has
+not found the plant yet. A plan that keeps m_i from its limits after stage i leaves room for this, and for the plans that follow it.
+These are the restricted constraints of robust MPC (L. Chisci, J. A. Rossiter, G. Zappa, Automatica 37(7), 2001), with the
+feedback of the loop itself and the deviations that adaptation leaves.
+
+The largest |d_k| are jumps of the desired response, five to seven times their root mean square. A bound that lets them return in
+every cycle is needlessly wide. One in the order of the run misses what the run with margins does differently, and what happens
+between two stages. So the margins are verified: the plants run with them, and what a limit of a state is still passed by is added,
+until no run passes one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -28,17 +34,27 @@ from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.review.grid import each, review_grid
 from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import ideal_loops
-from fpirhc.review.prediction import NominalRun, nominal_run, response_errors
+from fpirhc.review.prediction import NominalRun, exactly, nominal_run, response_errors
+from fpirhc.simulation.simulate import simulate
 from fpirhc.task.problem import Problem, cycles_per_stage
 
 _POINTS = 5  # of the reference, whose loops are compared
 _DRAWS = 8  # of the parameters
+_KEPT = 1e-8  # of the range: what a limit may be passed by
+
+Margins = Mapping[str, tuple[float, ...]]
 
 
 def tightened(
-    problem: Problem, controller: Controller, *, mismatch: float | None = None, widen: float = 1.1, seed: int = 0
+    problem: Problem,
+    controller: Controller,
+    *,
+    mismatch: float | None = None,
+    widen: float = 1.1,
+    passes: int = 12,
+    seed: int = 0,
 ) -> Controller:
-    """Return the controller whose plans keep a margin from the limits of states, from one run of the model.
+    """Return the controller whose plans keep a margin from the limits of states, and with which the plants keep the limits.
 
     Args:
         problem: with hard limits of states. The margins are computed for it, and it stays as it is.
@@ -46,25 +62,56 @@ def tightened(
         mismatch: margin of the parameters' box around the exact ones, percent; the margins are the largest over draws from the box.
             None: the exact parameters alone.
         widen: factor on the margins, which are computed to first order.
-        seed: of the draws.
+        passes: most runs of each plant that verify the margins; 0: predicted margins, from one run of the model.
+        seed: of the draws and of the runs.
 
     Raises:
         InvalidProblem: no limits of states, or margins that leave nothing between two limits (all are named).
-        InvalidValue: a factor that is not positive.
-        NotSupported: see `nominal_run`; a controller that does not plan, or whose loop does not converge even with the right model.
+        InvalidValue: a factor that is not positive, a negative number of passes.
+        NotSupported: see `nominal_run`; a controller that does not plan, or whose loop does not converge even with the right model;
+            a limit that is still passed in the last run.
     """
-    margins = state_margins(problem, controller, mismatch=mismatch, widen=widen, seed=seed)
+    margins = state_margins(problem, controller, mismatch=mismatch, widen=widen, passes=passes, seed=seed)
     planned = controller.with_margins(margins)
     planned.check(problem)
     return planned
 
 
 def state_margins(
-    problem: Problem, controller: Controller, *, mismatch: float | None = None, widen: float = 1.1, seed: int = 0
-) -> Mapping[str, tuple[float, ...]]:
+    problem: Problem,
+    controller: Controller,
+    *,
+    mismatch: float | None = None,
+    widen: float = 1.1,
+    passes: int = 12,
+    seed: int = 0,
+) -> Margins:
     """Return the margins of `tightened` by name of the limited state, one number for every stage; arguments as there."""
     if not 0 < widen < np.inf:
         raise InvalidValue(f"tightened(widen={widen!r}): expected a positive number")
+    if passes < 0:
+        raise InvalidValue(f"tightened(passes={passes!r}): expected 0 or a positive number of runs")
+    plants = _parameters(problem, mismatch, seed)
+    margins = _predicted(problem, controller, plants, widen)
+    for k in range(passes):
+        beyond = np.max([_beyond(problem, controller.with_margins(margins), p, seed) for p in plants], axis=0)
+        passed = {
+            e: float(v) for e, v in zip(problem.plant.state.elements, beyond, strict=True) if v > 0 and e in margins
+        }
+        if not passed:
+            break
+        if k + 1 == passes:
+            amounts = ", ".join(f"'{e}' by {v:.2g}" for e, v in passed.items())
+            raise NotSupported(
+                f"no margins: after {passes} runs the plant still passes its limits ({amounts}); with tightened(passes=0) the "
+                "plans keep the predicted margins, and no run verifies them"
+            )
+        margins = {e: tuple(v + max(widen, 1.0) * passed.get(e, 0.0) for v in m) for e, m in margins.items()}
+    return margins
+
+
+def _predicted(problem: Problem, controller: Controller, plants: np.ndarray, widen: float) -> Margins:
+    """The margins that follow from one run of the model, times `widen`."""
     ready = resolved(problem, controller)
     hard = [e for e in problem.limits.states if e not in problem.limits.soft and e not in problem.limits.prices]
     if ready.planner is None or problem.horizon is None:
@@ -72,13 +119,26 @@ def state_margins(
     if not hard:
         raise InvalidProblem("no margins: the problem has no hard limits of states; name them in Limits(states=...)")
     nominal = nominal_run(problem, controller)
-    deviation = np.max([_deviation(nominal, p) for p in _parameters(problem, mismatch, seed)], axis=0)
     cycles, stages = cycles_per_stage(problem.horizon, problem.period), problem.horizon.stages
     loops = ideal_loops(review_grid(problem, 0.0, 0), nominal.controller, _POINTS)
-    reached = np.max([_reached(loop, cycles * stages, deviation) for loop, _ in loops], axis=0)
+    deviations = [_deviations(nominal, p) for p in plants]
+    reached = np.max([_reached(loop, cycles * stages, d) for loop, _ in loops for d in deviations], axis=0)
     rows = widen * reached[cycles - 1 :: cycles]
     places = {e: k for k, e in enumerate(problem.plant.state.elements)}
     return {e: tuple(map(float, rows[:, places[e]])) for e in hard}
+
+
+def _beyond(problem: Problem, controller: Controller, exact: np.ndarray, seed: int) -> np.ndarray:
+    """By how much a run of this plant passes each limit of a state after `measure_from`, shape (nx,); 0 where it keeps it."""
+    controller.check(problem)
+    run = simulate(replace(problem, plant=exactly(problem.plant, exact)), controller, seed=seed)
+    if run.stop is not None:
+        raise NotSupported(f"no margins: the run that verifies them ended early: {run.stop}")
+    lower, upper = problem.limits.state_bounds(problem.plant)
+    states = run["state"][min(round(problem.measure_from / problem.period), run.cycles - 1) :]
+    beyond = np.maximum(states - upper, lower - states).max(axis=0)
+    range_ = np.where(np.isfinite(upper - lower), upper - lower, 1.0)
+    return np.where(beyond > _KEPT * range_, beyond, 0.0)
 
 
 def _parameters(problem: Problem, mismatch: float | None, seed: int) -> np.ndarray:
@@ -87,8 +147,8 @@ def _parameters(problem: Problem, mismatch: float | None, seed: int) -> np.ndarr
     return draws[:1] if mismatch is None else draws[: 1 + _DRAWS]
 
 
-def _deviation(nominal: NominalRun, exact: np.ndarray) -> np.ndarray:
-    """Largest |d_k| of the run by state, shape (nx,)."""
+def _deviations(nominal: NominalRun, exact: np.ndarray) -> np.ndarray:
+    """d_k of the run after `measure_from`, shape (cycles, nx)."""
     problem, plant = nominal.problem, nominal.problem.plant
     advance = problem.integrator.step(plant, problem.period)
     errors = response_errors(nominal, exact=exact)
@@ -96,22 +156,21 @@ def _deviation(nominal: NominalRun, exact: np.ndarray) -> np.ndarray:
     still = np.zeros((nominal.cycles, len(plant.names)))
     own = each(plant.inverse_function, nominal.states[:-1], nominal.desired, believed)
     moved = each(advance, nominal.states[:-1], errors.command, rows, still)
-    predicted = each(advance, nominal.states[:-1], own, believed, still)
-    sizes = np.abs(moved - predicted)
-    if not np.isfinite(sizes).all():
+    deviations = moved - each(advance, nominal.states[:-1], own, believed, still)
+    if not np.isfinite(deviations).all():
         raise NotSupported("no margins: the predicted deviations do not stay finite")
-    return sizes[min(round(problem.measure_from / problem.period), nominal.cycles - 1) :].max(axis=0)
+    return np.asarray(deviations[min(round(problem.measure_from / problem.period), nominal.cycles - 1) :])
 
 
-def _reached(loop: LinearLoop, cycles: int, deviation: np.ndarray) -> np.ndarray:
-    """Sum over the first cycles of |H_l| d, shape (cycles, nx)."""
+def _reached(loop: LinearLoop, cycles: int, deviations: np.ndarray) -> np.ndarray:
+    """Largest over k of the sum of |H_l d_(k-l)| over l < 1 ... cycles: shape (cycles, nx)."""
     if loop.radius >= 1:
         raise NotSupported("no margins: the loop does not converge even with the right model")
     memory = np.zeros((len(loop.dynamics), len(loop.state)))
     memory[loop.state, np.arange(len(loop.state))] = 1.0
-    sums, total = [], np.zeros(len(loop.state))
-    for _ in range(cycles):
-        total = total + np.abs(memory[loop.state]) @ deviation
-        sums.append(total)
+    sums, total = [], np.zeros_like(deviations)
+    for late in range(cycles):
+        total[late:] += np.abs(deviations[: len(deviations) - late] @ memory[loop.state].T)
+        sums.append(total.max(axis=0))
         memory = loop.dynamics @ memory
     return np.array(sums)

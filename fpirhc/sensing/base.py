@@ -43,6 +43,14 @@ class DerivativeEstimator(Checked, ABC):
     def measures(self, plant: Plant) -> tuple[str, ...]:
         """Names of the measured quantities: state elements, and highest derivatives of controlled coordinates."""
 
+    def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
+        """State elements that follow from these measured quantities alone; by default those among them."""
+        return tuple(e for e in plant.state.elements if e in measured)
+
+    def answers(self, plant: Plant) -> tuple[str, ...]:
+        """Names of the measured quantities that the response follows from; by default all."""
+        return self.measures(plant)
+
     @abstractmethod
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
         """Block (seen) -> (state, realised).
@@ -77,6 +85,11 @@ class DerivativeEstimator(Checked, ABC):
         Raises:
             InvalidValue: with a remedy.
         """
+
+
+def known_by_positions(plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
+    """State elements of the coordinates that are measured: their derivatives are estimated."""
+    return tuple(e for e in plant.state.elements if e.rstrip("'") in measured)
 
 
 def response_names(plant: Plant) -> tuple[str, ...]:

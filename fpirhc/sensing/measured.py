@@ -26,6 +26,10 @@ class Measured(DerivativeEstimator):
         """The whole state and every controlled coordinate's highest derivative."""
         return plant.state.elements + response_names(plant)
 
+    def answers(self, plant: Plant) -> tuple[str, ...]:
+        """The highest derivatives."""
+        return response_names(plant)
+
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
         """Block that names the measured quantities."""
         del period, start

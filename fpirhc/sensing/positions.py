@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -16,7 +17,14 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import Array, DerivativeEstimator, backward_difference, combine, spline_weights
+from fpirhc.sensing.base import (
+    Array,
+    DerivativeEstimator,
+    backward_difference,
+    combine,
+    known_by_positions,
+    spline_weights,
+)
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -34,6 +42,14 @@ class _Finite(DerivativeEstimator):
     def measures(self, plant: Plant) -> tuple[str, ...]:
         """The coordinates themselves."""
         return plant.names
+
+    def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
+        """Measured coordinates and their derivatives."""
+        return known_by_positions(plant, measured)
+
+    def answers(self, plant: Plant) -> tuple[str, ...]:
+        """The controlled coordinates."""
+        return plant.controlled_names
 
     def weights(self, order: int, period: float) -> Array:
         """The response's formula as an average of n-th differences, each with its B-spline of requests."""

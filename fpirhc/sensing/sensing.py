@@ -1,10 +1,13 @@
 """The way from the plant to the controller: sensors, their dead time, and an estimator of unmeasured quantities.
 
-    true plant -> sensors -> measurement dead time -> estimator -> controller
+    true plant -> sensors -> measurement dead time -> [estimator -> controller]
 
 Where sensing is not ideal, a run's `state` and `realised` are the estimates that the controller receives. The true signals are
-`plant_state` and `plant_realised`, the sensors' output is `measured`, and `true_error` counts in the metrics. Random series are
-drawn before the run, so the loop itself stays a function.
+`plant_state` and `plant_realised`, the sensors' output is `measured`, which reaches the estimator after the dead time as `arrived`,
+and `true_error` counts in the metrics. Random series are drawn before the run, so the loop itself stays a function.
+
+An estimator and the controller behind it are one step from raw measurements to the command (`fpirhc.controllers.seeing`): a
+controller on a machine is given what its sensors show.
 
 Before the run there are no samples, so the first estimates of the response are not measured ones. The deformation therefore waits
 for `warm_up_cycles`, until the estimator's window holds samples of this run alone; until then the deformed response is the desired
@@ -13,16 +16,17 @@ one.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, response_names
+from fpirhc.sensing.belief import Belief
 from fpirhc.sensing.measured import Measured
 from fpirhc.sensing.sensor import Sensor
 from fpirhc.symbolic.block import Block
@@ -43,15 +47,42 @@ class Sensing(Checked):
             highest derivative of a controlled coordinate ("q1''"). A quantity that is not named is measured perfectly.
         estimator: of state and response from the measured quantities: Measured, VelocityDifference, LowPassDifference,
             PositionDifference, SavitzkyGolay, StateVariableFilter.
+        measured: names of the quantities that sensors show; None: all that the estimator needs.
+        belief: how the states that no sensor shows are known: ModelStates, KalmanFilter. See `fpirhc.sensing.belief`.
     """
 
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
     estimator: DerivativeEstimator = field(default_factory=Measured)
+    measured: Sequence[str] | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    belief: Belief | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
 
     @property
     def ideal(self) -> bool:
         """Whether the controller receives the true state and response."""
-        return not self.sensors and self.estimator.measures_all
+        return not self.sensors and not self.estimates
+
+    @property
+    def estimates(self) -> bool:
+        """Whether state or response are estimated, so that a controller's step begins with raw measurements."""
+        return not self.estimator.measures_all or self.measured is not None
+
+    def measures(self, plant: Plant) -> tuple[str, ...]:
+        """Names of the measured quantities: state elements, and highest derivatives of controlled coordinates."""
+        if self.measured is None:
+            return self.estimator.measures(plant)
+        return tuple(n for n in (*plant.state.elements, *response_names(plant)) if n in self.measured)
+
+    def known(self, plant: Plant) -> tuple[str, ...]:
+        """State elements that follow from what is measured."""
+        return self.estimator.known(plant, self.measures(plant))
+
+    def believed(self, plant: Plant) -> tuple[str, ...]:
+        """State elements that a controller is given from the belief."""
+        return self.belief.believes(plant, self.known(plant)) if self.belief is not None else ()
+
+    def believed_response(self, plant: Plant) -> tuple[str, ...]:
+        """Quantities that the response follows from and no sensor shows."""
+        return tuple(n for n in self.estimator.answers(plant) if n not in self.measures(plant))
 
     def check(self, plant: Plant) -> None:
         """Raise if a sensor's quantity is unknown or not measured, or the estimator cannot serve the plant.
@@ -60,16 +91,20 @@ class Sensing(Checked):
             InvalidProblem: all mistakes together.
         """
         mistakes = Mistakes("sensing")
-        measures, every = self.estimator.measures(plant), plant.state.elements + response_names(plant)
+        measures, every = self.measures(plant), plant.state.elements + response_names(plant)
         mistakes.unknown("sensors: quantity", self.sensors, every)
         for name in self.sensors:
             if name in every and name not in measures:
-                what = f"'{name}' is estimated by {type(self.estimator).__name__}, not measured"
+                by = self.belief if name in self.believed(plant) else self.estimator
+                what = f"'{name}' is estimated by {type(by).__name__}, not measured"
                 mistakes.add(f"sensors: {what}; sensors are those of {', '.join(measures)}")
-        try:
-            self.estimator.check(plant)
-        except InvalidValue as error:
-            mistakes.add(str(error))
+        mistakes.unknown("measured: quantity", self.measured or (), every)
+        checks = (self.estimator.check, lambda _: self._check_belief(plant, mistakes))
+        for check in checks:
+            try:
+                check(plant)
+            except FpirhcError as error:
+                mistakes.add(str(error))
         mistakes.raise_if_any()
 
     def delay(self, plant: Plant, period: float) -> float:
@@ -98,28 +133,60 @@ class Sensing(Checked):
             columns += [(lost.random(times.size) < sensor.dropout).astype(float)] if sensor.dropout else []
         return np.column_stack(columns) if columns else np.zeros((times.size, 0))
 
-    def blocks(
-        self, plant: Plant, period: float, start: Array, late: Wait | None, true: tuple[Signal, Signal], resting: Array
-    ) -> list[Block]:
-        """Blocks from the true state and response to 'state' and 'realised'.
+    def raw(self, plant: Plant, start: Array, late: Wait | None, resting: Array) -> Signal:
+        """Signal of the raw measurements as they arrive, with their values at the start.
 
         Args:
             plant: the plant that is measured.
-            period: control cycle, s.
+            start: first state of the problem, shape (nx,).
+            late: dead time of the measurement; None: none.
+            resting: response at the start, shape (n,).
+        """
+        names = self.measures(plant)
+        first = _start(plant, start, names, resting)
+        return vector(
+            "arrived" if late is not None else "measured", names, [_unit(plant, n) for n in names], first.tolist()
+        )
+
+    def blocks(
+        self, plant: Plant, start: Array, late: Wait | None, true: tuple[Signal, Signal], resting: Array
+    ) -> list[Block]:
+        """Blocks from the true state and response to the raw measurements that arrive.
+
+        Args:
+            plant: the plant that is measured.
             start: first state of the problem, shape (nx,).
             late: dead time of the measurement; None: none.
             true: signals of the true state and response.
             resting: response at the start, shape (n,).
         """
-        names = self.estimator.measures(plant)
-        first = _start(plant, start, names, resting)
-        measured = vector("measured", names, [_unit(plant, n) for n in names])
-        sensors = self._sensor_block(plant, true, measured, first)
-        if late is None:
-            return [sensors, self.estimator.block(plant, period, start, measured)]
-        arrived = replace(measured, name="_arrived", start=tuple(map(float, first)))
-        waiting = delay_block("see", measured, arrived, [late] * len(names))
-        return [sensors, waiting, self.estimator.block(plant, period, start, replace(arrived, start=()))]
+        arriving = self.raw(plant, start, late, resting)
+        measured = replace(arriving, name="measured", start=())
+        sensors = self._sensor_block(plant, true, measured, arriving.start_vector())
+        return (
+            [sensors, delay_block("see", measured, arriving, [late] * measured.size)] if late is not None else [sensors]
+        )
+
+    def _check_belief(self, plant: Plant, mistakes: Mistakes) -> None:
+        """Add a mistake where a quantity is neither measured nor believed, or a belief stands without need."""
+        names, measured = self.estimator.measures(plant), self.measures(plant)
+        missing = [n for n in names if n not in measured]
+        if self.measured is not None and not measured:
+            mistakes.add(
+                "measured: name at least one quantity; Sensing() without it measures all that the estimator needs"
+            )
+        elif self.belief is not None and self.measured is None:
+            mistakes.add(
+                f"belief: everything that {type(self.estimator).__name__} needs is measured; name what sensors show: "
+                f"Sensing(measured={list(measured)!r}, ...)"
+            )
+        elif self.belief is None and missing:
+            mistakes.add(
+                f"measured: {type(self.estimator).__name__} also needs {', '.join(missing)}; measure it, or state how it is "
+                "believed: Sensing(measured=..., belief=ModelStates())"
+            )
+        if self.belief is not None:
+            self.belief.check(plant, measured)
 
     def _columns(self) -> tuple[str, ...]:
         noisy = [(n, "noise", s.noise is not None) for n, s in self.sensors.items()]

@@ -10,6 +10,7 @@ and one count of an encoder makes it jump by w^n counts: a wide filter is noisy,
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -18,7 +19,7 @@ from scipy.special import comb
 
 from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import Array, DerivativeEstimator, spline_weights
+from fpirhc.sensing.base import Array, DerivativeEstimator, known_by_positions, spline_weights
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -54,6 +55,14 @@ class StateVariableFilter(DerivativeEstimator):
     def measures(self, plant: Plant) -> tuple[str, ...]:
         """The coordinates themselves."""
         return plant.names
+
+    def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
+        """Measured coordinates and their derivatives."""
+        return known_by_positions(plant, measured)
+
+    def answers(self, plant: Plant) -> tuple[str, ...]:
+        """The controlled coordinates."""
+        return plant.controlled_names
 
     def weights(self, order: int, period: float) -> Array:
         """The B-spline of an n-th difference through n low-passes (1 - p) / (1 - p / z), without the negligible tail."""

@@ -33,6 +33,10 @@ class VelocityDifference(DerivativeEstimator):
         """The whole state."""
         return plant.state.elements
 
+    def answers(self, plant: Plant) -> tuple[str, ...]:
+        """The highest derivatives of the controlled coordinates among the states."""
+        return _highest(plant)
+
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
         """Block (state) -> (state, its difference)."""
         return _difference_block(plant, period, start, seen, 0.0)
@@ -84,6 +88,10 @@ class LowPassDifference(DerivativeEstimator):
         """The whole state."""
         return plant.state.elements
 
+    def answers(self, plant: Plant) -> tuple[str, ...]:
+        """The highest derivatives of the controlled coordinates among the states."""
+        return _highest(plant)
+
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
         """Block (state) -> (state, its filtered difference)."""
         return _difference_block(plant, period, start, seen, self.pole(period))
@@ -106,11 +114,13 @@ class LowPassDifference(DerivativeEstimator):
         return 1
 
 
+def _highest(plant: Plant) -> tuple[str, ...]:
+    return tuple(plant.names[k] + "'" * (plant.orders[k] - 1) for k in plant.controlled_indices)
+
+
 def _difference_block(plant: Plant, period: float, start: Array, seen: Signal, pole: float) -> Block:
     """Block (state) -> (state, p f + (1 - p) difference over the period)."""
-    places = [
-        plant.state.elements.index(plant.names[k] + "'" * (plant.orders[k] - 1)) for k in plant.controlled_indices
-    ]
+    places = [plant.state.elements.index(e) for e in _highest(plant)]
     before = Signal("estimate_before", tuple(seen.elements[p] for p in places), start=tuple(map(float, start[places])))
     realised, smooth = plant.response_signal("realised"), Signal("estimate_smooth", plant.controlled_names)
     memory = (before, smooth, scalar("estimate_cycles")) if pole else (before,)

@@ -12,12 +12,16 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, Response, compose_controller, error_signal, like
+from fpirhc.controllers.base import Controller, Response, error_signal, like
 from fpirhc.controllers.contract import checked
-from fpirhc.controllers.gate import Gate
+from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
+from fpirhc.controllers.own_reference import given_signals, own_signals
+from fpirhc.controllers.plausible import plausible_range
+from fpirhc.controllers.seeing import compose_seeing, first_estimates, seeing_blocks
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, measures_all, sending_block
+from fpirhc.simulation.outside_blocks import outside_blocks, real_name
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -29,12 +33,13 @@ REALITY_STATE = "reality_state"  # signal of the state of a reality, in its own 
 
 
 def close_loop(problem: Problem, controller: Controller, live: LiveSettings | None = None) -> Composite:
-    """Return the closed loop as one step: (memory, [disturbance], [sensing]) -> (memory, trace).
+    """Return the closed loop as one step: (memory, [disturbance], [sensing], [setpoints]) -> (memory, trace).
 
     With a foreign reality the step also reads its measurements, and returns the inputs that it is sent.
 
     Both parameter sets are part of the memory (constant), so that other values need no new Function; live settings likewise. The
-    disturbance input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples.
+    disturbance input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples,
+    `setpoints` only where the reference is given some.
 
     Raises:
         NotSupported: a live setting that this loop cannot keep open.
@@ -46,12 +51,18 @@ def close_loop(problem: Problem, controller: Controller, live: LiveSettings | No
 
 def _closed(problem: Problem, controller: Controller, live: LiveSettings | None) -> Composite:
     ready = checked(problem, controller)
-    acting = Gate(nominal(problem), compose_controller(problem, ready), trusted=("time", "memory"))
+    task = nominal(problem)
+    # What a body outside measures may be wrong; what the loop computes itself is a result, however far it goes.
+    plausible = plausible_range(task) if problem.foreign is not None else {}
+    acting = Gate(task, compose_seeing(problem, ready), trusted=("time", "memory"), plausible=plausible)
     disturbed = disturbance_signals(problem)
     seeing = _sense_blocks(problem, ready.response(problem), predicts="state_ahead" in acting.inner.trace)
-    around = [_clock_block(problem.plant.time, problem.period), *seeing, acting.block(), *_actuate(problem, disturbed)]
+    judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
+    seeing = [block for block in seeing if block not in judging]
+    clock, actuating = _clock_block(problem.plant.time, problem.period), _actuate(problem, disturbed)
+    around = [clock, *outside_blocks(problem, ready), *seeing, acting.block(), *judging, *actuating]
     constants = live.held(around) if live is not None else []
-    reads = Layout((*disturbed, *problem.sensing.drawn, *foreign_signals(problem)))
+    reads = Layout((*disturbed, *problem.sensing.drawn, *given_signals(problem), *foreign_signals(problem)))
     sent = () if problem.foreign is None else (SENT,)
     return compose("loop", reads, around, [*_plant_delays(problem, ready), *constants], outputs=sent)
 
@@ -77,7 +88,19 @@ def start_memory(
         derived = loop.derived(numbers)
         starts |= {PREFIX + path: np.array([value]) for path, value in numbers.items()}
         starts |= {**derived.signals, **derived.memory()}
-    return loop.memory.pack(starts)
+    return loop.memory.pack(starts | _first_estimates(loop, problem, starts))
+
+
+def _first_estimates(loop: Composite, problem: Problem, starts: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What the estimator remembers at the start of this problem; a graph has it inside the controller's one signal."""
+    own = [s for block in seeing_blocks(problem) for s in block.memory.signals]
+    if not own or own[0].name in loop.memory:
+        return {s.name: s.start_vector() for s in own}
+    whole = loop.memory[INNER]
+    start, places = starts.get(INNER, whole.start_vector()).copy(), {c: k for k, c in enumerate(whole.elements)}
+    for s in own:
+        start[[places[c] for c in s.columns]] = s.start_vector()
+    return {INNER: start}
 
 
 def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:
@@ -99,7 +122,7 @@ def _plant_delays(problem: Problem, controller: Controller) -> list[Delay]:
         Delay(Signal("_acting_before", plant.input.elements, plant.input.units, acting), "_acting"),
         Delay(_forcing(plant, "_forcing_before"), "_forcing"),
         believed,
-        _held("_exact", plant, plant.exact),
+        replace(_held("_exact", plant, problem.real_parameters), source=real_name(problem)),
     ]
 
 
@@ -128,52 +151,57 @@ def _sense_blocks(problem: Problem, other: Response | None, *, predicts: bool) -
     if problem.sees_plant:
         sense = [_sense_block(problem, plant.state, response)]
         return [*sense, _truth_block(problem, plant.state)] if predicts or problem.dead_time.inputs else sense
-    true, shown, function = _true_blocks(problem, response)
+    true, shown = _true_blocks(problem, response)
     if problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued:
         return true  # with coordinates measured in place of others
-    return [*true, *_late_blocks(problem, shown, function)]
+    return [*true, *_late_blocks(problem, shown)]
 
 
-def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], tuple[Signal, Signal], ca.Function]:
-    """Blocks of the true state, response and error; the signals that sensors see; and the Function of the response among these."""
+def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], tuple[Signal, Signal]]:
+    """Blocks of the true state, response and error; and the signals that sensors see."""
     plant = problem.plant
     hidden = like(plant.state, "_seen_state"), like(response.signal, "_seen")
     if problem.foreign is not None and not measures_all(problem):
-        return [_sense_block(problem, hidden[0], Response(hidden[1], response.function))], hidden, response.function
+        return [_sense_block(problem, hidden[0], Response(hidden[1], response.function))], hidden
     true = like(plant.state, "plant_state"), like(response.signal, "plant_realised")
     sense = _sense_block(problem, true[0], Response(true[1], response.function))
     blocks = [sense, _truth_block(problem, true[0])]
     if problem.symbolic_reality is None or not problem.symbolic_reality.seen:
-        return blocks, true, response.function
+        return blocks, true
     direct = problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued
     shown = (plant.state, response.signal) if direct else hidden
     function = _own_response(problem, seen=True).function
-    return [*blocks, _seen_block(problem, shown, function)], shown, function
+    return [*blocks, _seen_block(problem, shown, function)], shown
 
 
-def _late_blocks(problem: Problem, shown: tuple[Signal, Signal], response: ca.Function) -> list[Block]:
-    """Blocks of sensors, their dead time and the estimator, from what the sensors see to what the controller is given."""
-    plant, behind = problem.plant, problem.dead_time.wait(MEASUREMENT, problem.period)
-    at = problem.real_start, problem.inputs_before, problem.real_plant.exact, np.zeros(len(problem.real_plant.names))
-    resting, first = response(*at).full().ravel(), problem.start_state
-    if problem.symbolic_reality is not None:
-        first = problem.symbolic_reality.state_function(plant, seen=True)(*at).full().ravel()
-    if not problem.sensing.ideal:
-        late = behind if MEASUREMENT in problem.dead_time.queued else None
-        return problem.sensing.blocks(plant, problem.period, first, late, shown, resting)
+def _late_blocks(problem: Problem, shown: tuple[Signal, Signal]) -> list[Block]:
+    """Blocks of sensors and their dead time, from what the sensors see to what the controller is given."""
+    plant, late, sensing = problem.plant, problem.dead_time.measurement_wait(problem.period), problem.sensing
+    first, resting = first_estimates(problem)
+    if not sensing.ideal:
+        sensors = sensing.blocks(plant, first, late, shown, resting)
+        if sensing.estimates:
+            return sensors
+        raw = sensing.raw(plant, first, late, resting)
+        return [*sensors, sensing.estimator.block(plant, problem.period, first, raw)]
     state = replace(plant.state, start=tuple(map(float, first)))
     realised = replace(shown[1], name="realised", start=tuple(map(float, resting)))
+    assert late is not None
     return [
-        delay_block("see_state", shown[0], state, [behind] * plant.state.size),
-        delay_block("see_response", shown[1], realised, [behind] * realised.size),
+        delay_block("see_state", shown[0], state, [late] * plant.state.size),
+        delay_block("see_response", shown[1], realised, [late] * realised.size),
     ]
 
 
 def _truth_block(problem: Problem, state: Signal) -> Block:
     """Block (time, true state) -> true error of the judged coordinates."""
-    plant, function = problem.plant, problem.reference.function(problem.plant)
+    plant = problem.plant
     places = [plant.state.elements.index(c) for c in problem.judged_names]
     writes = Layout((error_signal(problem, "true_error"),))
+    if own_signals(problem):
+        reads = Layout((like(plant.state, "reference"), state))
+        return Block("truth", reads, writes, lambda s: {"true_error": (s.reference - getattr(s, state.name))[places]})
+    function = problem.reference.function(plant)
 
     def step(s: Signals) -> dict[str, Expression]:
         return {"true_error": (function(s.time)[0] - getattr(s, state.name))[places]}
@@ -256,7 +284,8 @@ def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Si
     state = plant.state if problem.sees_plant else like(plant.state, "plant_state")
     if problem.symbolic_reality is not None:
         state = like(plant.state, REALITY_STATE)
-    reads = (state, arriving, like(plant.parameter, "_exact"), *disturbed)
+    exact = like(plant.parameter, real_name(problem))
+    reads = (state, arriving, exact, *disturbed)
     writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
 
     def step(s: Signals) -> dict[str, Expression]:
@@ -265,6 +294,10 @@ def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Si
             added = dict(zip(problem.disturbances, ca.vertsplit(s.disturbance), strict=True))
             u = u + ca.vertcat(*(added.get(name, 0) for name in plant.inputs))
             w = ca.vertcat(*(added.get(name, 0) for name in plant.names))
-        return {"_state_after": advance(getattr(s, state.name), u, s._exact, w), "_acting": u, "_forcing": w}
+        return {
+            "_state_after": advance(getattr(s, state.name), u, getattr(s, exact.name), w),
+            "_acting": u,
+            "_forcing": w,
+        }
 
     return Block("advance", Layout(reads), Layout(writes), step, opaque=problem.real_integrator.opaque)

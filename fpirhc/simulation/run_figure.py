@@ -31,6 +31,8 @@ def run_figure(run: Run) -> Figure:
         draw_line(axes[0], run, f"error.{name}", name, PALETTE[k])
         draw_line(axes[1], run, f"state.{name}", name, PALETTE[k])
         draw_line(axes[1], run, f"reference.{name}", f"{name} reference", PALETTE[k], "--")
+        if "setpoint" in run.layout:
+            draw_line(axes[1], run, f"setpoint.{name}", f"{name} set-point", PALETTE[k], ":")
     for k, name in enumerate(run.layout["command"].elements):
         draw_line(axes[2], run, f"command.{name}", name, PALETTE[k])
     first = run.layout["desired"].elements[0]

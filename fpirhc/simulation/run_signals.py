@@ -10,14 +10,16 @@ import numpy as np
 from fpirhc.contraction import contraction_along
 from fpirhc.contraction.identified import identified_factor
 from fpirhc.contraction.sampled import sampled_jacobians
-from fpirhc.contraction.spectrum import factors_along
+from fpirhc.contraction.spectrum import factors_along, response_jacobians
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.own_reference import own_signals
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.simulation.loop import REALITY_STATE
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.task.outside import model_values, real_values, rows_of
 from fpirhc.task.problem import Problem
 
 _CHUNK = 500  # cycles whose costs are evaluated in one call
@@ -30,7 +32,8 @@ def judgements(problem: Problem, controller: Controller, layout: Layout, log: np
     if problem.cost is not None and problem.horizon is not None:
         judged.append(_costs(problem, layout, log))
     gain = controller.deformation.effective_gain()
-    if gain != 0 and log.shape[0] and controller.response(problem) is None:
+    of_responses = controller.response(problem) is None and not controller.deforms_target
+    if gain != 0 and log.shape[0] and of_responses:
         factors = _contraction(problem, controller, layout, log)
         judged += [(scalar("contraction"), factors[:, None])] if np.isfinite(factors).all() else []
     return judged
@@ -49,12 +52,32 @@ def _contraction(problem: Problem, controller: Controller, layout: Layout, log: 
             np.nan if problem.response_delay else identified_factor(deformed, log[:, layout.slice("realised")], gain)
         )
         return np.full(len(log), shown)
+    if problem.signals:
+        return _contraction_outside(problem, controller, layout, log)
     if problem.symbolic_reality is None:
         return contraction_along(plant, states, deformed, gain, approximate=believed)
     real, modelled = log[:, layout.slice(REALITY_STATE)], replace(problem, plant=plant)
     return factors_along(
         len(log), lambda rows: sampled_jacobians(modelled, real[rows], states[rows], deformed[rows], believed), gain
     )
+
+
+def _contraction_outside(problem: Problem, controller: Controller, layout: Layout, log: np.ndarray) -> np.ndarray:
+    """The factor of every cycle with signals from outside: plant and model have those of the cycle."""
+    states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]
+    plant, own = problem.real_plant, controller.model_plant(problem)
+    times = log[:, layout.slice("time")].ravel() + problem.period / 2
+    real = rows_of(real_values(plant, problem.signals), times, plant.exact)
+    told = rows_of(model_values(own, controller.told(problem)), times, controller.parameters(own))
+    modelled = problem if own is problem.plant else replace(problem, plant=own)
+
+    def jacobians(rows: np.ndarray) -> np.ndarray:
+        if problem.symbolic_reality is None:
+            return response_jacobians(own, states[rows], deformed[rows], real[rows], told[rows])
+        moved = log[rows][:, layout.slice(REALITY_STATE)]
+        return sampled_jacobians(modelled, moved, states[rows], deformed[rows], told[rows], real[rows])
+
+    return factors_along(len(log), jacobians, controller.deformation.effective_gain())
 
 
 def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, np.ndarray]:
@@ -69,18 +92,21 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
     plant = problem.plant
     one_cycle = replace(problem.horizon, stages=1, step=problem.period, terminal=(), blocks=(), margins={})
     ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits)
-    data_of = stage_data(plant, problem.reference, one_cycle, problem.cost)
+    own, outside = bool(own_signals(problem)), real_values(plant, problem.signals)
+    data_of = stage_data(plant, problem.reference, one_cycle, problem.cost, signals=outside, previewed=own)
     states = log[:, layout.slice("plant_state")]
     commands = log[:, layout.slice("command")]
     states = np.asarray(ocp.start(states.T, np.vstack([commands[:1], commands[:-1]]).T).full()).T
     times = log[:, layout.slice("time")]
+    # Along the reference that the run had, where it is no function of the time alone.
+    motion = [log[:, layout.slice(name)] for name in ("reference", "reference_response")] if own else []
     function = _cost_function(ocp, data_of, _CHUNK)
     evaluator = Evaluator(function)
     costs = np.empty((log.shape[0], len(ocp.terms)))
-    evaluator.arguments[3][:] = plant.exact
+    evaluator.arguments[-1][:] = plant.exact
     for at in range(0, log.shape[0], _CHUNK):
         size = min(_CHUNK, log.shape[0] - at)
-        for argument, source in zip(evaluator.arguments, (times, states, commands), strict=False):
+        for argument, source in zip(evaluator.arguments, (times, *motion, states, commands), strict=False):
             argument.reshape(_CHUNK, -1)[:size] = source[at : at + size]
         evaluator.evaluate()
         costs[at : at + size] = evaluator.results[0].reshape(_CHUNK, -1)[:size]
@@ -88,11 +114,14 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
 
 
 def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int) -> ca.Function:
-    """Function (times, states, inputs, parameters) -> cost terms of `count` cycles."""
+    """Function (times, [states and responses of the reference], states, inputs, parameters) -> cost terms of `count` cycles."""
     t, s = ca.MX.sym("t"), ca.MX.sym("s", ocp.state.size)
-    u, p = ca.MX.sym("u", ocp.input.size), ca.MX.sym("p", data_of.size1_in(1))
-    one = ca.Function("fpirhc_cost", [t, s, u, p], [ocp.stage_cost(s, u, data_of(t, p)[:, 0])[1]])
+    u, p = ca.MX.sym("u", ocp.input.size), ca.MX.sym("p", data_of.size1_in(data_of.n_in() - 1))
+    motion = [ca.MX.sym(data_of.name_in(k), data_of.size1_in(k)) for k in range(1, data_of.n_in() - 1)]
+    data = data_of(t, *(ca.repmat(m, 1, 2) for m in motion), p)[:, 0]
+    one = ca.Function("fpirhc_cost", [t, *motion, s, u, p], [ocp.stage_cost(s, u, data)[1]])
     times, states = ca.MX.sym("t", 1, count), ca.MX.sym("s", ocp.state.size, count)
     inputs = ca.MX.sym("u", ocp.input.size, count)
-    terms = one.map(count)(times, states, inputs, ca.repmat(p, 1, count))
-    return ca.Function("fpirhc_costs", [times, states, inputs, p], [terms])
+    moves = [ca.MX.sym(m.name(), m.size1(), count) for m in motion]
+    terms = one.map(count)(times, *moves, states, inputs, ca.repmat(p, 1, count))
+    return ca.Function("fpirhc_costs", [times, *moves, states, inputs, p], [terms])

@@ -1,4 +1,4 @@
-"""Arguments of a step that are no arrays of float64: lists, other types of numbers, and mistakes."""
+"""Samples of a step: those of a run, and arguments that are no arrays of float64 (lists, other types of numbers, mistakes)."""
 
 from __future__ import annotations
 
@@ -7,6 +7,18 @@ from numbers import Real
 import numpy as np
 
 from fpirhc.errors import InvalidShape, InvalidValue
+from fpirhc.simulation.run import Run
+
+
+def raw_measurements(run: Run) -> np.ndarray:
+    """Return what the controller of a run was given in every cycle, shape (cycles, number of measurements).
+
+    It is what the sensors show, as it arrives; state and response where both are measured. `Stepper.step_measured` takes its rows.
+    """
+    for name in ("arrived", "measured"):
+        if name in run.layout:
+            return np.ascontiguousarray(run[name])
+    return np.hstack([run["state"], run["realised"]])
 
 
 def numbers(name: str, value: object, size: int) -> np.ndarray:

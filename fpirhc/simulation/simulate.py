@@ -22,6 +22,7 @@ from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.ranges import ranges_of
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.run_signals import judgements
+from fpirhc.simulation.set_points import Setpoints, set_point_record, set_point_table
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator, unwrapped
 from fpirhc.symbolic.layout import Layout
@@ -72,6 +73,7 @@ class Simulator:
         progress: Progress | None = None,
         settings: Numbers | None = None,
         changes: Changes | None = None,
+        setpoints: Setpoints | None = None,
     ) -> Run:
         """Run the loop once and return its signals.
 
@@ -83,10 +85,11 @@ class Simulator:
             progress: called with (cycles done, cycles in all).
             settings: numbers of live settings by path; the others have the numbers of the build.
             changes: numbers of live settings from a time on, by time in s.
+            setpoints: by coordinate, in place of those of the reference: a number, pairs (time, set-point), or a function of time.
 
         Raises:
-            InvalidName: a setting that is not live.
-            InvalidValue: a number that a setting does not accept; a change outside the run.
+            InvalidName: a setting that is not live; a coordinate without set-point.
+            InvalidValue: a number that a setting does not accept; a change outside the run; a set-point that cannot be reached.
             NotContractive: a gain with which the deformation cannot converge.
         """
         problem = variant or self.problem
@@ -94,7 +97,8 @@ class Simulator:
         problem, controller = force.problem, force.controller
         start = start_memory(self.loop, problem, controller, force.numbers)
         common = (problem, start, self.loop.trace, self.evaluator, seed, disturbed, progress)
-        logged, stop = (_run_chunks if problem.foreign is None else _run_foreign)(*common, force.patches)
+        chosen = _run_chunks if problem.foreign is None else _run_foreign
+        logged, stop = chosen(*common, force.patches, setpoints)
         layout, log = with_common_columns(self.loop.trace, logged)
         log.setflags(write=False)
         step_limit = controller.deformation.largest_step()
@@ -112,6 +116,9 @@ class Simulator:
         }
         if force.record:
             facts["live"] = [[time, dict(values)] for time, values in force.record]
+        points = set_point_record(problem, setpoints)
+        if points:
+            facts["setpoints"] = points
         if problem.reality is not None:
             facts["model is reality"] = controller.model_plant(problem) is not problem.plant
         title = name or type(self.controller).__name__
@@ -164,6 +171,7 @@ def simulate(
     progress: Progress | None = None,
     settings: Numbers | None = None,
     changes: Changes | None = None,
+    setpoints: Setpoints | None = None,
 ) -> Run:
     """Run the closed loop of problem and controller and return every signal, also those that judge the run.
 
@@ -180,10 +188,13 @@ def simulate(
         progress: called with (cycles done, cycles in all).
         settings: numbers of settings by path, in place of those of the controller and the problem.
         changes: numbers of settings from a time on, by time in s.
+        setpoints: by coordinate, in place of those of the reference: a number, pairs (time, set-point), or a function of time.
     """
     live = tuple(dict.fromkeys(path for numbers in (settings or {}, *(changes or {}).values()) for path in numbers))
     ready = simulator(problem, controller, compiled=compiled, flags=flags, live=live)
-    return judged_run(ready, seed=seed, name=name, progress=progress, settings=settings, changes=changes)
+    return judged_run(
+        ready, seed=seed, name=name, progress=progress, settings=settings, changes=changes, setpoints=setpoints
+    )
 
 
 def judged_run(
@@ -194,6 +205,7 @@ def judged_run(
     progress: Progress | None = None,
     settings: Numbers | None = None,
     changes: Changes | None = None,
+    setpoints: Setpoints | None = None,
 ) -> Run:
     """Run a loop that is ready and return every signal, also those that judge the run; see `simulate`.
 
@@ -204,9 +216,10 @@ def judged_run(
         progress: called with (cycles done, cycles in all).
         settings: numbers of live settings by path; the others have the numbers of the build.
         changes: numbers of live settings from a time on.
+        setpoints: by coordinate, in place of those of the reference.
     """
     title = name or ready.controller.task_name or type(ready.controller).__name__
-    run = ready.run(seed=seed, name=title, progress=progress, settings=settings, changes=changes)
+    run = ready.run(seed=seed, name=title, progress=progress, settings=settings, changes=changes, setpoints=setpoints)
     problem, controller = ready.problem, ready.controller
     if settings:
         problem, controller, _ = ready.live.changed(settings)
@@ -241,10 +254,11 @@ def _run_chunks(
     disturbed: bool,
     progress: Progress | None,
     patches: Sequence[tuple[int, np.ndarray, np.ndarray]] = (),
+    setpoints: Setpoints | None = None,
 ) -> tuple[np.ndarray, str | None]:
     cycles = problem.cycles
     padded = (-(-cycles // CHUNK) + (1 if patches else 0)) * CHUNK
-    tables = _tables(problem, seed, padded, disturbed)
+    tables = _tables(problem, seed, padded, disturbed, setpoints)
     log, ranges = np.empty((padded, trace.size)), ranges_of(problem, trace)
     evaluator.arguments[0][:] = start
     for at, end in _pieces(cycles, [cycle for cycle, _, _ in patches]):
@@ -291,18 +305,19 @@ def _run_foreign(
     disturbed: bool,
     progress: Progress | None,
     patches: Sequence[Patch] = (),
+    setpoints: Setpoints | None = None,
 ) -> tuple[np.ndarray, str | None]:
-    tables = _tables(problem, seed, problem.cycles, disturbed)
+    tables = _tables(problem, seed, problem.cycles, disturbed, setpoints)
     try:
         return run_foreign(problem, start, trace, evaluator, seed, tables, progress, patches)
     except SystemError as error:
         raise unwrapped(error) from None
 
 
-def _tables(problem: Problem, seed: int, cycles: int, disturbed: bool) -> list[np.ndarray]:
-    """Disturbances and the sensors' random series of every cycle, where there are any."""
-    both = float(disturbed) * disturbance_table(problem, seed, cycles), sensing_table(problem, seed, cycles)
-    return [table for table in both if table.shape[1]]
+def _tables(problem: Problem, seed: int, cycles: int, disturbed: bool, setpoints: Setpoints | None) -> list[np.ndarray]:
+    """Disturbances, the sensors' random series, and set-points of every cycle, where there are any."""
+    random = float(disturbed) * disturbance_table(problem, seed, cycles), sensing_table(problem, seed, cycles)
+    return [table for table in (*random, set_point_table(problem, setpoints, cycles)) if table.shape[1]]
 
 
 def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:

@@ -9,15 +9,19 @@ from typing import NoReturn, Protocol, cast
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, compose_controller
+from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.gate import HELD, Gate
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
+from fpirhc.controllers.own_reference import given_signals
 from fpirhc.controllers.plausible import plausible_range
-from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidName, InvalidValue, NotSupported
+from fpirhc.controllers.seeing import compose_seeing, raw_signal
+from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidName, InvalidShape, InvalidValue, NotSupported
+from fpirhc.sensing.base import response_names
 from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, Watch, machine_step
 from fpirhc.simulation.sample import numbers as numbers_of
 from fpirhc.simulation.sample import one_number
+from fpirhc.simulation.set_points import SetpointsNow, set_points_now
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
@@ -44,6 +48,11 @@ class Stepper:
         command, memory = stepper.step(time, state, realised, memory)
 
     All memory is in the argument: the same arguments give the same command. `trace()` returns every signal of the last step.
+
+    Where the problem's sensing estimates state or response, the estimator is part of the step, which is given what the sensors
+    show, in the order of `measures`:
+
+        command, memory = stepper.step_measured(time, measured, memory)
 
     A bad sample skips the cycle: one that is not finite, outside its plausible range, or (with `max_age`) out of date. The command
     is the last one, every memory stays as it was, the status is BAD_SAMPLE, and the signal 'skipped' counts. Before the first good
@@ -105,6 +114,7 @@ class Stepper:
         self._bind(
             backend.function if backend else self._composite.function, ready.parameters(ready.model_plant(problem))
         )
+        self.measures = _measures(problem)  # names of the raw measurements
         self.refused, self.why_refused = 0, ""
         self.numbers: dict[str, float] = self._live.start
         self._force(self.numbers)
@@ -123,23 +133,26 @@ class Stepper:
         *,
         taken: float | None = None,
         settings: Numbers | None = None,
+        setpoints: SetpointsNow | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return (command, memory for the next cycle).
 
         Args:
             time: s.
-            state: the measured state, shape (nx,).
+            state: the measured state, shape (nx,). Where it is estimated, use `step_measured`.
             realised: the measured response of the controlled coordinates to the last command; any finite value in the first cycle,
                 and for a controller that does not adapt.
             memory: from `start` or from the step before.
             taken: time stamp of the sample, s; None: it was taken at `time`. Read with `max_age` only.
             settings: numbers of live settings from this step on, by path. Checks and derived numbers are computed in Python before
                  the step, a tenth of a millisecond for gains and some tens for the weights of a horizon; see `change`.
+            setpoints: set-points from this step on, by coordinate: a number, or where they are announced one number per node of the
+                 horizon; see `aim`.
 
         Raises:
             InvalidShape: a wrong number of entries, named.
             InvalidValue: an argument that is not made of numbers, or the memory of another controller.
-            InvalidName: a setting that is not live.
+            InvalidName: a setting that is not live; a coordinate without set-point.
             ConcurrentUse: another thread is inside this stepper.
         """
         # Taking the only token out of a list is atomic, and five times as fast as a lock.
@@ -148,8 +161,8 @@ class Stepper:
         except IndexError:
             _refuse_thread()
         try:
-            if settings:
-                self.change(settings)
+            if settings or setpoints or isinstance(time, bool):
+                self._take(time, settings, setpoints)
             try:
                 # A view takes arrays of float64 of its own shape and nothing else; numpy's assignment broadcasts, and is slower.
                 self._time[0] = time
@@ -174,6 +187,37 @@ class Stepper:
         finally:
             self._tokens.append(token)
 
+    def step_measured(
+        self,
+        time: float,
+        measured: np.ndarray,
+        memory: np.ndarray,
+        *,
+        taken: float | None = None,
+        settings: Numbers | None = None,
+        setpoints: SetpointsNow | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return (command, memory for the next cycle) from raw measurements.
+
+        Args:
+            time: s.
+            measured: what the sensors show, in the order of `measures`; late by the dead time of the measurement, as it arrives.
+            memory: from `start` or from the step before.
+            taken: time stamp of the sample, as in `step`.
+            settings: numbers of live settings from this step on, as in `step`.
+            setpoints: as in `step`.
+
+        Raises:
+            FpirhcError: as in `step`.
+        """
+        if self.estimates:
+            return self.step(time, measured, _NOTHING, memory, taken=taken, settings=settings, setpoints=setpoints)
+        column = numbers_of("measured", measured, len(self.measures))
+        size = len(self._state)
+        return self.step(
+            time, column[:size], column[size:], memory, taken=taken, settings=settings, setpoints=setpoints
+        )
+
     def change(self, settings: Numbers) -> bool:
         """Put numbers of live settings in force from the next step on, by path, and return whether they were accepted.
 
@@ -191,6 +235,35 @@ class Stepper:
             return False
         self.numbers = numbers
         return True
+
+    def aim(self, setpoints: SetpointsNow) -> bool:
+        """Put set-points in force from the next step on, by coordinate, and return whether they were accepted.
+
+        A set-point that is not finite, or outside the range or the limits of its state, is refused with all others of the call: the
+        old ones stay, `refused` counts, and `why_refused` states the reason.
+
+        Raises:
+            InvalidName: a coordinate without set-point.
+            InvalidShape: neither one number nor one per node.
+        """
+        try:
+            row = set_points_now(self._live.problem, setpoints, self._setpoints)
+        except InvalidValue as error:
+            self.refused, self.why_refused = self.refused + 1, str(error)
+            return False
+        self._setpoints[:] = row
+        return True
+
+    @property
+    def setpoints(self) -> dict[str, float | list[float]]:
+        """The set-points in force, by coordinate; where they are announced, one per node of the horizon."""
+        names = self._live.problem.plant.names
+        rows = self._setpoints.reshape(-1, len(names)).T
+        return {
+            name: row.tolist() if row.size > 1 else float(row[0])
+            for name, row in zip(names, rows, strict=True)
+            if row.size
+        }
 
     def _force(self, numbers: Mapping[str, float]) -> None:
         """Write the settings and what follows from them into the arguments; nothing is written where something is refused."""
@@ -235,23 +308,42 @@ class Stepper:
         arguments["parameters"][:] = parameters
         places = {name: k + 1 for k, name in enumerate(self._composite.reads.names)}  # after the memory
         self._settings = {name: self._evaluator.arguments[places[name]] for name in self._composite.settings.names}
+        self._setpoints = np.zeros(0)
+        for signal in given_signals(self._live.problem):
+            self._setpoints = self._evaluator.arguments[places[signal.name]]
+            self._setpoints[:] = signal.start_vector()
         memory_next, self._trace, command = self._evaluator.results
         self._new_command, self._new_memory = command.copy, memory_next.copy
-        self._memory, self._time, self._state, self._realised = (
-            _view(arguments[n]) for n in ("memory", "time", "state", "realised")
-        )
+        raw = raw_signal(self._live.problem)
+        self.estimates = raw is not None  # whether the step begins with raw measurements
+        sample = ("state", "realised") if raw is None else (raw.name,)
+        self._memory, self._time, self._state, *rest = (_view(arguments[n]) for n in ("memory", "time", *sample))
+        self._realised = rest[0] if rest else _view(_NOTHING)
         self._memory_array = arguments["memory"]
         self._taken = _view(arguments["taken"]) if self._ages else self._time
         self._command = _view(command)
         self._fingerprint = float(self.memory[FINGERPRINT].start[0])
 
+    def _take(self, time: object, settings: Numbers | None, setpoints: SetpointsNow | None) -> None:
+        """Put numbers in force, and refuse a truth value as time."""
+        if settings:
+            self.change(settings)
+        if setpoints:
+            self.aim(setpoints)
+        if isinstance(time, bool):
+            one_number("time", time)
+
     def _accept(self, time: object, state: object, realised: object, memory: object) -> None:
         """Take arguments that are no arrays of float64, or say what is wrong with them."""
-        values = {
-            "state": (self._state, state),
-            "realised": (self._realised, realised),
-            "memory": (self._memory, memory),
-        }
+        first = "measured" if self.estimates else "state"
+        if self.estimates and np.size(cast(float, realised)):
+            raise InvalidShape(
+                f"this controller estimates its state and response from {', '.join(self.measures)}: use "
+                "step_measured(time, measured, memory) with these, in this order"
+            )
+        values = {first: (self._state, state), "memory": (self._memory, memory)}
+        if not self.estimates:
+            values["realised"] = (self._realised, realised)
         checked_values = {name: numbers_of(name, value, len(view)) for name, (view, value) in values.items()}
         self._time[0] = one_number("time", time)
         for name, (view, _) in values.items():
@@ -285,7 +377,7 @@ def _composed(
     gates: list[Gate] = []
 
     def compose(problem: Problem, controller: Controller) -> Composite:
-        inner = compose_controller(problem, controller)
+        inner = compose_seeing(problem, controller)
         gates.append(Gate(live.problem, inner, plausible=plausible, max_age=max_age))
         return machine_step(live.problem, ready, gates[-1], watch)
 
@@ -293,7 +385,14 @@ def _composed(
     return composite, gates[-1].named(composite.memory)
 
 
+_NOTHING = np.zeros(0)
 _NOT_WRITTEN = float("nan")  # the gate's command is finite: what is still NaN was not written
+
+
+def _measures(problem: Problem) -> tuple[str, ...]:
+    """Names of what a step is given: the state and the responses, or what the sensors show."""
+    raw = raw_signal(problem)
+    return (*problem.plant.state.elements, *response_names(problem.plant)) if raw is None else raw.elements
 
 
 def _view(array: np.ndarray) -> _View:

@@ -14,6 +14,7 @@ from fpirhc.optimisers.certificate import Certificate, certify
 from fpirhc.optimisers.plan import Plan, solve
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.studies.comparison.optimiser_choices import optimiser_choices
+from fpirhc.task.outside import previewed_values
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +53,10 @@ def solve_first(task: Task, names: Sequence[str], tolerance: float) -> list[Solv
     if unknown:
         raise InvalidName(f"optimiser '{unknown[0]}' is unknown.{nearest(unknown[0], [*choices, 'all'])}")
     plant = problem.plant
-    ocp = transcribe(plant, problem.reference, problem.horizon, problem.cost, problem.limits)
-    data = np.asarray(
-        stage_data(plant, problem.reference, problem.horizon, problem.cost)(0.0, plant.approximate).full()
-    )
+    ahead = previewed_values(plant, problem.signals)
+    ocp = transcribe(plant, problem.reference, problem.horizon, problem.cost, problem.limits, ahead)
+    data_of = stage_data(plant, problem.reference, problem.horizon, problem.cost, signals=ahead)
+    data = np.asarray(data_of(0.0, plant.approximate).full())
     first = np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel()
     solved = []
     for name in choices if "all" in names else dict.fromkeys(names):

@@ -101,6 +101,10 @@ class DeadTime(Checked):
         late = self.measurement if name == MEASUREMENT else self.inputs.get(name, 0.0)
         return Wait(late / period, self.longest.get(name, 0.0) / period)
 
+    def measurement_wait(self, period: float) -> Wait | None:
+        """Return how long measurements wait; None where there is no queue."""
+        return self.wait(MEASUREMENT, period) if MEASUREMENT in self.queued else None
+
     def check(self, plant: Plant, period: float) -> None:
         """Raise if a name is unknown, or a dead time is negative, not finite, or too long.
 

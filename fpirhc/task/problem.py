@@ -16,6 +16,7 @@ from fpirhc.fields.kinds import Duration
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.stage_check import check_stage
+from fpirhc.plant.algebraic import unsolved
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
@@ -25,11 +26,14 @@ from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.foreign import Foreign
 from fpirhc.task.limits import Limits
+from fpirhc.task.outside import External, check_signals, real_values, rows_of, signals_of
 from fpirhc.task.problem_view import problem_facts, problem_table
 from fpirhc.task.reality import Reality
 from fpirhc.task.reference import Reference
+from fpirhc.task.steps import check_steps
 
 MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
+_INSTANTS = 101  # at which signals from outside are tried before a run
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +60,7 @@ class Problem(Checked):
         judged: coordinates whose errors are logged and measured; None: the controlled ones.
         reality: what a run moves, where it is not `plant` with its exact parameters: another plant (`Reality`), or an object
             outside (`Foreign`). `plant` is then the model alone.
+        signals: values over time of every signal from outside that the plants declare, by name: `Known`, `Unknown` or `Believed`.
         name: of the problem in results; the problem of a file has the name of the file.
 
     Raises:
@@ -78,6 +83,7 @@ class Problem(Checked):
     judged: Sequence[str] | None = None
     input_before: Mapping[str, float] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
     reality: Reality | Foreign | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    signals: Mapping[str, External] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
     name: str = field(default="", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
@@ -90,14 +96,16 @@ class Problem(Checked):
         disturbed = [*plant.inputs, *(() if self.foreign else self.real_plant.coordinates)]
         mistakes.unknown("disturbances: input or coordinate", self.disturbances, disturbed)
         instants, random = np.array([0.0, self.period]), np.random.default_rng(0)
+        check_signals(self._plants, self.signals, np.linspace(0.0, self.duration, _INSTANTS), mistakes)
         checks = (
             *((lambda one=one: one.values(instants, random)) for one in self.disturbances.values()),
             lambda: self.limits.check(plant),
             lambda: self.reference.function(plant),
+            lambda: check_steps(plant, self.limits, self.reference.set_points),
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant),
             lambda: self.symbolic_reality.check(plant) if self.symbolic_reality else None,
-            lambda: self.foreign.check(plant, self.sensing.estimator.measures(plant)) if self.foreign else None,
+            lambda: self.foreign.check(plant, self.sensing.measures(plant)) if self.foreign else None,
         )
         for check in checks:
             try:
@@ -169,7 +177,8 @@ class Problem(Checked):
             return self
         known = {*self.plant.inputs, *self.plant.coordinates}
         disturbances = {name: one for name, one in self.disturbances.items() if name in known}
-        return replace(self, reality=None, disturbances=disturbances)
+        signals = signals_of(self.plant, self.signals)
+        return replace(self, reality=None, disturbances=disturbances, signals=signals)
 
     @property
     def real_integrator(self) -> Integrator:
@@ -186,6 +195,17 @@ class Problem(Checked):
         if self.symbolic_reality is None:
             return self.start_state
         return self.symbolic_reality.start_state(self.plant, self.start_state, self.inputs_before)
+
+    @property
+    def real_parameters(self) -> np.ndarray:
+        """Parameters of the plant that a run moves in its first cycle: the exact ones, with the real values of signals."""
+        plant = self.real_plant
+        return rows_of(real_values(plant, self.signals), np.array([self.period / 2]), plant.exact)[0]
+
+    @property
+    def _plants(self) -> tuple[Plant, ...]:
+        """The model, and another plant that moves."""
+        return (self.plant,) if self.symbolic_reality is None else (self.plant, self.real_plant)
 
     @cached_property
     def start_state(self) -> np.ndarray:
@@ -294,13 +314,17 @@ def _check_input_before(problem: Problem, mistakes: Mistakes) -> None:
 def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
     """Add a mistake where the response is not finite at the start, or cannot be solved for the inputs there."""
     plant = problem.plant
-    if plant.controlled is None and len(plant.inputs) != len(plant.coordinates):
+    exact = () if problem.reality else (("exact", plant.exact),)  # with a reality these values move nothing
+    for which, values in (("approximate", plant.approximate), *exact):
+        why = unsolved(plant, problem.start_state, problem.inputs_before, values)
+        if why:
+            mistakes.add(f"algebraic states at the start ({which} parameters): {why}")
+    if not mistakes.none or (plant.controlled is None and len(plant.inputs) != len(plant.coordinates)):
         return
     x, u, p = plant.symbols()
     response = plant.controlled_response_function(x, u, p)
     gain_of = ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response])
     state = ", ".join(f"{e} = {v:g}" for e, v in zip(plant.state.elements, problem.start_state, strict=True))
-    exact = () if problem.reality else (("exact", plant.exact),)  # with a reality these values move nothing
     for which, values in (("approximate", plant.approximate), *exact):
         gain, free = (np.asarray(m.full()) for m in gain_of(problem.start_state, problem.inputs_before, values))
         if not np.all(np.isfinite(free)):

@@ -20,6 +20,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
+from fpirhc.plant.algebraic import unsolved
 from fpirhc.plant.chain import derivatives_function, input_reaches_at
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.plant import Plant
@@ -156,6 +157,9 @@ class Reality(Checked):
             InvalidProblem: with the fastest pole, and the sub-steps that would do.
         """
         plant = self.plant
+        why = unsolved(plant, start, command, plant.exact)
+        if why:
+            raise InvalidProblem(f"reality: algebraic states at the start: {why}")
         rates = np.asarray(plant.derivative_function(start, command, plant.exact).full()).ravel()
         if not np.isfinite(rates).all():
             wrong = plant.state.elements[int(np.argmin(np.isfinite(rates)))]

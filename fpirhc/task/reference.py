@@ -1,7 +1,12 @@
 """References: the nominal motion and its derivatives, as a function of time.
 
 Every reference gives one Function t -> (nominal state, nominal response): the coordinates with all derivatives that the
-plant's state has, and the highest derivative of each. Derivatives come from automatic differentiation.
+plant's state has, and the highest derivative of each. Derivatives come from automatic differentiation. Whatever is decided before a
+run (scales, reviews, first plans) uses this nominal motion.
+
+A reference may depend on more than the time: on values that a run is given, and on a memory. Such a reference has a block of its
+own in the controller's step. The block reads what is given from outside, and writes the reference's own signals, from which motion
+and preview follow in every cycle. Without own signals the motion is the nominal one.
 """
 
 from __future__ import annotations
@@ -17,12 +22,18 @@ from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import kind
-from fpirhc.symbolic.layout import Expression
+from fpirhc.symbolic.layout import Expression, Signal
+
+Steps = float | Sequence[Sequence[float]]  # one set-point, or pairs (time, set-point)
 
 
 class Reference(Checked, ABC):
-    """Contract: the nominal motion of every coordinate."""
+    """Contract: the nominal motion of every coordinate, and how the motion of a run differs from it.
+
+    A horizon of N stages asks for a preview of N + 1 nodes; `stages` is N, or 0 for a problem without a horizon.
+    """
 
     @property
     def opaque(self) -> bool:
@@ -55,6 +66,61 @@ class Reference(Checked, ABC):
         t = matrix.sym("t")
         values = _differentiate(matrix(self.coordinates(t)[coordinate]), t, order)
         return ca.Function("fpirhc_reference_derivatives", [t], [ca.densify(ca.vertcat(*values))])
+
+    @property
+    def set_points(self) -> Mapping[str, Steps]:
+        """The set-points of a run that is given no others, by coordinate; {}: a run gives this reference no set-points."""
+        return {}
+
+    def given(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
+        """Return the signals that a controller reads from outside for this reference."""
+        del plant, stages
+        return ()
+
+    def own(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
+        """Return the signals on which the motion depends besides the time; the block writes them."""
+        del plant, stages
+        return ()
+
+    def block(self, plant: Plant, stages: int, period: float) -> Block | None:
+        """Return the block from what is given to the own signals; None: there are no own signals."""
+        del plant, stages, period
+        return None
+
+    def motion_now(self, plant: Plant, stages: int, ahead: float = 0.0) -> ca.Function:
+        """Function (t, own signals) -> (state, response) as far as it is known now.
+
+        Args:
+            plant: with the coordinates.
+            stages: of the horizon.
+            ahead: time by which the motion lies in the future.
+        """
+        del stages
+        function = self.function(plant)
+        if ahead == 0:
+            return function
+        t = kind(self.opaque).sym("t")
+        return ca.Function("fpirhc_reference_ahead", [t], list(function(t + ahead)), ["t"], ["state", "response"])
+
+    def chain(self, plant: Plant, stages: int, coordinate: str, order: int) -> ca.Function:
+        """Function (t, own signals) -> the coordinate's value and its derivatives up to `order`, shape (order + 1,)."""
+        del plant, stages
+        return self.derivatives(coordinate, order)
+
+    def preview(self, plant: Plant, stages: int, step: float) -> ca.Function | None:
+        """Function (own signals) -> (states (nx, N + 1), responses (n, N + 1)) at the nodes; None without own signals."""
+        del plant, stages, step
+        return None
+
+    def rests(self, until: float) -> bool:
+        """Return whether the nominal motion is known to stand still up to some time, whatever the numbers of live settings are."""
+        del until
+        return False
+
+    def largest_jump(self, plant: Plant) -> float:
+        """Largest known jump of the controlled responses from one cycle to the next, which no derivative shows."""
+        del plant
+        return 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,6 +11,7 @@ import fpirhc as fp
 from attack.faults import Cycle, Fault
 from fpirhc.controllers.contract import Controller, checked
 from fpirhc.errors import FpirhcError
+from fpirhc.sensing.base import response_names
 from fpirhc.simulation.loop import _own_response
 from fpirhc.status import Status
 
@@ -118,7 +119,7 @@ class Bench:
             if active and fault is not None and fault.sample is not None:
                 fault.sample(cycle)
             past.append((x.copy(), realised))
-            command, memory = self.stepper.step(cycle.time, cycle.state, cycle.realised, cycle.memory)
+            command, memory = self._step(cycle)
             commands.append(command)
             statuses.append(Status(int(self.stepper.trace()["status"][0])))
             u = command
@@ -128,6 +129,22 @@ class Bench:
             self.lost |= not (np.abs(x) <= _GONE).all()
         return np.array(commands), statuses
 
+    def _step(self, cycle: Cycle) -> tuple[np.ndarray, np.ndarray]:
+        return self._stepped(cycle.time, *self._shown(cycle), cycle.memory)
+
+    @property
+    def _stepped(self) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+        return self.stepper.step_measured if self.stepper.estimates else self.stepper.step
+
+    def _shown(self, cycle: Cycle) -> tuple[np.ndarray, ...]:
+        """What a step is given; a controller that estimates its state is given what its sensors show."""
+        if not self.stepper.estimates:
+            return cycle.state, cycle.realised
+        plant = self.problem.plant
+        names = (*plant.state.elements, *response_names(plant))
+        values = dict(zip(names, (*cycle.state, *cycle.realised), strict=True))
+        return (np.array([values[n] for n in self.stepper.measures]),)
+
     def _differs(self, fault: Fault) -> bool:
         """Whether later commands differ from those with the tick of the fault left out, for the same measurements."""
         memories = [self.stepper.start()] * 2
@@ -136,13 +153,15 @@ class Bench:
         size = self.stepper.signals["desired"].size
         for k in range(fault.first + 10):
             state, realised = x + 1e-3 * generator.standard_normal(x.size), generator.standard_normal(size)
-            cycle = Cycle(k, k * self.problem.period, state, realised, memories[0], [])
+            clean = Cycle(k, k * self.problem.period, state, realised, memories[1], [])
+            cycle = Cycle(k, clean.time, state.copy(), realised.copy(), memories[0], [])
             if k == fault.first and fault.sample is not None:
                 fault.sample(cycle)
-            one, memories[0] = self.stepper.step(cycle.time, cycle.state, cycle.realised, cycle.memory)
-            if k == fault.first:
-                continue
-            other, memories[1] = self.stepper.step(k * self.problem.period, state, realised, memories[1])
+            one, memories[0] = self._step(cycle)
+            shown, right = self._shown(cycle), self._shown(clean)
+            if cycle.time != clean.time or not all(map(np.array_equal, shown, right)):
+                continue  # the fault reaches what the step is given
+            other, memories[1] = self._step(clean)
             if not np.array_equal(one, other):
                 return True
         return False

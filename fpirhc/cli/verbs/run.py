@@ -18,13 +18,16 @@ if TYPE_CHECKING:
     from fpirhc.task.problem import Problem
 
 
+_SETPOINT = "setpoints."  # before a coordinate, in place of the path of a setting
+
+
 def _add(parser: argparse.ArgumentParser) -> None:
     add_problem(parser)
     parser.add_argument("controller", metavar="CONTROLLER", help="name of a controller in the problem file")
     add_out(parser)
     add_seed(parser, "the noise")
     add_no_compile(parser)
-    text = "another number for a setting, such as deformation.gain=-1.2, cost.states.q1=500 or limits.inputs.Q1=-50,20"
+    text = "another number for a setting, such as deformation.gain=-1.2 or limits.inputs.Q1=-50,20; or a set-point, setpoints.q1=2"
     parser.add_argument("--set", action="append", default=[], dest="settings", metavar="PATH=NUMBER", help=text)
 
 
@@ -42,7 +45,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
         problem, run = _simulated(
             task.problem,
             controller,
-            numbers(options.settings),
+            *by_kind(numbers(options.settings)),
             seed=options.seed,
             name=name,
             compiled=not options.no_compile,
@@ -77,8 +80,31 @@ def numbers(settings: Sequence[str]) -> dict[str, float | tuple[float, ...]]:
     return values
 
 
+def by_kind(
+    values: Mapping[str, float | tuple[float, ...]],
+) -> tuple[dict[str, float | tuple[float, ...]], dict[str, float] | None]:
+    """Return the numbers of settings by path, and the set-points by coordinate; None without set-points.
+
+    Raises:
+        InvalidValue: a set-point that is no single number.
+    """
+    from fpirhc.errors import InvalidValue
+
+    points: dict[str, float] = {}
+    for path, value in values.items():
+        if path.startswith(_SETPOINT):
+            if isinstance(value, tuple):
+                raise InvalidValue(f"--set {path}: a set-point is one number; steps stand in the problem file")
+            points[path.removeprefix(_SETPOINT)] = value
+    return {path: value for path, value in values.items() if not path.startswith(_SETPOINT)}, points or None
+
+
 def _simulated(
-    problem: Problem, controller: Controller, settings: Mapping[str, float | tuple[float, ...]], **run: Any
+    problem: Problem,
+    controller: Controller,
+    settings: Mapping[str, float | tuple[float, ...]],
+    setpoints: Mapping[str, float] | None,
+    **run: Any,
 ) -> tuple[Problem, Run]:
     """The problem and a run of it with these settings: live ones where they can be, so that other numbers need no compiler."""
     from fpirhc.controllers.live_settings import live_settings
@@ -86,6 +112,7 @@ def _simulated(
     from fpirhc.problem_files.settings import is_whole, with_settings
     from fpirhc.simulation.simulate import simulate
 
+    run["setpoints"] = setpoints
     if not settings:
         return problem, simulate(problem, controller, **run)
     try:

@@ -10,18 +10,19 @@ In terms of a deformation h = r - q'', where r is the response that the present 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import clip, like
+from fpirhc.controllers.response_pairs import ResponsePairs
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.learning.rules.base import Bounds, Evidence, Pair, Rule
 from fpirhc.plant.regressor import Combination, Regressor
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals, Value, is_finite, pair
+from fpirhc.symbolic.expression import Signals, is_finite, pair
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 
@@ -59,7 +60,7 @@ class Learning:
 
         Raises:
             NotSupported: the plant is not fully actuated, not of order 2, or has no symmetric mass matrix; there is dead time
-                where the rule pairs command and response.
+                where the controller pairs command and response.
             InvalidValue: parameters enter nonlinearly, a first estimate is outside its bounds, or the bounds admit a mass matrix
                 that is not positive definite where the controller inverts it.
         """
@@ -67,10 +68,10 @@ class Learning:
         regressor = self.regressor(problem)
         self.rule.check(self.bounds)
         _check_bounds(regressor, self.bounds)
-        if (reads_response or self.rule.reads_response) and (problem.dead_time.inputs or problem.dead_time.measurement):
+        if reads_response and (problem.dead_time.inputs or problem.dead_time.measurement):
             raise NotSupported(
-                "the last command and the response measured now belong together only without dead time; use SlotineLi with a "
-                "LyapunovRule and no deformation, or a controller that does not learn"
+                "the last command and the response measured now belong together only without dead time; use SlotineLi without "
+                "a deformation, or a controller that does not learn"
             )
         states = _states(problem)
         resting = states * [name in problem.plant.coordinates for name in problem.plant.state.elements]
@@ -95,8 +96,12 @@ class Learning:
         lower, upper = ([b[k] for b in self.bounds.values()] for k in (0, 1))
         equation = equation_function(regressor)
         learned = Signal("learned", regressor.signal.elements, regressor.signal.units)
+        pairs = ResponsePairs(problem, problem.dead_time)
+        late = (pairs.state,) if pairs.waiting else ()
+        begins = problem.warm_up_cycles if self.rule.reads_response else 1
         reads = (
             plant.state,
+            *late,
             plant.response_signal("realised"),
             plant.parameter,
             like(plant.input, "_command_before"),
@@ -106,36 +111,27 @@ class Learning:
         )
 
         def step(s: Signals) -> dict[str, Expression]:
-            running = s.warm_up > 0.5
+            running = s.warm_up > begins - 0.5
+            state, command, waiting = pairs.pair(s, s._command_before)
             old = ca.if_else(running, s.learned, clip(regressor.theta_function(s.parameters), lower, upper))
             evidence = Evidence(
                 lambda: gradient(s, old),
-                lambda: pair(equation(s.state, s.realised, s._command_before, old, s.parameters)),
+                lambda: pair(equation(state, s.realised, command, old, s.parameters)),
                 s._clipped_before,
             )
             candidate = old + self.rule.change(evidence, self.bounds, problem.period)
             good = ca.logic_and(running, is_finite(candidate))
             new = ca.if_else(good, clip(candidate, lower, upper), old)
-            return {"estimate": new, "_believed": ca.vertcat(new, s.parameters[others]), "learned_next": new}
+            return {"estimate": new, "_believed": ca.vertcat(new, s.parameters[others]), "learned_next": new, **waiting}
 
-        return Block("learn", Layout(reads), Layout((regressor.signal, believed)), step, Layout((learned,)))
+        return Block(
+            "learn", Layout(reads), Layout((regressor.signal, believed)), step, Layout((learned, *pairs.memory))
+        )
 
 
 def learning_delays() -> list[Delay]:
     """Return the delays of learning, besides those of the closing blocks."""
     return [Delay(scalar("_clipped_before"), "clipped")]
-
-
-def fed(block: Block, name: str, source: Signal) -> Block:
-    """Return the block with `source` in place of the signal `name`; a block that does not read `name` stays as it is."""
-    if name not in block.reads:
-        return block
-    reads = tuple(source if s.name == name else s for s in block.reads.signals)
-
-    def step(s: Signals) -> Mapping[str, Value]:
-        return block.step(Signals({**vars(s), name: getattr(s, source.name)}))
-
-    return Block(block.name, Layout(reads), block.writes, step, block.memory, block.opaque)
 
 
 def equation_function(regressor: Regressor) -> ca.Function:

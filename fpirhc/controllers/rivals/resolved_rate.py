@@ -33,6 +33,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, invert_block, like, reference_block
+from fpirhc.controllers.own_reference import motion_of, own_signals, own_values
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
@@ -112,14 +113,14 @@ class ResolvedAccelerationRate(Controller):
 
 def _nominal_block(problem: Problem) -> Block:
     """Block time -> nominal response now and one cycle later."""
-    plant, function = problem.plant, problem.reference.function(problem.plant)
+    plant, function = problem.plant, motion_of(problem, ahead=problem.period)
     controlled = list(plant.controlled_indices)
 
     def step(s: Signals) -> dict[str, Expression]:
-        later = function(s.time + problem.period)[1][controlled]
+        later = function(s.time, *own_values(problem, s))[1][controlled]
         return {"nominal": s._reference_response, "_nominal_later": later}
 
-    reads = Layout((plant.time, plant.response_signal("_reference_response")))
+    reads = Layout((plant.time, plant.response_signal("_reference_response"), *own_signals(problem)))
     writes = Layout((plant.response_signal("nominal"), plant.response_signal("_nominal_later")))
     return Block("nominal", reads, writes, step, opaque=problem.reference.opaque)
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
-from fpirhc.controllers.rivals.learned_parameters import Learning, fed, learning_delays
+from fpirhc.controllers.base import Controller, closing_blocks, fed, like, reference_block
+from fpirhc.controllers.rivals.learned_parameters import Learning, learning_delays
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue

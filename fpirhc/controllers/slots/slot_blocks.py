@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 import casadi as ca
 
 from fpirhc.controllers.base import clip, error_signal, like
+from fpirhc.controllers.own_reference import motion_of, own_signals, own_values, stages_of
 from fpirhc.controllers.slots.slot import Channel, First
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block
@@ -34,27 +35,27 @@ def by_slot(channels: Sequence[Channel], name: str) -> Signal:
 
 def reference_block(problem: Problem) -> Block:
     """Block (time, state) -> (reference state, error of the judged coordinates)."""
-    plant, function = problem.plant, problem.reference.function(problem.plant)
+    plant, function = problem.plant, motion_of(problem)
     places = [plant.state.elements.index(c) for c in problem.judged_names]
 
     def step(s: Signals) -> dict[str, Expression]:
-        reference = function(s.time)[0]
+        reference = function(s.time, *own_values(problem, s))[0]
         return {"reference": reference, "error": reference[places] - s.state[places]}
 
     writes = Layout((like(plant.state, "reference"), error_signal(problem, "error")))
-    reads = Layout((plant.time, plant.state))
+    reads = Layout((plant.time, plant.state, *own_signals(problem)))
     return Block("reference", reads, writes, step, opaque=problem.reference.opaque)
 
 
 def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
     """Block -> the slot's chain, its target, y^(r),N, alpha and beta of the model, and whether beta is large enough."""
     plant, chain = problem.plant, one.chain
-    derivatives = problem.reference.derivatives(chain.coordinate, chain.order)
+    derivatives = problem.reference.chain(plant, stages_of(problem), chain.coordinate, chain.order)
     place = plant.input.elements.index(chain.input)
     smallest = smallest_gain * abs(one.start_gain)
 
     def step(s: Signals) -> dict[str, Expression]:
-        nominal = derivatives(s.time)
+        nominal = derivatives(s.time, *own_values(problem, s))
         others = ca.vertcat(*(0 if k == place else s._command_before[k] for k in range(plant.input.size)))
         gain = chain.gain(s.state, others, s.parameters)
         good = ca.fabs(gain) >= smallest
@@ -73,8 +74,10 @@ def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
     elements = one.plant.state.elements
     writes = [one.signal(n, elements) for n in ("state", "target")]
     writes += [one.signal(n) for n in ("nominal", "free", "gain", "good", "divisor")]
-    reads = Layout((plant.time, plant.state, plant.parameter, like(plant.input, "_command_before")))
-    return Block(f"slot_state_{one.number}", reads, Layout(tuple(writes)), step, opaque=problem.reference.opaque)
+    reads = (plant.time, plant.state, plant.parameter, like(plant.input, "_command_before"), *own_signals(problem))
+    return Block(
+        f"slot_state_{one.number}", Layout(reads), Layout(tuple(writes)), step, opaque=problem.reference.opaque
+    )
 
 
 def admissible_block(channels: Sequence[Channel]) -> Block:

@@ -11,11 +11,12 @@ receding horizon whenever it plans.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, command_before, compose_controller, embedded, like
+from fpirhc.controllers.response_pairs import ResponsePairs
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotSupported
 from fpirhc.learning.estimators.base import Estimator, Seen
@@ -23,6 +24,7 @@ from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, is_finite
 from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.problem import Problem
 
 _BELIEVED = "_believed"
@@ -32,13 +34,20 @@ _BELIEVED = "_believed"
 class Estimating(Controller):
     """The wrapped controller with the parameters of its model corrected every cycle.
 
+    Behind dead time or an estimator, a response belongs to an older state and command; see `fpirhc.controllers.response_pairs`.
+
     Args:
         controller: any controller that uses its model.
         estimator: learns the change of the parameters.
+        dead_time: that is believed; None: the problem's.
+        at_once: whether a new estimate changes the command in every cycle. A receding horizon otherwise holds the inputs of its
+            plan, which uses the estimate of the cycle in which it was made.
     """
 
     controller: Controller
     estimator: Estimator
+    dead_time: DeadTime | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    at_once: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
 
     @property
     def inner(self) -> Controller:
@@ -65,6 +74,11 @@ class Estimating(Controller):
         """True: the parameters of the model change during a run."""
         return True
 
+    @property
+    def model_acts_at_once(self) -> bool:
+        """Whether a new estimate changes the command in every cycle."""
+        return self.at_once or self.controller.model_acts_at_once
+
     def linear_around(self, inner: Controller) -> Controller:
         """Return the inner controller: near the reference the parameters are those of the start."""
         return inner
@@ -74,15 +88,18 @@ class Estimating(Controller):
 
         Raises:
             FpirhcError: a check of the estimator or of the wrapped controller fails.
-            NotSupported: dead time, with which the response does not belong to the last command; a controller that reads a response
-                of its own.
+            NotSupported: a controller that reads a response of its own; a response that nobody measures.
         """
         modelled = self.inner_problem(problem)
         self.estimator.check(modelled)
         self.controller.check(modelled)
-        if problem.dead_time.measurement or any(problem.dead_time.inputs.values()):
+        if self.dead_time is not None:
+            self.dead_time.check(problem.plant, problem.period)
+        lost = problem.sensing.believed_response(problem.plant)
+        if lost and self.estimator.reads_response(modelled.plant):
             raise NotSupported(
-                "Estimating pairs a response with the command of one cycle before: no dead time is supported"
+                f"{type(self.estimator).__name__} learns from the response, which needs {', '.join(lost)}, and no sensor shows it; "
+                "measure it, or use a DisturbanceKalman that measures states alone"
             )
         if self.controller.response(modelled) is not None:
             raise NotSupported(
@@ -92,34 +109,38 @@ class Estimating(Controller):
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the block estimate, and the wrapped controller as one block."""
         modelled = self.inner_problem(problem)
-        inner = compose_controller(modelled, self.controller)
+        controller = self.controller.following_its_model() if self.at_once else self.controller
+        inner = compose_controller(modelled, controller)
+        pairs = ResponsePairs(problem, self.dead_time or problem.dead_time)
         believed = Signal(_BELIEVED, modelled.plant.parameter.elements, modelled.plant.parameter.units)
         acted = replace(command_before(problem), name="_acted")
         blocks = [
-            _estimate_block(problem, modelled, self.estimator, believed, acted),
+            _estimate_block(pairs, modelled, self.estimator, believed, acted),
             embedded("controller", inner, {"parameters": believed}),
         ]
         return blocks, [Delay(acted, problem.plant.input.name)]
 
 
 def _estimate_block(
-    problem: Problem, modelled: Problem, estimator: Estimator, believed: Signal, acted: Signal
+    pairs: ResponsePairs, modelled: Problem, estimator: Estimator, believed: Signal, acted: Signal
 ) -> Block:
     """Block (state, realised, parameters, command of the last cycle) -> (corrected parameters, the learned ones among them)."""
-    plant, model = problem.plant, modelled.plant
+    plant, model = pairs.problem.plant, modelled.plant
     names = estimator.learned()
     places = [model.parameter.elements.index(n) for n in names]
     count = len(plant.parameters)
     estimate = Signal("estimate", names, tuple(model.parameters[n].unit for n in names))
     memory = estimator.memory(modelled)
     correct, followed = estimator.step(modelled), estimator.following(modelled)
-    own = memory + Layout((like(estimate, "estimate_change"), scalar("estimate_begun")))
+    own = memory + Layout((like(estimate, "estimate_change"), scalar("estimate_begun"), *pairs.memory))
 
     def step(s: Signals) -> dict[str, Value]:
         parameters = ca.vertcat(s.parameters[:count], ca.DM(model.approximate[count:]))
         before = {m: getattr(s, m) for m in memory.names}
+        state, command, waiting = pairs.pair(s, s._acted)
         numbers = None if followed is None else getattr(s, followed.signal.name)
-        evidence = Seen(s.state, s._acted, s.realised, parameters, s.estimate_begun, numbers)
+        begun = s.estimate_begun > pairs.cycles - 0.5
+        evidence = Seen(state, command, s.realised, parameters, begun, numbers)
         parameter_change, next_memory = correct(evidence, before)
         # A change that is not finite is not learned: one bad measurement must not spoil the model for ever.
         finite = is_finite(ca.vertcat(parameter_change, *next_memory.values()))
@@ -131,11 +152,12 @@ def _estimate_block(
             believed.name: values,
             "estimate": values[places],
             "estimate_change_next": change,
-            "estimate_begun_next": 1,
+            "estimate_begun_next": ca.fmin(s.estimate_begun + 1, pairs.cycles),
             **remembered,
+            **waiting,
         }
 
-    reads = Layout((plant.state, plant.response_signal("realised"), plant.parameter, acted))
+    reads = Layout((pairs.state, plant.response_signal("realised"), plant.parameter, acted))
     block = Block("estimate", reads, Layout((believed, estimate)), step, own, opaque=True)
     return block if followed is None else replace(block, reads=reads + followed.reads, derived=followed.derived)
 

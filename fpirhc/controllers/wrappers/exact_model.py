@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotSupported
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.task.outside import External, really_known, signals_of
 from fpirhc.task.problem import Problem
 
 
@@ -41,7 +43,12 @@ class ExactModel(Controller):
         """Return the problem with the exact parameters as approximate ones, so that work before a run uses them too."""
         plant = self.model_plant(problem)
         exact = {name: replace(p, approximate=p.exact) for name, p in plant.parameters.items()}
-        return replace(problem, plant=replace(plant, parameters=exact), reality=None)
+        signals = signals_of(plant, self.told(problem))
+        return replace(problem, plant=replace(plant, parameters=exact), reality=None, signals=signals)
+
+    def told(self, problem: Problem) -> Mapping[str, External]:
+        """Return the signals told as they really are."""
+        return really_known(problem.signals)
 
     def model_plant(self, problem: Problem) -> Plant:
         """Return the plant that a run moves."""

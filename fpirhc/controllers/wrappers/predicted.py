@@ -2,7 +2,9 @@
 
 With a dead time of the inputs the command of this cycle acts later, and with a dead time of the measurement the measured state is
 old. The wrapper integrates the measured state over both, with the commands that are on their way. The wrapped controller is given
-the resulting state and the time at which its command acts. So a receding horizon starts where its first input acts.
+the resulting state and the time at which its command acts. So a receding horizon starts where its first input acts. A filtered
+set-point cannot be shifted in time: the state ahead is led along the reference of now, so that the plant follows it later by the
+dead time, and the errors of a run contain this delay.
 
 There are two ways to predict:
 
@@ -27,6 +29,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, embedded, like
 from fpirhc.controllers.mirror import MEASURED
+from fpirhc.controllers.own_reference import own_signals
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
@@ -192,6 +195,17 @@ class Predicted(Controller):
     def feeds(self) -> Mapping[str, str]:
         """Time and state ahead in place of time and state."""
         return {"time": "time_ahead", "state": "state_ahead", **self.controller.feeds}
+
+    def notes(self, problem: Problem) -> tuple[str, ...]:
+        """Return the notes of the wrapped controller; with set-points, that they are followed late by the dead time."""
+        notes = self.controller.notes(problem)
+        if not own_signals(problem) or not self._cycles(problem):
+            return notes
+        late = f"{self._cycles(problem) * problem.period:g} {problem.time_unit}"
+        return (
+            *notes,
+            f"Predicted follows set-points {late} late: one that is not known ahead cannot act before the dead time is over",
+        )
 
     def check(self, problem: Problem) -> None:
         """Raise if the wrapped controller, the predictor or the dead time does not fit the problem.

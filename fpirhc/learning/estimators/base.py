@@ -1,6 +1,7 @@
 """The contract of estimators: a change of the model's parameters from commands and measurements.
 
-At t_k an estimator receives the state, and the response just before t_k to the command held since t_{k-1}. It returns a change of
+At t_k an estimator receives the state, and the response just before t_k to the command held since t_{k-1}; both are older behind
+dead time. It returns a change of
 the parameters that it learns; the rest of the model stays as it is. A disturbance is a parameter too: see `disturbed`.
 """
 
@@ -22,11 +23,11 @@ class Seen:
     """Data of an estimator in one cycle.
 
     Args:
-        state: the measured state.
-        command: it acted until now and caused `response` at `state`.
+        state: the measured state at which the response was measured.
+        command: it caused `response` at `state`: the last one, or an older one behind dead time and estimators.
         response: the measured response.
         parameters: those of the model without the estimator's change.
-        valid: 0 in the first cycle, before the first command, and 1 from then on.
+        valid: 0 before the first pair of this run (in the first cycle, and until the first sample of the run arrives), then 1.
         followed: what the estimator computes from its live settings; None without any.
     """
 
@@ -47,6 +48,10 @@ class Estimator(Checked, ABC):
     def model(self, plant: Plant) -> Plant:
         """The model whose parameters are learned: the plant, or the plant with further parameters after its own."""
         return plant
+
+    def reads_response(self, plant: Plant) -> bool:  # noqa: ARG002
+        """Whether it learns from the measured response of this plant; True by default."""
+        return True
 
     @abstractmethod
     def learned(self) -> tuple[str, ...]:

@@ -1,16 +1,18 @@
 """A disturbance model with a Kalman filter: the estimator of offset-free predictive control.
 
-The model's responses have unknown disturbances that drift as random walks, and some states are measured,
+The model's responses have unknown disturbances that drift as random walks, and some states and responses are measured,
 
-    q_i^(r_i) = f^_i(q, ..., u) + w_i + n_i,      w_i' = white noise,      y = C x + white noise.
+    q_i^(r_i) = f^_i(q, ..., u) + w_i + n_i,      w_i' = white noise,      y = h(x, u, w) + white noise.
 
 The state and the disturbances are estimated together. The nonlinear model predicts over one period. The stationary gain of the
 Kalman filter, for the model linearised on the reference at t = 0, corrects,
 
-    x- = F(x^, u, w^),      x^ = x- + K_x (y - C x-),      w^ <- w^ + K_w (y - C x-).
+    x- = F(x^, u, w^),      x^ = x- + K_x (y - h(x-, u, w^)),      w^ <- w^ + K_w (y - h(x-, u, w^)).
 
-A constant disturbance is estimated without error, whatever the tuning, if [A - I, B; C, 0] has full column rank (B: effect of the
-disturbances on the state), which needs at least as many measured states as disturbances. Otherwise `check` refuses the filter.
+A measured response shows its disturbance in the same cycle, states show it through their motion. A constant disturbance is
+estimated without error, whatever the tuning, if [A - I, B; C, D] has full column rank (B, D: effect of the disturbances on the
+state and on what is measured), which needs at least as many measured quantities as disturbances. Otherwise `check` refuses the
+filter.
 
 References:
     G. Pannocchia and J. B. Rawlings, Disturbance models for offset-free model-predictive control, AIChE Journal 49(2), 2003.
@@ -31,6 +33,7 @@ from fpirhc.learning.estimators.disturbed import disturbance_name, disturbed
 from fpirhc.learning.estimators.uncertain import require_positive
 from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Plant
+from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.following import Following, following
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -50,7 +53,8 @@ class DisturbanceKalman(Estimator):
 
     Args:
         drift: coordinate -> deviation of the change of its disturbance in one second, response unit / s^0.5.
-        measured: state (q1, q1', ...) -> deviation of its measurement noise, in its unit.
+        measured: state (q1, q1', ...) or response (q1'' for order 2) -> deviation of its measurement noise, in its unit. A response
+            shows its disturbance at once, and a deformation has it; an estimator that is late cannot serve the filter.
         noise: coordinate -> deviation of the white noise of its response in every cycle; zero where not named.
 
     Raises:
@@ -76,17 +80,28 @@ class DisturbanceKalman(Estimator):
         """The disturbances."""
         return tuple(disturbance_name(c) for c in self.drift)
 
+    def reads_response(self, plant: Plant) -> bool:
+        """Whether some response is measured."""
+        return bool(self._responses(plant))
+
     def check(self, problem: Problem) -> None:
-        """Raise if names do not fit the plant, or the measured states do not determine the disturbances.
+        """Raise if names do not fit the plant, or what is measured does not determine the disturbances.
 
         Raises:
             InvalidProblem: unknown names.
-            NotSupported: the rank condition is not met, or no stationary gain exists.
+            NotSupported: the rank condition is not met, or no stationary gain exists; a measured response that is estimated late.
         """
         mistakes = Mistakes("DisturbanceKalman")
-        mistakes.unknown("measured: state", self.measured, problem.plant.state.elements)
+        plant = problem.plant
+        mistakes.unknown("measured: state or response", self.measured, plant.state.elements + response_names(plant))
         mistakes.unknown("noise: coordinate", self.noise, problem.plant.coordinates)
         mistakes.raise_if_any()
+        late = problem.sensing.delay(plant, problem.period)
+        if self._responses(plant) and late > 0:
+            raise NotSupported(
+                f"DisturbanceKalman: {', '.join(self._responses(plant))} is estimated {late:.4g} cycles late, and the filter needs "
+                "it at once; measure states alone, or give the sensing VelocityDifference() or an accelerometer"
+            )
         self._check_rank(problem)
         self.gain(problem)
 
@@ -144,15 +159,16 @@ class DisturbanceKalman(Estimator):
         model = problem.plant
         advance, no_forcing = RungeKutta4().step(model, problem.period), ca.DM.zeros(len(model.names))
         fixed = None if is_live(self) else ca.DM(self.gain(problem))
-        seen_places = [model.state.elements.index(e) for e in self.measured]
+        shown = self._shown_function(model)
         places = [model.parameter.elements.index(n) for n in self.learned()]
 
         def correct(seen: Seen, memory: Mapping[str, Expression]) -> tuple[Expression, dict[str, Expression]]:
             parameters = seen.parameters + 0
             parameters[places] += memory["observed_disturbance"]
             predicted = advance(memory["observed_state"], seen.command, parameters, no_forcing)
-            innovation = (seen.state - predicted)[seen_places]
-            gain = _gain(fixed, seen, len(seen_places))
+            measured = self._measured(model, seen)
+            innovation = measured - shown(predicted, seen.command, parameters)
+            gain = _gain(fixed, seen, len(self.measured))
             on_state, on_disturbance = gain[: model.state.size, :], gain[model.state.size :, :]
             running = seen.valid > 0.5
             state = ca.if_else(running, predicted + on_state @ innovation, seen.state)
@@ -160,6 +176,25 @@ class DisturbanceKalman(Estimator):
             return disturbance, {"observed_state": state, "observed_disturbance": disturbance}
 
         return correct
+
+    def _responses(self, plant: Plant) -> tuple[str, ...]:
+        """Names of the measured responses."""
+        return tuple(n for n in self.measured if n in response_names(plant))
+
+    def _measured(self, model: Plant, seen: Seen) -> Expression:
+        """The measured quantities as a column."""
+        states = {e: seen.state[k] for k, e in enumerate(model.state.elements)}
+        responses = {e: seen.response[k] for k, e in enumerate(response_names(model))}
+        return ca.vertcat(*({**states, **responses}[name] for name in self.measured))
+
+    def _shown_function(self, model: Plant) -> ca.Function:
+        """Function (state, command that acted, parameters) -> the measured quantities."""
+        x, u, p = model.symbols()
+        states = dict(zip(model.state.elements, ca.vertsplit(x), strict=True))
+        if self._responses(model):
+            responses = ca.vertsplit(model.controlled_response_function(x, u, p))
+            states |= dict(zip(response_names(model), responses, strict=True))
+        return ca.Function("fpirhc_shown", [x, u, p], [ca.densify(ca.vertcat(*(states[n] for n in self.measured)))])
 
     def _matrices(self, problem: Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """A of state and disturbances over one period, the effect of response noise on the state, and C."""
@@ -172,23 +207,26 @@ class DisturbanceKalman(Estimator):
         disturbance_input = b[:, [model.names.index(c) for c in self.drift]]
         size = len(self.drift)
         augmented = np.block([[a, disturbance_input], [np.zeros((size, a.shape[1])), np.eye(size)]])
-        c = np.zeros((len(self.measured), augmented.shape[1]))
-        c[np.arange(len(c)), [model.state.elements.index(e) for e in self.measured]] = 1
-        return augmented, b, c
+        shown = self._shown_function(model)(x, u, p)
+        places = [model.parameter.elements.index(n) for n in self.learned()]
+        slopes = ca.Function(
+            "fpirhc_seen", [x, u, p], [ca.horzcat(ca.jacobian(shown, x), ca.jacobian(shown, p)[:, places])]
+        )
+        return augmented, b, np.asarray(slopes(*_operating_point(problem)).full())
 
     def _check_rank(self, problem: Problem) -> None:
         measured, disturbances = ", ".join(self.measured), ", ".join(self.learned())
         if len(self.drift) > len(self.measured):
             raise NotSupported(
                 f"DisturbanceKalman: {len(self.drift)} disturbances ({disturbances}) cannot be found from "
-                f"{len(self.measured)} measured state(s) ({measured}): measure as many, or estimate fewer"
+                f"{len(self.measured)} measured quantity(ies) ({measured}): measure as many, or estimate fewer"
             )
         a, _, c = self._matrices(problem)
         used = self._used(problem, a, c)
         rank = _rank(a[np.ix_(used, used)], c[:, used])
         if rank < used.sum():
             raise NotSupported(
-                f"DisturbanceKalman: a constant {disturbances} cannot be determined from {measured}: [A - I, B; C, 0] has rank "
+                f"DisturbanceKalman: a constant {disturbances} cannot be determined from {measured}: [A - I, B; C, D] has rank "
                 f"{rank} and needs {used.sum()} (Pannocchia and Rawlings 2003); measure another state, or disturb the response "
                 "of a coordinate that acts on a measured state"
             )

@@ -9,8 +9,10 @@ from fpirhc.horizon.sweep import Expansion, sweep
 from fpirhc.optimisers.bounds import BOUNDARY, Interior
 from fpirhc.optimisers.certified import certify, largest_gap
 from fpirhc.optimisers.limited_turn.call import Call
+from fpirhc.optimisers.limited_turn.descent import priced
 from fpirhc.optimisers.limited_turn.merit import merit, merit_slope
-from fpirhc.optimisers.limited_turn.state import KEPT, PURE, WARM, State, choose, fixed, point
+from fpirhc.optimisers.limited_turn.phases import restart
+from fpirhc.optimisers.limited_turn.state import COLD, KEPT, PURE, WARM, State, choose, fixed, point
 
 
 class Direction:
@@ -35,6 +37,9 @@ class Direction:
         y = Interior(s["t"], s["e"], s["z"])
         placed = limits.inside(p, s["z"], s["mu"], s["slacks"] == WARM)
         y = Interior(*(ca.if_else(s["slacks"] == KEPT, a, b) for a, b in zip(y, placed, strict=True)))
+        t, e = limits.path(p, s["mu"])
+        anew = ca.if_else(s["slacks"] == COLD, ca.if_else(limits.present, s["mu"] / t, 0), y.z)
+        y = Interior(*(ca.if_else(s["descends"], a, b) for a, b in zip((t, e, anew), y, strict=True)))
         barrier = limits.interior(p, y, s["mu"])
         weight, lean = (ca.if_else(pure, a, b) for a, b in zip((weights, leans), barrier, strict=True))
         v, gains, dx, du, swept, ok = self._swept(s, p, weight, lean, needed)
@@ -42,7 +47,9 @@ class Direction:
         now = {**s, "z": ca.if_else(pure, held, y.z), "use_exact": use_exact, **fixed(again=0)}
         now = choose(now, pure, now, {**now, "t": y.t, "e": y.e, **fixed(slacks=KEPT)})
         delta = ca.fmax(10 * s["delta"], 1e-6)
-        failed = {**now, "delta": delta, "stuck": ca.logic_or(s["stuck"], delta > 1e8), **fixed(fresh=2, use_exact=1)}
+        failed = {**now, "delta": delta, **fixed(fresh=2, use_exact=1)}
+        over = {**failed, **fixed(stuck=1)} if call.settings.realtime else restart(call, failed)
+        failed = choose(failed, delta > 1e8, over, failed)
         stepped = {**now, "v": v, "gains": gains, "dx": dx, "du": du, "swept": swept}
         steps = {**stepped, "next_z": limits.pure_multipliers(p, held, du, dx)}
         inside = self._inside(stepped, p, y, s["mu"])
@@ -58,7 +65,7 @@ class Direction:
         inside = {**s, "dt": by.t, "de": by.e, "dz": by.z, "alpha": alpha, "alpha_dual": alpha_dual}
         inside["theta"], inside["phi"] = merit(call, p, y, mu)
         inside["dphi"] = merit_slope(call, inside, p)
-        return inside
+        return choose(inside, inside["descends"] > 0, priced(call, inside, p), inside)
 
     def _swept(self, s: State, p: Expansion, weight: ca.MX, lean: ca.MX, needed: ca.MX) -> list[ca.MX]:
         arguments = [*p, weight, lean, s["costates"], s["delta"], self._call.data]

@@ -7,8 +7,9 @@ import casadi as ca
 from fpirhc.horizon.sweep import Expansion
 from fpirhc.optimisers.bounds import Interior
 from fpirhc.optimisers.certified import barrier_error
-from fpirhc.optimisers.limited_settings import MOST_RAISES, MU_MOST, MU_ROUNDS, MU_WARM, NEAR
+from fpirhc.optimisers.limited_settings import LEAST_DAMPING, MOST_RAISES, MU_MOST, MU_ROUNDS, MU_WARM, NEAR
 from fpirhc.optimisers.limited_turn.call import Call
+from fpirhc.optimisers.limited_turn.descent import falls_enough, sum_of_gaps
 from fpirhc.optimisers.limited_turn.filter import passes_filter
 from fpirhc.optimisers.limited_turn.merit import merit, trial
 from fpirhc.optimisers.limited_turn.phases import enter_pure, restart
@@ -18,10 +19,12 @@ from fpirhc.symbolic.expression import FINITE
 
 def judge_interior(call: Call, s: State, p: Expansion, usable: ca.MX) -> State:
     """Return the state with the plan accepted, or with a shorter or more damped step."""
-    y = trial(call, s)
+    y = trial(call, s, p)
     theta, phi = merit(call, p, y, s["mu"])
+    phi += ca.if_else(s["descends"], s["price"] * sum_of_gaps(call, p), 0)
     finite = ca.logic_and(ca.fabs(phi) <= FINITE, ca.fabs(theta) <= FINITE)
     passes, filtered = passes_filter(call, s, theta, phi)
+    passes = ca.if_else(s["descends"], falls_enough(s, phi, call.scales.cost), passes)
     if call.settings.realtime:
         passes, filtered = ca.MX(1), {}
     ok = ca.logic_and(ca.logic_and(usable, finite), passes)
@@ -52,7 +55,8 @@ def _eased_damping(s: State) -> ca.MX:
     """The damping after an accepted plan: less after a whole step, more after a step that was halved often."""
     halvings, delta = s["halvings"], s["delta"]
     eased = ca.if_else(delta > 5e-7, delta / 5, 0)
-    return ca.if_else(halvings >= 3, ca.fmax(4 * delta, 1e-4), ca.if_else(halvings > 0, delta, eased))
+    eased = ca.if_else(halvings >= 3, ca.fmax(4 * delta, 1e-4), ca.if_else(halvings > 0, delta, eased))
+    return ca.if_else(s["descends"], ca.fmax(eased, LEAST_DAMPING), eased)
 
 
 def _lowered_barrier(call: Call, s: State, rest: ca.MX, products: tuple[ca.MX, ca.MX]) -> tuple[ca.MX, ca.MX]:
@@ -92,5 +96,6 @@ def _shortened(call: Call, s: State) -> State:
     if call.settings.realtime:
         return restart(call, raised)
     gives_up = ca.logic_or(raised["raises"] > MOST_RAISES, raised["delta"] > 1e8)
-    raised = choose(s, gives_up, restart(call, raised), {**raised, **fixed(again=1)})
+    again = {**raised, **fixed(again=1), "use_exact": ca.if_else(s["descends"], 0, s["use_exact"])}
+    raised = choose(s, gives_up, restart(call, raised), again)
     return choose(s, s["halvings"] + 1 <= 8, halved, raised)

@@ -5,7 +5,16 @@ from __future__ import annotations
 import casadi as ca
 
 from fpirhc.optimisers.guess import guesses
-from fpirhc.optimisers.limited_settings import MU_END, MU_LEAST, MU_MOST, MU_WARM, REFERENCE
+from fpirhc.optimisers.limited_settings import (
+    DESCENT,
+    LAST_START,
+    LEAST_DAMPING,
+    MU_END,
+    MU_LEAST,
+    MU_MOST,
+    MU_WARM,
+    REFERENCE,
+)
 from fpirhc.optimisers.limited_turn.call import Call
 from fpirhc.optimisers.limited_turn.state import (
     BEGINS,
@@ -51,7 +60,7 @@ def restart(call: Call, s: State) -> State:
     """Begin again from the next first guess; the iteration is stuck after the last one."""
     start = s["start"] + 1
     cold = begin_cold(call, {**s, "start": start}, None)
-    return choose(s, start > REFERENCE, {**s, "start": start, **fixed(stuck=1)}, cold)
+    return choose(s, start > LAST_START, {**s, "start": start, **fixed(stuck=1)}, cold)
 
 
 def begin_cold(call: Call, s: State, inputs: ca.MX | None) -> State:
@@ -64,12 +73,15 @@ def begin_cold(call: Call, s: State, inputs: ca.MX | None) -> State:
     """
     n, reach = call.ocp.stages, ca.DM(0.01 * call.scales.inputs)
     references, forward = guesses(call.ocp)(call.data)
-    states = ca.if_else(s["start"] == REFERENCE, references, ca.repmat(call.s0, 1, n + 1))
+    on_reference = ca.logic_or(s["start"] == REFERENCE, s["start"] == DESCENT)
+    states = ca.if_else(on_reference, references, ca.repmat(call.s0, 1, n + 1))
     hair = ca.repmat(ca.fmin(reach, 0.25 * (call.upper - call.lower)), 1, n)
     first = forward[:, :n] if inputs is None else inputs
     low, high = ca.repmat(call.lower, 1, n) + hair, ca.repmat(call.upper, 1, n) - hair
     none = {"gains": 0 * s["gains"], "costates": 0 * s["costates"]}
     guess = {"point_inputs": ca.fmin(ca.fmax(first, low), high), "point_states": states}
-    zeros = fixed(filtered=0, raises=0, halvings=0, delta=0, use_exact=0)
+    descends = s["start"] >= DESCENT
+    zeros = fixed(filtered=0, raises=0, halvings=0, use_exact=0, price=call.scales.cost)
+    zeros |= {"descends": descends, "delta": LEAST_DAMPING * descends}
     mu = fixed(mu=call.scales.cost, floor=MU_END * call.scales.cost)
     return {**s, **none, **guess, **zeros, **mu, **fixed(phase=INTERIOR, slacks=COLD, fresh=1)}

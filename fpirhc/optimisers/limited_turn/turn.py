@@ -2,9 +2,9 @@
 
 A phase of pure steps accepts a plan that halves the scaled error E of the first-order conditions. It is patient for a few steps,
 because a change of the active limits raises E at first. A phase of interior steps accepts a plan by a filter of (infeasibility
-theta, barrier function phi) after Fletcher and Leyffer as in IPOPT. A Levenberg-Marquardt term replaces its restoration, because
-limits of states give way anyway. Where mu is low enough pure steps end the phase; where they do not contract, an interior phase
-goes on.
+theta, barrier function phi) after Fletcher and Leyffer as in IPOPT. Where the filter accepts none, a Levenberg-Marquardt term
+grows, then another first plan is tried, and at last descents (`descent.py`). Limits of states give way, so nothing else is to be
+restored. Where mu is low enough pure steps end the phase; where they do not contract, an interior phase goes on.
 
 References: R. Fletcher, S. Leyffer, Math. Program. 91, 2002; A. Waechter, L. T. Biegler, Math. Program. 106, 2006.
 """
@@ -17,6 +17,7 @@ from fpirhc.horizon.sweep import Expansion, expand
 from fpirhc.optimisers.certified import Certified
 from fpirhc.optimisers.limited_settings import NEAR, ROLLED, SEVERAL
 from fpirhc.optimisers.limited_turn.call import Call
+from fpirhc.optimisers.limited_turn.descent import box, descending
 from fpirhc.optimisers.limited_turn.direction import Direction
 from fpirhc.optimisers.limited_turn.interior import judge_interior
 from fpirhc.optimisers.limited_turn.phases import enter_interior, enter_pure, restart
@@ -56,15 +57,16 @@ class Turn:
         """The next plan, expanded; whether it is rolled out, and whether it is finite."""
         call, old, fresh = self._call, point(s), s["fresh"] > 0
         pure = ca.logic_and(ca.logic_not(fresh), s["phase"] == PURE)
-        share = ca.if_else(ca.logic_or(fresh, pure), 0, s["alpha"])
+        share, descent = ca.if_else(ca.logic_or(fresh, pure), 0, s["alpha"]), descending(s)
         deformed = ca.reshape(self._deformed(ca.vec(s["v"])), old.inputs.shape)
-        inputs = old.inputs + ca.if_else(share > 0, share * s["du"], 0) + ca.if_else(pure, deformed, 0)
-        states = old.states + ca.if_else(share > 0, share * s["dx"], 0)
+        move = ca.if_else(descent, s["v"], s["du"])
+        inputs = old.inputs + ca.if_else(share > 0, share * move, 0) + ca.if_else(pure, deformed, 0)
+        states = old.states + ca.if_else(ca.logic_and(share > 0, ca.logic_not(descent)), share * s["dx"], 0)
+        gaps = ca.if_else(descent, (1 - share) * (old.next_states - old.states[:, 1:]), 0)
         starts = ca.logic_and(ca.logic_and(s["fresh"] == 1, s["slacks"] == COLD), s["start"] == ROLLED)
         last = ca.logic_and(final, int(call.settings.realtime))
-        rolled = ca.if_else(fresh, starts, ca.logic_or(pure, last))
-        arguments = (call.s0, call.data, call.lower, call.upper)
-        p = Expansion(*self._expand(inputs, states, s["gains"], rolled, *arguments))
+        rolled = ca.if_else(fresh, starts, ca.logic_or(ca.logic_or(pure, last), descent))
+        p = Expansion(*self._expand(inputs, states, s["gains"], rolled, gaps, call.s0, call.data, *box(call, s)))
         return p, rolled, is_usable(p)
 
     def _judged(self, s: State, p: Expansion, rolled: ca.MX, usable: ca.MX) -> State:
@@ -72,7 +74,8 @@ class Turn:
         guessed = self._judge_fresh(s, p, rolled, usable)
         stepped = judge_pure(self._call, s, p, usable), judge_interior(self._call, s, p, usable)
         judged = choose(s, fresh, guessed, choose(s, pure, *stepped))
-        return {**judged, "rolled": ca.if_else(judged["accepted"], rolled, s["rolled"])}
+        whole = ca.logic_and(rolled, judged["descends"] == 0)
+        return {**judged, "rolled": ca.if_else(judged["accepted"], whole, s["rolled"])}
 
     def _judge_fresh(self, s: State, p: Expansion, rolled: ca.MX, usable: ca.MX) -> State:
         """A plan that was not made by a sweep: first guesses, remembered plans, and the last one again."""

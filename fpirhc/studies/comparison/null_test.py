@@ -23,6 +23,7 @@ from fpirhc.simulation.metrics.window import by_name
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.studies.comparison.changes import ROUNDING, Change, major, outcome_of
 from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.task.outside import as_told
 from fpirhc.task.problem import Problem
 
 CYCLES = 2000  # measured cycles of a run at most
@@ -81,9 +82,11 @@ def null_test(
         seed: of the sensors' noise.
     """
     begin = time.perf_counter()
-    null = _null_problem(problem.of_model)
-    if problem.reality is not None:  # the loops of the comparison move the reality
-        without, adapting = (simulator(problem.of_model, one.controller, compiled=one.compiled) for one in loops)
+    own = problem.of_model
+    own = replace(own, signals=as_told(own.plant, own.signals)) if own.signals else own
+    null = _null_problem(own)
+    if problem.reality is not None or problem.signals:  # the loops of the comparison have the real plant and signals
+        without, adapting = (simulator(own, one.controller, compiled=one.compiled) for one in loops)
         loops = without, adapting
     before, after = (_errors(loop, null, seed) for loop in loops)
     changes = {n: Change(n, before[n], after[n], scales.get(n, 1.0)) for n in before if weighed is None or n in weighed}

@@ -8,6 +8,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
+from fpirhc.controllers.own_reference import own_signals
 from fpirhc.errors import FpirhcError
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
@@ -17,6 +18,7 @@ from fpirhc.simulation.run import Run
 from fpirhc.status import Status
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import native
+from fpirhc.task.outside import model_values, previewed_values, rows_of, signals_of
 from fpirhc.task.problem import Problem, cycles_per_stage
 
 SAMPLES = 25  # plans of a run that are solved again
@@ -43,35 +45,44 @@ def measure_optimality(
 ) -> Optimality | None:
     """Return the excess cost of sampled plans.
 
-    The result is None where plans do not start from a state in the run, where no plan was solved, and for a controller that
-    learns, because the models of its plans are not in the run. A negative excess is that of another local optimum, which the
-    controller reached and the solve from rest did not.
+    The result is None where plans do not start from a state in the run, where no plan was solved, for a controller that learns,
+    because the models of its plans are not in the run, and towards set-points, because what its plans knew of them is not either.
+    A negative excess is that of another local optimum, which the controller reached and the solve from rest did not.
     """
     ready = checked(problem, controller)
     planner, feeds = ready.planner, ready.feeds
     if planner is None or not planner.restarts or problem.horizon is None or run.cycles < 2:
         return None
-    if ready.learns or "parameters" in feeds:
+    if ready.learns or "parameters" in feeds or own_signals(problem):
         return None
     times, states = (run[feeds[n] if feeds.get(n) in run.layout.names else n] for n in ("time", "state"))
     model = ready.model_plant(problem)
-    planned = planner.planned(problem if model is problem.plant else replace(problem, plant=model, reality=None))
+    told = ready.told(problem)
+    other = (
+        replace(problem, plant=model, reality=None, signals=signals_of(model, told))
+        if model is not problem.plant
+        else problem
+    )
+    planned = planner.planned(other)
     assert planned.horizon is not None
     assert planned.cost is not None
-    ocp = transcribe(planned.plant, planned.reference, planned.horizon, planned.cost, planned.limits)
+    ahead = previewed_values(model, told)
+    ocp = transcribe(planned.plant, planned.reference, planned.horizon, planned.cost, planned.limits, ahead)
     try:
         solve = _Solver(ocp, compiled)
     except FpirhcError:
         return None
-    data_of = stage_data(planned.plant, planned.reference, planned.horizon, planned.cost)
+    data_of = stage_data(planned.plant, planned.reference, planned.horizon, planned.cost, signals=ahead)
     stride = cycles_per_stage(problem.horizon, problem.period)
     plans = np.arange(stride, run.cycles, stride)
     rows = plans[np.unique(np.linspace(0, plans.size - 1, SAMPLES).astype(int))] if plans.size else plans
-    parameters, excess = ready.parameters(model), []
+    times = np.ravel(times)
+    parameters = rows_of(model_values(model, told), times + problem.period / 2, ready.parameters(model))
+    excess = []
     for row in rows:
         shift = run["command_shift"][row - 1]
         first = ocp.start(states[row], run["command"][row - 1] - shift).full().ravel()
-        data = np.asarray(data_of(np.ravel(times)[row], parameters).full())
+        data = np.asarray(data_of(times[row], parameters[row]).full())
         best = solve(first, data, ocp.input_lower - shift, ocp.input_upper - shift)
         cost_of_plan = run["solve.cost"][row]
         if best is not None and run["status"][row] <= Status.NOT_CONVERGED:

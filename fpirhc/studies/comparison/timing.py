@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.simulation.run import Run
+from fpirhc.simulation.sample import raw_measurements
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.task.problem import Problem, cycles_per_stage
 
@@ -94,8 +96,8 @@ class _Replay:
     """A controller on the measurements of its run, block by block."""
 
     def __init__(self, stepper: Stepper, run: Run) -> None:
-        self._step, self._memory, self._at = stepper.step, stepper.start(), 0
-        self._signals = run.time, run["state"], run["realised"]
+        self._step, self._memory, self._at = _step_of(stepper), stepper.start(), 0
+        self._signals = run.time, *_samples(stepper, run)
 
     def micro(self, block: int) -> float:
         """The mean time of a cycle over the next block; the median would hide cycles that plan."""
@@ -105,6 +107,20 @@ class _Replay:
             _, self._memory = self._step(times[k], states[k], realised[k], self._memory)
         self._at += block
         return (time.perf_counter_ns() - begin) / 1e3 / block
+
+
+def _samples(stepper: Stepper, run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """States and responses of a run; raw measurements, and nothing, for a step that estimates."""
+    if not stepper.estimates:
+        return run["state"], run["realised"]
+    measured = raw_measurements(run)
+    return measured, measured[:, :0]
+
+
+def _step_of(stepper: Stepper) -> Callable[[float, np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    if not stepper.estimates:
+        return stepper.step
+    return lambda now, measured, _, memory: stepper.step_measured(now, measured, memory)
 
 
 def measure_cycle(problem: Problem, controller: Controller, run: Run, *, compiled: bool = True) -> CycleTime | None:
@@ -119,10 +135,11 @@ def measure_cycle(problem: Problem, controller: Controller, run: Run, *, compile
     stepper = Stepper(problem, controller, compiled=compiled, bounded=False)
     memory = stepper.start()
     taken = np.empty(cycles)
-    times, states, realised = run.time[:cycles], run["state"][:cycles], run["realised"][:cycles]
+    times, step = run.time[:cycles], _step_of(stepper)
+    states, realised = (part[:cycles] for part in _samples(stepper, run))
     for k in range(cycles):
         begin = time.perf_counter_ns()
-        _, memory = stepper.step(times[k], states[k], realised[k], memory)
+        _, memory = step(times[k], states[k], realised[k], memory)
         taken[k] = time.perf_counter_ns() - begin
     micro = taken / 1e3
     later = micro[1:]

@@ -1,0 +1,110 @@
+"""The state and the command to which a measured response belongs, behind dead time and an estimator.
+
+    f_k = response at x_{k-D} to u_{k-1-D-d},      d: dead time of input and measurement, D: delay of the estimator, in cycles
+
+A measured state is as late as the response, by the dead time of the measurement, so it waits for the estimator's delay alone; the
+command waits for all three. Fractions of a cycle are interpolated, as the dead times themselves are. A learner that is given this
+pair has the same regressors as one without dead time, d + D cycles later.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+
+from fpirhc.controllers.mirror_path import MEASURED, measured_state
+from fpirhc.deformation.queue import Queue
+from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.layout import Expression, Signal
+from fpirhc.task.dead_time import DeadTime
+from fpirhc.task.problem import Problem
+
+_STATES, _COMMANDS = "pair_states", "pair_commands"
+_NONE = 1e-9  # a fraction of a cycle below this counts as zero
+
+
+@dataclass(frozen=True, eq=False)
+class ResponsePairs:
+    """Pairs of a learner.
+
+    Args:
+        problem: with the plant that is measured.
+        dead_time: that is believed.
+    """
+
+    problem: Problem
+    dead_time: DeadTime
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a response belongs to another pair than the measured state and the last command."""
+        return self._states.length > 1 or self._commands.length > 1
+
+    @property
+    def state(self) -> Signal:
+        """The signal of the measured state; behind dead time a controller may act on a predicted one."""
+        return measured_state(self.problem.plant) if self.waiting else self.problem.plant.state
+
+    @property
+    def cycles(self) -> int:
+        """Number of the first cycle whose pair belongs to this run: before it, samples show the start."""
+        late = self.dead_time.measurement / self.problem.period
+        first = self.problem.sensing.warm_up_cycles(self.problem.plant, late)
+        return max(int(first), math.ceil(late - _NONE) + 1)
+
+    @property
+    def memory(self) -> tuple[Signal, ...]:
+        """Past states and commands."""
+        problem = self.problem
+        states = _past(_STATES, problem.plant.state.elements, problem.start_state.tolist(), self._states.length)
+        commands = _past(_COMMANDS, problem.plant.input.elements, problem.inputs_before.tolist(), self._commands.length)
+        return (*states, *commands)
+
+    def pair(self, s: Signals, newest: Expression) -> tuple[Expression, Expression, dict[str, Expression]]:
+        """Return state and command of the response, and what is remembered.
+
+        Args:
+            s: signals of the cycle.
+            newest: command of the last cycle.
+        """
+        remembered: dict[str, Expression] = {}
+        results = []
+        state = getattr(s, MEASURED if self.waiting else self.problem.plant.state.name)
+        for name, queue, now in ((_STATES, self._states, state), (_COMMANDS, self._commands, newest)):
+            column, size = now, now.numel()
+            if queue.length > 1:
+                column = ca.vertcat(now, getattr(s, name))
+                remembered[f"{name}_next"] = column[: size * (queue.length - 1)]
+            results.append(queue.delayed(column, size) if queue.length > 1 else now)
+        return results[0], results[1], remembered
+
+    @cached_property
+    def _delay(self) -> float:
+        delay = self.problem.sensing.delay(self.problem.plant, self.problem.period)
+        return delay if delay > _NONE else 0.0
+
+    @property
+    def _states(self) -> Queue:
+        return Queue(self._delay)
+
+    @property
+    def _commands(self) -> Queue:
+        period, late = self.problem.period, self.dead_time
+        waits = (late.inputs.get(name, 0.0) + late.measurement for name in self.problem.plant.inputs)
+        return Queue(tuple(_rounded(wait / period) + self._delay for wait in waits))
+
+
+def _rounded(cycles: float) -> float:
+    """The cycles; what is a whole number but for rounding is whole."""
+    whole = round(cycles)
+    return float(whole) if abs(cycles - whole) < _NONE * max(1, whole) else cycles
+
+
+def _past(name: str, elements: tuple[str, ...], first: list[float], length: int) -> tuple[Signal, ...]:
+    if length < 2:
+        return ()
+    names = tuple(f"{e}@{k}" for k in range(1, length) for e in elements)
+    return (Signal(name, names, start=tuple(first) * (length - 1)),)

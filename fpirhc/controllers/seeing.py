@@ -1,0 +1,99 @@
+"""Sensing and controller as ONE step: from the raw measurements to the command.
+
+    raw measurements -> [estimator -> controller] -> command
+
+A sensor shows what it measures; velocities, filters and queues of samples are the controller's business. So the estimator is the
+first block of the composed step. A machine gives the step what its sensors show, and a skipped cycle leaves the estimator's memory
+as it was, like every other memory. Where state and response are both measured, there is nothing to estimate, and the step reads
+them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller, compose_controller, compose_informed, controller_reads
+from fpirhc.controllers.believing import Believing, check_believed
+from fpirhc.controllers.contract import checked
+from fpirhc.controllers.mirror import with_measured_state
+from fpirhc.controllers.own_reference import with_reference
+from fpirhc.symbolic.block import Block, Composite
+from fpirhc.symbolic.layout import Layout, Signal
+from fpirhc.task.dead_time import Wait
+from fpirhc.task.problem import Problem
+
+
+def compose_seeing(problem: Problem, controller: Controller) -> Composite:
+    """Return sensing and controller as one step: (memory, time, raw measurements, parameters) -> (memory, trace, command).
+
+    Where nothing is estimated it is `compose_controller`.
+
+    Args:
+        problem: that the controller is composed for.
+        controller: checked here against the problem.
+    """
+    raw = raw_signal(problem)
+    if raw is None:
+        return compose_controller(problem, controller)
+    ready = checked(problem, controller)
+    blocks, delays = ready.blocks(problem)
+    blocks = with_reference(problem, blocks)
+    time, _, _, parameters, *given = controller_reads(problem, ready).signals
+    check_believed(problem, ready)
+    believing = _believing(problem)
+    own = [believing.delay] if believing is not None else []
+    every = [*seeing_blocks(problem), *with_measured_state(problem.plant, blocks)]
+    return compose_informed(problem, ready, Layout((time, raw, parameters, *given)), every, [*delays, *own])
+
+
+def raw_signal(problem: Problem) -> Signal | None:
+    """Return the signal of the raw measurements that a step begins with; None where state and response are both measured."""
+    if not problem.sensing.estimates:
+        return None
+    return problem.sensing.raw(problem.plant, *_first(problem))
+
+
+def seeing_blocks(problem: Problem) -> list[Block]:
+    """Return the blocks from the raw measurements to 'state' and 'realised'; none where both are measured."""
+    raw = raw_signal(problem)
+    if raw is None:
+        return []
+    believing, (start, _) = _believing(problem), first_estimates(problem)
+    if believing is not None:
+        return [believing.block]
+    if problem.sensing.measured is not None:
+        return _estimating_part(problem, raw, start)
+    return [problem.sensing.estimator.block(problem.plant, problem.period, start, raw)]
+
+
+def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Return state and response that sensors without noise show at the start, shapes (nx,) and (n,)."""
+    plant, reality = problem.plant, problem.symbolic_reality
+    at = problem.real_start, problem.inputs_before, problem.real_parameters
+    if reality is None:
+        return problem.start_state, plant.controlled_response_function(*at).full().ravel()
+    calm = np.zeros(len(problem.real_plant.names))
+    state = reality.state_function(plant, seen=True)(*at, calm)
+    return state.full().ravel(), reality.response_function(plant, seen=True)(*at, calm).full().ravel()
+
+
+def _believing(problem: Problem) -> Believing | None:
+    raw = raw_signal(problem)
+    if raw is None or problem.sensing.belief is None:
+        return None
+    return Believing(problem, raw, first_estimates(problem)[0])
+
+
+def _estimating_part(problem: Problem, raw: Signal, start: np.ndarray) -> list[Block]:
+    """The estimator behind a block that leaves out what it does not need."""
+    names = problem.sensing.estimator.measures(problem.plant)
+    places = [raw.elements.index(n) for n in names]
+    needed = Signal("_needed", names)
+    select = Block("select", Layout((raw,)), Layout((needed,)), lambda s: {needed.name: getattr(s, raw.name)[places]})
+    return [select, problem.sensing.estimator.block(problem.plant, problem.period, start, needed)]
+
+
+def _first(problem: Problem) -> tuple[np.ndarray, Wait | None, np.ndarray]:
+    """First state, dead time of the measurement, and first response."""
+    start, resting = first_estimates(problem)
+    return start, problem.dead_time.measurement_wait(problem.period), resting

@@ -1,0 +1,170 @@
+"""Algebraic states: quantities that equations tie to the state at every instant, such as node voltages or contact forces.
+
+    0 = g(x, z, u, p),        dg/dz regular (index 1)
+
+They are computed inside the response by a fixed number of Newton's steps from a stated guess,
+
+    z <- z - (dg/dz)^-1 g(x, z, u, p),
+
+so that the work per evaluation is fixed and nothing is remembered. Equations that are affine in z take one step, which is exact. A
+last step that is not small leaves NaN, which ends a run by name: values that do not solve the equations are never used.
+
+Reference: K. E. Brenan, S. L. Campbell, L. R. Petzold, Numerical Solution of Initial-Value Problems in DAEs, 1996, ch. 2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import FpirhcError, Mistakes
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import Few
+from fpirhc.fields.user_code import called, named_results, scalar_expression
+from fpirhc.symbolic.expression import total
+from fpirhc.symbolic.layout import Expression, Named
+
+if TYPE_CHECKING:
+    from fpirhc.plant.plant import Plant
+
+SMALL = 1e-6  # last step of Newton's method, relative; the error left is about its square
+SINGULAR = 1e-12  # ratio of the least to the largest singular value of dg/dz
+
+
+@dataclass(frozen=True, eq=False)
+class Algebraic(Checked):
+    """Algebraic states of a plant: `Plant(algebraic=Algebraic(units={"node": "V"}, ...))`.
+
+    The response has their values by name as its last argument, after the parameters.
+
+    Args:
+        units: name -> unit of every algebraic state.
+        equations: function of (q, q', ..., u, p, z) that returns {algebraic state: an expression that is to be zero}; which name
+            an equation has does not matter.
+        guess: from where Newton's method begins: numbers by name, or a function of (q, q', ..., u, p) that returns expressions.
+        steps: of Newton's method, where the equations are not affine in z.
+    """
+
+    units: Mapping[str, str]
+    equations: Callable[..., Mapping[str, Expression]]
+    guess: Mapping[str, float] | Callable[..., Mapping[str, Expression]]
+    steps: Few = 6
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the algebraic states."""
+        return tuple(self.units)
+
+    def view(self, z: Expression) -> Named:
+        """Return values of the algebraic states by name."""
+        return Named(self.names, z, "algebraic state")
+
+    def residual(self, views: tuple[Named, ...], z: Expression) -> Expression:
+        """Return g as a column."""
+        values = named_results("algebraic", called("algebraic", self.equations, *views, self.view(z)))
+        return ca.vertcat(*(ca.SX(scalar_expression(f"algebraic: equation '{n}'", values[n])) for n in self.names))
+
+    def first(self, views: tuple[Named, ...]) -> Expression:
+        """Return the guess as a column."""
+        values = called("algebraic: guess", self.guess, *views) if callable(self.guess) else self.guess
+        return ca.vertcat(*(ca.SX(scalar_expression(f"algebraic: guess of '{n}'", values[n])) for n in self.names))
+
+    def solved(self, views: tuple[Named, ...], known: Expression) -> Expression:
+        """Return z that solves the equations, as a column; NaN where Newton's method has not arrived.
+
+        Args:
+            views: of state, input and parameters.
+            known: their symbols in one column.
+        """
+        z = ca.SX.sym("z", len(self.names))
+        residual = self.residual(views, z)
+        slope = ca.jacobian(residual, z)
+        step_of = ca.Function("fpirhc_newton_step", [z, known], [ca.densify(ca.solve(slope, residual))])
+        at = self.first(views)
+        if not ca.depends_on(slope, z):
+            return at - step_of(at, known)
+        step: Expression = at
+        for _ in range(self.steps):
+            step = step_of(at, known)
+            at = at - step
+        left = total(ca.fabs(step[k]) > SMALL * (1 + ca.fabs(at[k])) for k in range(len(self.names)))
+        # NaN is on neither side of a comparison, so arriving is asked for and not missing.
+        return ca.vertcat(*(ca.if_else(left < 0.5, at[k], math.nan) for k in range(len(self.names))))
+
+
+def check_algebraic(plant: Plant, algebraic: Algebraic, views: tuple[Named, ...], mistakes: Mistakes) -> None:
+    """Add every mistake in the names, the guess and the equations to `mistakes`."""
+    others = [*plant.state.elements, *plant.inputs, *plant.parameters]
+    for name in algebraic.names:
+        if not str(name).isidentifier() or name in others:
+            mistakes.add(
+                f"algebraic: '{name}' is no name of its own; use letters, digits and underscores, and no other name twice"
+            )
+    if not algebraic.names:
+        mistakes.add("algebraic: units are empty; name at least one algebraic state, with its unit")
+    z = ca.SX.sym("z", max(1, len(algebraic.names)))
+    parts: dict[str, Callable[[], object]] = {
+        "equations": lambda: called("algebraic", algebraic.equations, *views, algebraic.view(z)),
+        "guess": lambda: (
+            called("algebraic: guess", algebraic.guess, *views) if callable(algebraic.guess) else algebraic.guess
+        ),
+    }
+    for what, part in parts.items():
+        try:
+            values = named_results(f"algebraic: {what}", part())
+        except FpirhcError as error:
+            mistakes.add(str(error))
+            continue
+        mistakes.unknown(f"algebraic: {what}: algebraic state", values, algebraic.names)
+        for name in algebraic.names:
+            if name not in values:
+                mistakes.add(f"algebraic: {what} have nothing for '{name}'; add it")
+    if mistakes.none:
+        try:
+            algebraic.residual(views, z)
+            algebraic.first(views)
+        except FpirhcError as error:
+            mistakes.add(str(error))
+
+
+def unsolved(plant: Plant, state: np.ndarray, command: np.ndarray, parameters: np.ndarray) -> str:
+    """Return why the algebraic states cannot be computed at a point; empty where they can, and without any.
+
+    Args:
+        plant: the plant.
+        state: shape (nx,).
+        command: shape (nu,).
+        parameters: shape (np,).
+    """
+    algebraic = plant.algebraic
+    if algebraic is None:
+        return ""
+    names = ", ".join(algebraic.names)
+    solution = np.asarray(plant.algebraic_function(state, command, parameters).full()).ravel()
+    x, u, p = plant.symbols()
+    z = ca.SX.sym("z", len(algebraic.names))
+    slope = ca.jacobian(algebraic.residual(plant.views(x, u, p), z), z)
+    first = algebraic.first(plant.views(x, u, p))
+    at_guess = np.asarray(ca.Function("fpirhc_guess", [x, u, p], [first])(state, command, parameters).full()).ravel()
+    at = np.where(np.isfinite(solution), solution, at_guess)
+    values = np.asarray(
+        ca.Function("fpirhc_regular", [x, u, p, z], [ca.densify(slope)])(state, command, parameters, at).full()
+    )
+    if not np.isfinite(values).all():
+        return f"the slopes of the equations of {names} are not finite; choose another guess"
+    sizes = np.linalg.svd(values / np.maximum(np.abs(values).max(axis=1, keepdims=True), 1e-300), compute_uv=False)
+    if sizes[-1] <= SINGULAR * sizes[0]:
+        return (
+            f"the equations of {names} do not determine them: their slopes are singular (index above 1); differentiate them, "
+            "or make one of them a coordinate"
+        )
+    if not np.isfinite(solution).all():
+        return (
+            f"Newton's method does not arrive at {names} in {algebraic.steps} steps; give a nearer guess, or more steps"
+        )
+    return ""

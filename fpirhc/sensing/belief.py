@@ -1,0 +1,119 @@
+"""The contract of beliefs: states of the model that no sensor shows, from the own commands and from what is measured.
+
+    x-_k = F(x^_{k-1}, u_{k-1}, p)         the model over one cycle, with the command that acted
+    x^_k = x-_k corrected by what is measured
+
+A belief lives in the time of the samples: with a measurement that is late by d cycles, x^_k is the state at t_{k-d}, as every
+measured state is, and u is the command that acted then.
+
+The response is never believed. The model's response to a command is the request itself, from which a deformation learns nothing.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.fields.checked import Checked
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.layout import Expression, Layout
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What a belief is built from.
+
+    Args:
+        plant: the model.
+        advance: Function (state, input, parameters, forcing) -> state one cycle later.
+        start: first state, shape (nx,).
+        measured: names of the measured quantities.
+    """
+
+    plant: Plant
+    advance: ca.Function
+    start: np.ndarray
+    measured: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Data of a belief in one cycle.
+
+    Args:
+        measured: what the sensors show, by name of the quantity.
+        known: state elements that follow from these alone: measured, or derivatives of measured coordinates.
+        command: it acted until the sample was taken.
+        parameters: of the model.
+        moves: 1 where the sample is one cycle later than the last one; 0 for a sample that still shows the start.
+        counts: 1 where the sample was taken in this run, and is not the start again that fills a dead time.
+    """
+
+    measured: Mapping[str, Expression]
+    known: Mapping[str, Expression]
+    command: Expression
+    parameters: Expression
+    moves: Expression
+    counts: Expression
+
+
+Remembered: TypeAlias = Mapping[str, Expression]
+Predict: TypeAlias = Callable[[Evidence, Remembered], Expression]
+Correct: TypeAlias = Callable[[Evidence, Remembered, Expression], tuple[Expression, dict[str, Expression]]]
+
+
+class Belief(Checked, ABC):
+    """Contract: a frozen value that becomes a prediction and a correction of the model's state."""
+
+    @abstractmethod
+    def check(self, plant: Plant, measured: tuple[str, ...]) -> None:
+        """Raise if it cannot serve the plant with these measured quantities.
+
+        Raises:
+            InvalidProblem: all mistakes together.
+        """
+
+    @abstractmethod
+    def believes(self, plant: Plant, known: tuple[str, ...]) -> tuple[str, ...]:
+        """State elements that the controller is given from the belief.
+
+        Args:
+            plant: the model.
+            known: state elements that follow from what is measured.
+        """
+
+    def uses(self, measured: tuple[str, ...]) -> tuple[str, ...]:
+        """Names of the measured quantities that correct the state; by default all."""
+        return measured
+
+    @abstractmethod
+    def memory(self, model: Model) -> Layout:
+        """Signals that are remembered from cycle to cycle."""
+
+    @abstractmethod
+    def predict(self, model: Model) -> Predict:
+        """Function (evidence, memory) -> predicted state x-; of `evidence.known` nothing may be used yet."""
+
+    @abstractmethod
+    def correct(self, model: Model) -> Correct:
+        """Function (evidence, memory, predicted state) -> (state x^, memory one cycle later)."""
+
+    @abstractmethod
+    def free(self, slopes: Sequence[np.ndarray], shown: Sequence[np.ndarray], known: Sequence[int]) -> np.ndarray:
+        """Basis of the errors of the state that no measurement corrects, shape (nx, number).
+
+        Args:
+            slopes: Jacobians of the rates along the reference, each (nx, nx).
+            shown: Jacobians of the measured quantities there, each (number, nx).
+            known: places of the known state elements.
+        """
+
+    @property
+    def must_decay(self) -> bool:
+        """Whether errors that no measurement corrects must decay by themselves, or the belief is refused."""
+        return False

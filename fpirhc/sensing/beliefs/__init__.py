@@ -1,0 +1,1 @@
+"""Beliefs: one file per way to know states that no sensor shows."""

@@ -1,0 +1,173 @@
+"""States that no sensor shows, by an extended Kalman filter with its covariance in memory.
+
+    x- = F(x^, u, p),                 A = dF/dx,   B = dF/dw        the model and its Jacobians at x^
+    P- = A P A' + B W B'                                            w: white noise of the responses, deviation per cycle
+    S = C P- C' + R,   K = P- C' / S,   C = dh/dx at x-             h: the measured quantities, R: their noise
+    x^ = x- + K (y - h(x-, u, p)),    P = (I - K C) P- (I - K C)' + K R K'
+
+The last line is Joseph's form: a sum of two squares stays symmetric and positive whatever K is, which P- - K C P- does not after
+rounding. The Jacobians are symbolic; nothing is inverted but S, which is at least R. For a linear plant this is the Kalman filter,
+and its covariance goes to the solution of the Riccati equation.
+
+References:
+    A. H. Jazwinski, Stochastic Processes and Filtering Theory, Academic Press 1970, ch. 8 (extended filter).
+    R. S. Bucy and P. D. Joseph, Filtering for Stochastic Processes with Applications to Guidance, Interscience 1968.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.fields.kinds import Positive
+from fpirhc.plant.plant import Plant
+from fpirhc.sensing.base import response_names
+from fpirhc.sensing.belief import Belief, Correct, Evidence, Model, Predict, Remembered
+from fpirhc.sensing.observability import unobservable
+from fpirhc.symbolic.layout import Expression, Layout, Signal
+
+_STATE, _COVARIANCE = "belief_state", "belief_covariance"
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanFilter(Belief):
+    """The whole state from noisy measurements of a part of it.
+
+    Args:
+        measured: quantity (q1, q1', q1'' ...) -> deviation of the noise of its sensor, in its unit. They are among
+            `Sensing(measured=...)`.
+        noise: coordinate -> deviation of what its response has beyond the model in every cycle, white, in the response's unit. It
+            stands for disturbances and for what is wrong in the model: the larger, the more the filter trusts the sensors.
+        start: state -> deviation of its first value; zero, that is known, where not named.
+
+    Raises:
+        InvalidValue: no measured quantity, no noise.
+    """
+
+    measured: Mapping[str, Positive]
+    noise: Mapping[str, Positive]
+    start: Mapping[str, Positive] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("measured", "noise"):
+            if not getattr(self, name):
+                raise InvalidValue(f"KalmanFilter({name}={{}}): name at least one")
+
+    def check(self, plant: Plant, measured: tuple[str, ...]) -> None:
+        """Raise if a name is unknown or not measured.
+
+        Raises:
+            InvalidProblem: all mistakes together.
+        """
+        mistakes = Mistakes("KalmanFilter")
+        every = plant.state.elements + response_names(plant)
+        mistakes.unknown("measured: quantity", self.measured, every)
+        for name in self.measured:
+            if name in every and name not in measured:
+                mistakes.add(
+                    f"measured: no sensor shows '{name}'; those of Sensing(measured=...) are {', '.join(measured)}"
+                )
+        mistakes.unknown("noise: coordinate", self.noise, plant.coordinates)
+        mistakes.unknown("start: state", self.start, plant.state.elements)
+        mistakes.raise_if_any()
+
+    def believes(self, plant: Plant, known: tuple[str, ...]) -> tuple[str, ...]:
+        """The whole state: measured states come filtered."""
+        del known
+        return plant.state.elements
+
+    def uses(self, measured: tuple[str, ...]) -> tuple[str, ...]:
+        """The quantities whose noise is named."""
+        del measured
+        return tuple(self.measured)
+
+    def memory(self, model: Model) -> Layout:
+        """The believed state, and its covariance column by column."""
+        state = model.plant.state
+        first = np.diag([self.start.get(e, 0.0) ** 2 for e in state.elements])
+        entries = tuple(f"{i},{j}" for j in state.elements for i in state.elements)
+        return Layout(
+            (
+                Signal(_STATE, state.elements, state.units, tuple(map(float, model.start))),
+                Signal(_COVARIANCE, entries, start=tuple(map(float, first.ravel()))),
+            )
+        )
+
+    def predict(self, model: Model) -> Predict:
+        """One cycle of the model."""
+        calm = np.zeros(len(model.plant.names))
+
+        def predicted(evidence: Evidence, memory: Remembered) -> Expression:
+            before = memory[_STATE]
+            after = model.advance(before, evidence.command, evidence.parameters, calm)
+            return ca.if_else(evidence.moves, after, before)
+
+        return predicted
+
+    def correct(self, model: Model) -> Correct:
+        """The correction by what is measured; a sample that shows the start once more corrects nothing."""
+        spread, gain = self._spread_function(model), self._gain_function(model)
+
+        def corrected(
+            evidence: Evidence, memory: Remembered, predicted: Expression
+        ) -> tuple[Expression, dict[str, Expression]]:
+            u, p, before = evidence.command, evidence.parameters, memory[_COVARIANCE]
+            moved = ca.if_else(evidence.moves, spread(memory[_STATE], before, u, p), before)
+            shown = ca.vertcat(*(evidence.measured[n] for n in self.measured))
+            state, covariance = gain(predicted, moved, u, p, shown)
+            state = ca.if_else(evidence.counts, state, predicted)
+            return state, {_STATE: state, _COVARIANCE: ca.if_else(evidence.counts, covariance, moved)}
+
+        return corrected
+
+    def free(self, slopes: Sequence[np.ndarray], shown: Sequence[np.ndarray], known: Sequence[int]) -> np.ndarray:
+        """What cannot be observed along the reference."""
+        del known
+        return unobservable(slopes, shown)
+
+    @property
+    def must_decay(self) -> bool:
+        """True: the covariance of an error that neither decays nor is observed would stay or grow for ever."""
+        return True
+
+    def _spread_function(self, model: Model) -> ca.Function:
+        """Function (state, covariance, input, parameters) -> covariance of the prediction one cycle later."""
+        plant, size = model.plant, model.plant.state.size
+        x, u, p = plant.symbols()
+        w, before = ca.SX.sym("w", len(plant.names)), ca.SX.sym("P", size * size)
+        after = model.advance(x, u, p, w)
+        jacobians = ca.Function("fpirhc_slopes", [x, u, p, w], [ca.jacobian(after, x), ca.jacobian(after, w)])
+        slope, effect = (ca.densify(m) for m in jacobians(x, u, p, ca.SX.zeros(w.numel())))
+        white = ca.diag(ca.DM([self.noise.get(n, 0.0) ** 2 for n in plant.names]))
+        spread = slope @ ca.reshape(before, size, size) @ slope.T + effect @ white @ effect.T
+        return ca.Function("fpirhc_spread", [x, before, u, p], [ca.densify(ca.vec(spread))])
+
+    def _gain_function(self, model: Model) -> ca.Function:
+        """Function (prediction, its covariance, input, parameters, measured) -> (state, covariance)."""
+        plant, size = model.plant, model.plant.state.size
+        x, u, p = plant.symbols()
+        y, column = ca.SX.sym("y", len(self.measured)), ca.SX.sym("P", size * size)
+        covariance = ca.reshape(column, size, size)
+        expected = ca.vertcat(*shown_by(plant, tuple(self.measured), x, u, p))
+        slope = ca.densify(ca.jacobian(expected, x))
+        noise = ca.diag(ca.DM([d**2 for d in self.measured.values()]))
+        innovation = slope @ covariance @ slope.T + noise
+        gain = ca.solve(ca.densify(innovation), slope @ covariance).T
+        rest = ca.SX.eye(size) - gain @ slope
+        joseph = rest @ covariance @ rest.T + gain @ noise @ gain.T
+        results = [x + gain @ (y - expected), ca.vec(joseph)]
+        return ca.Function("fpirhc_kalman", [x, column, u, p, y], [ca.densify(r) for r in results])
+
+
+def shown_by(plant: Plant, names: tuple[str, ...], x: ca.SX, u: ca.SX, p: ca.SX) -> list[ca.SX]:
+    """Return measured quantities as expressions of the state and the input that acted."""
+    responses = dict(zip(response_names(plant), ca.vertsplit(plant.controlled_response_function(x, u, p)), strict=True))
+    states = dict(zip(plant.state.elements, ca.vertsplit(x), strict=True))
+    return [{**states, **responses}[name] for name in names]
+
+
+EXAMPLES = (KalmanFilter(measured={"a": 1e-3, "b": 1e-3}, noise={"a": 1.0, "b": 1.0}),)

@@ -1,0 +1,60 @@
+"""What cannot be observed along a motion.
+
+An error e of the believed state follows e' = A(t) e and shows as C(t) e. It never shows if it lies in a space V with
+
+    C_i V = 0   and   A_i V in V      for all instants i;
+
+the largest such space is found from the kernel of all C_i by leaving out, again and again, what some A_i moves out of it. At one
+instant it is the kernel of Kalman's observability matrix, without its powers of A, which would hide slow states among fast ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+_NOTHING = 1e-9  # share of a matrix below which a part of it counts as zero
+
+
+def unobservable(slopes: Sequence[np.ndarray], shown: Sequence[np.ndarray]) -> np.ndarray:
+    """Return an orthonormal basis of the errors that never show, shape (nx, number).
+
+    Args:
+        slopes: A_i, each (nx, nx), in states of size one.
+        shown: C_i, each (number, nx), in states of size one.
+    """
+    basis = _kernel(np.vstack([_rows_of_size_one(c) for c in shown]))
+    motions = [a / max(np.abs(a).max(), np.finfo(float).tiny) for a in slopes]
+    while basis.shape[1]:
+        leaving = np.vstack([a @ basis - basis @ (basis.T @ (a @ basis)) for a in motions])
+        staying = _kernel(leaving)
+        if staying.shape[1] == basis.shape[1]:
+            break
+        basis = basis @ staying
+    return basis
+
+
+def members(basis: np.ndarray) -> list[int]:
+    """Return the places of the states that have a part in these errors."""
+    return [k for k, row in enumerate(basis) if np.abs(row).max(initial=0.0) > 1e-6]
+
+
+def slowest(slopes: Sequence[np.ndarray], basis: np.ndarray) -> float:
+    """Return the largest real part of the poles with which these errors move, in 1 / unit of time; negative: all decay."""
+    if not basis.shape[1]:
+        return -np.inf
+    dual = np.linalg.pinv(basis)
+    return max(float(np.linalg.eigvals(dual @ a @ basis).real.max()) for a in slopes)
+
+
+def _kernel(matrix: np.ndarray) -> np.ndarray:
+    _, values, rows = np.linalg.svd(matrix, full_matrices=True)
+    rank = int((values > _NOTHING).sum())
+    return np.asarray(rows[rank:].T)
+
+
+def _rows_of_size_one(matrix: np.ndarray) -> np.ndarray:
+    """The matrix with rows of size one at most; rows of zero stay zero."""
+    largest = np.abs(matrix).max(axis=1, keepdims=True)
+    return np.asarray(matrix / np.where(largest > 0, largest, 1.0))

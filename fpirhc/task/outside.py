@@ -1,0 +1,234 @@
+"""Signals from outside: quantities that act on a plant and that nobody controls, such as weather, load, demand or prices.
+
+A signal is declared in the plant, `parameters={"ambient": outside(nominal=293.0, unit="K")}`, and read as `p.ambient`. Its values
+are those of the problem, `Problem(signals={"ambient": Known(Samples(...))})`. The plant gets the real values, the model what it is
+told: the same ones, others, or the nominal value. A course of values that the model knows is previewed: every stage of a horizon
+has its own.
+
+As a disturbance, a signal is sampled once per control cycle and held. The sample is that of the middle of the cycle, so its mean
+over the cycle is right to second order, and a step at the boundary of two cycles is never off by one. A stage takes the middle of
+the stage.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import FpirhcError, Mistakes
+from fpirhc.fields.checked import Checked
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.expression import kind
+from fpirhc.task.samples import Course, course_function, is_opaque, span_of
+
+
+class External(Checked, ABC):
+    """Contract: what a signal really is, and what the model is told of it."""
+
+    @property
+    @abstractmethod
+    def real(self) -> Course:
+        """Values that act on the plant."""
+
+    @property
+    @abstractmethod
+    def told(self) -> Course | None:
+        """Values that the model has; None: the nominal one."""
+
+    @property
+    def previewed(self) -> bool:
+        """Whether a horizon has the values of the future; else those of the cycle are held along it."""
+        return self.told is not None
+
+
+@dataclass(frozen=True, eq=False)
+class Known(External):
+    """A signal that the model has as it is.
+
+    Args:
+        values: `Samples`, a function of time that returns an expression, or a number.
+        preview: whether the future is known too, as from a schedule or a forecast; False: only the value of the cycle, as from a
+            sensor.
+    """
+
+    values: Course
+    preview: bool = True
+
+    @property
+    def real(self) -> Course:
+        """The values."""
+        return self.values
+
+    @property
+    def told(self) -> Course:
+        """The values."""
+        return self.values
+
+    @property
+    def previewed(self) -> bool:
+        """As stated."""
+        return self.preview
+
+
+@dataclass(frozen=True, eq=False)
+class Unknown(External):
+    """A signal that the plant gets and the model does not: the model has the nominal value.
+
+    Args:
+        values: `Samples`, a function of time that returns an expression, or a number.
+    """
+
+    values: Course
+
+    @property
+    def real(self) -> Course:
+        """The values."""
+        return self.values
+
+    @property
+    def told(self) -> None:
+        """Nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Believed(External):
+    """A signal of which the model is told something else, such as a wrong forecast.
+
+    Args:
+        values: what acts on the plant.
+        model: what the model is told.
+        preview: whether the model has its values of the future too.
+    """
+
+    values: Course
+    model: Course
+    preview: bool = True
+
+    @property
+    def real(self) -> Course:
+        """What acts on the plant."""
+        return self.values
+
+    @property
+    def told(self) -> Course:
+        """What the model is told."""
+        return self.model
+
+    @property
+    def previewed(self) -> bool:
+        """As stated."""
+        return self.preview
+
+
+def real_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function | None:
+    """Function (time, parameters) -> parameters with the real values of the signals; None where the plant has none."""
+    return _filled(plant, {n: signals[n].real for n in plant.signal_names if n in signals})
+
+
+def model_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function | None:
+    """Function (time, parameters) -> parameters with what the model is told at this time; None where it is told nothing."""
+    told = {n: signals[n].told for n in plant.signal_names if n in signals}
+    return _filled(plant, {n: course for n, course in told.items() if course is not None})
+
+
+def previewed_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function | None:
+    """Function (time, parameters) -> parameters with what the model is told of a later time; None where it is told nothing."""
+    ahead = {n: one for n, one in signals.items() if one.previewed}
+    return model_values(plant, ahead)
+
+
+def told_places(plant: Plant, signals: Mapping[str, External]) -> tuple[int, ...]:
+    """Places of the signals among the parameters of which the model is told something."""
+    names = [n for n in plant.signal_names if n in signals and signals[n].told is not None]
+    return tuple(plant.parameter.elements.index(n) for n in names)
+
+
+def signals_of(plant: Plant, signals: Mapping[str, External]) -> dict[str, External]:
+    """Return the signals that a plant has."""
+    return {name: one for name, one in signals.items() if name in plant.signal_names}
+
+
+def really_known(signals: Mapping[str, External]) -> Mapping[str, External]:
+    """Return the same signals, told to the model as they are: what an exact model knows."""
+    return {name: Known(one.real) for name, one in signals.items()}
+
+
+def as_told(plant: Plant, signals: Mapping[str, External]) -> dict[str, External]:
+    """Return signals that are what the model believes: the world of a null test."""
+    nominal = {name: plant.parameters[name].approximate for name in plant.signal_names}
+    made: dict[str, External] = {}
+    for name, one in signals_of(plant, signals).items():
+        told = one.told
+        made[name] = Known(nominal[name] if told is None else told, preview=one.previewed or told is None)
+    return made
+
+
+def rows_of(function: ca.Function | None, times: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """Return the parameters at some times, shape (m, np): the same row m times where there is no function."""
+    if function is None:
+        return np.repeat(parameters[None, :], len(times), axis=0)
+    columns = function.map(len(times))(times[None, :], np.repeat(parameters[:, None], len(times), axis=1))
+    return np.asarray(columns.full()).T
+
+
+def check_signals(
+    plants: Sequence[Plant], signals: Mapping[str, External], times: np.ndarray, mistakes: Mistakes
+) -> None:
+    """Add every mistake of the signals to `mistakes`.
+
+    Args:
+        plants: the model, and the plant of a reality where there is one.
+        signals: of the problem.
+        times: of the run: its first, some between, its last.
+        mistakes: to which they are added.
+    """
+    units: dict[str, str] = {}
+    for plant in plants:
+        for name in plant.signal_names:
+            unit = plant.parameters[name].unit
+            if units.setdefault(name, unit) != unit:
+                mistakes.add(
+                    f"signals: '{name}' is in {units[name]} in the model and in {unit} in the reality; write one unit"
+                )
+            if name not in signals:
+                mistakes.add(
+                    f"signals: '{name}' [{unit}] has no values; add signals={{'{name}': Known(Samples(times, values))}}, or Unknown"
+                )
+    ordinary = {name for plant in plants for name in plant.parameters} - units.keys()
+    for name in ordinary & signals.keys():
+        mistakes.add(f"signals: '{name}' is a parameter; declare it as outside(nominal=..., unit=...) in the plant")
+    mistakes.unknown("signals: name", signals.keys() - ordinary, units)
+    for name, one in signals.items():
+        for what, course in (("values", one.real), ("values of the model", one.told)):
+            if course is not None:
+                _check_course(f"signals: {what} of '{name}'", course, times, mistakes)
+
+
+def _check_course(what: str, course: Course, times: np.ndarray, mistakes: Mistakes) -> None:
+    first, last = span_of(course)
+    if first > times[0] or last < times[-1]:
+        mistakes.add(
+            f"{what} are stated from {first:g} to {last:g}, the run is from {times[0]:g} to {times[-1]:g}; add samples"
+        )
+        return
+    try:
+        values = np.asarray(course_function([course]).map(times.size)(times[None, :]).full()).ravel()
+    except FpirhcError as error:
+        mistakes.add(f"{what}: {error}")
+        return
+    if not np.isfinite(values).all():
+        mistakes.add(f"{what} are not finite at t = {times[int(np.argmin(np.isfinite(values)))]:g}")
+
+
+def _filled(plant: Plant, courses: Mapping[str, Course]) -> ca.Function | None:
+    if not courses:
+        return None
+    matrix = kind(any(map(is_opaque, courses.values())))
+    t, p = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
+    values = dict(zip(courses, ca.vertsplit(course_function(list(courses.values()))(t)), strict=True))
+    entries = [values.get(name, p[k]) for k, name in enumerate(plant.parameter.elements)]
+    return ca.Function("fpirhc_signals", [t, p], [ca.densify(ca.vertcat(*entries))], ["t", "p"], ["parameters"])

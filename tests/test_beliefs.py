@@ -1,0 +1,474 @@
+"""Believed states: what no sensor shows, by the model and by Kalman's filter; what cannot be known is named before the run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import abroad
+import casadi as ca
+import numpy as np
+import pytest
+import scipy.linalg
+from plants import linear, pendulum
+
+import fpirhc as fp
+from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.observed import free_errors
+from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, NotSupported
+from fpirhc.sensing.belief import Belief
+from fpirhc.sensing.observability import unobservable
+from fpirhc.simulation.sample import raw_measurements
+from fpirhc.status import Status
+from fpirhc.symbolic.native import find_compiler
+
+CTC = fp.ComputedTorque(fp.Exponential(rate=0.5))
+FPI = fp.ComputedTorque(fp.Exponential(rate=0.5), fp.Affine(gain=-0.5))
+KALMAN = fp.KalmanFilter(measured={"C1": 1e-2}, noise={"C1": 0.3, "C2": 0.05, "C3": 0.05})
+
+
+def infusion(belief: Belief, **changes: Any) -> fp.Problem:
+    """Propofol: the plasma is measured, three compartments are not; time in minutes."""
+    sensing = fp.Sensing({}, fp.VelocityDifference(), measured=["C1"], belief=belief)
+    settings: dict[str, Any] = {"duration": 30.0, "measure_from": 5.0, "sensing": sensing}
+    return replace(abroad.load("drug_infusion").problem, **(settings | changes))
+
+
+def tanks(belief: Belief, **changes: Any) -> fp.Problem:
+    """Four tanks whose lower levels are measured."""
+    problem = abroad.load("quadruple_tank").problem
+    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["h1", "h2"], belief=belief)
+    settings: dict[str, Any] = {"duration": 60 * problem.period, "measure_from": 0.0, "sensing": sensing}
+    return replace(problem, **(settings | changes))
+
+
+def servo(belief: Belief, **changes: Any) -> fp.Problem:
+    """A load on a flexible shaft: the motor's angle is measured, late by two cycles."""
+    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["motor"], belief=belief)
+    late = fp.DeadTime(inputs={"V": 0.025}, measurement=0.02)
+    settings: dict[str, Any] = {"duration": 1.0, "measure_from": 0.0, "sensing": sensing, "dead_time": late}
+    return replace(abroad.load("flexible_servo").problem, **(settings | changes))
+
+
+def swing(belief: Belief, believed: float = 1.0, **changes: Any) -> fp.Problem:
+    """A pendulum whose angle is measured."""
+    plant = pendulum(1.0, believed)
+    settings: dict[str, Any] = {
+        "plant": replace(plant, parameters={**plant.parameters, "l": fp.Parameter(0.6, 0.6, "m")}),
+        "reference": fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(2 * t)}),
+        "start": {"angle": 0.1, "angle'": 1.6},
+        "period": 0.01,
+        "duration": 3.0,
+        "sensing": fp.Sensing(
+            {"angle": fp.Sensor(noise=fp.Noise(2e-3))}, fp.PositionDifference(), measured=["angle"], belief=belief
+        ),
+    }
+    return fp.Problem(**(settings | changes))
+
+
+TRACK = fp.ComputedTorque(fp.Exponential(rate=4.0))
+ANGLE = fp.KalmanFilter(measured={"angle": 2e-3}, noise={"angle": 0.5}, start={"angle": 0.05, "angle'": 0.1})
+
+
+def run(problem: fp.Problem, controller: Controller, seed: int = 0, compiled: bool = False) -> fp.Run:
+    return fp.simulate(problem, controller, seed=seed, compiled=compiled)
+
+
+# The model alone
+
+
+@pytest.mark.parametrize(
+    ("make", "controller"), [(infusion, CTC), (tanks, None), (servo, CTC)], ids=["infusion", "tanks", "servo"]
+)
+@pytest.mark.parametrize("corrected", [True, False])
+def test_a_right_model_believes_what_is(make, controller, corrected):
+    """With exact parameters the believed states are the plant's, as late as the measurement is, to rounding."""
+    problem = make(fp.ModelStates(corrected))
+    if make is servo:  # a difference of angles would be half a cycle late
+        sensing = replace(problem.sensing, estimator=fp.VelocityDifference(), measured=["motor", "motor'"])
+        problem = replace(problem, sensing=sensing)
+    result = run(problem, fp.ExactModel(controller or abroad.load("quadruple_tank").controllers["RHC"]))
+    late = round(problem.dead_time.measurement / problem.period)
+    assert result.stop is None
+    places = [result.layout["state"].elements.index(e) for e in problem.sensing.believed(problem.plant)]
+    believed, true = result["state"][:, places], result["plant_state"][:, places]
+    assert places
+    assert np.ptp(true, axis=0).min() > 0
+    if late:
+        assert np.array_equal(believed[: late + 1], np.tile(true[0], (late + 1, 1)))
+    np.testing.assert_allclose(believed[late:], true[: len(true) - late], atol=1e-11 * (1 + np.abs(true).max()))
+
+
+def test_a_right_model_in_known_weather_believes_what_is():
+    """A heated room: the walls are believed, the weather of each cycle is a signal from outside that the model is told."""
+    weather = fp.Known(lambda t: 280.0 + 5.0 * ca.sin(0.4 * t))
+    plant = fp.Plant(
+        coordinates={"air": "K", "walls": "K"},
+        inputs={"heat": "kW"},
+        controlled=("air",),
+        order=1,
+        parameters={"loss": fp.Parameter(0.3, 0.3, "kW/K"), "ambient": fp.outside(nominal=280.0, unit="K")},
+        response=lambda q, u, p: {
+            "air": p.loss * (p.ambient - q.air) + 0.5 * (q.walls - q.air) + u.heat,
+            "walls": 0.1 * (q.air - q.walls) + 0.05 * (p.ambient - q.walls),
+        },
+        time_unit="h",
+    )
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"air": 293.0 + ca.sin(0.3 * t), "walls": 290.0 + 0 * t}),
+        start={"air": 292.0, "walls": 289.0},
+        period=0.25,
+        duration=20.0,
+        signals={"ambient": weather},
+        sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["air"], belief=fp.ModelStates()),
+    )
+    result = run(problem, CTC)
+    assert np.ptp(result["plant_state.walls"]) > 1
+    np.testing.assert_allclose(result["state"], result["plant_state"], atol=1e-10)
+
+
+def test_a_wrong_model_drifts_no_further_than_its_bound():
+    """C2' = k21 (C1 - C2) with C1 measured: |e| <= max|(k21 - k21^)(C1 - C2)| / k21^, from e' = -k21^ e + (k21 - k21^)(C1 - C2)."""
+    problem = infusion(fp.ModelStates(), duration=120.0)
+    result = run(problem, CTC)
+    parameters = problem.plant.parameters["k21"]
+    error = np.abs(result["state.C2"] - result["plant_state.C2"])
+    drive = np.abs((parameters.exact - parameters.approximate) * (result["plant_state.C1"] - result["plant_state.C2"]))
+    bound = drive.max() / parameters.approximate
+    assert 0.1 * bound < error.max() <= bound * (1 + 1e-2)  # the command is held, C1 moves within a cycle
+
+
+def test_a_model_that_runs_by_itself_drifts_without_bound():
+    """Y'' = b u, only y' measured and b wrong by 20 %: y is off by the integral of (b^ - b) u exactly, however long."""
+    problem = fp.Problem(
+        plant=linear(1.2, 1.0),
+        reference=fp.Trajectory(lambda t: {"y": 0.5 * t**2}),
+        start={"y": 0.0},
+        period=0.01,
+        duration=4.0,
+        sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["y'"], belief=fp.ModelStates(corrected=False)),
+    )
+    result = run(problem, TRACK)
+    command, period = result["command"][:-1, 0], problem.period
+    speed = np.concatenate([[0.0], np.cumsum(-0.2 * command * period)])
+    expected = np.concatenate([[0.0], np.cumsum(speed[:-1] * period - 0.2 * command * period**2 / 2)])
+    np.testing.assert_allclose((result["state.y"] - result["plant_state.y"]), expected, atol=1e-10)
+    assert abs(expected[-1]) > 0.5
+    assert not free_errors(problem).decays
+
+
+# Kalman's filter
+
+
+def recursion(problem: fp.Problem, result: fp.Run, filter: fp.KalmanFilter) -> tuple[np.ndarray, np.ndarray]:
+    """The extended filter of the pendulum in numpy, with rates by hand and Jacobians by the complex step."""
+    m, length, step = 1.0, 0.6, problem.period
+    believed = problem.plant.parameters["m"].approximate
+
+    def rate(x, u, w):
+        torque = (u - 0.1 * x[1]) / (believed * length**2)
+        return np.array([x[1], torque - 9.81 / length * np.sin(x[0]) + w])
+
+    def advance(x, u, w):
+        k1 = rate(x, u, w)
+        k2 = rate(x + step / 2 * k1, u, w)
+        k3 = rate(x + step / 2 * k2, u, w)
+        k4 = rate(x + step * k3, u, w)
+        return x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+    def slopes(x, u):
+        tiny = 1e-30j
+        columns = [advance(x + tiny * e, u, 0.0).imag / 1e-30 for e in np.eye(2)]
+        return np.column_stack(columns), (advance(x.astype(complex), u, tiny).imag / 1e-30)[:, None]
+
+    x, c = problem.start_state.copy(), np.array([[1.0, 0.0]])
+    p = np.diag([0.05**2, 0.1**2])
+    states, measured = [], raw_measurements(result)
+    for k in range(result.cycles):
+        if k:
+            u = result["command"][k - 1, 0]
+            a, b = slopes(x, u)
+            x, p = advance(x, u, 0.0), a @ p @ a.T + 0.5**2 * b @ b.T
+        gain = p @ c.T / (c @ p @ c.T + 2e-3**2)
+        x = x + gain @ (measured[k] - c @ x)
+        p = p - gain @ c @ p
+        states.append(x)
+    assert m == problem.plant.parameters["m"].exact
+    assert filter is problem.sensing.belief
+    return np.array(states), p
+
+
+def test_it_is_the_extended_filter_of_the_books():
+    """Against an independent recursion in numpy on the nonlinear pendulum, with a wrong mass, to 1e-10."""
+    problem = swing(ANGLE, believed=1.3)
+    result = run(problem, TRACK)
+    states, covariance = recursion(problem, result, ANGLE)
+    np.testing.assert_allclose(result["state"], states, atol=1e-10)
+    stepper = fp.Stepper(problem, TRACK, compiled=False)
+    memory = stepper.start()
+    for k in range(result.cycles):
+        _, memory = stepper.step_measured(float(result.time[k]), raw_measurements(result)[k], memory)
+    own = memory[stepper.memory.slice("belief_covariance")].reshape(2, 2)
+    np.testing.assert_allclose(own, covariance, rtol=1e-10)
+    assert np.linalg.eigvalsh(own).min() > 0
+
+
+def test_on_a_linear_plant_it_becomes_the_stationary_filter():
+    """Its covariance goes to the solution of the Riccati equation, from scipy, and its gain to that of a double integrator."""
+    filter = fp.KalmanFilter(measured={"y": 1e-3}, noise={"y": 0.5}, start={"y": 1.0, "y'": 1.0})
+    problem = fp.Problem(
+        plant=linear(1.0, 1.0),
+        reference=fp.Trajectory(lambda t: {"y": 0.3 * ca.sin(t)}),
+        start={"y": 0.0},
+        period=0.01,
+        duration=6.0,
+        sensing=fp.Sensing({}, fp.PositionDifference(), measured=["y"], belief=filter),
+    )
+    result, stepper = run(problem, TRACK), fp.Stepper(problem, TRACK, compiled=False)
+    memory, h = stepper.start(), problem.period
+    for k in range(result.cycles):
+        _, memory = stepper.step_measured(float(result.time[k]), raw_measurements(result)[k], memory)
+    a, b, c = np.array([[1, h], [0, 1]]), np.array([[h**2 / 2], [h]]), np.array([[1.0, 0.0]])
+    prior = scipy.linalg.solve_discrete_are(a.T, c.T, 0.25 * b @ b.T, np.array([[1e-6]]))
+    gain = prior @ c.T / (c @ prior @ c.T + 1e-6)
+    own = memory[stepper.memory.slice("belief_covariance")].reshape(2, 2)
+    np.testing.assert_allclose(own, prior - gain @ c @ prior, rtol=1e-8)
+
+
+def test_its_covariance_is_that_of_its_errors():
+    """With the right model and the stated noise, e' P^-1 e has the mean 2 of chi-squared, within four standard deviations.
+
+    Errors of neighbouring cycles belong together, so 60 runs count with one cycle each. The disturbance is the filter's noise.
+    """
+    problem = swing(ANGLE, duration=0.6, disturbances={"angle": fp.Noise(0.5)})
+    other = replace(problem, sensing=replace(problem.sensing, belief=replace(ANGLE, start={})))
+    stepper = fp.Stepper(other, TRACK, compiled=False)
+    simulator = fp.simulator(other, TRACK, compiled=False)
+    squares = []
+    for seed in range(60):
+        result, memory = simulator.run(seed=seed), stepper.start()
+        measured = raw_measurements(result)
+        for k in range(result.cycles):
+            _, memory = stepper.step_measured(float(result.time[k]), measured[k], memory)
+        covariance = memory[stepper.memory.slice("belief_covariance")].reshape(2, 2)
+        error = result["state"][-1] - result["plant_state"][-1]
+        squares.append(error @ np.linalg.solve(covariance, error))
+    assert np.mean(squares) == pytest.approx(2.0, abs=4 * 2 / np.sqrt(60))
+
+
+def test_it_knows_the_angle_and_its_speed_better_than_differences_do():
+    """From the noisy angle alone: a third of the sensor's error in the angle, a hundredth of the difference's in the speed."""
+    filtered = run(swing(replace(ANGLE, noise={"angle": 0.02})), TRACK)
+    plain = run(
+        swing(ANGLE, sensing=fp.Sensing({"angle": fp.Sensor(noise=fp.Noise(2e-3))}, fp.PositionDifference())), TRACK
+    )
+    errors = [np.sqrt(np.mean((r["state"] - r["plant_state"])[50:] ** 2, axis=0)) for r in (filtered, plain)]
+    assert errors[0][0] < errors[1][0] / 3
+    assert errors[0][1] < errors[1][1] / 100
+
+
+def test_an_accelerometer_may_correct_it():
+    """A measured response has the model's Jacobian; the belief of the speed is then better than from the angle alone."""
+    sensors = {"angle": fp.Sensor(noise=fp.Noise(2e-3)), "angle''": fp.Sensor(noise=fp.Noise(0.05))}
+    with_it = replace(ANGLE, measured={"angle": 2e-3, "angle''": 0.05}, noise={"angle": 0.05})
+    errors = []
+    for filter in (with_it, replace(ANGLE, noise={"angle": 0.05})):
+        sensing = fp.Sensing(sensors, fp.Measured(), measured=["angle", "angle''"], belief=filter)
+        result = run(swing(filter, believed=1.0, sensing=sensing), TRACK)
+        errors.append(np.sqrt(np.mean((result["state"] - result["plant_state"])[50:, 1] ** 2)))
+    assert errors[0] < errors[1]
+
+
+@pytest.mark.parametrize("belief", [fp.ModelStates(), KALMAN], ids=lambda b: type(b).__name__)
+def test_adaptation_works_on_believed_states(belief):
+    """The patient is another one than the model's: with FPI the plasma errs a tenth, though three compartments are believed."""
+    errors = {}
+    for name, controller in (("without", CTC), ("with", FPI)):
+        problem = infusion(belief, duration=60.0, measure_from=20.0)
+        errors[name] = fp.measure(problem, run(problem, controller)).rms_error["C1"]
+    assert errors["with"] < 0.1 * errors["without"]
+
+
+# One step with the controller
+
+
+BELIEFS: dict[str, tuple[Callable[..., fp.Problem], Belief]] = {
+    "model": (infusion, fp.ModelStates()),
+    "Kalman": (infusion, KALMAN),
+    "late servo": (servo, fp.KalmanFilter(measured={"motor": 1e-3}, noise={"load": 1.0, "motor": 1.0})),
+    "tanks": (tanks, fp.KalmanFilter(measured={"h1": 1e-2, "h2": 1e-2}, noise={"h3": 0.01, "h4": 0.01, "h1": 0.01})),
+}
+
+
+def case(name: str) -> tuple[fp.Problem, Controller]:
+    make, belief = BELIEFS[name]
+    controllers = {"tanks": abroad.load("quadruple_tank").controllers["RHC"], "late servo": CTC}
+    return make(belief), controllers.get(name, FPI)
+
+
+@pytest.mark.parametrize("name", BELIEFS)
+def test_a_stepper_believes_as_the_loop_does(name):
+    """Raw measurements of a run give its commands bit by bit; a bad one leaves state and covariance as they were."""
+    problem, controller = case(name)
+    result = run(problem, controller)
+    anything = dict.fromkeys(problem.sensing.measures(problem.plant), (-np.inf, np.inf))
+    stepper = fp.Stepper(problem, controller, compiled=False, plausible=anything)
+    memory, measured = stepper.start(), raw_measurements(result)
+    for k in range(result.cycles):
+        if k == 10:
+            held, after = stepper.step_measured(float(result.time[k]), measured[k] * np.nan, memory)
+            assert Status(int(stepper.trace()["status"][0])) == Status.BAD_SAMPLE
+            assert [stepper.memory.columns[i] for i in np.flatnonzero(after != memory)] == ["skipped_before"]
+            assert np.array_equal(held, result["command"][k - 1])
+        command, memory = stepper.step_measured(float(result.time[k]), measured[k], memory)
+        assert np.array_equal(command, result["command"][k])
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no compiler")
+@pytest.mark.parametrize("name", ["Kalman", "late servo"])
+def test_compiled_loops_believe_alike(name):
+    """C and the virtual machine agree to 1e-9 of the states' size."""
+    problem, controller = case(name)
+    virtual, compiled = run(problem, controller), run(problem, controller, compiled=True)
+    np.testing.assert_allclose(compiled["state"], virtual["state"], atol=1e-9 * np.abs(virtual["state"]).max())
+
+
+def test_a_model_referenced_form_passes_the_null_test_on_believed_states():
+    """With an exact model it changes nothing: the twin's response passes the same estimator."""
+    problem = tanks(fp.ModelStates())
+    referenced = fp.ComputedTorque(fp.Exponential(rate=0.05), fp.ModelReferenced(fp.Affine(gain=-0.5)))
+    plain = fp.ComputedTorque(fp.Exponential(rate=0.05))
+    first, second = (run(problem, fp.ExactModel(c)) for c in (plain, referenced))
+    np.testing.assert_allclose(first["state"], second["state"], atol=1e-9)
+
+
+# What cannot be known is named
+
+
+def test_unobservable_errors_are_those_of_the_books():
+    """Random plants with 0 to 3 states that show nowhere, turned: the space is found, and Kalman's matrix has its rank."""
+    random = np.random.default_rng(5)
+    for hidden in range(4):
+        a, c = random.normal(size=(6, 6)), random.normal(size=(2, 6))
+        a[: 6 - hidden, 6 - hidden :], c[:, 6 - hidden :] = 0, 0
+        turn = np.linalg.qr(random.normal(size=(6, 6)))[0]
+        turned, shown = turn @ a @ turn.T, c @ turn.T
+        basis = unobservable([turned], [shown])
+        kalman = np.vstack([shown @ np.linalg.matrix_power(turned, k) for k in range(6)])
+        assert basis.shape[1] == hidden == 6 - np.linalg.matrix_rank(kalman)
+        planted = turn[:, 6 - hidden :]
+        np.testing.assert_allclose(planted @ (planted.T @ basis), basis, atol=1e-9)
+
+
+def test_motion_can_show_what_rest_hides():
+    """Two instants with other slopes see together what each alone does not."""
+    c = np.array([[1.0, 0.0, 0.0]])
+    first, second = np.zeros((3, 3)), np.zeros((3, 3))
+    first[0, 1], second[0, 2] = 1.0, 1.0
+    assert unobservable([first], [c]).shape[1] == 1
+    assert unobservable([second], [c]).shape[1] == 1
+    assert unobservable([first, second], [c, c]).shape[1] == 0
+
+
+def test_errors_that_decay_are_allowed_and_known():
+    """The effect site follows the plasma and shows nowhere; its error decays with ke0 of the model, 0.26 / min."""
+    free = free_errors(infusion(KALMAN))
+    assert free.states == ("Ce",)
+    assert free.pole == pytest.approx(-0.26, rel=1e-9)
+    assert free_errors(infusion(fp.ModelStates())).states == ("C2", "C3", "Ce")
+
+
+def test_a_state_that_cannot_be_observed_is_named_before_the_run():
+    """From the load's speed nobody knows the angles: a turn of the whole servo shows nowhere and stays."""
+    belief = fp.KalmanFilter(measured={"load'": 0.1}, noise={"motor": 1.0})
+    problem = servo(belief, sensing=fp.Sensing({}, fp.PositionDifference(), measured=["load'"], belief=belief))
+    with pytest.raises(
+        NotSupported,
+        match=r"KalmanFilter: load and motor cannot be observed along the reference from load'.*measure load",
+    ):
+        run(problem, CTC)
+
+
+def test_a_review_says_whether_believed_states_become_right():
+    """Yes with the time constant of the slowest error, no where it stays."""
+    texts = {}
+    for name, problem in (("infusion", infusion(fp.ModelStates())), ("servo", servo(fp.ModelStates()))):
+        answers = fp.review(problem, {"CTC": CTC}, mismatch=0.0, seed=0).problem
+        [texts[name]] = [a for a in answers if a.question == "Are the believed states right after a while?"]
+    assert texts["infusion"].verdict == "yes"
+    assert "time constant of 303 min" in texts["infusion"].evidence
+    assert texts["servo"].verdict in ("yes", "no")
+
+
+BAD: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
+    "unknown quantity": (
+        lambda: infusion(KALMAN, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["c1"], belief=KALMAN)),
+        InvalidProblem,
+        "measured: quantity 'c1'.*Did you mean 'C1'",
+    ),
+    "nothing measured": (
+        lambda: infusion(KALMAN, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=[], belief=fp.ModelStates())),
+        InvalidProblem,
+        "name at least one quantity",
+    ),
+    "no belief": (
+        lambda: infusion(KALMAN, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["C1"])),
+        InvalidProblem,
+        "VelocityDifference also needs C2, C3, Ce; measure it, or state how it is believed",
+    ),
+    "belief without need": (
+        lambda: infusion(KALMAN, sensing=fp.Sensing({}, fp.PositionDifference(), belief=fp.ModelStates())),
+        InvalidProblem,
+        r"everything that PositionDifference needs is measured; name what sensors show: Sensing\(measured=\['C1'",
+    ),
+    "filter of what is not measured": (
+        lambda: infusion(replace(KALMAN, measured={"C2": 0.1})),
+        InvalidProblem,
+        "no sensor shows 'C2'; those of Sensing\\(measured=...\\) are C1",
+    ),
+    "unknown noise": (
+        lambda: infusion(replace(KALMAN, noise={"C22": 0.1})),
+        InvalidProblem,
+        "noise: coordinate 'C22'.*Did you mean 'C2'",
+    ),
+    "sensor of a believed state": (
+        lambda: infusion(
+            KALMAN,
+            sensing=fp.Sensing(
+                {"C2": fp.Sensor(quantum=0.1)}, fp.VelocityDifference(), measured=["C1"], belief=fp.ModelStates()
+            ),
+        ),
+        InvalidProblem,
+        "'C2' is estimated by ModelStates, not measured; sensors are those of C1",
+    ),
+    "no noise": (lambda: fp.KalmanFilter(measured={"C1": 0.1}, noise={}), InvalidValue, "name at least one"),
+    "response of the model": (
+        lambda: run(
+            infusion(KALMAN, sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["Ce"], belief=fp.ModelStates())),
+            FPI,
+        ),
+        NotSupported,
+        "the response that Affine compares needs C1, which no sensor shows.*nothing can be learned",
+    ),
+    "late by a fraction": (
+        lambda: run(infusion(KALMAN, dead_time=fp.DeadTime(measurement=0.25)), CTC),
+        NotSupported,
+        "late by whole cycles, and 0.25 min are 1.5 cycles",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_mistakes_are_named(what):
+    make, kind, message = BAD[what]
+    with pytest.raises(kind, match=f"(?s){message}"):
+        make()
+
+
+def test_a_controller_that_does_not_adapt_may_believe_its_response():
+    """Control of the plasma from the effect site alone: the response is the model's, and nobody learns from it."""
+    sensing = fp.Sensing({}, fp.VelocityDifference(), measured=["Ce"], belief=fp.ModelStates())
+    result = run(infusion(KALMAN, sensing=sensing), fp.ExactModel(CTC))
+    np.testing.assert_allclose(result["state"], result["plant_state"], atol=1e-11)

@@ -1,0 +1,294 @@
+"""Learners behind dead time and estimators, disturbances seen in the response, and estimates that act in every cycle."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import abroad
+import casadi as ca
+import numpy as np
+import pytest
+import scipy.linalg
+from plants import linear, pendulum
+
+import fpirhc as fp
+from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.replanning import Replanning
+from fpirhc.controllers.response_pairs import ResponsePairs
+from fpirhc.symbolic.expression import Signals
+
+PERIOD = 0.01
+TRACK = fp.ComputedTorque(fp.Exponential(rate=2.0))
+LEARNED = {"k": fp.Uncertain(0.0, 10.0, 1.0), "b": fp.Uncertain(0.1, 5.0, 0.5)}
+LEARNERS = {
+    "RLS": fp.RecursiveLeastSquares(LEARNED, {"y": 0.1}, 5.0),
+    "MHE": fp.MovingHorizon(LEARNED, {"y": 0.1}, 20, 5.0),
+}
+LATE = {
+    "input": fp.DeadTime(inputs={"u": 0.05}),
+    "fraction": fp.DeadTime(inputs={"u": 0.033}),
+    "measurement": fp.DeadTime(measurement=0.05),
+    "both": fp.DeadTime(inputs={"u": 0.03}, measurement=0.02),
+}
+
+
+def spring(**changes: Any) -> fp.Problem:
+    """Y'' = b u - k y with wrong k and b, both of which are learned."""
+    plant = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "N"},
+        parameters={"k": fp.Parameter(2.0, 3.0, "1/s^2"), "b": fp.Parameter(1.5, 1.0, "1/kg")},
+        response=lambda q, v, u, p: {"y": p.b * u.u - p.k * q.y},
+    )
+    settings: dict[str, Any] = {
+        "plant": plant,
+        "reference": fp.Trajectory(lambda t: {"y": 0.3 * ca.sin(2 * t) + 0.1 * ca.sin(5 * t)}),
+        "start": {"y": 0.05},
+        "period": PERIOD,
+        "duration": 4.0,
+        "limits": fp.Limits(inputs={"u": (-20.0, 20.0)}),
+        "horizon": fp.Horizon(stages=10, step=10 * PERIOD),
+        "cost": fp.Quadratic(states={"y": 1e2, "y'": 1.0}, deviation={"u": 0.01}),
+    }
+    return fp.Problem(**(settings | changes))
+
+
+def run(problem: fp.Problem, controller: Controller) -> fp.Run:
+    return fp.simulate(problem, controller, seed=0, compiled=False)
+
+
+# Pairs
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+@pytest.mark.parametrize("late", LATE)
+def test_parameters_are_found_behind_dead_time(learner, late):
+    """To 1e-3, where pairs that ignore the dead time leave errors a hundred times as large."""
+    problem = spring(dead_time=LATE[late])
+    errors = []
+    for believed in (None, fp.DeadTime()):
+        result = run(problem, fp.Estimating(TRACK, LEARNERS[learner], dead_time=believed))
+        errors.append(np.abs(result["estimate"][-1] - [3.0, 1.0]).max())
+    assert errors[0] < 1e-3
+    assert errors[1] > 100 * errors[0]
+
+
+def test_regressors_are_those_without_dead_time_some_cycles_later():
+    """Late samples of the same motion give the same estimates, bit by bit, when they arrive.
+
+    The motion is forced: the learner looks on while a law without feedback from the late samples drives the plant.
+    """
+    problem = spring()
+    follow = fp.Estimating(Onlooker(), LEARNERS["RLS"])
+    at_once = run(problem, follow)["estimate"]
+    later = run(replace(problem, dead_time=fp.DeadTime(measurement=0.07)), follow)["estimate"]
+    np.testing.assert_array_equal(later[7 + 1 :], at_once[1:-7])
+    assert np.ptp(at_once) > 0.5
+
+
+class Onlooker(fp.ComputedTorque):
+    """Computed torque that follows a table of forces and not what it measures."""
+
+    def __init__(self) -> None:
+        super().__init__(fp.Exponential(rate=2.0))
+
+    def blocks(self, problem):
+        """The command is a sine."""
+        blocks, delays = super().blocks(problem)
+        [place] = [k for k, b in enumerate(blocks) if b.name == "invert"]
+        forced = replace(
+            blocks[place], step=lambda s: {"command_unclipped": 2 * ca.sin(3 * s.time)}, reads=_timed(blocks[place])
+        )
+        blocks[place] = forced
+        return blocks, delays
+
+
+def _timed(block):
+    from fpirhc.symbolic.layout import Layout, scalar
+
+    return block.reads if "time" in block.reads else block.reads + Layout((scalar("time", "s"),))
+
+
+def test_an_estimator_of_the_response_delays_its_pair():
+    """State and command wait for the estimator's centre, 4.5 cycles with this window; the command also for the dead time."""
+    problem = spring(sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window=11, degree=3)))
+    pairs = ResponsePairs(problem, fp.DeadTime(inputs={"u": 0.02}))
+    states, commands = (
+        dict(zip((m.name for m in pairs.memory), pairs.memory, strict=True))[n]
+        for n in ("pair_states", "pair_commands")
+    )
+    past = np.arange(1.0, 1 + states.size // 2)
+    s = Signals(
+        {
+            "_measured_state": ca.SX(ca.DM([0.0, 0.0])),
+            "pair_states": ca.SX(ca.DM(np.repeat(past, 2))),
+            "pair_commands": ca.SX(ca.DM(np.arange(1.0, 1 + commands.size))),
+        }
+    )
+    state, command, _ = pairs.pair(s, ca.SX(0.0))
+    assert ca.DM(state).full().ravel() == pytest.approx([4.5, 4.5])
+    assert ca.DM(command).full().ravel() == pytest.approx([6.5])
+
+
+def test_an_estimated_response_teaches_the_parameters():
+    """From positions alone, by a window of 11 samples: within 2 %, and three times further off where its delay is ignored."""
+    problem = spring(sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window=11, degree=3)), duration=8.0)
+    result = run(problem, fp.Estimating(TRACK, LEARNERS["RLS"]))
+    assert np.abs(result["estimate"][-1] / [3.0, 1.0] - 1).max() < 0.02
+
+
+def test_a_learner_inside_a_prediction_learns_from_what_was_measured():
+    """The controller acts on the state ahead; the pair has the measured state, and the parameters are found."""
+    problem = spring(dead_time=fp.DeadTime(inputs={"u": 0.04}))
+    late = fp.Predicted(fp.Estimating(TRACK, LEARNERS["RLS"]), inputs=0.04)
+    assert np.abs(run(problem, late)["estimate"][-1] - [3.0, 1.0]).max() < 1e-3
+
+
+def test_a_rule_of_inverse_dynamics_learns_behind_dead_time():
+    """Mass and stiffness of y'' = (u - k y) / m by projection inside Slotine and Li's controller, with a command 30 ms late."""
+    plant = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "N"},
+        parameters={"k": fp.Parameter(2.0, 3.0, "N/m"), "m": fp.Parameter(1.5, 1.0, "kg")},
+        response=lambda q, v, u, p: {"y": (u.u - p.k * q.y) / p.m},
+    )
+    problem = spring(plant=plant, dead_time=fp.DeadTime(inputs={"u": 0.03}), duration=10.0)
+    bounds = {"k": (0.0, 10.0), "m": (0.2, 5.0)}
+    result = run(problem, fp.SlotineLi(2.0, {"y": 4.0}, fp.Projection(gain=0.1), bounds))
+    assert result.stop is None
+    np.testing.assert_allclose(result["estimate"][-1], [3.0, 1.0], atol=1e-3)
+
+
+def test_prediction_around_or_inside_the_learner_agree():
+    """Both learn from the measured state: the same estimates to 1e-6 after two seconds, on slightly different motions."""
+    problem = spring(dead_time=LATE["both"])
+    learner = LEARNERS["RLS"]
+    orders = (
+        fp.Predicted(fp.Estimating(TRACK, learner), inputs=0.03, measurement=0.02),
+        fp.Estimating(fp.Predicted(TRACK, inputs=0.03, measurement=0.02), learner),
+    )
+    first, second = (run(problem, c)["estimate"] for c in orders)
+    np.testing.assert_allclose(first[200:], second[200:], atol=1e-3)
+    assert np.abs(first[-1] - [3.0, 1.0]).max() < 1e-3
+
+
+def test_offset_free_control_works_behind_dead_time():
+    """Four tanks of others with late pumps: the disturbance model leaves less than .6 of the level's error, transients included."""
+    task = abroad.load("quadruple_tank")
+    late = fp.DeadTime(inputs=dict.fromkeys(task.problem.plant.inputs, 2 * task.problem.period))
+    problem = replace(task.problem, dead_time=late)
+    plain = task.controllers["RHC"]
+    filter = fp.DisturbanceKalman({"h1": 0.1, "h2": 0.1}, {"h1": 1e-2, "h2": 1e-2}, noise={"h3": 0.1, "h4": 0.1})
+    lead = next(iter(late.inputs.values()))
+    errors = [
+        max(fp.measure(problem, run(problem, fp.Predicted(c, inputs=lead))).rms_error.values())
+        for c in (plain, fp.Estimating(plain, filter))
+    ]
+    assert errors[1] < 0.6 * errors[0]
+
+
+# The response in the filter
+
+
+def test_the_gain_of_a_measured_response_is_that_of_the_stationary_filter():
+    """A double integrator with y and y'' = b u + w measured: the Riccati equation written out by hand, solved by scipy."""
+    problem = spring(plant=linear(1.0, 1.0))
+    filter = fp.DisturbanceKalman({"y": 2.0}, {"y": 1e-3, "y''": 0.3}, noise={"y": 0.5})
+    h = PERIOD
+    a = np.array([[1, h, h**2 / 2], [0, 1, h], [0, 0, 1]])
+    b, c = np.array([[h**2 / 2], [h], [0]]), np.array([[1.0, 0, 0], [0, 0, 1.0]])
+    q, r = 0.5**2 * b @ b.T + np.diag([0, 0, 4 * h]), np.diag([1e-6, 0.09])
+    p = scipy.linalg.solve_discrete_are(a.T, c.T, q, r)
+    expected = p @ c.T @ np.linalg.inv(c @ p @ c.T + r)
+    np.testing.assert_allclose(filter.gain(replace(problem, plant=filter.model(problem.plant))), expected, rtol=1e-7)
+
+
+def test_a_response_shows_its_disturbance_at_once():
+    """After a step of the push the filter with the response has 90 % in a cycle, the one with positions alone much later."""
+    problem = spring(plant=linear(1.0, 1.0), disturbances={"y": fp.Step(1.0, 2.0)}, duration=2.0)
+    cycles = []
+    for measured in ({"y": 1e-3}, {"y": 1e-3, "y''": 0.05}):
+        estimate = run(problem, fp.Estimating(TRACK, fp.DisturbanceKalman({"y": 5.0}, measured)))["estimate"][:, 0]
+        assert estimate[-1] == pytest.approx(2.0, rel=1e-3)
+        cycles.append(int(np.argmax(estimate > 1.8)) - 100)
+    assert cycles[1] <= 2
+    assert cycles[0] >= 8
+
+
+def test_the_response_alone_is_a_low_pass_of_the_model_error():
+    """Measured alone, with the states nearly exact, w^ <- w^ + L (f - f^ - w^) with the stationary L of a random walk.
+
+    L = (sqrt(q^2 + 4 q r) + q) / (sqrt(q^2 + 4 q r) + q + 2 r), the scalar Riccati equation by hand.
+    """
+    problem = spring(
+        plant=pendulum(),
+        reference=fp.Trajectory(lambda t: {"angle": 0.3 * ca.sin(t)}),
+        start={"angle": 0.0},
+        limits=fp.Limits(),
+        horizon=None,
+        cost=None,
+    )
+    filter = fp.DisturbanceKalman({"angle": 3.0}, {"angle": 1e-9, "angle'": 1e-9, "angle''": 0.5}, noise={"angle": 1e3})
+    result = run(problem, fp.Estimating(TRACK, filter))
+    q, r = 9 * PERIOD, 0.25
+    root = np.sqrt(q**2 + 4 * q * r)
+    expected = (root + q) / (root + q + 2 * r)
+    plant, states, commands = problem.plant, result["state"], result["command"]
+    error = np.array(
+        [
+            float(result["realised"][k, 0] - plant.response_function(states[k], commands[k - 1], plant.approximate))
+            for k in range(1, result.cycles)
+        ]
+    )
+    own, w = result["estimate"][:, 0], np.zeros(result.cycles)
+    for k in range(1, result.cycles):
+        w[k] = w[k - 1] + expected * (error[k - 1] - w[k - 1])
+    np.testing.assert_allclose(own, w, atol=2e-2 * np.abs(w).max())
+    assert np.ptp(w) > 0.1
+
+
+# Estimates that act in every cycle
+
+
+def offset_free(at_once: bool, replanning: Replanning | None = None) -> fp.Estimating:
+    plan = fp.RecedingHorizon(
+        fp.FixedPoint(iterations=3, tolerance=1e-6), replanning=replanning or fp.FromMeasurement()
+    )
+    return fp.Estimating(plan, fp.DisturbanceKalman({"y": 20.0}, {"y": 1e-4, "y'": 1e-3}), at_once=at_once)
+
+
+def test_a_new_estimate_changes_the_command_between_plans():
+    """Y'' = b u + w: the command is the plan's input minus what w has changed since the plan, over b."""
+    problem = spring(plant=linear(1.0, 0.8), disturbances={"y": fp.Sine(1.0, 3.0)})
+    result = run(problem, offset_free(at_once=True))
+    command, planned, w = result["command"][:, 0], result["planned"][:, 0], result["estimate"][:, 0]
+    since = w - np.repeat(w[::10], 10)[: w.size]
+    np.testing.assert_allclose(command, planned - since / 0.8, atol=1e-9)
+    assert np.abs(since).max() > 0.1
+    held = run(problem, offset_free(at_once=False))
+    np.testing.assert_allclose(held["command"], held["planned"], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "replanning",
+    [fp.FromMeasurement(), fp.FromMeasurementTracked(fp.Exponential(rate=5.0)), fp.FromPlan(fp.Exponential(rate=5.0))],
+    ids=str,
+)
+def test_acting_in_every_cycle_rejects_a_disturbance_better(replanning):
+    """A push that changes within a plan's time: less error at the rate of the deformation than at that of the plans."""
+    problem = spring(plant=linear(1.0, 1.0), disturbances={"y": fp.Sine(2.0, 4.0)}, measure_from=1.0)
+    errors = []
+    for at_once in (False, True):
+        controller = offset_free(at_once, replanning)
+        errors.append(fp.measure(problem, run(problem, controller)).rms_error["y"])
+    assert errors[1] < 0.8 * errors[0] or replanning != fp.FromMeasurement()
+    assert errors[1] <= 1.001 * errors[0]
+
+
+def test_a_model_that_does_not_learn_is_followed_by_nothing():
+    """The commands are those of the controller that does not follow its model, to rounding."""
+    problem = spring()
+    plan = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-6), fp.Affine(gain=-0.3))
+    first, second = run(problem, plan), run(problem, plan.following_its_model())
+    np.testing.assert_allclose(first["command"], second["command"], atol=1e-12)

@@ -1,0 +1,348 @@
+"""Signals from outside: known and previewed, unknown, believed; a room that is heated against the weather."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import fpirhc as fp
+from fpirhc.errors import InvalidField, InvalidProblem, InvalidShape, InvalidValue
+from fpirhc.symbolic.expression import expression
+
+PERIOD, DURATION = 0.25, 30.0  # h
+
+
+def response(q, u, p):
+    """Temperatures of the air and of the walls, K/h."""
+    return {
+        "air": (p.loss * (p.ambient - q.air) + p.wall * (q.walls - q.air) + u.heat) / p.heat_capacity,
+        "walls": p.wall * (q.air - q.walls) / 6.0,
+    }
+
+
+def room(ambient: fp.Parameter, *, wrong: float = 1.0) -> fp.Plant:
+    """A room; the model's loss is `wrong` times too large."""
+    return fp.Plant(
+        coordinates={"air": "K", "walls": "K"},
+        inputs={"heat": "kW"},
+        controlled=("air",),
+        order=1,
+        response=response,
+        parameters={
+            "loss": fp.Parameter(approximate=0.3 * wrong, exact=0.3, unit="kW/K"),
+            "ambient": ambient,
+            "wall": fp.Parameter(approximate=0.5, exact=0.5, unit="kW/K"),
+            "heat_capacity": fp.Parameter(approximate=1.2, exact=1.2, unit="kWh/K"),
+        },
+        time_unit="h",
+    )
+
+
+def task(plant: fp.Plant, signals: Any = None, **changes: Any) -> fp.Problem:
+    """Keep the room at 293 K, with a daily swing of one degree."""
+    values = {
+        "plant": plant,
+        "reference": fp.Trajectory(lambda t: {"air": 293.0 + ca.sin(0.26 * t), "walls": 293.0 + 0 * t}),
+        "start": {"air": 292.0, "walls": 292.5},
+        "period": PERIOD,
+        "duration": DURATION,
+        "horizon": fp.Horizon(stages=12, step=2 * PERIOD),
+        "cost": fp.Quadratic(states={"air": 1.0}, effort={"heat": 1e-3}),
+        "signals": signals or {},
+    }
+    return fp.Problem(**{**values, **changes})
+
+
+OUTSIDE = fp.outside(nominal=283.0, unit="K")
+NIGHT = fp.Samples([0.0, 6.0, 12.0, 18.0, 24.0, 30.0], [283.0, 276.0, 274.0, 281.0, 285.0, 279.0], hold="linear")
+FRONT = fp.Samples([0.0, 15.0], [283.0, 268.0])  # a cold front at 15 h
+RHC = fp.RecedingHorizon(fp.FixedPoint(iterations=4, tolerance=1e-6))
+CTC = fp.ComputedTorque(fp.Exponential(rate=0.6))
+CONTROLLERS = {
+    "CTC": CTC,
+    "CTC+FPI": CTC.with_deformation(fp.Affine(gain=-0.5)),
+    "CTC+model-referenced": CTC.with_deformation(fp.ModelReferenced(fp.Affine(gain=-0.5))),
+    "RHC": RHC,
+    "RHC+FPI": RHC.with_deformation(fp.Affine(gain=-0.5)),
+}
+
+
+def run(problem: fp.Problem, controller: Any, **more: Any) -> fp.Run:
+    """One run in CasADi's virtual machine."""
+    return fp.simulate(problem, controller, seed=1, **{"compiled": False, **more})
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize(
+    "course", [276.5, lambda t: 276.5 + 0 * t, fp.Samples([0.0], [276.5])], ids=("number", "formula", "samples")
+)
+def test_a_constant_signal_is_the_parameter_of_that_value(name, course):
+    """The values enter at the parameter's place, so every signal of a run is the same number."""
+    fixed = run(task(room(fp.Parameter(276.5, 276.5, "K"), wrong=1.3)), CONTROLLERS[name])
+    signal = run(task(room(OUTSIDE, wrong=1.3), {"ambient": fp.Known(course)}), CONTROLLERS[name])
+    for column in fixed.layout.columns:
+        scale = 1 + np.abs(fixed[column]).max()
+        assert np.abs(signal[column] - fixed[column]).max() <= 1e-13 * scale, column
+
+
+@pytest.mark.parametrize("name", ["CTC+FPI", "CTC+model-referenced", "RHC+FPI"])
+def test_the_compiled_loop_looks_values_up_as_the_virtual_machine_does(name):
+    """Look-up of samples is generated C."""
+    problem = task(room(OUTSIDE, wrong=1.3), {"ambient": fp.Believed(NIGHT, FRONT)})
+    slow, fast = run(problem, CONTROLLERS[name]), run(problem, CONTROLLERS[name], compiled=True)
+    assert fast.compiled
+    assert np.array_equal(fast["signals.ambient"], slow["signals.ambient"])
+    assert fast["state.air"] == pytest.approx(slow["state.air"], abs=1e-9)
+
+
+def test_the_plant_moves_as_an_independent_solver_says():
+    """With the weather held over each cycle to the solver's accuracy; with the true weather up to the square of the period."""
+    problem = task(room(OUTSIDE, wrong=1.3), {"ambient": fp.Known(NIGHT)}, integrator=fp.RungeKutta4(4))
+    errors = {}
+    for period in (PERIOD, PERIOD / 2):
+        one = replace(problem, period=period)
+        logged = run(one, CONTROLLERS["CTC+FPI"])
+        assert logged["signals.ambient"] == pytest.approx(_weather(logged.time + period / 2), abs=1e-12)
+        held = np.abs(
+            _moved(logged, period, lambda t, start, half=period / 2: _weather(start + half)) - logged["state"]
+        ).max()
+        errors[period] = np.abs(_moved(logged, period, lambda t, start: _weather(t)) - logged["state"]).max()
+        assert held < 1e-7
+    assert errors[PERIOD] / errors[PERIOD / 2] == pytest.approx(4.0, rel=0.25)
+
+
+def _weather(t):
+    return np.interp(t, np.asarray(NIGHT.times), np.asarray(NIGHT.values))
+
+
+def _moved(logged, period, ambient):
+    """States by scipy under the logged commands."""
+    states = [logged["state"][0]]
+    for k, heat in enumerate(logged["command.heat"][:-1]):
+        start = k * period
+
+        def rate(t, x, heat=heat, start=start):
+            outside = ambient(t, start)
+            return [(0.3 * (outside - x[0]) + 0.5 * (x[1] - x[0]) + heat) / 1.2, 0.5 * (x[0] - x[1]) / 6.0]
+
+        states.append(solve_ivp(rate, (start, start + period), states[-1], rtol=1e-11, atol=1e-11).y[:, -1])
+    return np.array(states)
+
+
+def test_a_preview_lowers_the_cost_of_a_known_load():
+    """A cold front at 6 h and a slow boiler: a forecast heats before, a sensor late, no signal never."""
+    front = fp.Samples([0.0, 6.0], [283.0, 268.0])
+    cost = fp.Quadratic(states={"air": 1.0}, rate={"heat": 3.0})
+    choices = {"preview": fp.Known(front), "measured": fp.Known(front, preview=False), "unknown": fp.Unknown(front)}
+    costs = {}
+    for name, one in choices.items():
+        logged = run(task(room(OUTSIDE), {"ambient": one}, cost=cost, duration=12.0), RHC)
+        assert logged["signals.ambient"][-1] == 268.0
+        costs[name] = float(logged["cost"].sum())
+    assert costs["preview"] < 0.8 * costs["measured"]
+    assert costs["measured"] < 0.8 * costs["unknown"]
+
+
+def test_stages_have_values_of_their_own():
+    """Every stage of the data has the value of its middle; without preview all have that of the cycle."""
+    from fpirhc.horizon.stage_data import data_layout, stage_data
+    from fpirhc.task.outside import previewed_values
+
+    for preview in (True, False):
+        problem = task(room(OUTSIDE), {"ambient": fp.Known(NIGHT, preview=preview)})
+        ahead = previewed_values(problem.plant, problem.signals)
+        horizon, cost = problem.horizon, problem.cost
+        assert horizon is not None
+        assert cost is not None
+        data_of = stage_data(problem.plant, problem.reference, horizon, cost, signals=ahead)
+        table = np.asarray(data_of(5.0, problem.plant.approximate).full())
+        row = table[data_layout(problem.plant, horizon).slice("parameters")][1]
+        middles = 5.0 + (np.arange(13) + 0.5) * 2 * PERIOD
+        assert row == pytest.approx(_weather(middles) if preview else np.full(13, 283.0))
+
+
+LATE: dict[str, tuple[dict[str, Any], fp.ModelReferenced]] = {
+    "ideal": ({}, fp.ModelReferenced(fp.Affine(gain=-0.5))),
+    "dead time": (
+        {"dead_time": fp.DeadTime(inputs={"heat": 2 * PERIOD}, measurement=PERIOD)},
+        fp.ModelReferenced(fp.Affine(gain=-0.3), cycles=2, measurement=1.0),
+    ),
+    "estimated": (
+        {"sensing": fp.Sensing(estimator=fp.SavitzkyGolay(window=3, degree=2))},
+        fp.ModelReferenced(fp.Affine(gain=-0.3)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LATE)
+def test_a_right_model_with_known_weather_leaves_a_model_referenced_deformation_at_zero(name):
+    """The model's response is that of the signals that acted, behind dead time and estimator too: adaptation changes nothing."""
+    changes, deformation = LATE[name]
+    problem = task(room(OUTSIDE), {"ambient": fp.Known(NIGHT)}, **changes)
+    base = fp.Predicted(CTC, inputs=2 * PERIOD, measurement=PERIOD) if name == "dead time" else CTC
+    without, adapted = run(problem, base), run(problem, base.with_deformation(deformation))
+    assert np.abs(adapted["state"] - without["state"]).max() < 1e-9
+    told_wrong = replace(problem, signals={"ambient": fp.Unknown(NIGHT)})
+    assert np.abs(run(told_wrong, base.with_deformation(deformation))["state"] - without["state"]).max() > 1e-2
+
+
+def test_who_is_told_what():
+    """The log shows both; an exact model is told the truth."""
+    plant = room(OUTSIDE, wrong=1.3)
+    told = {
+        "known": (fp.Known(NIGHT), _weather),
+        "unknown": (fp.Unknown(NIGHT), lambda t: np.full(t.shape, 283.0)),
+        "believed": (fp.Believed(NIGHT, lambda t: 280.0 - t / 10), lambda t: 280.0 - t / 10),
+    }
+    for one, expected in told.values():
+        logged = run(task(plant, {"ambient": one}), CTC)
+        at = logged.time + PERIOD / 2
+        assert logged["signals.ambient"] == pytest.approx(_weather(at), abs=1e-12)
+        assert logged["signals_told.ambient"] == pytest.approx(expected(at), abs=1e-12)
+    exact = run(task(plant, {"ambient": fp.Unknown(NIGHT)}), fp.ExactModel(CTC))
+    right = run(task(room(OUTSIDE), {"ambient": fp.Known(NIGHT)}), CTC)
+    assert np.array_equal(exact["signals_told"], exact["signals"])
+    assert np.array_equal(exact["state"], right["state"])
+
+
+def test_unknown_weather_is_what_adaptation_is_for():
+    """The deformation learns the missing heat: the same law with FPI is more than twice as good."""
+    problem = task(room(OUTSIDE, wrong=1.3), {"ambient": fp.Unknown(FRONT)}, measure_from=5.0)
+    errors = {
+        n: np.sqrt(np.mean(run(problem, CONTROLLERS[n])["error.air"][20:] ** 2))
+        for n in ("CTC", "CTC+model-referenced")
+    }
+    assert errors["CTC+model-referenced"] < 0.5 * errors["CTC"]
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_stepper_is_told_what_the_loop_is_told(name):
+    """The values are a function of time inside the controller."""
+    problem = task(room(OUTSIDE, wrong=1.3), {"ambient": fp.Known(NIGHT)})
+    logged = run(problem, CONTROLLERS[name])
+    stepper = fp.Stepper(problem, CONTROLLERS[name], compiled=False)
+    memory = stepper.start()
+    for k in range(40):
+        command, memory = stepper.step(logged["time"].ravel()[k], logged["state"][k], logged["realised"][k], memory)
+        assert np.array_equal(command, logged["command"][k])
+
+
+def test_a_reality_may_have_signals_that_the_model_does_not_have():
+    """The sun shines on the reality alone; both have the weather."""
+
+    def sunny(q, u, p):
+        rates = response(q, u, p)
+        return {**rates, "air": rates["air"] + p.sun / p.heat_capacity}
+
+    model = room(OUTSIDE)
+    plant = replace(model, response=sunny, parameters={**model.parameters, "sun": fp.outside(nominal=0.0, unit="kW")})
+    signals = {"ambient": fp.Known(NIGHT), "sun": fp.Unknown(fp.Samples([0.0, 8.0, 16.0], [0.0, 2.0, 0.0]))}
+    logged = run(task(model, signals, reality=fp.Reality(plant)), CONTROLLERS["CTC+FPI"])
+    assert sorted(c for c in logged.layout.columns if c.startswith("signals")) == [
+        "signals.ambient",
+        "signals.sun",
+        "signals_told.ambient",
+    ]
+    assert set(np.unique(logged["signals.sun"])) == {0.0, 2.0}
+    dark = run(task(model, {"ambient": fp.Known(NIGHT)}), CONTROLLERS["CTC+FPI"])
+    assert np.abs(logged["state.air"] - dark["state.air"]).max() > 0.05
+    with pytest.raises(InvalidProblem, match=r"'sun' .* has no values"):
+        task(model, {"ambient": fp.Known(NIGHT)}, reality=fp.Reality(plant))
+
+
+def test_the_contraction_is_that_of_the_weather_of_the_cycle():
+    """Here an input gain changes with a signal: the factor of a cycle is |1 - a real/told| at its values."""
+    plant = fp.Plant(
+        coordinates={"x": "m"},
+        inputs={"u": "N"},
+        order=1,
+        response=lambda q, u, p: {"x": p.gain * u.u - q.x},
+        parameters={"gain": fp.outside(nominal=2.0, unit="m/N/s")},
+    )
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"x": 1 + ca.sin(t)}),
+        start={"x": 1.0},
+        period=0.01,
+        duration=1.0,
+        signals={"gain": fp.Unknown(lambda t: 2.0 + t)},
+    )
+    logged = run(problem, fp.ComputedTorque(fp.Exponential(rate=2.0), fp.Affine(gain=-0.5)))
+    expected = np.abs(1 - 0.25 * (2.0 + logged["time"].ravel() + 0.005) / 2.0)
+    assert logged["contraction"].ravel() == pytest.approx(expected, abs=1e-9)
+
+
+def test_values_are_looked_up_as_stated():
+    """Zero: until the next sample; linear: between them; the nearest one outside."""
+    at = ca.MX.sym("t")
+    zero, line = (
+        fp.Samples([0.0, 1.0, 3.0], [5.0, 7.0, 1.0]),
+        fp.Samples([0.0, 1.0, 3.0], [5.0, 7.0, 1.0], hold="linear"),
+    )
+    of = ca.Function("f", [expression(at)], [zero(expression(at)), line(expression(at))])
+    times = np.array([-1.0, 0.0, 0.5, 1.0, 2.0, 3.0, 9.0])
+    values = np.array([[float(v) for v in of(t)] for t in times])
+    assert values[:, 0].tolist() == [5.0, 5.0, 5.0, 7.0, 7.0, 1.0, 1.0]
+    assert values[:, 1].tolist() == [5.0, 5.0, 6.0, 7.0, 4.0, 1.0, 1.0]
+
+
+BAD = {
+    "no values": ({}, r"'ambient' \[K\] has no values"),
+    "too short": (
+        {"ambient": fp.Known(fp.Samples([0.0, 9.0], [1.0, 2.0], hold="linear"))},
+        "stated from 0 to 9, the run is from 0 to 30",
+    ),
+    "too late": ({"ambient": fp.Unknown(fp.Samples([2.0], [1.0]))}, "stated from 2 to inf"),
+    "of the model too short": (
+        {"ambient": fp.Believed(280.0, fp.Samples([0.0, 9.0], [1.0, 2.0], hold="linear"))},
+        "values of the model of 'ambient'",
+    ),
+    "unknown name": ({"ambient": fp.Known(1.0), "ambiant": fp.Known(1.0)}, "'ambiant' is unknown.*'ambient'"),
+    "a parameter": ({"ambient": fp.Known(1.0), "loss": fp.Known(1.0)}, "'loss' is a parameter; declare it as outside"),
+    "not finite": ({"ambient": fp.Known(lambda t: ca.sqrt(t - 15))}, "not finite at t = 0"),
+    "raises": ({"ambient": fp.Known(lambda t: t / (1 // 0))}, "ZeroDivisionError"),
+    "a vector": ({"ambient": fp.Known(lambda t: ca.vertcat(t, t))}, "one scalar"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_problem_says_what_is_wrong_with_its_signals(name):
+    """One sentence with the name, before any run."""
+    signals, text = BAD[name]
+    with pytest.raises(InvalidProblem, match=text):
+        task(room(OUTSIDE), signals)
+
+
+def test_samples_say_what_is_wrong_with_them():
+    """Shapes, order, finiteness, hold."""
+    with pytest.raises(InvalidShape, match="one value per time"):
+        fp.Samples([0.0, 1.0], [1.0])
+    with pytest.raises(InvalidShape, match="at least 2"):
+        fp.Samples([0.0], [1.0], hold="linear")
+    with pytest.raises(InvalidValue, match="must increase"):
+        fp.Samples([0.0, 0.0], [1.0, 2.0])
+    with pytest.raises(InvalidField, match="expected a number"):
+        fp.Samples([0.0], [np.nan])
+
+
+def test_scenarios_do_not_draw_signals():
+    """Their values are those of the problem; the other parameters are drawn."""
+    from fpirhc.plant.mismatch import exact_ranges
+
+    ranges = exact_ranges(room(OUTSIDE), 20.0)
+    assert ranges["ambient"] == (283.0, 283.0)
+    assert ranges["loss"] == pytest.approx((0.24, 0.36))
+
+
+def test_a_null_test_has_the_weather_that_the_model_believes():
+    """Unknown weather must not count as harm of the deformation: the null world is the model's."""
+    from fpirhc.review.null_runs import null_runs
+
+    problem = task(room(OUTSIDE, wrong=1.3), {"ambient": fp.Unknown(FRONT)})
+    runs = null_runs(problem, CONTROLLERS["CTC+model-referenced"])
+    assert runs.adapted["air"] == pytest.approx(runs.without["air"], rel=1e-9)

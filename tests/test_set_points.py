@@ -1,0 +1,400 @@
+"""Set-points: the filter is exact, every controller follows it as a trajectory, and a run may have others without another build."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from plants import chain
+from scipy.linalg import expm
+from scipy.special import comb
+
+import fpirhc as fp
+from fpirhc.cli.verbs.run import by_kind
+from fpirhc.controllers.contract import resolved
+from fpirhc.controllers.demands import reference_demand
+from fpirhc.errors import InvalidName, InvalidProblem, InvalidShape, InvalidValue, NotSupported
+from fpirhc.report.terminal import set_points_in_force
+from fpirhc.simulation.loop import close_loop
+from fpirhc.simulation.run_file import load_run
+from fpirhc.studies.comparison.optimality import measure_optimality
+from fpirhc.symbolic.native import native
+from fpirhc.task.equal_poles import transition
+
+TWO_MASS = fp.load_problem("two_mass")
+STEPS = {"q1": [(0.0, 2.2), (0.1, 2.4)], "q2": [(0.0, 5.4), (0.1, 5.6), (0.2, 5.3)]}
+
+
+def on(problem, reference, duration=0.3):
+    """The problem with another reference, judged from its start."""
+    return replace(problem, reference=reference, duration=duration, measure_from=0.0)
+
+
+def two_mass(duration=0.3, **changes):
+    """two_mass with set-points that change."""
+    return on(TWO_MASS.problem, fp.Setpoint(**{"values": STEPS, "rate": 10.0, **changes}), duration)
+
+
+def closed_form(rate, order, starts, steps):
+    """The filter's motion as a trajectory: y = w_0 + sum change (1 - e^(-a s) sum_{k<m} (a s)^k / k!), s: time since a change."""
+
+    def rise(t, at):
+        s, term, terms = t - at, 1.0, 1.0
+        for k in range(1, order):
+            term = term * rate * s / k
+            terms = terms + term
+        return ca.if_else(t >= at * (1 - 1e-12), 1 - ca.exp(-rate * s) * terms, 0)
+
+    def motion(t):
+        values = {}
+        for name, start in starts.items():
+            levels = [start, *(w for _, w in steps[name])]
+            changes = [(at, new - old) for (at, new), old in zip(steps[name], levels[:-1], strict=True)]
+            values[name] = start + sum(change * rise(t, at) for at, change in changes if change)
+        return values
+
+    return fp.Trajectory(motion)
+
+
+@pytest.mark.parametrize("order", range(1, 7))
+def test_transition_is_the_matrix_exponential(order):
+    """Phi(h) = e^(A h) of the companion matrix of (s + a)^m, as scipy computes it."""
+    random = np.random.default_rng(order)
+    for _ in range(5):
+        rate, time = random.uniform(0.5, 20.0), random.uniform(1e-4, 0.5)
+        companion = np.diag(np.ones(order - 1), 1)
+        companion[-1] = [-comb(order, j, exact=True) * rate ** (order - j) for j in range(order)]
+        expected = expm(companion * time)
+        np.testing.assert_allclose(
+            np.array(transition(rate, time, order), dtype=float),
+            expected,
+            rtol=1e-9,
+            atol=1e-10 * np.abs(expected).max(),
+        )
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_nominal_motion_is_the_closed_form(order):
+    """What is judged before a run is the closed form with its derivatives by differentiation."""
+    steps = {"y": [(0.0, 1.0), (0.5, -0.5), (1.25, 2.0)]}
+    ours = fp.Setpoint(steps, rate=4.0, order=order, start={"y": 0.3}).function(chain(2))
+    expected = closed_form(4.0, order, {"y": 0.3}, steps).function(chain(2))
+    for t in (0.0, 0.2, 0.7, 1.5, 4.0):
+        for result, value in zip(ours(t), expected(t), strict=True):
+            np.testing.assert_allclose(result.full(), value.full(), rtol=0, atol=2e-13)
+
+
+SHIPPED = {
+    "two_mass": ({"q1": 2.4, "q2": 5.2}, 2),
+    "mrac_pendulum": ({"angle": 0.5}, 2),
+    "cart_pole": ({"cart": 0.2, "angle": 0.0}, 2),
+    "cart_pole_slots": ({"cart": -0.05, "angle": 0.0}, 4),
+}
+LONG = ("RHC, absolute effort", "RHC+FPI, absolute effort", "RHC, stiff", "RHC+FPI, stiff, small S")
+
+
+@pytest.mark.parametrize(
+    ("name", "controller"), [(n, c) for n in SHIPPED for c in fp.load_problem(n).controllers if c not in LONG]
+)
+def test_every_controller_follows_a_set_point_as_the_trajectory_of_the_filter(name, controller):
+    """The same motion as a trajectory: only rounding differs.
+
+    A plan adds nothing of its own, because its scale and first plan follow from the nominal motion, which is the same.
+    """
+    task, (aims, order) = fp.load_problem(name), SHIPPED[name]
+    problem = task.problem
+    starts = {c: float(problem.start.get(c, 0.0)) for c in problem.plant.names}
+    rate = 8.0
+    ours = on(problem, fp.Setpoint(aims, rate=rate, order=order, start=starts), 0.2)
+    theirs = on(problem, closed_form(rate, order, starts, {c: [(0.0, w)] for c, w in aims.items()}), 0.2)
+    runs = [fp.simulate(p, task.controllers[controller], seed=0, compiled=False) for p in (ours, theirs)]
+    assert runs[0].cycles == runs[1].cycles > 0
+    states = [run["plant_state"] for run in runs]
+    assert np.ptp(states[1], axis=0).max() > 1e-3  # it does move
+    scale = np.maximum(1.0, np.abs(states[1]).max())
+    assert np.abs(states[0] - states[1]).max() < 1e-12 * scale
+    np.testing.assert_allclose(runs[0]["reference"], runs[1]["reference"], rtol=0, atol=1e-12)
+    if "cost" in runs[0].layout:
+        np.testing.assert_allclose(runs[0]["cost"], runs[1]["cost"], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("controller", ["CTC", "CTC+FPI (eq 6)"])
+def test_steps_within_a_run_equal_the_trajectory(controller):
+    """The law holds through changes where no horizon knows them ahead: 1e-12 of states, motions and responses."""
+    starts = {"q1": 2.2, "q2": 5.4}
+    problems = two_mass(), on(TWO_MASS.problem, closed_form(10.0, 2, starts, STEPS))
+    ours, theirs = (fp.simulate(p, TWO_MASS.controllers[controller], seed=0, compiled=False) for p in problems)
+    for signal in ("state", "reference", "desired"):
+        np.testing.assert_allclose(ours[signal], theirs[signal], rtol=0, atol=1e-11 if signal == "desired" else 1e-12)
+
+
+def test_a_horizon_knows_announced_set_points_and_no_others():
+    """Announced steps at nodes of the horizon equal the trajectory; unannounced ones move nothing before their time."""
+    controller, starts = TWO_MASS.controllers["RHC+FPI"], {"q1": 2.2, "q2": 5.4}
+    steps = {"q1": [(0.0, 2.2), (0.25, 2.4)], "q2": [(0.0, 5.4), (0.25, 5.2)]}
+    announced = two_mass(values=steps, announced=True)
+    known = on(TWO_MASS.problem, closed_form(10.0, 2, starts, steps))
+    surprise, still = two_mass(values=steps), two_mass(values=starts)
+    a, b, c, d = (fp.simulate(p, controller, seed=0, compiled=False) for p in (announced, known, surprise, still))
+    np.testing.assert_allclose(a["state"], b["state"], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(c["command"][:250], d["command"][:250])
+    assert np.abs(a["command"][150:250] - d["command"][150:250]).max() > 0.1
+    assert np.abs(c["command"][250] - d["command"][250]).max() > 0.1
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("controller", ["CTC+FPI (eq 6)", "RHC+FPI"])
+def test_changed_equals_rebuilt_without_another_build(controller, compiled, monkeypatch):
+    """Other set-points in one loop are bit by bit the loop that is built with them. Two runs need one build."""
+    builds = []
+
+    def counted(*arguments, **options):
+        builds.append(arguments)
+        return native(*arguments, **options)
+
+    monkeypatch.setattr("fpirhc.simulation.simulate.native", counted)
+    # The first horizon ends at 0.2 s: scale and first plan of both are those of the same nominal motion.
+    others = {"q1": [(0.0, 2.2), (0.22, 2.5)], "q2": [(0.0, 5.4), (0.25, 5.1)]}
+    quiet = two_mass(values={"q1": 2.2, "q2": 5.4})
+    ready = fp.simulator(quiet, TWO_MASS.controllers[controller], compiled=compiled)
+    first, changed = ready.run(seed=0), ready.run(seed=0, setpoints=others)
+    assert len(builds) == int(compiled)
+    rebuilt = fp.simulate(two_mass(values=others), TWO_MASS.controllers[controller], seed=0, compiled=compiled)
+    np.testing.assert_array_equal(changed["command"], rebuilt["command"])
+    np.testing.assert_array_equal(changed["reference"], rebuilt["reference"])
+    assert np.abs(changed["command"] - first["command"]).max() > 0.1
+    np.testing.assert_array_equal(first["setpoint"], np.tile([2.2, 5.4], (300, 1)))
+
+
+def test_compiled_equals_virtual_machine():
+    """CTC+FPI with steps is the same, bit by bit."""
+    runs = [fp.simulate(two_mass(), TWO_MASS.controllers["CTC+FPI (eq 6)"], seed=0, compiled=c) for c in (True, False)]
+    assert runs[0].compiled
+    np.testing.assert_array_equal(runs[0].log, runs[1].log)
+
+
+@pytest.mark.parametrize("announced", [False, True])
+def test_stepper_agrees_with_the_loop(announced):
+    """Stepped with what the loop saw, and with the set-points when they change, the stepper gives the loop's commands."""
+    problem = two_mass(announced=announced)
+    controller = TWO_MASS.controllers["RHC+FPI" if announced else "CTC+FPI (eq 6)"]
+    run = fp.simulate(problem, controller, seed=0, compiled=False)
+    stepper = fp.Stepper(problem, controller, compiled=False)
+    memory, step = stepper.start(), problem.horizon.step
+    for k in range(run.cycles):
+        window = [run.time[k] + step * j for j in range(problem.horizon.stages + 1 if announced else 1)]
+        points = {n: [w for t in window for w in [[v for at, v in s if at <= t + 1e-9][-1]]] for n, s in STEPS.items()}
+        sample = run["state"][k].copy(), run["realised"][k].copy()
+        command, memory = stepper.step(run.time[k], *sample, memory, setpoints=points)
+        np.testing.assert_array_equal(command, run["command"][k])
+    assert stepper.refused == 0
+
+
+def test_a_step_without_set_points_keeps_the_old_ones():
+    """Refused set-points leave all old ones in force, are counted, and have a reason."""
+    problem = two_mass(values={"q1": 2.2, "q2": 5.4})
+    problem = replace(problem, limits=replace(problem.limits, states={"q1": (1.0, 3.0)}))
+    stepper = fp.Stepper(problem, TWO_MASS.controllers["CTC"], compiled=False)
+    sample = 0.0, problem.start_state, np.zeros(2), stepper.start()
+    stepper.step(*sample, setpoints={"q1": 2.5})
+    assert stepper.setpoints == {"q1": 2.5, "q2": 5.4}
+    bad: list[tuple[Any, str]] = [(np.nan, "nan, expected a finite"), (3.5, "limits of 1 to 3"), ("x", "number")]
+    for k, (value, words) in enumerate(bad):
+        stepper.step(*sample, setpoints={"q1": value, "q2": 5.5})
+        assert stepper.setpoints == {"q1": 2.5, "q2": 5.4}
+        assert stepper.refused == k + 1
+        assert words in stepper.why_refused
+    assert stepper.trace()["setpoint"].tolist() == [2.5, 5.4]
+    with pytest.raises(InvalidName, match=r"'q3' is unknown\. Did you mean"):
+        stepper.step(*sample, setpoints={"q3": 1.0})
+    with pytest.raises(InvalidShape, match="expected one number, got 2"):
+        stepper.step(*sample, setpoints={"q1": [1.0, 2.0]})
+
+
+@pytest.mark.parametrize(
+    ("setpoints", "error", "words"),
+    [
+        ({"q3": 2.0}, InvalidName, "'q3' is unknown. Did you mean"),
+        ({"q1": float("nan")}, InvalidValue, "finite"),
+        ({"q1": [(0.0, 2.0), (0.1, float("inf"))]}, InvalidValue, "finite"),
+        ({"q1": [(0.1, 2.0)]}, InvalidValue, "begin at 0"),
+        ({"q1": [(0.0, 2.0), (0.0, 2.1)]}, InvalidValue, "increase"),
+        ({"q1": [2.0, 2.1]}, InvalidValue, "pairs"),
+        ({"q1": []}, InvalidValue, "pairs"),
+        ({"q1": "fast"}, InvalidValue, "expected"),
+        ({"q1": lambda t: None}, InvalidValue, "does not return a number"),
+        ({"q1": lambda t: np.nan}, InvalidValue, "'q1' is nan"),
+    ],
+)
+def test_bad_set_points_of_a_run(setpoints, error, words):
+    """They are refused before the run, by name."""
+    ready = fp.simulator(two_mass(), TWO_MASS.controllers["CTC"], compiled=False)
+    with pytest.raises(error, match=words):
+        ready.run(seed=0, setpoints=setpoints)
+
+
+def test_bad_references():
+    """A wrong set-point is a mistake of the problem: missing, unknown, out of range, or with too low a filter."""
+    for changes, words in (
+        ({"values": {"q1": 1.0}}, "'q2' has no set-point"),
+        ({"values": {"q1": 1.0, "q2": 2.0, "q4": 1.0}}, "'q4' is unknown"),
+        ({"order": 1}, "below the order 2"),
+    ):
+        with pytest.raises(InvalidProblem, match=words):
+            two_mass(**changes)
+    with pytest.raises(InvalidProblem, match="start: coordinate 'q5' is unknown"):
+        fp.Setpoint(STEPS, rate=1.0, start={"q5": 0.0})
+    limited = replace(TWO_MASS.problem.limits, states={"q1": (2.0, 2.3)})
+    with pytest.raises(InvalidProblem, match=r"'q1' is 2\.4, outside its limits of 2 to 2\.3"):
+        replace(two_mass(), limits=limited)
+    replace(two_mass(), limits=replace(limited, soft={"q1": 1.0}))  # a limit with a price may be passed
+    with pytest.raises(InvalidName, match="Trajectory is given none"):
+        fp.simulate(TWO_MASS.problem, TWO_MASS.controllers["CTC"], seed=0, compiled=False, setpoints={"q1": 1.0})
+
+
+def test_functions_of_time():
+    """A function of time is sampled in every cycle; steps are the function that jumps."""
+    ready = fp.simulator(two_mass(), TWO_MASS.controllers["CTC+FPI (eq 6)"], compiled=False)
+    functions = {n: lambda t, s=s: [v for at, v in s if at <= t + 1e-9][-1] for n, s in STEPS.items()}
+    sampled, stepped = ready.run(seed=0, setpoints=functions), ready.run(seed=0)
+    np.testing.assert_array_equal(sampled.log, stepped.log)
+    assert sampled.settings["setpoints"] == {"q1": "a function of time", "q2": "a function of time"}
+
+
+def test_run_and_file_record_what_was_in_force(tmp_path):
+    """Signal 'setpoint' has it cycle by cycle, the facts have it as steps; the terminal shows it."""
+    run = fp.simulate(
+        two_mass(), TWO_MASS.controllers["CTC"], seed=0, compiled=False, setpoints={"q1": [(0.0, 2.2), (0.0505, 2.3)]}
+    )
+    run.save(tmp_path / "run.npz")
+    again = load_run(tmp_path / "run.npz")
+    np.testing.assert_array_equal(again["setpoint.q1"], np.where(np.arange(300) < 51, 2.2, 2.3))
+    assert again.settings["setpoints"] == {"q1": [[0.0, 2.2], [0.0505, 2.3]], "q2": [list(p) for p in STEPS["q2"]]}
+    assert set_points_in_force(again)[0] == "set-points of q1: 2.2 from 0 s, 2.3 from 0.0505 s"
+
+
+@pytest.mark.parametrize(
+    ("name", "compiled"), [("CTC+FPI (eq 6)", False), ("CTC+FPI (eq 6)", True), ("RHC+FPI", False)]
+)
+def test_live_rate_of_the_filter(name, compiled):
+    """Changed equals rebuilt bit by bit, also with a plan where the reference rests over the first horizon."""
+    steps = {"q1": [(0.0, 2.2), (0.21, 2.4)], "q2": 5.4}
+    controller = TWO_MASS.controllers[name]
+    ready = fp.simulator(two_mass(values=steps), controller, compiled=compiled, live=["reference.rate"])
+    changed = ready.run(seed=0, settings={"reference.rate": 7.3})
+    rebuilt = fp.simulate(two_mass(values=steps, rate=7.3), controller, seed=0, compiled=compiled)
+    np.testing.assert_array_equal(changed["reference"], rebuilt["reference"])
+    np.testing.assert_array_equal(changed["command"], rebuilt["command"])
+
+
+def test_live_rate_is_refused_where_a_plan_depends_on_it():
+    """A reference that moves within the first horizon decides the optimiser's scale."""
+    with pytest.raises(NotSupported, match=r"'reference\.rate' cannot be live with a plan"):
+        fp.simulator(two_mass(), TWO_MASS.controllers["RHC"], compiled=False, live=["reference.rate"])
+    with pytest.raises(InvalidName, match=r"reference"):
+        fp.simulator(two_mass(), TWO_MASS.controllers["CTC"], compiled=False, live=["referense.rate"])
+
+
+def test_slots_need_the_order_of_their_chain():
+    """A slot differentiates its coordinate as often as its chain is long."""
+    task = fp.load_problem("two_tanks_slots")
+    problem = on(task.problem, fp.Setpoint({"h1": 5.0, "h2": 5.0}, rate=2.0), 0.01 * task.problem.duration)
+    with pytest.raises(InvalidProblem, match=r"'h2' are needed up to order 2.*order 1; give Setpoint\(order=2\)"):
+        fp.simulate(problem, task.controllers["slots"], seed=0, compiled=False)
+
+
+def test_a_higher_filter_makes_a_step_smooth():
+    """With the plant's order the command jumps by about m a^2 change; with one order more it goes on as it was."""
+    steps = {"q1": [(0.0, 2.2), (0.1, 2.4)], "q2": 5.4}
+    jumps = []
+    for order in (2, 3):
+        run = fp.simulate(two_mass(values=steps, order=order), TWO_MASS.controllers["CTC"], seed=0, compiled=False)
+        jumps.append(abs(np.diff(run["command.Q1"])[99]))
+    mass = TWO_MASS.problem.plant.parameters["m1"].approximate
+    assert jumps[0] == pytest.approx(mass * 10.0**2 * 0.2, rel=0.02)
+    assert jumps[1] < 0.02 * jumps[0]
+
+
+def test_automatic_scale_covers_the_jump_of_the_response():
+    """A step moves the desired response at once by a^2 change, which no derivative shows: 2-norm over the coordinates."""
+    problem = two_mass(values={"q1": [(0.0, 2.2), (0.1, 2.4)], "q2": [(0.0, 5.4), (0.1, 5.7)]})
+    assert reference_demand(problem).change == pytest.approx(
+        10.0**2 * np.hypot(0.2, 0.3)
+    )  # and not more in a short run
+    smooth = replace(problem, reference=replace(problem.reference, order=3))
+    assert reference_demand(smooth).change < 5.0
+    ready = resolved(problem, fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5)))
+    assert ready.deformation.largest_step() > 10.0**2 * np.hypot(0.2, 0.3)
+
+
+def test_predicted_says_that_set_points_are_late():
+    """With dead time the plant follows later by it; without adaptation errors it is the same motion, shifted."""
+    task = fp.load_problem("delayed_mass")
+    name = task.problem.plant.names[0]
+    problem = on(task.problem, fp.Setpoint({name: [(0.0, 0.0), (0.2, 0.3)]}, rate=6.0), 1.0)
+    controller = task.controllers["CTC+FPI increment"]
+    notes = controller.notes(problem)
+    assert any("follows set-points 0.06 s late" in note for note in notes)
+    assert not any("late" in note for note in controller.notes(task.problem))
+    exact = fp.ExactModel(controller)
+    run = fp.simulate(problem, exact, seed=0, compiled=False)
+    late = round(0.06 / problem.period)
+    lag = run[f"plant_state.{name}"][late:] - run[f"reference.{name}"][:-late]
+    assert np.abs(lag).max() < 0.2 * np.abs(run[f"true_error.{name}"]).max()
+
+
+def test_reality_of_its_own_and_wrapped_controllers():
+    """Set-points reach the inner controller through wrappers, and the judge sees the reference that the controller had."""
+    task = fp.load_problem("noisy_motor")
+    name = task.problem.plant.names[0]
+    problem = on(
+        task.problem, fp.Setpoint({name: [(0.0, float(task.problem.start[name])), (0.05, 5.0)]}, rate=20.0), 0.2
+    )
+    for controller in (task.controllers["RHC+FPI"], task.controllers["RHC exact model"]):
+        run = fp.simulate(problem, controller, seed=0, compiled=False)
+        expected = run[f"reference.{name}"] - run[f"plant_state.{name}"]
+        np.testing.assert_array_equal(run[f"true_error.{name}"], expected)
+
+
+def test_unannounced_steps_of_two_mass():
+    """The adapted horizon follows steps at 1 s and 2 s far better than the plain one, and with smaller jumps of the command."""
+    steps = {"q1": [(0.0, 2.2), (1.0, 2.4), (2.0, 2.2)], "q2": [(0.0, 5.4), (1.0, 5.6), (2.0, 5.4)]}
+    problem, errors, jumps = two_mass(3.0, values=steps, rate=6.0), {}, {}
+    for name in ("RHC", "RHC+FPI"):
+        run = fp.simulate(problem, TWO_MASS.controllers[name], seed=0)
+        late = run.time > 0.9
+        errors[name] = np.abs(run["error"][late]).max(axis=0)
+        jumps[name] = np.abs(np.diff(run["command"][late], axis=0)).max()
+    assert np.all(errors["RHC+FPI"] < 0.5e-3)
+    assert np.all(errors["RHC"] > 8e-3)
+    assert jumps["RHC+FPI"] < 0.3 * jumps["RHC"]
+
+
+def test_plans_towards_set_points_have_no_gap():
+    """The nominal motion knows steps that the plans did not know: their cost is not compared with an optimum along it."""
+    problem, controller = two_mass(0.03), TWO_MASS.controllers["RHC"]
+    run = fp.simulate(problem, controller, seed=0, compiled=False)
+    assert measure_optimality(problem, controller, run, compiled=False) is None
+    along = on(TWO_MASS.problem, TWO_MASS.problem.reference, 0.03)
+    assert measure_optimality(along, controller, fp.simulate(along, controller, seed=0, compiled=False), compiled=False)
+
+
+def test_other_references_are_given_nothing():
+    """A loop along a trajectory reads no set-points and has no block of the reference's own."""
+    loop = close_loop(TWO_MASS.problem, TWO_MASS.controllers["RHC+FPI"])
+    assert "setpoints" not in loop.reads
+    assert TWO_MASS.problem.reference.block(TWO_MASS.problem.plant, 20, 1e-3) is None
+    run = fp.simulate(on(TWO_MASS.problem, TWO_MASS.problem.reference, 0.01), TWO_MASS.controllers["CTC"], seed=0)
+    assert "setpoint" not in run.layout
+    assert "setpoints" not in run.settings
+
+
+def test_command_line_parts():
+    """`--set setpoints.q1=2.5` is a set-point, all else a setting."""
+    assert by_kind({"setpoints.q1": 2.5, "deformation.gain": -1.0}) == ({"deformation.gain": -1.0}, {"q1": 2.5})
+    assert by_kind({"deformation.gain": -1.0}) == ({"deformation.gain": -1.0}, None)
+    with pytest.raises(InvalidValue, match="one number"):
+        by_kind({"setpoints.q1": (1.0, 2.0)})
