@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
@@ -109,11 +109,27 @@ WRONG = [
     (["start.q1"], InvalidName, "data of every loop"),
     (["cost.states.q3"], InvalidName, "q1"),
     (["optimiser.iterations"], NotSupported, "what the loop is made of"),
-    (["optimiser.tolerance"], NotSupported, "optimiser.tolerance"),
-    (["optimiser.damping"], NotSupported, "optimiser.damping"),
     (["optimiser.map.gain"], NotSupported, "optimiser.map.gain"),
     (["deformation"], InvalidValue, "go on with one of"),
 ]
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["VM", "C"])
+def test_tolerance_and_damping_of_the_plans_are_data(compiled):
+    """They stand in the data of the stages beside the weights, so one compiled plan serves all of them."""
+    short, controller = replace(PROBLEM, duration=0.05), cast(Any, PLANNED)
+    damped = replace(controller, optimiser=replace(controller.optimiser, damping=0.1))
+    paths = ["optimiser.tolerance", "optimiser.damping", "cost.states.q1"]
+    ready = simulator(short, damped, compiled=compiled, live=paths)
+    plain = ready.run(seed=0)
+    numbers = {"optimiser.tolerance": 1e-9, "optimiser.damping": 0.5, "cost.states.q1": 400.0}
+    for settings in ({}, dict([*numbers.items()][:1]), numbers):
+        changed = ready.run(seed=0, settings=settings)
+        assert np.array_equal(changed.log, rebuilt(ready, settings, compiled=compiled).log), settings
+        assert np.array_equal(changed["status"], plain["status"]) == (not settings)  # a tolerance of 1e-9 N is not met
+    for wrong, words in (({"optimiser.tolerance": 1e-15}, "rounded"), ({"optimiser.damping": -1.0}, "at least 0")):
+        with pytest.raises(InvalidValue, match=words):
+            ready.run(seed=0, settings=wrong)
 
 
 @pytest.mark.parametrize(("paths", "error", "words"), WRONG, ids=[w[0][0] for w in WRONG])

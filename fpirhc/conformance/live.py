@@ -65,7 +65,7 @@ def check_live(
 def number_paths(problem: Problem, controller: Controller) -> Iterator[str]:
     """Yield the path of every number of a controller, and of the problem's cost and limits where these are its own."""
     yield from _paths(controller, "")
-    for name in ("cost", "limits"):
+    for name in ("cost", "limits", "dead_time"):
         if getattr(problem, name) is not None and getattr(controller, name, None) is None:
             yield from _paths(getattr(problem, name), f"{name}.")
 

@@ -183,10 +183,10 @@ def commanding_blocks(problem: Problem, judged: Sequence[Signal] = ()) -> tuple[
     `judged` are solver statuses.
     """
     delays = [Delay(scalar("warm_up"), "_warm_up_now"), Delay(command_before(problem), "command")]
-    return [_limit_block(problem), _judge_block(judged), _warm_up_block(problem.warm_up_cycles)], delays
+    return [_limit_block(problem), _judge_block(judged), _warm_up_block(problem.longest_warm_up)], delays
 
 
-def _warm_up_block(warm_up_cycles: int) -> Block:
+def _warm_up_block(warm_up_cycles: float) -> Block:
     """Block that counts the cycles of a run up to `warm_up_cycles`, after which the response may be used."""
 
     def step(s: Signals) -> dict[str, Expression]:
@@ -196,7 +196,7 @@ def _warm_up_block(warm_up_cycles: int) -> Block:
 
 
 def deform_block(
-    plant: Plant, deformation: Deformation, warm_up_cycles: int = 1, largest: Sequence[float] = ()
+    plant: Plant, deformation: Deformation, warm_up_cycles: float = 1, largest: Sequence[float] = ()
 ) -> Block:
     """Block (request before, realised, desired) -> deformed request; without a valid pair it passes the desired response.
 

@@ -26,7 +26,7 @@ from fpirhc.symbolic.live import PREFIX, copied, live_number
 from fpirhc.symbolic.paths import changed_at, content_at, names_in
 from fpirhc.task.problem import Problem
 
-_OF_PROBLEM = ("cost", "limits", "reference")
+_OF_PROBLEM = ("cost", "limits", "dead_time", "reference")
 _ALWAYS_DATA = "parameters (exact and approximate) and the start are data of every loop; they need no live setting"
 Numbers = Mapping[str, float | Sequence[float]]  # by path; a pair for an interval
 
@@ -125,6 +125,8 @@ class LiveSettings:
         problem, unresolved = self.problem, self.unresolved
         for path, value in values.items():
             self._check_side(path, value)
+            if value == self._content(path):
+                continue
             if self._in_problem(path):
                 problem = changed_at(problem, path, value)
             else:

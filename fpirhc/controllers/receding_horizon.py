@@ -41,7 +41,7 @@ from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, Derived, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import DERIVED, PREFIX, is_live, live_numbers, nominal, settled
+from fpirhc.symbolic.live import DERIVED, PREFIX, LiveNumber, is_live, live_numbers, nominal, settled
 from fpirhc.task.outside import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_stage
 
@@ -111,7 +111,7 @@ class RecedingHorizon(Controller):
             raise InvalidProblem("RecedingHorizon needs Problem(horizon=...), which this problem does not have")
         if self.cost is None and problem.cost is None:
             raise InvalidProblem("RecedingHorizon needs Problem(cost=...) or a cost of its own")
-        self.optimiser.check(_optimal_control(self.planner.planned(problem)))
+        self.optimiser.check(_optimal_control(self.planner.planned(problem), self.optimiser))
 
     def check_numbers(self, problem: Problem) -> None:
         """Raise if the weights of the cost are not valid; `derived` of the plan block checks the rest.
@@ -142,12 +142,17 @@ class RecedingHorizon(Controller):
         return blocks, delays
 
 
-def _optimal_control(problem: Problem) -> OptimalControl:
+def _optimal_control(problem: Problem, optimiser: Optimiser) -> OptimalControl:
     assert problem.horizon is not None
     assert problem.cost is not None
-    ahead = previewed_values(problem.plant, problem.signals)
+    ahead, read = previewed_values(problem.plant, problem.signals), _read_from_data(optimiser)
     limits, start = problem.limits, problem.start_state
-    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, limits, ahead, start)
+    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, limits, ahead, start, read)
+
+
+def _read_from_data(optimiser: Optimiser) -> dict[str, LiveNumber]:
+    """Live numbers of the optimiser that its code reads from the data of the stages."""
+    return live_numbers(*(getattr(optimiser, name) for name in optimiser.in_data))
 
 
 def _due_block(cycles: int) -> Block:
@@ -166,7 +171,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     assert problem.horizon is not None
     assert problem.cost is not None
     _check_reference(problem)
-    plant, ocp = problem.plant, _optimal_control(problem)
+    plant, ocp = problem.plant, _optimal_control(problem, optimiser)
     count = live_signals(ocp.settings, plant.input).size
     data_of = _stage_data(problem, count)
     preview = preview_of(problem)
@@ -182,7 +187,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     def step(s: Signals) -> dict[str, Value]:
         own = own_values(problem, s)
         motion = () if preview is None else preview(*own)
-        data = running_data(s.time, *motion, s.parameters, *_live_rows(problem, ocp, s))
+        data = running_data(s.time, *motion, s.parameters, *_live_rows(problem, optimiser, ocp, s))
         if plant.outputs:
             data = shifted_reference(plant, ocp.data, ocp.stages + 1)(data, s._plan_state, s.output, s.parameters)
         # The shift of the last cycle is added to the plan's inputs, so their rate counts from the last command without it.
@@ -209,12 +214,13 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     def derived(values: Mapping[str, float]) -> Derived:
         lower, upper = settled(problem.limits, values).input_bounds(plant)
         ahead = replace(ocp.at(values), input_lower=lower, input_upper=upper)
-        optimiser.check(ahead)
+        settled(optimiser, values).check(ahead)
         signals = _derived_numbers(ahead) if ocp.settings else {}
-        return Derived(signals, lambda: optimiser.memory(ocp).unpack(_first_memory(start, optimiser, ahead, data_of)))
+        first = lambda: optimiser.memory(ocp).unpack(_first_memory(start, optimiser, ahead, data_of))  # noqa: E731
+        return Derived(signals, first, {name: _STALE[name] for name in signals})
 
     own = memory + Layout((scalar("plan_begun"),))
-    live = derived if is_live(problem) else None
+    live = derived if ocp.settings or is_live(problem.limits) else None
     return Block("plan", _plan_reads(problem, ocp), Layout(writes), step, own, opaque=True, derived=live)
 
 
@@ -269,6 +275,10 @@ def _derived_signals(ocp: OptimalControl) -> tuple[Signal, ...]:
     return tuple(Signal(name, elements[name], (), start) for name, start in starts.items())
 
 
+_LONGER = "the line search shortens its steps; plans are the same where they converge, and need more calls"
+_STALE = {_SCALE: _LONGER, _STEEPEST: _LONGER, _NUMBERS: "the terminal cost is that of the old weights"}
+
+
 def _computed(ocp: OptimalControl) -> tuple[str, ...]:
     """Paths of the numbers among the settings that the cost computes from the others."""
     return tuple(path for path in ocp.settings if path.startswith(DERIVED))
@@ -282,11 +292,12 @@ def _derived_numbers(ocp: OptimalControl) -> dict[str, np.ndarray]:
     return {_SCALE: ocp.scale, _STEEPEST: np.array([ocp.steepest]), **numbers}
 
 
-def _live_rows(problem: Problem, ocp: OptimalControl, s: Signals) -> list[Expression]:
+def _live_rows(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, s: Signals) -> list[Expression]:
     """The live settings, and what follows from them, at the end of a stage's data; nothing without any."""
     if not ocp.settings:
         return []
-    numbers = {path: number.of(ca.MX) for path, number in live_numbers(problem.cost, problem.limits).items()}
+    live = live_numbers(problem.cost, problem.limits) | _read_from_data(optimiser)
+    numbers = {path: number.of(ca.MX) for path, number in live.items()}
     if _computed(ocp):
         numbers |= dict(zip(_computed(ocp), ca.vertsplit(getattr(s, _NUMBERS)), strict=True))
     settings = (numbers[path] for path in ocp.settings)

@@ -53,7 +53,7 @@ class ResponsePairs:
         """Number of the first cycle whose pair belongs to this run: before it, samples show the start."""
         late = self.dead_time.measurement / self.problem.period
         first = self.problem.sensing.warm_up_cycles(self.problem.plant, late)
-        return max(first, math.ceil(late - _NONE) + 1)
+        return max(int(first), math.ceil(late - _NONE) + 1)
 
     @property
     def memory(self) -> tuple[Signal, ...]:

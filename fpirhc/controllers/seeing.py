@@ -20,6 +20,7 @@ from fpirhc.controllers.mirror import with_measured_state
 from fpirhc.controllers.own_reference import with_reference
 from fpirhc.symbolic.block import Block, Composite
 from fpirhc.symbolic.layout import Layout, Signal
+from fpirhc.task.dead_time import Wait
 from fpirhc.task.problem import Problem
 
 
@@ -101,7 +102,7 @@ def _estimating_part(problem: Problem, raw: Signal, start: np.ndarray) -> list[B
     return [select, problem.sensing.estimator.block(problem.plant, problem.period, start, needed)]
 
 
-def _first(problem: Problem) -> tuple[np.ndarray, float, np.ndarray]:
-    """First state, dead time of the measurement in cycles, and first response."""
+def _first(problem: Problem) -> tuple[np.ndarray, Wait | None, np.ndarray]:
+    """First state, dead time of the measurement, and first response."""
     start, resting = first_estimates(problem)
-    return start, problem.dead_time.measurement / problem.period, resting
+    return start, problem.dead_time.measurement_wait(problem.period), resting

@@ -1,4 +1,8 @@
-"""Past values of a vector, each entry with a delay of its own; pairing remembers them."""
+"""Past values of a vector, each entry with a delay of its own; pairing remembers them.
+
+A delay may be live up to a stated longest one: the queue then has the length of the longest, and the place where it is read is
+data.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +11,11 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.errors import InvalidValue
+from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.symbolic.expression import total
+from fpirhc.symbolic.functions import ceil, entry_at
 from fpirhc.symbolic.layout import Expression
+from fpirhc.symbolic.live import expressed, is_live, live_numbers, nominal
 
 MOST = 1000  # cycles of dead time; the memory has a fixed size
 Cycles = float | tuple[float, ...]  # one dead time for all channels, or one for each
@@ -24,15 +30,27 @@ class Queue:
     Args:
         cycles: delay of all entries, or a tuple with one per entry.
         width: of the triangular mean around the delay, cycles to either side.
+        longest: longest delay that a run may set, cycles; None: no delay is live.
     """
 
     cycles: Cycles
     width: int = 0
+    longest: float | None = None
 
     @property
     def length(self) -> int:
-        """Number of cycles that must be remembered, the newest included."""
-        return max(max(self._shares(c)) for c in every(self.cycles)) + 1
+        """Number of cycles that are remembered, the newest included."""
+        if self.longest is not None:
+            return math.ceil(self.longest) + self.width + 1
+        self._refuse_without_room()
+        return self._reach(nominal(self.cycles))
+
+    def needed(self, beside: Expression) -> Expression | int:
+        """Return how many of them the delays reach back to; `beside` is an expression of the same kind."""
+        if not is_live(self.cycles):
+            return self._reach(self.cycles)
+        ends = [expressed(ceil(c), beside) for c in every(self.cycles)]
+        return ca.mmax(ca.vertcat(*ends)) + self.width + 1
 
     def pushed(self, queue: Expression, newest: Expression) -> Expression:
         """Return the column one cycle later."""
@@ -42,6 +60,9 @@ class Queue:
 
     def delayed(self, queue: Expression, size: int) -> Expression:
         """Return what was pushed `cycles` ago, entry by entry; `size` is the number of entries."""
+        if is_live(self.cycles):
+            each = every(self.cycles) * (1 if isinstance(self.cycles, tuple) else size)
+            return ca.vertcat(*(self._read(queue[j::size], c) for j, c in enumerate(each)))
         if not isinstance(self.cycles, tuple):
             shares = self._shares(self.cycles)
             return total(share * queue[size * k : size * (k + 1)] for k, share in shares.items())
@@ -51,12 +72,36 @@ class Queue:
         )
         return ca.vertcat(*entries)
 
+    def _reach(self, cycles: Cycles) -> int:
+        return max(max(self._shares(c)) for c in every(cycles)) + 1
+
+    def _read(self, past: Expression, cycles: float) -> Expression:
+        """What was pushed a live number of cycles ago: the sum of `_shares`, in the same operations."""
+        delay = expressed(cycles, past)
+        whole = ca.floor(delay)
+        part, heights = delay - whole, [self._height(j) for j in range(-self.width, self.width + 1)]
+        shares = [
+            before * part + own * (1 - part) for before, own in zip([0.0, *heights], [*heights, 0.0], strict=True)
+        ]
+        return total(share * entry_at(past, whole + k - self.width) for k, share in enumerate(shares))
+
+    def _height(self, j: int) -> float:
+        """Of the triangle, `j` cycles from its middle."""
+        return (1 - abs(j) / (self.width + 1)) / (self.width + 1)
+
+    def _refuse_without_room(self) -> None:
+        for path in live_numbers(self.cycles):
+            raise NotSupported(
+                f"setting '{path}' cannot be live without its longest value, which is the length of a queue; give longest=... "
+                "beside cycles=..."
+            )
+
     def _shares(self, cycles: float) -> dict[int, float]:
         """Weights of what was pushed k cycles ago: a triangle over `width` cycles on both sides of `cycles`, interpolated."""
         shares: dict[int, float] = {}
         whole, part = math.floor(cycles), cycles - math.floor(cycles)
         for j in range(-self.width, self.width + 1):
-            height = (1 - abs(j) / (self.width + 1)) / (self.width + 1)
+            height = self._height(j)
             for place, share in ((whole + j, height * (1 - part)), (whole + j + 1, height * part)):
                 if share > 0:
                     shares[place] = shares.get(place, 0.0) + share
@@ -71,6 +116,15 @@ def every(cycles: Cycles) -> tuple[float, ...]:
 def several(cycles: Cycles) -> tuple[float, ...]:
     """The dead times where each entry has its own; else an empty tuple."""
     return cycles if isinstance(cycles, tuple) else ()
+
+
+def check_longest(owner: str, longest: float | None, cycles: Cycles) -> None:
+    """Raise InvalidValue for a longest dead time that is shorter than one of the dead times, or beyond 1000 cycles."""
+    if longest is not None and not max(every(cycles)) <= longest <= MOST:
+        raise InvalidValue(
+            f"{owner}: cycles={cycles!r} with longest={longest!r}: expected a longest dead time between the dead time and {MOST} "
+            "control cycles"
+        )
 
 
 def check_cycles(owner: str, cycles: Cycles, name: str = "cycles") -> None:

@@ -19,6 +19,7 @@ import numpy as np
 from fpirhc.horizon.live_data import SCALE, STEEPEST, Withheld
 from fpirhc.horizon.reference_expansion import ReferenceExpansion, expand_along, input_curvature, steepest_curvature
 from fpirhc.symbolic.layout import Layout, Signal
+from fpirhc.symbolic.live import LiveNumber, Number
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +100,21 @@ class OptimalControl:
         if data is None:
             Withheld(self.settings).refuse()
         return data[self.data.slice(SCALE), 0]
+
+    def place_of(self, number: LiveNumber) -> int:
+        """Return the place of a live setting in the data of every stage."""
+        return self.data.slice("settings").start + self.settings.index(number.paths[0])
+
+    def number_in(self, number: Number, data: ca.MX) -> ca.MX | float:
+        """Return a number of an optimiser as its expressions use it: itself, or an entry of the stages' data where it is live."""
+        return data[self.place_of(number), 0] if isinstance(number, LiveNumber) else float(number)
+
+    @property
+    def setting_numbers(self) -> dict[str, float]:
+        """Numbers of the live settings by path, as they stand in the data along the reference."""
+        if not self.settings:
+            return {}
+        return dict(zip(self.settings, map(float, self.nodes[2][self.data.slice("settings"), 0]), strict=True))
 
     def opened(self) -> OptimalControl:
         """Return the problem from which code is built: what follows from live settings or live limits has no number there."""

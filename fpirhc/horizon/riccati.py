@@ -19,9 +19,9 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import NotSupported
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.symbolic.expression import kind
+from fpirhc.symbolic.live import Number
 
 _SCALAR_CODE = 1000  # multiplications of one stage up to which scalar code is faster than matrix calls
 PIVOT = 1e-12  # relative size below which a pivot is replaced: the direction then still descends
@@ -32,9 +32,10 @@ def rounds(inputs: int) -> int:
     return 2 * inputs if inputs > 1 else 1
 
 
-def backward_sweep(ocp: OptimalControl, damping: float) -> ca.Function:
-    """Function (stage columns, P_N, p_N) -> (v (nu, N), K (nu, ns N)).
+def backward_sweep(ocp: OptimalControl, damping: Number) -> ca.Function:
+    """Function (stage columns, P_N, p_N, [damped]) -> (v (nu, N), K (nu, ns N)).
 
+    With live settings the last argument is what the damping adds to the curvature of the inputs, mu / D, shape (nu,).
     The stage columns, each stacked over the stages, are A, B, l_s, l_u, Q, S, R, U, lower, upper.
     """
     n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
@@ -44,47 +45,37 @@ def backward_sweep(ocp: OptimalControl, damping: float) -> ca.Function:
     value, slope = ca.MX.sym("P", ns, ns), ca.MX.sym("p", ns)
     sweep = _stage(ocp, damping).mapaccum("fpirhc_riccati_stages", n, 2)
     reversed_stages = [_reverse(column, width, n) for column, width in zip(stacked, shapes.values(), strict=True)]
-    _, _, moves, gains = sweep(value, slope, *reversed_stages)
+    damped = [ca.MX.sym("damped", nu)] if ocp.settings else []
+    _, _, moves, gains = sweep(value, slope, *reversed_stages, *(ca.repmat(d, 1, n) for d in damped))
     results = [_reverse(moves, 1, n), _reverse(gains, ns, n)]
-    names = [*shapes, "P", "p"]
-    return ca.Function("fpirhc_riccati", [*stacked, value, slope], results, names, ["v", "K"])
+    names = [*shapes, "P", "p", *(["damped"] if damped else [])]
+    return ca.Function("fpirhc_riccati", [*stacked, value, slope, *damped], results, names, ["v", "K"])
 
 
 def _reverse(stacked: ca.MX, width: int, stages: int) -> ca.MX:
     return ca.horzcat(*reversed(ca.horzsplit(stacked, width))) if stages > 1 else stacked
 
 
-def _stage(ocp: OptimalControl, damping: float) -> ca.Function:
-    """Function (P, p, A, B, l_s, l_u, Q, S, R, u, lower, upper) -> (P, p, v, K)."""
+def _stage(ocp: OptimalControl, damping: Number) -> ca.Function:
+    """Function (P, p, A, B, l_s, l_u, Q, S, R, u, lower, upper, [damped]) -> (P, p, v, K)."""
     ns, nu = ocp.state.size, ocp.input.size
     sym = kind(opaque=ns * ns * (ns + nu) > _SCALAR_CODE).sym
     value, slope = sym("P", ns, ns), sym("p", ns)
     a, b, by_state, by_input = sym("A", ns, ns), sym("B", ns, nu), sym("ls", ns), sym("lu", nu)
     q, s, r = sym("Q", ns, ns), sym("S", nu, ns), sym("R", nu, nu)
     u, lower, upper = sym("u", nu), sym("lower", nu), sym("upper", nu)
+    live = [sym("damped", nu)] if ocp.settings else []
+    added = ca.diag(live[0]) if live else ca.DM(np.diag(float(damping) / ocp.scale))
     value_a = ca.mtimes(value, a)
-    damped = r + ca.mtimes(b.T, ca.mtimes(value, b)) + _damping(ocp, damping)
+    damped = r + ca.mtimes(b.T, ca.mtimes(value, b)) + added
     coupled = s + ca.mtimes(b.T, value_a)
     input_slope = by_input + ca.mtimes(b.T, slope)
     move, gain = box_policy(nu, ns)(input_slope, damped, coupled, lower - u, upper - u)
     next_value = q + ca.mtimes(a.T, value_a) + ca.mtimes(coupled.T, gain)
     next_slope = by_state + ca.mtimes(a.T, slope) + ca.mtimes(coupled.T, move)
     next_slope += ca.mtimes(gain.T, input_slope + ca.mtimes(damped, move))
-    arguments = [value, slope, a, b, by_state, by_input, q, s, r, u, lower, upper]
+    arguments = [value, slope, a, b, by_state, by_input, q, s, r, u, lower, upper, *live]
     return ca.Function("fpirhc_riccati_stage", arguments, [0.5 * (next_value + next_value.T), next_slope, move, gain])
-
-
-def _damping(ocp: OptimalControl, damping: float) -> ca.DM:
-    """What the damping adds to the curvature of the inputs.
-
-    Raises:
-        NotSupported: a damping with live settings, whose curvature is no number of the code.
-    """
-    if damping and ocp.settings:
-        names = ", ".join(f"'{path}'" for path in ocp.settings)
-        raise NotSupported(f"settings {names} cannot be live with a damped optimiser; use FixedPoint(damping=0)")
-    curvature = np.zeros(ocp.input.size) if ocp.settings else ocp.curvature
-    return ca.DM(np.diag(float(damping) * ocp.step * curvature))
 
 
 def box_policy(nu: int, ns: int) -> ca.Function:

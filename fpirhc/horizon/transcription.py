@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import casadi as ca
 import numpy as np
@@ -31,7 +32,7 @@ from fpirhc.horizon.reference_expansion import expand_along, input_curvature
 from fpirhc.horizon.stage_data import data_layout, stage_data
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression, Named, Signal
-from fpirhc.symbolic.live import PREFIX, live_numbers, nominal, settled
+from fpirhc.symbolic.live import PREFIX, LiveNumber, live_numbers, nominal, settled
 from fpirhc.task.limits import Limits
 from fpirhc.task.reference import Reference
 
@@ -44,18 +45,20 @@ def transcribe(
     limits: Limits,
     signals: ca.Function | None = None,
     start: np.ndarray | None = None,
+    others: Mapping[str, LiveNumber] = MappingProxyType({}),
 ) -> OptimalControl:
     """Return the standard form of one horizon.
 
     Args:
         plant: the model.
         reference: of its states or outputs.
-        horizon: stages and step.
-        cost: of a plan.
-        limits: of a plan.
+        horizon: number and length of the stages.
+        cost: stage and terminal cost.
+        limits: of inputs, states, rates and paths.
         signals: from outside, as `stage_data` takes them.
         start: first state, shape (nx,), from which states without a reference are simulated to expand the cost along the reference;
             None: zero.
+        others: live settings by path that the optimiser reads from the data of the stages beside those of cost and limits.
 
     Raises:
         InvalidProblem: mistakes in the cost or the limits, or a cost that is not finite at the reference (the term is named).
@@ -63,13 +66,15 @@ def transcribe(
     nominal(cost).check(plant)
     limits.check(plant)
     _check_names(plant, horizon, limits)
-    stage = _stage_expressions(plant, reference, horizon, cost, limits)
+    stage = _stage_expressions(
+        plant, reference, horizon, cost, limits, [number.of(ca.SX) for number in others.values()]
+    )
     binding, free = stage.binding, stage.before.numel()
     dynamics, stage_cost, terminal_cost = _stage_functions(stage, horizon.step)
     table = np.asarray(stage_data(plant, reference, horizon, cost, signals=signals)(0.0, plant.approximate).full())
     nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
     settings = tuple(s.name().removeprefix(PREFIX) for s in stage.settings)
-    values = {path: number.value for path, number in live_numbers(cost, limits).items()}
+    values = {path: number.value for path, number in {**live_numbers(cost, limits), **others}.items()}
 
     def derive(numbers: Mapping[str, float]) -> dict[str, float]:
         advance = _advance(plant, horizon)
@@ -133,7 +138,9 @@ class _Stage:
     settings: list[ca.SX]
 
 
-def _stage_expressions(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits) -> _Stage:
+def _stage_expressions(
+    plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits, others: Sequence[Expression]
+) -> _Stage:
     layout = data_layout(plant, horizon)
     keeps_input = cost.uses_rate or bool(limits.rates) or bool(horizon.blocks)
     x, before = ca.SX.sym("x", plant.state.size), ca.SX.sym("before", plant.input.size * keeps_input)
@@ -156,7 +163,7 @@ def _stage_expressions(plant: Plant, reference: Reference, horizon: Horizon, cos
     except InvalidName as error:
         raise InvalidProblem(f"cost: {error}") from None
     binding = hard(written, soft_names(limits, plant))
-    settings = settings_in([x_next, *terms.values(), final, *(w.expression for w in binding)], theta)
+    settings = settings_in([x_next, *terms.values(), final, *(w.expression for w in binding), *others], theta)
     if settings:
         live = live_signals(tuple(s.name() for s in settings), plant.input)
         theta = ca.vertcat(theta, *settings, ca.SX.sym("live", live.size - len(settings)))

@@ -50,6 +50,11 @@ class Optimiser(Checked, ABC):
         """Scalars of the memory that a run logs: signal -> name in the memory."""
         return {}
 
+    @property
+    def in_data(self) -> tuple[str, ...]:
+        """Fields whose numbers may be live, because its code reads them from the data of the stages."""
+        return ()
+
     def check(self, ocp: OptimalControl) -> None:
         """Raise if the optimiser cannot serve the problem.
 
@@ -191,7 +196,7 @@ def remembered_plan(column: ca.MX, size: int, lower: ca.MX, upper: ca.MX) -> ca.
     return clip(ca.reshape(usable, size, column.numel() // size), lower, upper)
 
 
-def status_of(finite: Matrix, residual: Matrix, violation: Matrix | float, tolerance: float) -> Matrix:
+def status_of(finite: Matrix, residual: Matrix, violation: Matrix | float, tolerance: Matrix | float) -> Matrix:
     """Return the status number of a plan.
 
     Args:

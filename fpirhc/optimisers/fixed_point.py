@@ -56,6 +56,7 @@ from fpirhc.optimisers.plain import plain_step, shifted_plain
 from fpirhc.optimisers.plain_settings import MOST, PlainSettings, plain_memory
 from fpirhc.optimisers.rescue import rescue
 from fpirhc.symbolic.layout import Layout
+from fpirhc.symbolic.live import settled
 
 _DIGITS = 1e-15  # relative rounding of a number
 _MOST_LIMITED = 1000  # iterations of one converging call with limits of states
@@ -91,6 +92,11 @@ class FixedPoint(Optimiser):
         require_settings("FixedPoint", self.iterations, self.tolerance)
         if not 0 <= self.damping < float("inf"):
             raise InvalidValue(f"FixedPoint(damping={self.damping!r}): expected a finite number of at least 0")
+
+    @property
+    def in_data(self) -> tuple[str, ...]:
+        """Tolerance and damping; with limits of states they are in the code."""
+        return "tolerance", "damping"
 
     def check(self, ocp: OptimalControl) -> None:
         """Raise if the cost is not convex along the reference and the Hessian needs that, or the tolerance cannot be met.
@@ -140,7 +146,8 @@ class FixedPoint(Optimiser):
         if ocp.bounds_states:
             return None
         # Here the settings are numbers: a rescue runs outside the loop, for the numbers of one call.
-        limited = limited_step(replace(ocp, settings=()), self._limited(_MOST_LIMITED, realtime=False))
+        own = settled(self, ocp.setting_numbers)
+        limited = limited_step(replace(ocp, settings=()), own._limited(_MOST_LIMITED, realtime=False))
         return rescue(ocp, self.converging(ocp), self.memory(ocp), limited)
 
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:

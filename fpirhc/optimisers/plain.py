@@ -19,6 +19,7 @@ from fpirhc.optimisers.search import deformed_move, first_gamma
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, with_driver
 from fpirhc.symbolic.expression import FINITE
+from fpirhc.symbolic.live import LiveNumber, Number
 
 _TEXTS = ("kernels", "fixed_point", "entry")
 
@@ -76,12 +77,17 @@ def _metric(ocp: OptimalControl) -> dict[str, object]:
     return {"SCALE": f"{{{scale}}}", "FIRST_GAMMA": repr(first_gamma(ocp))}
 
 
+def _number(ocp: OptimalControl, number: Number) -> str:
+    """A number of the code, or its place in the data of the first stage where it is live."""
+    return f"data[{ocp.place_of(number)}]" if isinstance(number, LiveNumber) else repr(float(number))
+
+
 def _constants(ocp: OptimalControl, settings: PlainSettings) -> dict[str, object]:
     return {
         "ITERATIONS": settings.iterations,
         "STOP_EARLY": int(settings.converging),
-        "TOLERANCE": repr(float(settings.tolerance)),
-        "DAMPING": repr(float(settings.damping)),
+        "TOLERANCE": _number(ocp, settings.tolerance),
+        "DAMPING": _number(ocp, settings.damping),
         "SHARE": SHARE,
         "ARMIJO": ARMIJO,
         "SHORTER": SHORTER,

@@ -78,7 +78,9 @@ def _converged(
     choice = ca.Function.if_else("fpirhc_iteration_if_needed", work, rest)
     for _ in range(settings.iterations + 1):
         residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper, arguments.data)
-        needed = ca.logic_not(ca.logic_and(anchor.value < UNTRIED, residual <= settings.tolerance))
+        needed = ca.logic_not(
+            ca.logic_and(anchor.value < UNTRIED, residual <= ocp.number_in(settings.tolerance, arguments.data))
+        )
         needed = ca.logic_and(needed, plain < MOST_PLAIN)
         plain += ca.logic_and(needed, anchor.step < SHORTEST)
         anchor, count = Anchor(*choice(needed, *arguments, *anchor)), count + needed
@@ -98,7 +100,8 @@ def _results(
     finite = ca.logic_and(posed, evaluated)
     residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper, arguments.data)
     empty = ca.mmax(arguments.lower - arguments.upper) > 0
-    status = ca.if_else(empty, int(Status.INFEASIBLE), status_of(finite, residual, 0, settings.tolerance))
+    tolerance = ocp.number_in(settings.tolerance, arguments.data)
+    status = ca.if_else(empty, int(Status.INFEASIBLE), status_of(finite, residual, 0, tolerance))
     numbers = ca.if_else(finite, ca.vertcat(anchor.value, residual), ca.MX.zeros(2))
     solved = plain_memory(ocp).join(
         {

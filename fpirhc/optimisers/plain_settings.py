@@ -8,6 +8,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.horizon.hessian_models import HessianModel
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.symbolic.live import Number
 
 MOST = 100  # iterations of one converging call
 MOST_PLAIN = 30  # plain steps after which a converging call gives up
@@ -26,10 +27,10 @@ class PlainSettings:
         converging: whether a call stops where the tolerance is met.
     """
 
-    tolerance: float
+    tolerance: Number
     map: Deformation
     hessian: HessianModel
-    damping: float
+    damping: Number
     iterations: int
     converging: bool
 

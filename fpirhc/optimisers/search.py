@@ -14,6 +14,7 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import backward_sweep
 from fpirhc.optimisers.anchor import SHARE, SHORTEST, Anchor, Arguments, Expanded
 from fpirhc.optimisers.judgement import judgement
+from fpirhc.symbolic.live import Number
 
 
 def first_gamma(ocp: OptimalControl, data: ca.MX | None = None) -> float | ca.MX:
@@ -36,7 +37,7 @@ class Search:
         damping: added to the curvature of the inputs, in units of it.
     """
 
-    def __init__(self, ocp: OptimalControl, hessian: HessianModel, map: Deformation, damping: float) -> None:
+    def __init__(self, ocp: OptimalControl, hessian: HessianModel, map: Deformation, damping: Number) -> None:
         self._ocp = ocp
         self._expand, self._try = _expansion(ocp), _trial(ocp)
         self._judge = judgement(ocp)
@@ -107,7 +108,7 @@ def _expansion(ocp: OptimalControl) -> ca.Function:
     return ca.Function("fpirhc_expansion", [states, inputs, costs, data, *stacked], results)
 
 
-def _direction(ocp: OptimalControl, hessian: HessianModel, map: Deformation, damping: float) -> ca.Function:
+def _direction(ocp: OptimalControl, hessian: HessianModel, map: Deformation, damping: Number) -> ca.Function:
     """Function (U, X, A, B, l_s, l_u, costates, data, lower, upper) -> (v, K): the deformed feedforward and its feedback."""
     n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
     inputs, states = ca.MX.sym("U", nu, n), ca.MX.sym("X", ns, n + 1)
@@ -117,7 +118,8 @@ def _direction(ocp: OptimalControl, hessian: HessianModel, map: Deformation, dam
     hessians = hessian_stage(ocp, hessian).map(n)(states[:, :n], inputs, data[:, :n], costates)
     _, slope, value = hessian_end(ocp)(states[:, n], data[:, n])
     bounds = ca.repmat(lower, 1, n), ca.repmat(upper, 1, n)
-    move, gains = backward_sweep(ocp, damping)(*stacked, *hessians, inputs, *bounds, value, slope)
+    damped = [ocp.number_in(damping, data) / ocp.scale_in(data)] if ocp.settings else []
+    move, gains = backward_sweep(ocp, damping)(*stacked, *hessians, inputs, *bounds, value, slope, *damped)
     results = [ca.reshape(deformed_move(map, nu * n)(ca.vec(move)), nu, n), gains]
     return ca.Function("fpirhc_direction", [inputs, states, *stacked, costates, data, lower, upper], results)
 

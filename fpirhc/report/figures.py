@@ -13,6 +13,7 @@ from fpirhc.simulation.common_columns import shown_motion
 from fpirhc.simulation.drawing import (
     PALETTE,
     draw_bands,
+    draw_changes,
     draw_legend,
     draw_line,
     draw_responses,
@@ -90,6 +91,7 @@ def pair_figures(plain: Entry, adaptive: Entry) -> dict[str, Figure]:
             draw(axis, entry.run)
             if draw is not _draw_phase:
                 draw_bands(axis, entry.run)
+                draw_changes(axis, entry.run)
             axis.set_title(literal(entry.name), fontsize=10)
             draw_legend(axis)
         figures[title] = figure
@@ -145,6 +147,7 @@ def headline_figure(comparison: Comparison, plain: Entry, adaptive: Entry) -> Fi
         _draw_error(axes[1, column], entry.run)
         for row in (0, 1):
             draw_bands(axes[row, column], entry.run)
+            draw_changes(axes[row, column], entry.run)
         axes[0, column].set_title(literal(entry.name), fontsize=10)
         axes[0, column].set_xlabel("")
         draw_legend(axes[0, column])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -58,6 +58,7 @@ def render(comparison: Comparison) -> str:
         wanted_pictures(comparison),
         _contraction(comparison),
         _lyapunov(comparison),
+        _in_force(comparison),
         _settings(comparison),
     ]
     scripts = (_asset("uPlot.iife.min.js"), f"const DATA={data};\n{_asset('report.js')}")
@@ -216,6 +217,30 @@ def _lyapunov(comparison: Comparison) -> str:
     )
     picture = _picture(figure, "Lyapunov function over time with its ultimate bound", caption)
     return f"<section><h2>Lyapunov's view</h2>{picture}</section>"
+
+
+def _in_force(comparison: Comparison) -> str:
+    """Table of the live settings of every run, at its start and wherever they changed; empty where no run has any."""
+    rows = "".join(
+        f"<tr><th scope='row'>{_text(entry.name)}</th><td>{time:g}</td><td class='words'>{_text(path)}</td>"
+        f"<td>{value:.6g}</td></tr>"
+        for entry in comparison.entries
+        for time, path, value in _new_numbers(entry)
+    )
+    if not rows:
+        return ""
+    heads = ["controller", f"from [{comparison.time_unit}]", "setting", "number"]
+    words = "A number is in force from its time until the next one of the same setting. Dotted lines in the charts are changes."
+    table = wide_table(heads, rows, "live settings and the times from which they were in force")
+    return f"<section id='in-force'><h2>Settings in force</h2><p>{words}</p>{table}</section>"
+
+
+def _new_numbers(entry: Entry) -> Iterator[tuple[float, str, float]]:
+    """Time, path and number of every live setting at the start, and of those that changed later."""
+    last: Mapping[str, float] = {}
+    for time, numbers in entry.run.in_force:
+        yield from ((time, path, value) for path, value in numbers.items() if last.get(path) != value)
+        last = numbers
 
 
 def _settings(comparison: Comparison) -> str:

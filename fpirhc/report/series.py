@@ -49,7 +49,8 @@ def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]
     charts += [chart for e in entries for chart in _tubes(e, edges)]
     return {
         "controllers": [
-            {"name": e.name, "color": palette[k % len(palette)], "slots": _slots(e.run)} for k, e in enumerate(entries)
+            {"name": e.name, "color": palette[k % len(palette)], "slots": _slots(e.run), "changes": _changes(e.run)}
+            for k, e in enumerate(entries)
         ],
         "timeUnit": comparison.time_unit,
         "time": _round(np.repeat(longest.time[edges[:-1]], 2) + _halves(longest, edges)),
@@ -74,6 +75,11 @@ def _tubes(entry: Entry, edges: np.ndarray) -> list[dict[str, Any]]:
         unit = run.unit(f"error.{c}")
         charts.append({"title": title, "unit": unit, "series": series, "only": entry.name, "band": [2, 3]})
     return charts
+
+
+def _changes(run: Run) -> list[float]:
+    """Times at which live settings changed."""
+    return [float(f"{time:.6g}") for time, _ in run.in_force[1:]]
 
 
 def _slots(run: Run) -> list[list[float]]:

@@ -86,9 +86,10 @@ def show_run(run: Run, metrics: Metrics, saved: Path) -> None:
 
 def settings_in_force(run: Run) -> list[str]:
     """Return one line per time from which other live settings were in force."""
-    record = cast(list[tuple[float, dict[str, float]]], run.settings.get("live", []))
-    lines = [(time, ", ".join(f"{path} = {value:g}" for path, value in numbers.items())) for time, numbers in record]
-    return [f"settings from {time:g} s: {text}" for time, text in lines]
+    lines = [
+        (time, ", ".join(f"{path} = {value:g}" for path, value in numbers.items())) for time, numbers in run.in_force
+    ]
+    return [f"settings from {time:g} {run.time_unit}: {text}" for time, text in lines]
 
 
 def set_points_in_force(run: Run) -> list[str]:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
+from fpirhc.task.dead_time import MEASUREMENT
 from fpirhc.task.problem import Problem
 
 _WHOLE = 1e-9  # of a cycle
@@ -32,6 +33,21 @@ def scaled(problem: Problem, percent: float) -> Problem:
     times = problem.dead_time
     inputs = {name: changed(time) for name, time in times.inputs.items()}
     return replace(problem, dead_time=replace(times, inputs=inputs, measurement=changed(times.measurement)))
+
+
+def roomy(problem: Problem, percent: float) -> Problem:
+    """Return the problem with queues for dead times that are longer by so many percent, as `scaled` makes them."""
+    times, most = problem.dead_time, scaled(problem, percent).dead_time
+    longest = {**most.inputs, MEASUREMENT: most.measurement}
+    stated = {n: max(t, times.longest.get(n, 0.0)) for n, t in longest.items() if n in times.queued}
+    return replace(problem, dead_time=replace(times, longest={**times.longest, **stated}))
+
+
+def live_paths(problem: Problem) -> tuple[str, ...]:
+    """Return the paths of the dead times of a problem with queues for other ones."""
+    times = problem.dead_time
+    inputs = tuple(f"dead_time.inputs.{name}" for name in times.inputs if name in times.longest)
+    return (*inputs, "dead_time.measurement") if MEASUREMENT in times.longest else inputs
 
 
 def is_late(problem: Problem) -> bool:

@@ -16,7 +16,6 @@ one.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -32,8 +31,9 @@ from fpirhc.sensing.measured import Measured
 from fpirhc.sensing.sensor import Sensor
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.functions import ceil
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
-from fpirhc.task.dead_time import delay_block
+from fpirhc.task.dead_time import Wait, delay_block
 
 _STREAM = 1  # separates the sensors' random series from the series of disturbances
 
@@ -111,11 +111,11 @@ class Sensing(Checked):
         """Delay of the estimated response in cycles beyond the ideal pair; the largest of the controlled coordinates."""
         return max(self.estimator.delay(plant.orders[k], period) for k in plant.controlled_indices)
 
-    def warm_up_cycles(self, plant: Plant, late: float) -> int:
+    def warm_up_cycles(self, plant: Plant, late: float) -> float:
         """Number of the first cycle whose response may be used; samples arrive `late` cycles after they were taken."""
         if self.estimator.measures_all:
             return 1
-        return math.ceil(late) + max(self.estimator.fills(plant.orders[k]) for k in plant.controlled_indices)
+        return ceil(late) + max(self.estimator.fills(plant.orders[k]) for k in plant.controlled_indices)
 
     @property
     def drawn(self) -> tuple[Signal, ...]:
@@ -133,35 +133,39 @@ class Sensing(Checked):
             columns += [(lost.random(times.size) < sensor.dropout).astype(float)] if sensor.dropout else []
         return np.column_stack(columns) if columns else np.zeros((times.size, 0))
 
-    def raw(self, plant: Plant, start: Array, late: float, resting: Array) -> Signal:
+    def raw(self, plant: Plant, start: Array, late: Wait | None, resting: Array) -> Signal:
         """Signal of the raw measurements as they arrive, with their values at the start.
 
         Args:
             plant: the plant that is measured.
             start: first state of the problem, shape (nx,).
-            late: dead time of the measurement, cycles.
+            late: dead time of the measurement; None: none.
             resting: response at the start, shape (n,).
         """
         names = self.measures(plant)
         first = _start(plant, start, names, resting)
-        return vector("arrived" if late else "measured", names, [_unit(plant, n) for n in names], first.tolist())
+        return vector(
+            "arrived" if late is not None else "measured", names, [_unit(plant, n) for n in names], first.tolist()
+        )
 
     def blocks(
-        self, plant: Plant, start: Array, late: float, true: tuple[Signal, Signal], resting: Array
+        self, plant: Plant, start: Array, late: Wait | None, true: tuple[Signal, Signal], resting: Array
     ) -> list[Block]:
         """Blocks from the true state and response to the raw measurements that arrive.
 
         Args:
             plant: the plant that is measured.
             start: first state of the problem, shape (nx,).
-            late: dead time of the measurement, cycles.
+            late: dead time of the measurement; None: none.
             true: signals of the true state and response.
             resting: response at the start, shape (n,).
         """
         arriving = self.raw(plant, start, late, resting)
         measured = replace(arriving, name="measured", start=())
         sensors = self._sensor_block(plant, true, measured, arriving.start_vector())
-        return [sensors, delay_block("see", measured, arriving, [late] * measured.size)] if late else [sensors]
+        return (
+            [sensors, delay_block("see", measured, arriving, [late] * measured.size)] if late is not None else [sensors]
+        )
 
     def _check_belief(self, plant: Plant, mistakes: Mistakes) -> None:
         """Add a mistake where a quantity is neither measured nor believed, or a belief stands without need."""

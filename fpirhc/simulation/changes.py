@@ -45,6 +45,14 @@ def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Nu
     if not (live.paths or settings or changes):
         return InForce(problem, live.controller, {}, (), ())
     first = replace(live, problem=problem)
+    if problem.dead_time.longest != live.problem.dead_time.longest:
+        raise InvalidValue(
+            f"the loop is built for longest={dict(live.problem.dead_time.longest)} of its dead times; the variant states "
+            f"longest={dict(problem.dead_time.longest)}"
+        )
+    if not settings and not changes:  # a variant of the problem runs as it does without live settings
+        numbers = first.start
+        return InForce(problem, live.controller, numbers, (), [(0.0, numbers)])
     ready, controller, numbers = first.changed(settings)
     record: list[tuple[float, Mapping[str, float]]] = [(0.0, numbers)] if numbers else []
     patches, asked = [], dict(first.flat(settings))

@@ -64,6 +64,12 @@ def draw_bands(axis: Axes, run: Run) -> None:
         named.add(slot)
 
 
+def draw_changes(axis: Axes, run: Run) -> None:
+    """Draw the times at which live settings changed as vertical lines, named in the legend."""
+    for k, (time, _) in enumerate(run.in_force[1:]):
+        axis.axvline(time, color="#777777", lw=0.8, ls=":", label=None if k else "change of settings")
+
+
 def thinned(values: np.ndarray, points: int = _POINTS) -> np.ndarray:
     """Return every n-th row, about `points` in all."""
     return values[:: max(1, values.shape[0] // points)]

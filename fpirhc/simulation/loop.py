@@ -29,7 +29,7 @@ from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX, nominal
-from fpirhc.task.dead_time import delay_block
+from fpirhc.task.dead_time import MEASUREMENT, Wait, delay_block
 from fpirhc.task.problem import Problem
 
 Shown: TypeAlias = tuple[tuple[Signal, ...], Signal]  # signals of the motion, and of the response
@@ -156,7 +156,7 @@ def _sense_blocks(problem: Problem, other: Response | None, *, predicts: bool) -
         sense = [_sense_block(problem, measured_signals(plant), response)]
         return [*sense, _truth_block(problem, plant.output)] if predicts or problem.dead_time.inputs else sense
     true, shown = _true_blocks(problem, response)
-    if problem.sensing.ideal and not problem.dead_time.measurement:
+    if problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued:
         return true  # with coordinates measured in place of others
     return [*true, *_late_blocks(problem, shown)]
 
@@ -172,7 +172,7 @@ def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], Sho
     blocks = [sense, _truth_block(problem, true[0][-1])]
     if problem.symbolic_reality is None or not problem.symbolic_reality.seen:
         return blocks, true
-    direct = problem.sensing.ideal and not problem.dead_time.measurement
+    direct = problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued
     shown = (motion, response.signal) if direct else hidden
     function = _own_response(problem, seen=True).function
     return [*blocks, _seen_block(problem, shown, function)], shown
@@ -183,27 +183,28 @@ def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
 
     Sensors are those of the outputs where the plant has some; its state then comes with the dead time alone.
     """
-    plant, behind, sensing = problem.plant, problem.dead_time.measurement / problem.period, problem.sensing
+    plant, late, sensing = problem.plant, problem.dead_time.measurement_wait(problem.period), problem.sensing
     first, resting = first_estimates(problem)
     starts = (problem.start_state, first) if plant.outputs else (first,)
     states = [*zip(shown[0], measured_signals(plant), starts, strict=True)]
     if not sensing.ideal:
         *others, (seen, _, _) = states
-        sensors = [*_late_states(others, behind), *sensing.blocks(plant.face, first, behind, (seen, shown[1]), resting)]
+        sensors = [*_late_states(others, late), *sensing.blocks(plant.face, first, late, (seen, shown[1]), resting)]
         if sensing.estimates:
             return sensors
-        raw = sensing.raw(plant.face, first, behind, resting)
+        raw = sensing.raw(plant.face, first, late, resting)
         return [*sensors, on_face(plant, sensing.estimator.block(plant.face, problem.period, first, raw))]
+    assert late is not None
     realised = replace(shown[1], name="realised", start=tuple(map(float, resting)))
-    return [*_late_states(states, behind), delay_block("see_response", shown[1], realised, [behind] * realised.size)]
+    return [*_late_states(states, late), delay_block("see_response", shown[1], realised, [late] * realised.size)]
 
 
-def _late_states(states: Sequence[tuple[Signal, Signal, np.ndarray]], behind: float) -> list[Block]:
+def _late_states(states: Sequence[tuple[Signal, Signal, np.ndarray]], late: Wait | None) -> list[Block]:
     """Blocks of the dead time from true signals to measured ones, with the values before the run."""
-    if not behind:
+    if late is None:
         return [rename(f"see_{to.name}", true, to) for true, to, _ in states]
     return [
-        delay_block(f"see_{to.name}", true, replace(to, start=tuple(map(float, start))), [behind] * to.size)
+        delay_block(f"see_{to.name}", true, replace(to, start=tuple(map(float, start))), [late] * to.size)
         for true, to, start in states
     ]
 
@@ -286,13 +287,12 @@ def _seen_block(problem: Problem, shown: Shown, response: ca.Function) -> Block:
 
 def _actuate(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:
     """Blocks of the command's way to the plant, and of the plant over one period."""
-    cycles = [problem.dead_time.inputs.get(name, 0.0) / problem.period for name in problem.plant.inputs]
-    if not any(cycles):
+    if not set(problem.plant.inputs) & set(problem.dead_time.queued):
         return [_advance_block(problem, disturbed, problem.plant.input)]
-    plant = problem.plant
+    plant, waits = problem.plant, [problem.dead_time.wait(name, problem.period) for name in problem.plant.inputs]
     arriving = Signal("arriving", plant.input.elements, plant.input.units, tuple(map(float, problem.inputs_before)))
     return [
-        delay_block("send_command", problem.plant.input, arriving, cycles),
+        delay_block("send_command", problem.plant.input, arriving, waits),
         _advance_block(problem, disturbed, arriving),
     ]
 

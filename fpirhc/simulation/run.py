@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -80,6 +80,12 @@ class Run:
     def time_unit(self) -> str:
         """Unit of time, as the plant names it."""
         return self.unit("time")
+
+    @property
+    def in_force(self) -> tuple[tuple[float, Mapping[str, float]], ...]:
+        """Times from which numbers of live settings were in force, with the numbers by path; empty without live settings."""
+        record = cast(Sequence[tuple[float, Mapping[str, float]]], self.settings.get("live", ()))
+        return tuple((float(time), numbers) for time, numbers in record)
 
     @property
     def cycles(self) -> int:

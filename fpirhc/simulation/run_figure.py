@@ -8,6 +8,7 @@ from fpirhc.simulation.common_columns import shown_motion
 from fpirhc.simulation.drawing import (
     PALETTE,
     draw_bands,
+    draw_changes,
     draw_legend,
     draw_line,
     draw_responses,
@@ -45,6 +46,7 @@ def run_figure(run: Run) -> Figure:
     )
     for axis, label in zip(axes, labels, strict=True):
         draw_bands(axis, run)
+        draw_changes(axis, run)
         axis.set_ylabel(label)
         draw_legend(axis)
     axes[3].set_xlabel(time_label(run))

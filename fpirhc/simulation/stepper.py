@@ -281,6 +281,14 @@ class Stepper:
         for name, argument in self._settings.items():
             argument[:] = values[name]
 
+    def stale(self) -> dict[str, str]:
+        """Return what follows from live settings by way of Python, and what becomes of a device that goes on with the old number.
+
+        Gains, scales, limits, weights and dead times themselves are data, and may be written at any time. An empty text
+        says that the number must not stay as it was: change the settings that it follows from only where Python computes it.
+        """
+        return dict(self._composite.derived(self.numbers).stale) if self.numbers else {}
+
     def trace(self) -> dict[str, np.ndarray]:
         """Return every signal of the last step by name.
 

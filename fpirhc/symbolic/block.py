@@ -40,10 +40,13 @@ class Derived:
         signals: values of signals 'setting.derived.NAME', by their names.
         memory: function that returns values of remembered signals at the start of a run, by their names; a change during a run
             does not need them.
+        stale: what becomes of a loop that goes on with the old number of a signal, by name, for a device without Python; '' where
+            it must not.
     """
 
     signals: Mapping[str, np.ndarray] = field(default_factory=dict)
     memory: Callable[[], Mapping[str, np.ndarray]] = dict
+    stale: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +112,8 @@ class Block:
         if not function.has_free():
             return function, self.reads
         open_symbols = ca.symvar(ca.veccat(*results)) if self.opaque else ca.symvar(ca.vertcat(*results))
-        settings = [v for v in open_symbols if v.name().startswith(SETTING) and v.name() not in symbols]
+        declared = {v.name() for v in ca.symvar(ca.vertcat(*columns))} if columns else set()
+        settings = [v for v in open_symbols if v.name().startswith(SETTING) and v.name() not in declared]
         inputs = self.reads + Layout(tuple(scalar(v.name()) for v in settings))
         at = len(self.reads.signals)
         columns[at:at], names = settings, [*self.reads.names, *_identifiers(settings), *self.memory.names]
@@ -159,7 +163,8 @@ class Composite:
         """Return what follows from the numbers of all settings, by path."""
         parts = [b.derived(values) for b in self.blocks if b.derived is not None]
         signals = {name: value for part in parts for name, value in part.signals.items()}
-        return Derived(signals, lambda: {name: value for part in parts for name, value in part.memory().items()})
+        stale = {name: words for part in parts for name, words in part.stale.items()}
+        return Derived(signals, lambda: {name: value for part in parts for name, value in part.memory().items()}, stale)
 
     @property
     def opaque(self) -> bool:

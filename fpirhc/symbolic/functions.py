@@ -63,3 +63,27 @@ def numbers(values: Sequence[float | LiveNumber]) -> Expression:
 def sqrt(x: float) -> float:
     """Return the square root of a number, live or not."""
     return x.called(math.sqrt, ca.sqrt) if isinstance(x, LiveNumber) else math.sqrt(x)
+
+
+def ceil(x: float) -> float:
+    """Return the least whole number that is not below a number, live or not."""
+    return x.called(math.ceil, ca.ceil) if isinstance(x, LiveNumber) else math.ceil(x)
+
+
+def rounded(x: float) -> float:
+    """Return the nearest whole number to a number, live or not; the even one of two."""
+    return x.called(round, _nearest_even) if isinstance(x, LiveNumber) else round(x)
+
+
+def _nearest_even(x: Expression) -> Expression:
+    upper = ca.floor(x + 0.5)
+    return upper - ca.logic_and(upper - x == 0.5, ca.fmod(upper, 2) != 0)
+
+
+def entry_at(values: Expression, place: Expression) -> Expression:
+    """Return the entry of a column at a place that is known at run time; zero beyond its ends.
+
+    Every entry is looked at. CasADi's scalar code has no table, and an entry that is not taken does not spoil the sum.
+    """
+    entries = ca.vertsplit(values)
+    return cast(Expression, sum(ca.if_else(place == k, one, 0) for k, one in enumerate(entries)))

@@ -26,6 +26,7 @@ PREFIX = "setting."  # of the names of signals that are settings
 DERIVED = "derived."  # of the paths of numbers that Python computes from settings
 T = TypeVar("T")
 Kind = TypeVar("Kind", float, ca.SX, ca.MX)
+Value = TypeVar("Value", ca.SX, ca.MX)
 _Of = Callable[[type], object]  # kind (float, ca.SX or ca.MX) -> number or expression of that kind
 _Operation = Callable[[object, object], object]
 
@@ -161,6 +162,11 @@ def live_number(path: str, value: float) -> LiveNumber:
 def _expressed(value: object, kind: type) -> object:
     """A number of a step as an expression of that kind; what is no live number stays as it is."""
     return value._of(kind) if isinstance(value, LiveNumber) else value
+
+
+def expressed(value: float | LiveNumber, beside: Value) -> Value:
+    """Return a number as an expression of the kind of another one; a number that is not live stays as it is."""
+    return cast(Value, _expressed(value, type(beside)))
 
 
 def nominal(value: T) -> T:

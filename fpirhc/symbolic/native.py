@@ -36,7 +36,9 @@ from fpirhc.symbolic.work_vector import with_less_work
 # -ffp-contract=off: no fused multiply-add, so that C and the virtual machine round alike.
 # -z defs: a missing symbol must fail here and not end the process at the first call.
 _LINK = ("-Wl,-z,defs",) if sys.platform == "linux" else ()
-_FLAGS = ("-O3", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared", *_LINK)
+# -falign: where a loop begins in a cache line decides up to 17 % of a plan's time, and any other number of the code moves it.
+_ALIGNED = ("-falign-functions=64", "-falign-loops=64")
+_FLAGS = ("-O3", *_ALIGNED, "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared", *_LINK)
 _LARGE = 500_000  # bytes of C above which optimising takes longer than it saves: at 1.2 MB -O3 took 52 s and -O1 21 s
 _LARGE_FLAGS = ("-O1", *_FLAGS[1:])
 _NAME = "fpirhc_native"  # stands for the exported name, which is made of the key

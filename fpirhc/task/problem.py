@@ -23,7 +23,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line
 from fpirhc.symbolic.live import nominal
-from fpirhc.task.dead_time import DeadTime
+from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.foreign import Foreign
 from fpirhc.task.limits import Limits
@@ -155,7 +155,7 @@ class Problem(Checked):
     def sees_plant(self) -> bool:
         """Whether a controller receives the plant's own state and response, unchanged and without delay."""
         return (
-            not self.dead_time.measurement
+            MEASUREMENT not in self.dead_time.queued
             and self.sensing.ideal
             and not (self.symbolic_reality and self.symbolic_reality.seen)
         )
@@ -248,9 +248,20 @@ class Problem(Checked):
         return waiting / self.period + self.sensing.delay(self.plant.face, self.period)
 
     @property
-    def warm_up_cycles(self) -> int:
+    def answers_late(self) -> bool:
+        """Whether a response may take longer than the one cycle of every loop."""
+        return bool(self.dead_time.queued) or self.sensing.delay(self.plant.face, self.period) > 0
+
+    @property
+    def warm_up_cycles(self) -> float:
         """Number of the first cycle whose realised response may be used; no deformation acts before it."""
         return self.sensing.warm_up_cycles(self.plant.face, self.dead_time.measurement / self.period)
+
+    @property
+    def longest_warm_up(self) -> float:
+        """The same with the longest dead time that a run may set."""
+        late = max(nominal(self.dead_time.measurement), self.dead_time.longest.get(MEASUREMENT, 0.0))
+        return self.sensing.warm_up_cycles(self.plant.face, late / self.period)
 
 
 def _check_times(problem: Problem, mistakes: Mistakes) -> None:

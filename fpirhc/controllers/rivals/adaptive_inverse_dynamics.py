@@ -20,7 +20,9 @@ from fpirhc.members import Example
 from fpirhc.plant.regressor import Combination
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.following import following
 from fpirhc.symbolic.layout import Expression
+from fpirhc.symbolic.live import live_numbers, settled
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.error import error_chains, integral_signal
 from fpirhc.tracking.exponential import Exponential
@@ -84,18 +86,25 @@ class AdaptiveInverseDynamics(Controller):
 
     def _learn_block(self, problem: Problem) -> Block:
         plant, learning = problem.plant, self._learning
-        equation, weights = equation_function(learning.regressor(problem)), self.lyapunov_row()
+        equation = equation_function(learning.regressor(problem))
+        rows = following(
+            "lyapunov_row", live_numbers(self.tracking), lambda values: settled(self, values).lyapunov_row()
+        )
+        fixed = self.lyapunov_row() if rows is None else np.zeros(0)
 
         def gradient(s: Signals, estimate: Expression) -> Pair:
             matrix, _ = equation(s.state, s.realised, s._command_before, estimate, s.parameters)
             chains = error_chains(plant, s._target - s.state)
             if self.tracking.integral:
                 chains = [[s._integral_used[k], *chain] for k, chain in enumerate(chains)]
+            weights = fixed if rows is None else ca.vertsplit(getattr(s, rows.signal.name))
             along = [sum(w * e for w, e in zip(weights, chain, strict=True)) for chain in chains]
             return matrix, ca.vertcat(*along)
 
         reads = (like(plant.state, "_target"), integral_signal(plant, "_integral_used"))
-        return learning.block(problem, reads, gradient)
+        if rows is None:
+            return learning.block(problem, reads, gradient)
+        return replace(learning.block(problem, (*reads, *rows.reads.signals), gradient), derived=rows.derived)
 
     def lyapunov_row(self) -> np.ndarray:
         """Return B^T P: the weights of (e_int, e, e'), or of (e, e') without the integral, in w."""

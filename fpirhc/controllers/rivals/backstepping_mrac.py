@@ -20,7 +20,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
-import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
 from fpirhc.controllers.rivals.reference_model import model_block
@@ -30,6 +29,7 @@ from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Layout, vector
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.error import error_chains
@@ -72,14 +72,13 @@ class BacksteppingMRAC(Controller):
                 )
         mistakes.raise_if_any()
 
-    def nested(self) -> np.ndarray:
+    def nested(self) -> list[list[float]]:
         """Return the nested errors as sums over (e, e', ..., e^(n)), one per row; the law makes the last row zero."""
         size = len(self.rates)
-        rows = np.zeros((size + 1, size + 1))
-        rows[0, 0] = 1.0
+        rows = [[1.0, *[0.0] * size]]
         for i, rate in enumerate(self.rates):
-            before = rows[i - 1] if i else 0.0
-            rows[i + 1] = np.roll(rows[i], 1) + rate * rows[i] + before
+            last, before = rows[i], rows[i - 1] if i else [0.0] * (size + 1)
+            rows.append([last[k - 1] + rate * last[k] + before[k] for k in range(size + 1)])
         return rows
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
@@ -96,8 +95,8 @@ class BacksteppingMRAC(Controller):
 
         def step(s: Signals) -> dict[str, Expression]:
             chains = [ca.vertcat(*chain) for chain in error_chains(plant, s.model - s.state)]
-            nested = [ca.mtimes(ca.DM(rows[:-1, :-1]), chain) for chain in chains]
-            feedback = [ca.dot(ca.DM(rows[-1, :-1]), chain) for chain in chains]
+            nested = [ca.vertcat(*(ca.dot(numbers(row[:-1]), chain) for row in rows[:-1])) for chain in chains]
+            feedback = [ca.dot(numbers(rows[-1][:-1]), chain) for chain in chains]
             return {"nested": ca.vertcat(*nested), "desired": s.nominal + ca.vertcat(*feedback)}
 
         reads = Layout((plant.state, like(plant.state, "model"), plant.response_signal("nominal")))

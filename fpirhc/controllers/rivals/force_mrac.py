@@ -100,7 +100,7 @@ class ForceMRAC(Controller):
         ]
         return blocks, [*delays, *self.tracking.delays(plant)]
 
-    def _force_block(self, plant: Plant, warm_up_cycles: int) -> Block:
+    def _force_block(self, plant: Plant, warm_up_cycles: float) -> Block:
         """Block (state, desired, realised, last command) -> Q^Des, Q^Rec, Q^Def, and the model's response to it."""
         memory = self.deformation.memory(plant.input.elements)
         inverse, response = plant.inverse_function, plant.controlled_response_function

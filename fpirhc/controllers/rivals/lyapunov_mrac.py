@@ -42,7 +42,7 @@ from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.functions import power
+from fpirhc.symbolic.functions import numbers, power
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.error import error_chains
@@ -127,7 +127,7 @@ class LyapunovMRAC(Controller):
 
         def step(s: Signals) -> dict[str, Expression]:
             errors = error_chains(plant, s.reference - s.state)
-            feedback = [ca.dot(ca.DM(list(decay_gains(rate, len(c)))), ca.vertcat(*c)) for c in errors]
+            feedback = [ca.dot(numbers(decay_gains(rate, len(c))), ca.vertcat(*c)) for c in errors]
             desired = s._reference_response + ca.vertcat(*feedback)
             begun = start(s.state, desired, s.parameters)
             first = ca.if_else(s.warm_up > 0.5, s._gains_first_before, begun)

@@ -10,6 +10,7 @@ The deviation follows its exact solution over one period, so the model has no in
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -17,10 +18,12 @@ from scipy.linalg import expm
 
 from fpirhc.controllers.base import like
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.functions import power
+from fpirhc.symbolic.block import Block, Values
+from fpirhc.symbolic.expression import Signals, expression
+from fpirhc.symbolic.following import following
+from fpirhc.symbolic.functions import numbers, power
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.live import live_numbers, settled
 from fpirhc.tracking.error import error_chains
 
 
@@ -43,7 +46,15 @@ def model_block(plant: Plant, rate: float, period: float) -> Block:
     """
     chains = [_chain(plant, k) for k in plant.controlled_indices]
     gains = [decay_gains(rate, len(chain)) for chain in chains]
-    steps = [expm(companion(g) * period) for g in gains]
+    ends_of_steps = np.cumsum([0, *(len(g) ** 2 for g in gains)]).tolist()
+
+    def steps_at(values: Values) -> np.ndarray:
+        orders = [len(chain) for chain in chains]
+        own = (decay_gains(settled(rate, values), order) for order in orders)
+        return np.concatenate([expm(companion(g) * period).ravel(order="F") for g in own])
+
+    live = following("model_steps", live_numbers(rate), steps_at)
+    fixed = steps_at({}) if live is None else np.zeros(0)
     memory = Layout((Signal("model_deviation", tuple(e for chain in chains for e in chain)),))
     ends = np.cumsum([0, *(len(chain) for chain in chains)]).tolist()
 
@@ -52,8 +63,12 @@ def model_block(plant: Plant, rate: float, period: float) -> Block:
         deviation = ca.vertsplit(ca.if_else(s.warm_up > 0.5, s.model_deviation, first), ends)
         spread = dict(zip(memory.signals[0].elements, ca.vertsplit(ca.vertcat(*deviation)), strict=True))
         lag = ca.vertcat(*(spread.get(e, 0) for e in plant.state.elements))
-        pull = [ca.dot(ca.DM(list(g)), d) for g, d in zip(gains, deviation, strict=True)]
-        deviation_next = [ca.mtimes(ca.DM(m), d) for m, d in zip(steps, deviation, strict=True)]
+        pull = [ca.dot(numbers(g), d) for g, d in zip(gains, deviation, strict=True)]
+        entries = ca.vertsplit(
+            expression(ca.DM(fixed)) if live is None else getattr(s, live.signal.name), ends_of_steps
+        )
+        steps = [ca.reshape(m, len(g), len(g)) for m, g in zip(entries, gains, strict=True)]
+        deviation_next = [ca.mtimes(m, d) for m, d in zip(steps, deviation, strict=True)]
         return {
             "model": s.reference - lag,
             "nominal": s._reference_response + ca.vertcat(*pull),
@@ -67,7 +82,8 @@ def model_block(plant: Plant, rate: float, period: float) -> Block:
         scalar("warm_up"),
     )
     writes = (like(plant.state, "model"), plant.response_signal("nominal"))
-    return Block("reference_model", Layout(reads), Layout(writes), step, memory)
+    block = Block("reference_model", Layout(reads), Layout(writes), step, memory)
+    return block if live is None else replace(block, reads=block.reads + Layout((live.signal,)), derived=live.derived)
 
 
 def _chain(plant: Plant, index: int) -> list[str]:

@@ -131,14 +131,16 @@ def _estimate_block(
     count = len(plant.parameters)
     estimate = Signal("estimate", names, tuple(model.parameters[n].unit for n in names))
     memory = estimator.memory(modelled)
-    correct = estimator.step(modelled)
+    correct, followed = estimator.step(modelled), estimator.following(modelled)
     own = memory + Layout((like(estimate, "estimate_change"), scalar("estimate_begun"), *pairs.memory))
 
     def step(s: Signals) -> dict[str, Value]:
         parameters = ca.vertcat(s.parameters[:count], ca.DM(model.approximate[count:]))
         before = {m: getattr(s, m) for m in memory.names}
         state, command, waiting = pairs.pair(s, s._acted)
-        evidence = Seen(state, command, s.realised, parameters, s.estimate_begun > pairs.cycles - 0.5)
+        numbers = None if followed is None else getattr(s, followed.signal.name)
+        begun = s.estimate_begun > pairs.cycles - 0.5
+        evidence = Seen(state, command, s.realised, parameters, begun, numbers)
         parameter_change, next_memory = correct(evidence, before)
         # A change that is not finite is not learned: one bad measurement must not spoil the model for ever.
         finite = is_finite(ca.vertcat(parameter_change, *next_memory.values()))
@@ -156,7 +158,8 @@ def _estimate_block(
         }
 
     reads = Layout((pairs.state, plant.response_signal("realised"), plant.parameter, acted))
-    return Block("estimate", reads, Layout((believed, estimate)), step, own, opaque=True)
+    block = Block("estimate", reads, Layout((believed, estimate)), step, own, opaque=True)
+    return block if followed is None else replace(block, reads=reads + followed.reads, derived=followed.derived)
 
 
 def examples(inner: Controller) -> tuple[Controller, ...]:

@@ -38,7 +38,9 @@ from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
+from fpirhc.symbolic.functions import entry_at, rounded
 from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.live import expressed, is_live, live_numbers
 from fpirhc.task.dead_time import MOST, DeadTime
 from fpirhc.task.problem import Problem
 
@@ -158,17 +160,23 @@ class Predicted(Controller):
         inputs: dead time of the inputs, s; the sum of both dead times is rounded to control cycles.
         measurement: dead time of the measurement, s.
         by: how the state is predicted.
+        longest: the longest sum of both dead times that a run may set, s, `live=["inputs"]`; None: they are not live.
 
     Raises:
-        InvalidValue: a dead time that is negative or not finite.
+        InvalidValue: a dead time that is negative or not finite; a longest one that is shorter than their sum.
     """
 
     controller: Controller
     inputs: float
     measurement: float = 0.0
     by: Predictor = field(default_factory=ByModel)
+    longest: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
 
     def __post_init__(self) -> None:
+        if self.longest is not None and not self.inputs + self.measurement <= self.longest < np.inf:
+            raise InvalidValue(
+                f"Predicted(longest={self.longest!r}): expected at least {self.inputs + self.measurement:g} s, the dead time"
+            )
         for name, value in (("inputs", self.inputs), ("measurement", self.measurement)):
             if not (np.isfinite(value) and value >= 0):
                 raise InvalidValue(f"Predicted({name}={value!r}): expected a number of seconds of at least 0")
@@ -214,30 +222,83 @@ class Predicted(Controller):
                 f"Predicted: {self.by} compares the responses of the plant's controlled coordinates, but "
                 f"{type(self.controller).__name__} reads others; use by=ByModel()"
             )
-        if self._cycles(problem) > MOST:
-            raise InvalidValue(f"Predicted: {self._cycles(problem)} cycles of dead time, more than {MOST}")
+        if self._length(problem) > MOST:
+            raise InvalidValue(f"Predicted: {self._length(problem)} cycles of dead time, more than {MOST}")
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the block predict, and the wrapped controller as one block; without dead time the controller's own blocks."""
-        plant, cycles = problem.plant, self._cycles(problem)
-        if not cycles:
+        plant = problem.plant
+        if not self._length(problem):
             return self.controller.blocks(problem)
         inner = compose_controller(problem, self.controller, ahead=True)
         ahead = {"time": like(plant.time, "time_ahead"), "state": like(plant.state, "state_ahead")}
         feeds = {**ahead, MEASURED: plant.state}
         sent = self.by.sent(plant)
         before = Signal("_sent_before", sent.elements, sent.units, self.by.sent_at_start(problem))
-        predict = _predict_block(problem, self.by, cycles, self.inputs, before, tuple(ahead.values()))
+        ahead_by = _Lead(self._cycles(problem), self._length(problem), self.inputs)
+        predict = _predict_block(problem, self.by, ahead_by, before, tuple(ahead.values()))
         return [predict, embedded("controller", inner, feeds)], [Delay(before, sent.name)]
 
-    def _cycles(self, problem: Problem) -> int:
-        return round((self.inputs + self.measurement) / problem.period)
+    def _cycles(self, problem: Problem) -> float:
+        """Cycles over which the state is predicted; they may be live."""
+        return rounded((self.inputs + self.measurement) / problem.period)
+
+    def _length(self, problem: Problem) -> int:
+        """Cycles for which there is a queue."""
+        if self.longest is not None:
+            return round(self.longest / problem.period)
+        for path in live_numbers(self.inputs, self.measurement):
+            raise NotSupported(
+                f"setting '{path}' cannot be live without its longest value, which is the length of a queue; give "
+                "Predicted(longest=...)"
+            )
+        return int(self._cycles(problem))
 
 
-def _predict_block(
-    problem: Problem, by: Predictor, cycles: int, lead: float, before: Signal, writes: tuple[Signal, ...]
-) -> Block:
-    plant, size = problem.plant, before.size
+@dataclass(frozen=True)
+class _Lead:
+    """How far ahead the state is predicted.
+
+    Args:
+        cycles: over which the state is integrated; they may be live.
+        longest: cycles for which there is a queue.
+        time: by which the clock is ahead, s.
+    """
+
+    cycles: float
+    longest: int
+    time: float
+
+    def oldest(self, queued: Expression, size: int) -> Expression:
+        """Return the value that acted while the response was realised."""
+        if not is_live(self.cycles):
+            return queued[size * int(self.cycles) : size * (int(self.cycles) + 1)]
+        place = expressed(self.cycles, queued)
+        return ca.vertcat(*(entry_at(queued[j::size], place) for j in range(size)))
+
+    def integrated(
+        self, advance: ca.Function, state: Expression, sent: list[Expression], same: list[Expression]
+    ) -> Expression:
+        """Return the state after the values on their way, `sent`, the oldest of which is the last one."""
+        if not is_live(self.cycles):
+            count = int(self.cycles)
+            if not count:
+                return state
+            columns = ca.horzcat(*reversed(sent[:count]))
+            path = advance.mapaccum("fpirhc_predicted", count)(state, columns, *(ca.repmat(v, 1, count) for v in same))
+            return path[:, -1]
+        # Where fewer values are on their way than the queue holds, the first steps leave the state as it is.
+        x, u, due = ca.SX.sym("x", state.numel()), ca.SX.sym("u", sent[0].numel()), ca.SX.sym("due")
+        held = [ca.SX.sym(f"held{k}", v.numel()) for k, v in enumerate(same)]
+        step = ca.Function("fpirhc_due", [x, u, *held, due], [ca.if_else(due, advance(x, u, *held), x)])
+        acts = expressed(self.cycles, state) > ca.DM(list(reversed(range(self.longest)))).T
+        columns = ca.horzcat(*reversed(sent))
+        repeated = (ca.repmat(v, 1, self.longest) for v in same)
+        return step.mapaccum("fpirhc_predicted", self.longest)(state, columns, *repeated, acts)[:, -1]
+
+
+def _predict_block(problem: Problem, by: Predictor, lead: _Lead, before: Signal, writes: tuple[Signal, ...]) -> Block:
+    plant, size, cycles = problem.plant, before.size, lead.longest
     # One value more than is on its way: the oldest acted while the response was realised.
     past = tuple(f"{e}@{k}" for k in range(1, cycles + 2) for e in before.elements)
     queue = Signal("sent", past, start=by.sent_at_start(problem) * (cycles + 1))
@@ -253,12 +314,11 @@ def _predict_block(
         memory_next = {"sent_next": queued}
         error = expression(ca.MX.zeros(len(plant.names)))
         if corrected:
-            error = corrected(s.residual, s.state, queued[size * cycles :], s.realised, s.parameters)
+            error = corrected(s.residual, s.state, lead.oldest(queued, size), s.realised, s.parameters)
             memory_next["residual_next"] = error
-        columns = ca.horzcat(*(queued[size * k : size * (k + 1)] for k in reversed(range(cycles))))
-        same = ca.repmat(s.parameters, 1, cycles), ca.repmat(error, 1, cycles)
-        path = advance.mapaccum("fpirhc_predicted", cycles)(s.state, columns, *same)
-        return {"time_ahead": s.time + lead, "state_ahead": path[:, -1], **memory_next}
+        on_their_way = [queued[size * k : size * (k + 1)] for k in range(cycles)]
+        state = lead.integrated(advance, s.state, on_their_way, [s.parameters, error])
+        return {"time_ahead": s.time + lead.time, "state_ahead": state, **memory_next}
 
     return Block("predict", Layout(reads), Layout(writes), step, Layout(own), opaque=True)
 

@@ -25,14 +25,14 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Pairing
 from fpirhc.deformation.leaky import check_pole, chosen_pole
-from fpirhc.deformation.queue import MOST, Cycles, Queue, check_cycles, check_uncertainty, every, several
+from fpirhc.deformation.queue import MOST, Cycles, Queue, check_cycles, check_longest, check_uncertainty, every, several
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -55,12 +55,14 @@ class _Queued(Wrapper):
         map: any deformation that iterates.
         cycles: dead time d between a request and its response, beyond the one cycle that every loop has; a tuple gives every
             controlled coordinate its own.
+        longest: longest dead time that a run may set, `live=["deformation.cycles"]`; None: the dead time is not live.
 
     Raises:
         InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time.
     """
 
     cycles: Cycles
+    longest: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
 
     @property
     def constant(self) -> bool:
@@ -98,7 +100,7 @@ class _Queued(Wrapper):
         desired_then = ca.if_else(first, request, memory["queue_now"])
         past_requests = queue.pushed(memory["queue_requests"], request)
         past_desired = queue.pushed(memory["queue_desired"], desired_then)
-        valid = memory["queue_filled"] >= queue.length - 1
+        valid = memory["queue_filled"] >= queue.needed(memory["queue_filled"]) - 1
         next_request, next_memory = self._request(_Past(past_requests, past_desired), response, desired, inner)
         remembered = {name: ca.if_else(valid, value, inner[name]) for name, value in next_memory.items()}
         filled = ca.fmin(memory["queue_filled"] + 1, queue.length)
@@ -125,6 +127,7 @@ class Paired(_Queued):
         map: any deformation that iterates.
         cycles: dead time d, or one for every controlled coordinate.
         uncertainty: half width of the triangular mean over the requests around the pair, whole cycles, at most d.
+        longest: longest dead time that a run may set; None: the dead time is not live.
 
     Raises:
         InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time.
@@ -134,6 +137,7 @@ class Paired(_Queued):
 
     def __post_init__(self) -> None:
         check_cycles("Paired", self.cycles)
+        check_longest("Paired", self.longest, self.cycles)
         check_uncertainty("Paired", self.uncertainty, self.cycles)
         if self.uncertainty > min(every(self.cycles)):
             raise InvalidValue(
@@ -148,7 +152,7 @@ class Paired(_Queued):
 
     @property
     def _queue(self) -> Queue:
-        return Queue(self.cycles, self.uncertainty)
+        return Queue(self.cycles, self.uncertainty, self.longest)
 
     def _request(
         self, past: _Past, response: Expression, desired: Expression, memory: Mapping[str, Expression]
@@ -166,6 +170,7 @@ class Increment(_Queued):
         uncertainty: m, by how many cycles the dead time may be wrong, at most d rounded up; None: max(1, 10 % of d), and 0
             without dead time.
         pole: p of the leak, in [0, 1); None: from the uncertainty, by the theorem.
+        longest: longest dead time that a run may set; None: the dead time is not live.
 
     Raises:
         InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time; a pole
@@ -177,6 +182,7 @@ class Increment(_Queued):
 
     def __post_init__(self) -> None:
         check_cycles("Increment", self.cycles)
+        check_longest("Increment", self.longest, self.cycles)
         if self.uncertainty is not None:
             check_uncertainty("Increment", self.uncertainty, self.cycles)
         if self.pole is not None:
@@ -194,7 +200,7 @@ class Increment(_Queued):
 
     @property
     def _queue(self) -> Queue:
-        return Queue(self.cycles)
+        return Queue(self.cycles, longest=self.longest)
 
     def _request(
         self, past: _Past, response: Expression, desired: Expression, memory: Mapping[str, Expression]

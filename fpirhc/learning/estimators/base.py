@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.following import Following
 from fpirhc.symbolic.layout import Expression, Layout
 from fpirhc.task.problem import Problem
 
@@ -27,6 +28,7 @@ class Seen:
         response: the measured response.
         parameters: those of the model without the estimator's change.
         valid: 0 before the first pair of this run (in the first cycle, and until the first sample of the run arrives), then 1.
+        followed: what the estimator computes from its live settings; None without any.
     """
 
     state: Expression
@@ -34,6 +36,7 @@ class Seen:
     response: Expression
     parameters: Expression
     valid: Expression
+    followed: Expression | None = None
 
 
 Correct = Callable[[Seen, Mapping[str, Expression]], tuple[Expression, dict[str, Expression]]]
@@ -61,6 +64,10 @@ class Estimator(Checked, ABC):
     @abstractmethod
     def memory(self, problem: Problem) -> Layout:
         """Signals that are remembered from cycle to cycle."""
+
+    def following(self, problem: Problem) -> Following | None:  # noqa: ARG002
+        """Return the numbers that it computes from its live settings; None: none."""
+        return None
 
     @abstractmethod
     def step(self, problem: Problem) -> Correct:

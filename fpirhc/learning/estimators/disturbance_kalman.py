@@ -34,9 +34,13 @@ from fpirhc.learning.estimators.uncertain import require_positive
 from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
+from fpirhc.symbolic.expression import expression
+from fpirhc.symbolic.following import Following, following
 from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.live import is_live, live_numbers, nominal, settled
 from fpirhc.task.problem import Problem
 
+_STALE = "the filter stays stable, and keeps the bandwidth of the old deviations"
 _SLOWEST = 1e-9  # decay per cycle below which a mode of the filter counts as undamped
 
 
@@ -145,12 +149,16 @@ class DisturbanceKalman(Estimator):
             )
         )
 
+    def following(self, problem: Problem) -> Following | None:
+        """The stationary gain, column by column."""
+        fixed = nominal(problem)
+        return following("gain", live_numbers(self), lambda v: settled(self, v).gain(fixed).ravel(order="F"), _STALE)
+
     def step(self, problem: Problem) -> Correct:
         """Prediction by the model, and the correction by the gain."""
         model = problem.plant
         advance, no_forcing = RungeKutta4().step(model, problem.period), ca.DM.zeros(len(model.names))
-        gain = self.gain(problem)
-        on_state, on_disturbance = ca.DM(gain[: model.state.size]), ca.DM(gain[model.state.size :])
+        fixed = None if is_live(self) else ca.DM(self.gain(problem))
         shown = self._shown_function(model)
         places = [model.parameter.elements.index(n) for n in self.learned()]
 
@@ -160,6 +168,8 @@ class DisturbanceKalman(Estimator):
             predicted = advance(memory["observed_state"], seen.command, parameters, no_forcing)
             measured = self._measured(model, seen)
             innovation = measured - shown(predicted, seen.command, parameters)
+            gain = _gain(fixed, seen, len(self.measured))
+            on_state, on_disturbance = gain[: model.state.size, :], gain[model.state.size :, :]
             running = seen.valid > 0.5
             state = ca.if_else(running, predicted + on_state @ innovation, seen.state)
             disturbance = ca.if_else(running, memory["observed_disturbance"] + on_disturbance @ innovation, 0)
@@ -238,6 +248,14 @@ class DisturbanceKalman(Estimator):
         rest = a[np.ix_(~used, ~used)]
         harmless = used[judged].all() and np.abs(np.linalg.eigvals(rest)).max(initial=0.0) < 1 + _SLOWEST
         return used if harmless else everything
+
+
+def _gain(fixed: ca.DM | None, seen: Seen, measured: int) -> Expression:
+    """The gain of the build, or that of the live settings in force."""
+    if fixed is not None:
+        return expression(fixed)
+    assert seen.followed is not None
+    return ca.reshape(seen.followed, seen.followed.numel() // measured, measured)
 
 
 def _rank(a: np.ndarray, c: np.ndarray) -> int:

@@ -38,6 +38,28 @@ function bands(chart, spec) {
   ctx.restore();
 }
 
+// Times at which live settings changed, in the colour of their controller.
+function changes(chart, spec) {
+  const { ctx, bbox } = chart;
+  ctx.save();
+  ctx.beginPath();
+  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
+  ctx.clip();
+  ctx.setLineDash([3 * devicePixelRatio, 3 * devicePixelRatio]);
+  ctx.lineWidth = devicePixelRatio;
+  for (const c of DATA.controllers)
+    if (spec.only ? c.name === spec.only : shown.has(c.name))
+      for (const time of c.changes) {
+        const x = chart.valToPos(time, "x", true);
+        ctx.strokeStyle = colors[c.name];
+        ctx.beginPath();
+        ctx.moveTo(x, bbox.top);
+        ctx.lineTo(x, bbox.top + bbox.height);
+        ctx.stroke();
+      }
+  ctx.restore();
+}
+
 // All boxes stand in the grid before a chart is drawn: a box that is alone in it is as wide as the page.
 function place(spec) {
   const box = document.createElement("div");
@@ -69,7 +91,7 @@ function draw({ box, spec }) {
     scales: { x: { time: false } },
     axes: [{ ...axis, ...labelled, label: "t [" + DATA.timeUnit + "]" }, { ...axis, size: 62 }],
     cursor: { sync: { key: sync.key } },
-    hooks: { setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)] },
+    hooks: { setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)], draw: [(chart) => changes(chart, spec)] },
   };
   const chart = new uPlot(options, [DATA.time, ...spec.series.map((s) => s.values)], box);
   plots.push({ chart, box, spec });

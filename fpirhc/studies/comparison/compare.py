@@ -16,6 +16,7 @@ from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, NotSupported, nearest
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.response_prediction import Prediction, predict_response
+from fpirhc.simulation.changes import Changes
 from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
 from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.metrics.columns import columns
@@ -201,6 +202,7 @@ def compare(
     compiled: bool = True,
     command: str = "",
     progress: Progress | None = None,
+    changes: Mapping[str, Changes] | None = None,
 ) -> Comparison:
     """Run the task's controllers with the same disturbances and return their results.
 
@@ -213,15 +215,19 @@ def compare(
         compiled: whether runs use compiled C.
         command: the command line, for the report.
         progress: function of (controller, cycles done, cycles in all).
+        changes: numbers of settings from a time on, by time in s, by controller.
 
     Raises:
         InvalidProblem: unknown controllers, or deformations with a gain of the wrong sign.
     """
     begin = time.perf_counter()
     selected = select(task, controllers)
+    mistakes = Mistakes("changes")
+    mistakes.unknown("controller", changes or (), selected)
+    mistakes.raise_if_any()
     check_gains(task, selected)
     loops: dict[str, Simulator] = {}
-    ran, skipped = _entries(task, selected, seed, compiled, progress, loops)
+    ran, skipped = _entries(task, selected, seed, compiled, progress, loops, changes or {})
     sizes = scales(task.problem)
     entries = beside_each_other(task.problem, ran, loops, sizes, compiled=compiled)
     judged = findings(entries, skipped, task.headline, sizes)
@@ -273,13 +279,16 @@ def _entries(
     compiled: bool,
     progress: Progress | None,
     loops: dict[str, Simulator],
+    changes: Mapping[str, Changes],
 ) -> tuple[list[Entry], dict[str, str]]:
     """Entries of the controllers that ran, and reasons why the others were skipped; the loops that ran are added to `loops`."""
     entries: list[Entry] = []
     skipped: dict[str, str] = {}
     for name, controller in controllers.items():
         try:
-            entries.append(_entry(task, controllers, name, controller, seed, compiled, progress, loops))
+            entries.append(
+                _entry(task, controllers, name, controller, seed, compiled, progress, loops, changes.get(name, {}))
+            )
         except FpirhcError as error:
             skipped[name] = str(error)
         except KeyboardInterrupt:
@@ -298,6 +307,7 @@ def _entry(
     compiled: bool,
     progress: Progress | None,
     loops: dict[str, Simulator],
+    changes: Changes,
 ) -> Entry:
     problem = task.problem
     ready = resolved(problem, controller)
@@ -307,8 +317,9 @@ def _entry(
             progress(name, done, total)
 
     report(0, problem.cycles)
-    loops[name] = simulator(problem, ready, compiled=compiled)
-    run = judged_run(loops[name], seed=seed, name=name, progress=report)
+    live = tuple(dict.fromkeys(path for numbers in changes.values() for path in numbers))
+    loops[name] = simulator(problem, ready, compiled=compiled, live=live)
+    run = judged_run(loops[name], seed=seed, name=name, progress=report, changes=changes)
     adaptive, every = ready.deformation.adapts, plan_every(problem, ready)
     view = lyapunov_view(problem, ready, run)
     metrics = measure(problem, run, task.metrics)

@@ -10,14 +10,14 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any
 
-from fpirhc.controllers.contract import resolved
+from fpirhc.controllers.contract import Controller, checked, resolved
 from fpirhc.describe import describe
-from fpirhc.errors import FpirhcError
+from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero
 from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.review.late import is_late, scaled
+from fpirhc.review.late import is_late, live_paths, roomy, scaled
 from fpirhc.simulation.metrics import measure
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.studies.scenarios.draws import COMPARING, Scenario, draw, with_exact
@@ -95,6 +95,7 @@ class Bench:
         self._task, self._conditions = task, conditions
         self._ranges = ranges(task.problem)
         self._simulators: dict[tuple[str, int], Simulator | FpirhcError] = {}
+        self._shared: dict[str, Simulator | None] = {}
         self._drawn: tuple[int, Scenario, Problem] | None = None
 
     def record(self, number: int, name: str, settings: Mapping[str, float] | None = None) -> dict[str, Any]:
@@ -138,13 +139,19 @@ class Bench:
             self._drawn = (number, scenario, with_exact(late, scenario.exact))
         return self._drawn[1:]
 
-    def _lateness(self, scenario: Scenario) -> int:
+    @property
+    def _draws_dead_times(self) -> bool:
         """Whether the plant's dead times are other ones than the controllers'; they are not in studies that tune."""
-        drawn = self._conditions.use == COMPARING and self._conditions.percent > 0 and is_late(self._task.problem)
-        return scenario.lateness if drawn else 0
+        return self._conditions.use == COMPARING and self._conditions.percent > 0 and is_late(self._task.problem)
+
+    def _lateness(self, scenario: Scenario) -> int:
+        return scenario.lateness if self._draws_dead_times else 0
 
     def _late(self, lateness: int) -> Problem:
-        problem = self._task.problem
+        """The problem with other dead times, and with queues for the longest of them."""
+        if not self._draws_dead_times:
+            return self._task.problem
+        problem = roomy(self._task.problem, self._conditions.percent)
         return scaled(problem, lateness * self._conditions.percent) if lateness else problem
 
     def _simulator(self, name: str, lateness: int = 0) -> Simulator:
@@ -167,11 +174,29 @@ class Bench:
         live, compiled = self._live.get(name, ()), self._conditions.compiled
         compile_it = compiled if compiled is not None else bool(live)
         try:
-            controller = self._task.controllers[name]
-            controller = resolved(self._task.problem, controller) if lateness else controller
-            return simulator(self._late(lateness), controller, compiled=compile_it, live=live)
+            controller, late = self._task.controllers[name], self._late(lateness)
+            controller = resolved(self._task.problem, controller) if self._draws_dead_times else controller
+            shared = self._for_all_dead_times(name, controller, compile_it)
+            if shared is not None:
+                checked(late, controller)
+                return shared
+            return simulator(late, controller, compiled=compile_it, live=live)
         except FpirhcError as error:
             return error
+
+    def _for_all_dead_times(self, name: str, controller: Controller, compile_it: bool) -> Simulator | None:
+        """One loop for all dead times that are drawn; None where none are, and where a loop needs them while it is built."""
+        if not self._draws_dead_times:
+            return None
+        if name not in self._shared:
+            problem = self._late(0)
+            live = (*self._live.get(name, ()), *live_paths(problem))
+            try:
+                ready = simulator(problem, controller, compiled=compile_it, live=live)
+                self._shared[name] = None if ready.remembers else ready
+            except NotSupported:
+                self._shared[name] = None
+        return self._shared[name]
 
 
 def _finite(value: Any) -> Any:

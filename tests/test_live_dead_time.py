@@ -1,0 +1,198 @@
+"""Dead times that a run may set: one loop for all of them up to the stated longest, bit by bit the loop that is built with each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.controllers.base import Controller
+from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
+from fpirhc.problem_files.problem_file import load_problem
+from fpirhc.simulation.simulate import simulator
+from fpirhc.studies.scenarios.bench import Bench, Conditions
+from fpirhc.studies.scenarios.draws import COMPARING
+from fpirhc.task.dead_time import DeadTime
+
+TWO = load_problem("two_mass")
+LATE = load_problem("delayed_mass")
+LONGEST = {"Q1": 0.012, "Q2": 0.02, "measurement": 0.008}  # s; cycles of 1 ms
+QUEUED = replace(
+    TWO.problem,
+    duration=0.2,
+    measure_from=0.0,
+    dead_time=DeadTime(inputs={"Q1": 0.003, "Q2": 0.0}, measurement=0.002, longest=LONGEST),
+)
+PLANT = ["dead_time.inputs.Q1", "dead_time.inputs.Q2", "dead_time.measurement"]
+WAYS = pytest.mark.parametrize("compiled", [True, False], ids=["C", "VM"])
+
+
+def same_signals(one: fp.Run, other: fp.Run) -> bool:
+    """Whether two runs agree bit by bit in every signal that both have."""
+    names = set(one.layout.names) & set(other.layout.names)
+    assert {"command", "true_error", "deformed"} <= names
+    return all(np.array_equal(one[name], other[name], equal_nan=True) for name in names)
+
+
+@pytest.mark.parametrize(
+    ("name", "compiled"),
+    [
+        ("CTC+FPI (eq 6)", True),
+        ("CTC+FPI (eq 6)", False),
+        ("RHC+FPI", False),
+        pytest.param("RHC+FPI", True, marks=pytest.mark.slow),
+    ],
+)
+def test_a_dead_time_that_is_set_is_the_one_that_is_built(name, compiled):
+    """Whole and broken cycles, none at all, and the longest; the rebuilt loop has queues of its own length."""
+    controller, rng = TWO.controllers[name], np.random.default_rng(3)
+    ready = simulator(QUEUED, controller, compiled=compiled, live=PLANT)
+    plain = simulator(QUEUED, controller, compiled=compiled).run(seed=0)
+    assert same_signals(ready.run(seed=0), plain)
+    cases = [(0.0, 0.0, 0.0), tuple(rng.uniform(0, 1, 3) * list(LONGEST.values())), (0.012, 0.02, 0.008)]
+    cases = cases[:2] if name == "RHC+FPI" else [*cases, (0.005, 0.011, 0.003)]
+    for q1, q2, seen in cases:
+        numbers: dict[str, Any] = dict(zip(PLANT, map(float, (q1, q2, seen)), strict=True))
+        own = replace(QUEUED, dead_time=DeadTime(inputs={"Q1": float(q1), "Q2": float(q2)}, measurement=float(seen)))
+        rebuilt = simulator(own, controller, compiled=compiled).run(seed=0)
+        assert same_signals(ready.run(seed=0, settings=numbers), rebuilt), numbers
+        assert rebuilt.cycles == 200
+
+
+def test_a_dead_time_that_changes_during_a_run_reads_another_place_of_the_queue():
+    """The command that acts is that of d cycles before, whatever d was earlier; before the run it is the one of the problem."""
+    ready = simulator(QUEUED, TWO.controllers["CTC+FPI (eq 6)"], live=PLANT[:1])
+    run = ready.run(seed=0, changes={0.05: {PLANT[0]: 0.011}, 0.1: {PLANT[0]: 0.0}, 0.15: {PLANT[0]: 0.0025}})
+    command, arriving = run["command"][:, 0], run["arriving"][:, 0]
+    before = QUEUED.inputs_before[0]
+    sent = np.concatenate([np.full(20, before), command])
+    whole = np.array([3] * 50 + [11] * 50 + [0] * 50)
+    assert np.array_equal(arriving[:150], sent[np.arange(150) + 20 - whole])
+    k = np.arange(150, 200) + 20
+    assert np.array_equal(arriving[150:], (1 - 0.5) * sent[k - 2] + 0.5 * sent[k - 3])
+    assert np.ptp(command) > 1.0
+
+
+@WAYS
+def test_an_estimator_waits_for_its_samples_behind_the_dead_time_in_force(compiled):
+    """No response is used before its samples have arrived; how long that takes depends on the dead time."""
+    sensing = fp.Sensing(estimator=fp.PositionDifference())
+    problem = replace(QUEUED, sensing=sensing)
+    controller = fp.ComputedTorque(fp.Exponential(rate=4.0), fp.Sigmoid(gain=-0.2, scale=20.0))
+    ready = simulator(problem, controller, compiled=compiled, live=PLANT[2:])
+    for late in (0.0, 0.0031, 0.008):
+        own = replace(problem, dead_time=replace(problem.dead_time, measurement=late))
+        rebuilt = simulator(own, controller, compiled=compiled).run(seed=0)
+        assert same_signals(ready.run(seed=0, settings={PLANT[2]: late}), rebuilt), late
+
+
+LAW = fp.Exponential(rate=6.0)
+SIGMOID = fp.Sigmoid(gain=-0.5, scale=20.0)
+INCREMENT = fp.Increment(SIGMOID.with_effective_gain(1 / 1.5), cycles=60, uncertainty=6, longest=80)
+BELIEFS: dict[str, tuple[Controller, str, tuple[float, ...]]] = {
+    "pair": (
+        fp.ComputedTorque(LAW, fp.Paired(SIGMOID, cycles=60, longest=90)),
+        "deformation.cycles",
+        (50, 33.4, 0, 90),
+    ),
+    "mean of pairs": (
+        fp.ComputedTorque(LAW, fp.Paired(SIGMOID, cycles=60, uncertainty=5, longest=90)),
+        "deformation.cycles",
+        (50, 33.4, 90),
+    ),
+    "increment": (fp.ComputedTorque(LAW, INCREMENT), "deformation.cycles", (50, 77.7, 6)),
+    "prediction by the requests": (
+        fp.Predicted(fp.ComputedTorque(LAW, INCREMENT), inputs=0.06, longest=0.08, by=fp.ByDesired()),
+        "inputs",
+        (0.05, 0.0773, 0.0),
+    ),
+    "prediction with the residual": (
+        fp.Predicted(fp.ComputedTorque(LAW, INCREMENT), inputs=0.06, longest=0.08, by=fp.ByModel(residual_time=0.2)),
+        "inputs",
+        (0.05, 0.0785, 0.002),
+    ),
+    "plan from the prediction": (
+        replace(cast(Any, LATE.controllers["RHC"]), longest=0.08),
+        "measurement",
+        (0.01, 0.0195),
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "compiled"),
+    [*((name, False) for name in BELIEFS), *(pytest.param(n, True, marks=pytest.mark.slow) for n in list(BELIEFS)[:3])],
+)
+def test_a_belief_that_is_set_is_the_one_that_is_built(name, compiled):
+    """The controller's own dead time, and the plant's beside it, in one compiled loop."""
+    controller, path, values = BELIEFS[name]
+    dead_time = DeadTime(inputs={"Q": 0.06}, longest={"Q": 0.1})
+    problem = replace(LATE.problem, duration=0.15, measure_from=0.0, dead_time=dead_time)
+    ready = simulator(problem, controller, compiled=compiled, live=[path, "dead_time.inputs.Q"])
+    assert same_signals(ready.run(seed=0), simulator(problem, controller, compiled=compiled).run(seed=0))
+    for k, value in enumerate(values):
+        numbers: dict[str, Any] = {path: value, "dead_time.inputs.Q": 0.045 + 0.01 * k}
+        changed, own, _ = ready.live.changed(numbers)
+        rebuilt = simulator(changed, own, compiled=compiled).run(seed=0)
+        assert same_signals(ready.run(seed=0, settings=numbers), rebuilt), numbers
+        assert np.ptp(rebuilt["command"]) > 0
+
+
+def test_a_dead_time_is_live_up_to_its_stated_longest():
+    """Without a longest one there is no room in the queue; beyond it a number is refused before a run begins."""
+    with pytest.raises(NotSupported, match=r"dead_time\.inputs\.Q.*longest=\{'Q'"):
+        simulator(LATE.problem, LATE.controllers["CTC"], live=["dead_time.inputs.Q"])
+    with pytest.raises(NotSupported, match=r"deformation\.cycles.*longest"):
+        simulator(LATE.problem, LATE.controllers["CTC+FPI paired"], live=["deformation.cycles"])
+    with pytest.raises(NotSupported, match=r"inputs.*longest"):
+        simulator(LATE.problem, LATE.controllers["RHC"], live=["inputs"])
+    ready = simulator(QUEUED, TWO.controllers["CTC"], compiled=False, live=PLANT)
+    for value, words in (
+        (0.0123, "longer than its stated longest"),
+        (-0.001, "at least 0"),
+        (float("inf"), "cannot become"),
+    ):
+        with pytest.raises((InvalidProblem, InvalidValue), match=words):
+            ready.run(seed=0, settings={PLANT[0]: value})
+    with pytest.raises(InvalidValue, match="the variant states"):
+        ready.run(seed=0, variant=replace(QUEUED, dead_time=DeadTime(longest={"Q1": 0.1})))
+    with pytest.raises(InvalidProblem, match="longest"):
+        replace(QUEUED, dead_time=DeadTime(longest={"Q1": 0.0}))
+    with pytest.raises(InvalidProblem, match=r"longest.*'Q3'"):
+        replace(QUEUED, dead_time=DeadTime(longest={"Q3": 0.1}))
+    with pytest.raises(InvalidValue, match=r"Paired.*longest"):
+        fp.Paired(SIGMOID, cycles=60, longest=50)
+    with pytest.raises(InvalidValue, match=r"Predicted\(longest"):
+        fp.Predicted(fp.ComputedTorque(LAW), inputs=0.06, longest=0.05)
+
+
+def test_a_device_keeps_its_belief_where_another_is_refused():
+    """The number in force stays, and the refusal counts."""
+    controller = fp.ComputedTorque(LAW, fp.Paired(SIGMOID, cycles=5, longest=9))
+    stepper = fp.Stepper(LATE.problem, controller, compiled=False, live=["deformation.cycles"])
+    assert stepper.change({"deformation.cycles": 7.5})
+    assert not stepper.change({"deformation.cycles": 9.5})
+    assert not stepper.change({"deformation.cycles": -1.0})
+    assert stepper.refused == 2
+    assert stepper.numbers == {"deformation.cycles": 7.5}
+
+
+def test_scenarios_share_one_loop_for_all_dead_times():
+    """What a scenario costs does not depend on whether its dead time was set or built."""
+    problem = replace(LATE.problem, duration=0.1, measure_from=0.0)
+    names = ("CTC+FPI paired", "CTC+FPI increment")
+    task = replace(LATE, problem=problem, controllers={name: LATE.controllers[name] for name in names})
+    conditions = Conditions(3, COMPARING, 20.0, compiled=False)
+    shared, apart = Bench(task, conditions), Bench(task, conditions)
+    apart._shared = dict.fromkeys(names)
+    for name in names:
+        records = [shared.record(number, name) for number in range(6)]
+        assert records == [apart.record(number, name) for number in range(6)]
+    assert {type(one).__name__ for one in shared._simulators.values()} == {"Simulator"}
+    for name in names:
+        of_name = [id(one) for (owner, _), one in shared._simulators.items() if owner == name]
+        assert len(of_name) > 1
+        assert len(set(of_name)) == 1
