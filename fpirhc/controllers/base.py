@@ -21,6 +21,7 @@ import casadi as ca
 from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
+from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.largest_response import largest_response
 from fpirhc.controllers.mirror import measured_state, mirror_blocks, with_measured_state
 from fpirhc.controllers.outside_block import ACTED, NOW, Told
@@ -38,11 +39,11 @@ _ABSURD = 1e4  # times the largest response that limits allow; a loop that diver
 
 
 def controller_reads(problem: Problem, controller: Controller) -> Layout:
-    """Return what a controller reads in every cycle: time, state, realised response, parameters, and what a reference is given."""
+    """Return what a controller reads in every cycle: time, motion, realised response, parameters, and what a reference is given."""
     plant, response = problem.plant, controller.response(problem)
     realised = response.signal if response else plant.response_signal("realised")
     parameters = controller.model_plant(problem).parameter
-    return Layout((plant.time, plant.state, realised, parameters, *given_signals(problem)))
+    return Layout((plant.time, *measured_signals(plant), realised, parameters, *given_signals(problem)))
 
 
 def compose_controller(problem: Problem, controller: Controller, *, ahead: bool = False) -> Composite:
@@ -127,32 +128,28 @@ def fed(block: Block, name: str, source: Signal) -> Block:
 
 
 def reference_block(problem: Problem) -> Block:
-    """Block (time, state) -> (reference state, response of the controlled coordinates, error of the judged ones)."""
-    plant = problem.plant
+    """Block (time, state or outputs) -> (their reference, response of the controlled ones, error of the judged ones)."""
+    plant, seen = problem.plant, problem.plant.output
     function = motion_of(problem)
-    controlled = list(plant.controlled_indices)
-    places = [plant.state.elements.index(c) for c in problem.judged_names]
+    controlled = list(plant.face.controlled_indices)
+    places = [seen.elements.index(c) for c in problem.judged_names]
 
     def step(s: Signals) -> dict[str, Expression]:
         state, response = function(s.time, *own_values(problem, s))
         return {
             "reference": state,
             "_reference_response": response[controlled],
-            "error": state[places] - s.state[places],
+            "error": state[places] - getattr(s, seen.name)[places],
         }
 
-    reads = Layout((plant.time, plant.state, *own_signals(problem)))
-    writes = (
-        like(plant.state, "reference"),
-        plant.response_signal("_reference_response"),
-        error_signal(problem, "error"),
-    )
+    reads = Layout((plant.time, seen, *own_signals(problem)))
+    writes = (like(seen, "reference"), plant.response_signal("_reference_response"), error_signal(problem, "error"))
     return Block("reference", reads, Layout(writes), step, opaque=problem.reference.opaque)
 
 
 def error_signal(problem: Problem, name: str) -> Signal:
     """Return a signal that holds an error of every judged coordinate."""
-    units = [problem.plant.coordinates[c] for c in problem.judged_names]
+    units = [problem.plant.face.coordinates[c] for c in problem.judged_names]
     return vector(name, problem.judged_names, units)
 
 

@@ -37,7 +37,7 @@ from fpirhc.task.problem import Problem
 HELD = "held_command"  # in the memory: the command that a skipped cycle repeats
 DOUBTED = "doubted"  # in the memory: samples in a row that were finite but not plausible
 TAKEN = "taken"  # time stamp of a sample
-_SAMPLE = ("time", "state", "realised", "measured", "arrived", TAKEN)
+_SAMPLE = ("time", "state", "output", "realised", "measured", "arrived", TAKEN)
 _DOUBTED = 20  # samples in a row after which the plant, and not the sensor, is where it should not be
 _WIDER = 100.0  # factor of the range inside which such samples are believed
 INNER = "controller_memory"  # in the memory: that of a graph as one signal
@@ -83,6 +83,8 @@ class Gate:
         """The last command, what is kept of the last good sample, the count of doubted ones, and the controller's memory."""
         plant = self.problem.plant
         starts = {"state": tuple(float(v) for v in self.problem.start_state), TAKEN: (-FINITE,)}
+        if plant.outputs:
+            starts["output"] = tuple(float(v) for v in self.problem.start_output)
         first = self.problem.inputs_before
         held = Signal(HELD, plant.input.elements, plant.input.units, tuple(float(v) for v in first))
         good = [replace(s, name=f"good_{s.name}", start=starts.get(s.name, s.start)) for s in self.stored.signals]

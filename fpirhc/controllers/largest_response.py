@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fpirhc.controllers.reference_states import reference_states
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem
 
@@ -17,12 +18,15 @@ _SAMPLES = 100  # instants at which the reference is looked at
 
 
 def largest_response(problem: Problem) -> tuple[float, ...]:
-    """Return L of every controlled coordinate, by the limits of the build; infinite where an input has no finite limits."""
+    """Return L of every controlled coordinate, by the limits of the build; infinite where an input has no finite limits.
+
+    For outputs it is infinite too: the states that belong to their reference are not known before a run.
+    """
     task = nominal(problem)
     plant = task.plant
     lower, upper = task.limits.input_bounds(plant)
     free = (float("inf"),) * len(plant.controlled_names)
-    if not np.isfinite(upper - lower).all():
+    if plant.outputs or not np.isfinite(upper - lower).all():
         return free
     states, middle = _states(task), (lower + upper) / 2
     corners = [middle] + [_with(middle, k, v) for k in range(middle.size) for v in (lower[k], upper[k])]
@@ -38,9 +42,8 @@ def largest_response(problem: Problem) -> tuple[float, ...]:
 
 def _states(task: Problem) -> np.ndarray:
     """States along the reference, and the start, shape (nx, number)."""
-    times = np.linspace(0.0, task.duration, _SAMPLES)
-    states = task.reference.function(task.plant).map(_SAMPLES)(times[None, :])[0]
-    return np.hstack([np.asarray(states.full()), np.asarray(task.start_state)[:, None]])
+    states = reference_states(task, _SAMPLES)
+    return np.hstack([states, np.asarray(task.start_state)[:, None]])
 
 
 def _responses(task: Problem, states: np.ndarray, command: np.ndarray) -> np.ndarray:

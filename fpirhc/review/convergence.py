@@ -94,7 +94,9 @@ def box_converges(loops: Loops) -> Answer:
 
 def _mend(grid: ReviewGrid, controller: Controller, loops: Loops) -> str:
     if loops.ideal is not None and loops.ideal.radius >= 1:
-        stiff = stiff_advice(grid, controller.parameters(grid.problem.plant), planned=is_planned(controller))
+        advised = not grid.problem.plant.outputs  # its stages are looked at along references of states
+        believed = controller.parameters(grid.problem.plant)
+        stiff = stiff_advice(grid, believed, planned=is_planned(controller)) if advised else ""
         outer = "The outer loop does not converge even with the right model"
         return f"{outer}. {stiff}" if stiff else f"{outer}: lower its rate, or predict over the dead time."
     return "Change the gain to the recommended one; under dead time pair the deformation."

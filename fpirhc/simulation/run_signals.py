@@ -91,7 +91,7 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
     assert problem.cost is not None
     plant = problem.plant
     one_cycle = replace(problem.horizon, stages=1, step=problem.period, terminal=(), blocks=(), margins={})
-    ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits)
+    ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits, start=problem.start_state)
     own, outside = bool(own_signals(problem)), real_values(plant, problem.signals)
     data_of = stage_data(plant, problem.reference, one_cycle, problem.cost, signals=outside, previewed=own)
     states = log[:, layout.slice("plant_state")]
