@@ -2,8 +2,8 @@
 
     python benchmarks/set_points.py
 
-Process time of the compiled loop over 10 s of 1 kHz, alternating, best of several: along the sines of the shipped problem, and towards
-set-points that change every second.
+Process time of the compiled loop over 10 s of 1 kHz, alternating, best of several: along the sines of the shipped problem, and
+towards set-points that change every second.
 """
 
 from __future__ import annotations

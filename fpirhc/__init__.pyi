@@ -4,6 +4,7 @@ from .baselines.check import accept, bless, check_baseline
 from .conformance import check_controller, check_deformation, check_live, check_optimiser, check_plant, check_tracking
 from .contraction import assess_gain, check_gain, delayed_limit, response_jacobian, spectrum_over_box, spectrum_over_run
 from .controllers.computed_torque import ComputedTorque
+from .controllers.feedforward_only import FeedforwardOnly
 from .controllers.on_failure import Feedforward, HoldPlan, StopRun
 from .controllers.receding_horizon import RecedingHorizon
 from .controllers.replanning import FromMeasurement, FromMeasurementTracked, FromPlan
@@ -21,6 +22,8 @@ from .controllers.slots.floquet import Floquet, floquet_radius
 from .controllers.slots.schedules import FixedSchedule, Periodic
 from .controllers.slots.slot import Slot
 from .controllers.slots.slotted import Slotted
+from .controllers.target_pairing import ThroughModel
+from .controllers.wrappers.cascade import Cascade
 from .controllers.wrappers.estimating import Estimating
 from .controllers.wrappers.exact_model import ExactModel
 from .controllers.wrappers.predicted import ByDesired, ByModel, Predicted
@@ -62,6 +65,7 @@ from .optimisers.reduced_gradient import ReducedGradient
 from .plant.algebraic import Algebraic
 from .plant.implicit import ImplicitMidpoint, RadauIIA
 from .plant.integrators import Cvodes, Euler, RungeKutta4
+from .plant.outputs import Output
 from .plant.parameter import outside
 from .plant.plant import Parameter, Plant, structural_order
 from .plant.regressor import Combination, Regressor, linear_parameters
@@ -132,6 +136,7 @@ __all__ = [
     "ByError",
     "ByLookAhead",
     "ByModel",
+    "Cascade",
     "Certificate",
     "ColouredNoise",
     "Combination",
@@ -150,6 +155,7 @@ __all__ = [
     "Exponential",
     "Fatrop",
     "Feedforward",
+    "FeedforwardOnly",
     "Filtered",
     "FixedPoint",
     "FixedSchedule",
@@ -192,6 +198,7 @@ __all__ = [
     "Noise",
     "Normal",
     "Osqp",
+    "Output",
     "OutputChain",
     "OverTime",
     "Paired",
@@ -246,6 +253,7 @@ __all__ = [
     "StopRun",
     "Suggestion",
     "Table",
+    "ThroughModel",
     "Trajectory",
     "Tuned",
     "Tuning",

@@ -100,6 +100,35 @@ def test_a_right_model_believes_what_is(make, controller, corrected):
     np.testing.assert_allclose(believed[late:], true[: len(true) - late], atol=1e-11 * (1 + np.abs(true).max()))
 
 
+def test_a_right_model_in_known_weather_believes_what_is():
+    """A heated room: the walls are believed, the weather of each cycle is a signal from outside that the model is told."""
+    weather = fp.Known(lambda t: 280.0 + 5.0 * ca.sin(0.4 * t))
+    plant = fp.Plant(
+        coordinates={"air": "K", "walls": "K"},
+        inputs={"heat": "kW"},
+        controlled=("air",),
+        order=1,
+        parameters={"loss": fp.Parameter(0.3, 0.3, "kW/K"), "ambient": fp.outside(nominal=280.0, unit="K")},
+        response=lambda q, u, p: {
+            "air": p.loss * (p.ambient - q.air) + 0.5 * (q.walls - q.air) + u.heat,
+            "walls": 0.1 * (q.air - q.walls) + 0.05 * (p.ambient - q.walls),
+        },
+        time_unit="h",
+    )
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"air": 293.0 + ca.sin(0.3 * t), "walls": 290.0 + 0 * t}),
+        start={"air": 292.0, "walls": 289.0},
+        period=0.25,
+        duration=20.0,
+        signals={"ambient": weather},
+        sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["air"], belief=fp.ModelStates()),
+    )
+    result = run(problem, CTC)
+    assert np.ptp(result["plant_state.walls"]) > 1
+    np.testing.assert_allclose(result["state"], result["plant_state"], atol=1e-10)
+
+
 def test_a_wrong_model_drifts_no_further_than_its_bound():
     """C2' = k21 (C1 - C2) with C1 measured: |e| <= max|(k21 - k21^)(C1 - C2)| / k21^, from e' = -k21^ e + (k21 - k21^)(C1 - C2)."""
     problem = infusion(fp.ModelStates(), duration=120.0)

@@ -135,6 +135,19 @@ def test_bad_answer_ends_the_run_and_loses_nothing(kind):
     assert np.array_equal(result["command"], run(outside(problem))["command"][:100])
 
 
+def test_an_implausible_answer_is_a_skipped_cycle():
+    """A body that answers 1e9 m once: the command of that cycle is the last one, and the run goes on as if nothing had been."""
+    problem = task()
+    body = Faulty(problem, lambda answer: np.full_like(answer, 1e9))
+    spiked, clean = run(replace(problem, reality=fp.Foreign(body, MEASURES))), run(outside(problem))
+    assert spiked.stop is None
+    assert np.flatnonzero(spiked["status"] == fp.Status.BAD_SAMPLE).tolist() == [100]
+    assert np.array_equal(spiked["command"][100], spiked["command"][99])
+    assert np.array_equal(spiked["command"][:100], clean["command"][:100])
+    assert np.abs(spiked["state"][101:]).max() < 10.0
+    assert np.abs(spiked["state"][-1] - clean["state"][-1]).max() < 1e-3
+
+
 @pytest.mark.parametrize("kind", BAD)
 def test_bad_answers_are_held_as_stated(kind):
     """Two bad answers are bridged with the last good one and marked; the third ends the run."""

@@ -294,7 +294,7 @@ def test_other_results_damage_and_other_users_are_refused(tmp_path):
     with pytest.raises(OutputError, match=r"seed was 1, is 2\. Give another folder"):
         Ledger(path, {"seed": 2, "version": "a"})
     assert path.read_bytes() == whole
-    path.write_bytes(whole.replace(b'{"k":0}', b'{"k":0'))
+    path.write_bytes(whole.replace(b'{"k":0,', b'{"k":0'))
     with pytest.raises(OutputError, match="line 2 is damaged"):
         Ledger(path, {"seed": 1, "version": "a"})
 

@@ -20,6 +20,7 @@ from fpirhc.errors import InvalidName, InvalidProblem, InvalidShape, InvalidValu
 from fpirhc.report.terminal import set_points_in_force
 from fpirhc.simulation.loop import close_loop
 from fpirhc.simulation.run_file import load_run
+from fpirhc.studies.comparison.optimality import measure_optimality
 from fpirhc.symbolic.native import native
 from fpirhc.task.equal_poles import transition
 
@@ -370,6 +371,29 @@ def test_unannounced_steps_of_two_mass():
     assert np.all(errors["RHC+FPI"] < 0.5e-3)
     assert np.all(errors["RHC"] > 8e-3)
     assert jumps["RHC+FPI"] < 0.3 * jumps["RHC"]
+
+
+@pytest.mark.parametrize("controller", ["CTC+FPI (eq 6)", "RHC+FPI"])
+def test_set_points_of_outputs(controller):
+    """Outputs that are the coordinates are led as the coordinates are, bit by bit."""
+    plain = two_mass(0.15)
+    assert isinstance(plain.cost, fp.Quadratic)
+    same = {"q1": fp.Output("m", lambda q, v, p: q.q1), "q2": fp.Output("m", lambda q, v, p: q.q2)}
+    cost = replace(plain.cost, states={}, outputs=plain.cost.states)
+    outputs = replace(plain, plant=replace(plain.plant, outputs=same), cost=cost)
+    runs = [fp.simulate(p, TWO_MASS.controllers[controller], seed=0, compiled=False) for p in (plain, outputs)]
+    for signal in ("state", "command", "reference", "setpoint", "true_error", "cost"):
+        if signal in runs[0].layout:
+            np.testing.assert_array_equal(runs[0][signal], runs[1][signal])
+
+
+def test_plans_towards_set_points_have_no_gap():
+    """The nominal motion knows steps that the plans did not know: their cost is not compared with an optimum along it."""
+    problem, controller = two_mass(0.03), TWO_MASS.controllers["RHC"]
+    run = fp.simulate(problem, controller, seed=0, compiled=False)
+    assert measure_optimality(problem, controller, run, compiled=False) is None
+    along = on(TWO_MASS.problem, TWO_MASS.problem.reference, 0.03)
+    assert measure_optimality(along, controller, fp.simulate(along, controller, seed=0, compiled=False), compiled=False)
 
 
 def test_other_references_are_given_nothing():

@@ -205,6 +205,7 @@ def misuses(memory: np.ndarray) -> dict[str, tuple[type[FpirhcError], str, tuple
     x, r = np.zeros(4), np.zeros(2)
     return {
         "scalar state": (InvalidShape, "'state' has 4 entries", (0.0, 1.0, r, memory)),
+        "truth value as time": (InvalidValue, "'time' must be a number of seconds, got True", (True, x, r, memory)),
         "truth value": (InvalidValue, "'state' must be made of real numbers", (0.0, True, r, memory)),
         "text": (InvalidValue, "'state' must be made of real numbers", (0.0, "5", r, memory)),
         "no memory": (InvalidValue, "'memory' is not made of numbers", (0.0, x, r, None)),

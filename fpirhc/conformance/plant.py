@@ -53,7 +53,7 @@ class _Trial:
     def invertible(self) -> bool:
         """Whether as many coordinates are controlled as there are inputs."""
         plant = self.plant
-        return plant.controlled is not None or len(plant.inputs) == len(plant.coordinates)
+        return plant.controlled is not None or len(plant.inputs) == len(plant.face.coordinates)
 
     def points(self, generator: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray]]:
         """States and inputs."""
@@ -89,13 +89,14 @@ def response_is_finite(trial: _Trial, generator: np.random.Generator) -> None:
 
 
 def both_parameter_sets_enter(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """A parameter whose approximate and exact values differ enters the response, or else model and plant are the same."""
+    """A parameter whose values differ enters the response or an output, or else model and plant are the same."""
     plant = trial.plant
     size = len(plant.parameters)
     for which, values in trial.parameters.items():
         hold(values.shape == (size,), f"the {which} parameters have shape {values.shape}, expected ({size},)")
     x, u, p = plant.symbols()
-    pattern = ca.DM(ca.jacobian_sparsity(plant.response_function(x, u, p), p), 1)
+    seen = plant.response_function(x, u, p), plant.output_function(x, u, p, ca.SX.zeros(len(plant.names)))
+    pattern = ca.DM(ca.jacobian_sparsity(ca.vertcat(*seen), p), 1)
     entering = np.asarray(pattern.full()).sum(axis=0) > 0
     for k, name in enumerate(plant.parameters):
         approximate, exact = plant.approximate[k], plant.exact[k]

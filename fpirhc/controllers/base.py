@@ -14,12 +14,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from functools import reduce
 
 import casadi as ca
 
 from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
+from fpirhc.controllers.face import measured_signals
+from fpirhc.controllers.largest_response import largest_response
 from fpirhc.controllers.mirror import measured_state, mirror_blocks, with_measured_state
 from fpirhc.controllers.outside_block import ACTED, NOW, Told
 from fpirhc.controllers.own_reference import given_signals, motion_of, own_signals, own_values, with_reference
@@ -32,13 +35,15 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem
 
+_ABSURD = 1e4  # times the largest response that limits allow; a loop that diverges stays far below
+
 
 def controller_reads(problem: Problem, controller: Controller) -> Layout:
-    """Return what a controller reads in every cycle: time, state, realised response, parameters, and what a reference is given."""
+    """Return what a controller reads in every cycle: time, motion, realised response, parameters, and what a reference is given."""
     plant, response = problem.plant, controller.response(problem)
     realised = response.signal if response else plant.response_signal("realised")
     parameters = controller.model_plant(problem).parameter
-    return Layout((plant.time, plant.state, realised, parameters, *given_signals(problem)))
+    return Layout((plant.time, *measured_signals(plant), realised, parameters, *given_signals(problem)))
 
 
 def compose_controller(problem: Problem, controller: Controller, *, ahead: bool = False) -> Composite:
@@ -123,32 +128,28 @@ def fed(block: Block, name: str, source: Signal) -> Block:
 
 
 def reference_block(problem: Problem) -> Block:
-    """Block (time, state) -> (reference state, response of the controlled coordinates, error of the judged ones)."""
-    plant = problem.plant
+    """Block (time, state or outputs) -> (their reference, response of the controlled ones, error of the judged ones)."""
+    plant, seen = problem.plant, problem.plant.output
     function = motion_of(problem)
-    controlled = list(plant.controlled_indices)
-    places = [plant.state.elements.index(c) for c in problem.judged_names]
+    controlled = list(plant.face.controlled_indices)
+    places = [seen.elements.index(c) for c in problem.judged_names]
 
     def step(s: Signals) -> dict[str, Expression]:
         state, response = function(s.time, *own_values(problem, s))
         return {
             "reference": state,
             "_reference_response": response[controlled],
-            "error": state[places] - s.state[places],
+            "error": state[places] - getattr(s, seen.name)[places],
         }
 
-    reads = Layout((plant.time, plant.state, *own_signals(problem)))
-    writes = (
-        like(plant.state, "reference"),
-        plant.response_signal("_reference_response"),
-        error_signal(problem, "error"),
-    )
+    reads = Layout((plant.time, seen, *own_signals(problem)))
+    writes = (like(seen, "reference"), plant.response_signal("_reference_response"), error_signal(problem, "error"))
     return Block("reference", reads, Layout(writes), step, opaque=problem.reference.opaque)
 
 
 def error_signal(problem: Problem, name: str) -> Signal:
     """Return a signal that holds an error of every judged coordinate."""
-    units = [problem.plant.coordinates[c] for c in problem.judged_names]
+    units = [problem.plant.face.coordinates[c] for c in problem.judged_names]
     return vector(name, problem.judged_names, units)
 
 
@@ -164,7 +165,13 @@ def closing_blocks(
     plant = problem.plant
     closing, delays = commanding_blocks(problem, judged)
     mirrors, mirror_delays = mirror_blocks(problem, deformation)
-    blocks = [*mirrors, deform_block(plant, deformation, problem.warm_up_cycles), invert_block(plant), *closing]
+    largest = largest_response(problem)
+    blocks = [
+        *mirrors,
+        deform_block(plant, deformation, problem.warm_up_cycles, largest),
+        invert_block(plant),
+        *closing,
+    ]
     before = [] if mirrors else [Delay(plant.response_signal("_deformed_last"), "deformed")]
     return blocks, [*delays, *mirror_delays, *before]
 
@@ -188,16 +195,22 @@ def _warm_up_block(warm_up_cycles: int) -> Block:
     return Block("running", Layout((scalar("warm_up"),)), Layout((scalar("_warm_up_now"),)), step)
 
 
-def deform_block(plant: Plant, deformation: Deformation, warm_up_cycles: int = 1) -> Block:
+def deform_block(
+    plant: Plant, deformation: Deformation, warm_up_cycles: int = 1, largest: Sequence[float] = ()
+) -> Block:
     """Block (request before, realised, desired) -> deformed request; without a valid pair it passes the desired response.
 
     A model-referenced deformation is given the model's response, '_modelled', in place of the request before.
+
+    A response error beyond 10 000 times the largest response that limits allow is a fault of the sample. A map that remembers
+    remembers nothing of it, and the request stays as it was; the others come back by themselves.
 
     Args:
         plant: whose responses are deformed.
         deformation: the map.
         warm_up_cycles: number of cycles, counted by 'warm_up', after which a pair is valid: one, or more where the response is
             estimated from more samples.
+        largest: response of every controlled coordinate that the limits of the inputs allow; empty: any.
     """
     memory = deformation.memory(plant.controlled_names)
     request_before = "_deformed_last" if deformation.mirror is None else "_modelled"
@@ -208,14 +221,28 @@ def deform_block(plant: Plant, deformation: Deformation, warm_up_cycles: int = 1
         remembered = {m: getattr(s, m) for m in memory.names}
         deformed, next_memory = deformation.step(getattr(s, request_before), s.realised, s.desired, remembered)
         valid = s.warm_up > warm_up_cycles - 0.5
-        next_values = {f"{m}_next": ca.if_else(valid, next_memory[m], remembered[m]) for m in memory.names}
+        sane = _sane(s.realised - s.desired, largest) if memory.names else None
+        learns = valid if sane is None else ca.logic_and(valid, sane)
+        next_values = {f"{m}_next": ca.if_else(learns, next_memory[m], remembered[m]) for m in memory.names}
         shown = {name: next_values[f"{source}_next"] for name, source in deformation.shown().items()}
-        next_request = ca.if_else(valid, deformed, s.desired)
+        if sane is not None and deformation.mirror is None:
+            deformed = ca.if_else(sane, deformed, s._deformed_last)
+            learns = valid
+        next_request = ca.if_else(learns, deformed, s.desired)
         return {"_deformed_unclipped": next_request, "_deformation": next_request - s.desired, **shown, **next_values}
 
     written = [plant.response_signal(name) for name in ("_deformed_unclipped", "_deformation")]
     logged = [scalar(name) for name in deformation.shown()]
     return Block("deform", Layout(reads), Layout((*written, *logged)), step, memory)
+
+
+def _sane(error: Expression, largest: Sequence[float]) -> Expression | None:
+    """Whether no response error is absurd; NaN is not, because it has to show. None where there are no limits."""
+    sizes = zip(ca.vertsplit(error), largest, strict=True) if largest else ()
+    absurd = [ca.fabs(one) > _ABSURD * size for one, size in sizes if math.isfinite(size)]
+    if not absurd:
+        return None
+    return ca.logic_not(reduce(ca.logic_or, absurd))
 
 
 def invert_block(plant: Plant) -> Block:

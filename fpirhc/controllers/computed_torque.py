@@ -30,6 +30,11 @@ class ComputedTorque(Controller):
     tracking: Tracking
     deformation: Deformation = field(default_factory=Identity)
 
+    def outputs_unusable(self, problem: Problem) -> str:
+        """Return nothing: the law tracks outputs as it tracks coordinates."""
+        del problem
+        return ""
+
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, tracking, deform, invert, limit, judge, running, tracking update."""
         return tracked_blocks(problem, self.tracking, self.deformation)

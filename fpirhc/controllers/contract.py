@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.demands import plan_demand, reference_demand
-from fpirhc.controllers.form_check import check_form
+from fpirhc.controllers.form_check import check_form, check_outputs
 from fpirhc.controllers.gain_check import check_gain_sign, check_response_delay
 from fpirhc.deformation.base import Deformation, Demand, Mirror, with_inner
 from fpirhc.deformation.identity import Identity
@@ -149,9 +149,19 @@ class Controller(Checked, ABC):
         return False if self.inner is None else self.inner.learns
 
     @property
+    def model_acts_at_once(self) -> bool:
+        """Whether a change of its model changes the command in every cycle; False where a plan holds its inputs."""
+        return self.planner is None if self.inner is None else self.inner.model_acts_at_once
+
+    @property
     def deforms_response(self) -> bool:
         """Whether its deformation acts on the desired response; False where it acts on another signal, such as a command."""
         return True if self.inner is None else self.inner.deforms_response
+
+    @property
+    def deforms_target(self) -> bool:
+        """Whether its deformation acts on the target of an inner controller, and the response is the output itself."""
+        return False if self.inner is None else self.inner.deforms_target
 
     @property
     def law(self) -> Tracking | None:
@@ -199,6 +209,11 @@ class Controller(Checked, ABC):
             return self.around(self.inner.with_deformation(deformation))
         raise NotSupported(f"{type(self).__name__} has no deformation that can be replaced")
 
+    def stated(self, problem: Problem) -> Controller:
+        """Return the controller with every number of its own stated that it would take from the problem; itself without any."""
+        del problem
+        return self
+
     def following_its_model(self) -> Self:
         """Return the controller whose command follows a change of its model's parameters in every cycle, also between plans."""
         return self if self.inner is None else self.around(self.inner.following_its_model())
@@ -216,6 +231,13 @@ class Controller(Checked, ABC):
     def unusable(self, problem: Problem, mirror: Mirror) -> str:
         """Return why a model-referenced deformation with this mirror cannot be used on this problem; empty where it can."""
         return "" if self.inner is None else self.inner.unusable(self.inner_problem(problem), mirror)
+
+    def outputs_unusable(self, problem: Problem) -> str:  # noqa: ARG002
+        """Return why the controller cannot control a plant with outputs; empty where it can.
+
+        By default it cannot: a controller that takes the state for what follows the reference would follow the wrong one.
+        """
+        return "it takes the plant's state for what follows the reference"
 
     def floquet(self, problem: Problem) -> Floquet | None:
         """Return the stability of one period of a controller that switches; None for a controller that does not switch."""
@@ -244,6 +266,7 @@ def resolved(problem: Problem, controller: Controller) -> Controller:
     if controller.inner is not None:
         inner = resolved(controller.inner_problem(problem), controller.inner)
         controller = controller if inner is controller.inner else controller.around(inner)
+    controller = controller.stated(problem)
     deformation = controller.deformation
     demand = controller.demand(problem) if deformation.automatic else None
     return controller if demand is None else controller.with_deformation(deformation.suited(demand))
@@ -262,18 +285,21 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
     Raises:
         FpirhcError: the controller's own check fails.
         NotContractive: the gain of the deformation has the wrong sign, or is too large behind estimator and filter.
-        NotSupported: a form of the deformation that cannot be used here; a response of the controller's own behind sensors or dead
-            time.
+        NotSupported: a form of the deformation that cannot be used here; outputs that the controller does not cover; a response
+            of the controller's own behind sensors or dead time.
     """
     if not numbers_only and is_live(problem, controller):
         checked(nominal(problem), nominal(controller))
         return controller
+    check_outputs(problem, controller)
     ready = resolved(problem, controller)
     if numbers_only:
         ready.check_numbers(problem)
     else:
         ready.check(problem)
     check_form(problem, ready)
+    if ready.deforms_target:
+        return ready  # its own check judges a gain that acts on targets
     if ready.response(problem) is None:
         check_gain_sign(problem, ready.deformation)
         check_response_delay(problem, ready.deformation)

@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.contraction import step_for_basin
+from fpirhc.controllers.reference_states import reference_states
 from fpirhc.deformation.base import Demand
 from fpirhc.errors import InvalidValue
 from fpirhc.task.problem import Problem
@@ -26,8 +27,8 @@ _SAMPLES = 2000
 def reference_demand(problem: Problem, law: Tracking | None = None) -> Demand:
     """Return the change period max|d/dt r^N| of the nominal response r^N, or its largest jump, with the recovery for `law`."""
     t = ca.MX.sym("t")
-    responses = problem.reference.function(problem.plant)(t)[1][list(problem.plant.controlled_indices)]
-    response_of, jump = ca.Function("r", [t], [responses]), problem.reference.largest_jump(problem.plant)
+    responses = problem.reference.function(problem.plant)(t)[1][list(problem.plant.face.controlled_indices)]
+    response_of, jump = ca.Function("r", [t], [responses]), problem.reference.largest_jump(problem.plant.face)
     smooth = problem.period * _slew(response_of, problem.duration)
     change = max(jump, _largest_change(response_of, problem)) if jump else smooth
     return Demand(change, sudden=False, recovery=_recovery(problem, law))
@@ -64,8 +65,8 @@ def command_demand(problem: Problem, parameters: np.ndarray) -> Demand:
 
 def _recovery(problem: Problem, law: Tracking | None) -> float:
     """Step per cycle with which the plain form comes back from the largest expected error; 0 without a law of one rate."""
-    plant = problem.plant
-    laws = [law.feedback(plant.orders[k]) for k in plant.controlled_indices] if law else []
+    face = problem.plant.face
+    laws = [law.feedback(face.orders[k]) for k in face.controlled_indices] if law else []
     rates = [(len(one.gains), one.rate) for one in laws if one is not None and one.rate is not None]
     if not rates:
         return 0.0
@@ -77,10 +78,11 @@ def _largest_error(problem: Problem) -> float:
     """Largest |r^N - response(x^N, 0)| of the model along the reference, over the samples where it is finite."""
     plant = problem.plant
     times = np.linspace(0.0, problem.duration, _SAMPLES)
-    states, responses = (np.asarray(v.full()) for v in problem.reference.function(plant).map(_SAMPLES)(times[None, :]))
+    states = reference_states(problem, _SAMPLES)
+    responses = np.asarray(problem.reference.function(plant).map(_SAMPLES)(times[None, :])[1].full())
     model, still = np.repeat(plant.approximate[:, None], _SAMPLES, axis=1), np.zeros((plant.input.size, _SAMPLES))
     free = np.asarray(plant.controlled_response_function.map(_SAMPLES)(states, still, model).full())
-    sizes = np.linalg.norm(responses[list(plant.controlled_indices)] - free, axis=0)
+    sizes = np.linalg.norm(responses[list(plant.face.controlled_indices)] - free, axis=0)
     return float(sizes[np.isfinite(sizes)].max(initial=0.0))
 
 

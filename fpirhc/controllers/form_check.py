@@ -12,12 +12,32 @@ from fpirhc.task.problem import Problem
 
 
 class _Controller(Protocol):
-    """The two members of a controller that the check needs; the contract itself imports this module."""
+    """The members of a controller that the check needs; the contract itself imports this module."""
 
     @property
     def deformation(self) -> Deformation: ...
 
     def unusable(self, problem: Problem, mirror: Mirror) -> str: ...
+
+    def outputs_unusable(self, problem: Problem) -> str: ...
+
+
+def check_outputs(problem: Problem, controller: _Controller) -> None:
+    """Raise if the problem's plant has outputs and the controller, or its deformation, does not cover them.
+
+    Raises:
+        NotSupported: with the reason.
+    """
+    if not problem.plant.outputs:
+        return
+    name, mirror = type(controller).__name__, controller.deformation.mirror
+    reason = controller.outputs_unusable(problem)
+    if not reason and mirror is not None and (not problem.sensing.estimator.shows_response or mirror.measurement):
+        name = type(controller.deformation).__name__
+        reason = "it compares with a twin of the plant behind the estimator or the late measurement, which has coordinates only"
+    if reason:
+        what = ", ".join(problem.plant.outputs)
+        raise NotSupported(f"{name} does not cover outputs that are expressions of the state ({what}): {reason}")
 
 
 def check_form(problem: Problem, controller: _Controller) -> None:

@@ -5,7 +5,7 @@
 
 A sample fits when time, state and response - or the raw measurements that they are estimated from - are finite and inside their
 plausible range. The results of a skipped cycle are dropped. What is remembered is selected, never blended: a product with NaN would
-be NaN. A graph of calls is only given samples that fit: in a skipped cycle it is given the last good one again, so that no solver
+be NaN. A graph of calls is only given samples that fit. In a skipped cycle it is given the last good one again, so that no solver
 inside meets a number that is not finite. Scalar code has no solver inside, and needs no sample in store.
 
 An implausible sample is doubted, not refused for ever: after 20 of them in a row the plant is where it should not be, and the
@@ -37,7 +37,7 @@ from fpirhc.task.problem import Problem
 HELD = "held_command"  # in the memory: the command that a skipped cycle repeats
 DOUBTED = "doubted"  # in the memory: samples in a row that were finite but not plausible
 TAKEN = "taken"  # time stamp of a sample
-_SAMPLE = ("time", "state", "realised", "measured", "arrived", TAKEN)
+_SAMPLE = ("time", "state", "output", "realised", "measured", "arrived", TAKEN)
 _DOUBTED = 20  # samples in a row after which the plant, and not the sensor, is where it should not be
 _WIDER = 100.0  # factor of the range inside which such samples are believed
 INNER = "controller_memory"  # in the memory: that of a graph as one signal
@@ -83,6 +83,8 @@ class Gate:
         """The last command, what is kept of the last good sample, the count of doubted ones, and the controller's memory."""
         plant = self.problem.plant
         starts = {"state": tuple(float(v) for v in self.problem.start_state), TAKEN: (-FINITE,)}
+        if plant.outputs:
+            starts["output"] = tuple(float(v) for v in self.problem.start_output)
         first = self.problem.inputs_before
         held = Signal(HELD, plant.input.elements, plant.input.units, tuple(float(v) for v in first))
         good = [replace(s, name=f"good_{s.name}", start=starts.get(s.name, s.start)) for s in self.stored.signals]
@@ -130,7 +132,8 @@ class Gate:
             return {**values, "command": command, **{f"{m}_next": v for m, v in remembered.items()}}
 
         derived = self._derived if self.inner.derived_if_any else None
-        return Block("gate", self.reads, trace, step, self.memory, opaque=self.inner.opaque, derived=derived)
+        opaque, inside = self.inner.opaque, self.inner
+        return Block("gate", self.reads, trace, step, self.memory, opaque=opaque, derived=derived, inside=inside)
 
     def _derived(self, values: Values) -> Derived:
         """What follows from live settings, with the controller's memory as this block has it."""

@@ -19,6 +19,11 @@ from fpirhc.symbolic.layout import Expression
 class OnFailure(Checked, ABC):
     """Contract: the input to apply when the solve failed, and the status to report."""
 
+    @property
+    def uses_feedforward(self) -> bool:
+        """Whether the input that the model needs along the reference is applied; False by default."""
+        return False
+
     @abstractmethod
     def choose(
         self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
@@ -48,6 +53,11 @@ class HoldPlan(OnFailure):
 @dataclass(frozen=True)
 class Feedforward(OnFailure):
     """Apply the input that the model needs along the reference, without feedback from the plan."""
+
+    @property
+    def uses_feedforward(self) -> bool:
+        """Whether the feedforward is applied: it is."""
+        return True
 
     def choose(
         self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression

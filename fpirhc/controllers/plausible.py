@@ -28,6 +28,8 @@ _SAMPLES = 200  # instants at which the reference is looked at
 def plausible_range(problem: Problem, own: Mapping[str, Interval] | None = None) -> dict[str, Interval]:
     """Return intervals by column of the sample: "state.q1", "state.q1'" or "realised.q1"; of a raw one "measured.q1".
 
+    Of a plant with outputs they are those of its outputs, "output.y".
+
     Args:
         problem: the task.
         own: intervals by name, "q1", "q1'", or "q1''" for the response, that replace the automatic ones.
@@ -35,7 +37,7 @@ def plausible_range(problem: Problem, own: Mapping[str, Interval] | None = None)
     Raises:
         InvalidProblem: a name that is unknown or not measured, or an interval that is none.
     """
-    plant, ranges = problem.plant, {}
+    plant, ranges = problem.plant.face, {}
     columns = _columns(problem)
     _check(own or {}, columns)
     values = _values(problem)
@@ -58,19 +60,21 @@ def _columns(problem: Problem) -> dict[str, str]:
     plant, raw = problem.plant, raw_signal(problem)
     if raw is not None:
         return dict(zip(raw.elements, raw.columns, strict=True))
-    columns = {e: f"state.{e}" for e in plant.state.elements}
-    return columns | {n: f"realised.{c}" for n, c in zip(response_names(plant), plant.controlled_names, strict=True)}
+    columns = {e: f"{plant.output.name}.{e}" for e in plant.output.elements}
+    return columns | {
+        n: f"realised.{c}" for n, c in zip(response_names(plant.face), plant.controlled_names, strict=True)
+    }
 
 
 def _values(problem: Problem) -> dict[str, np.ndarray]:
     """Values of every coordinate that the problem names: reference, start, and finite limits."""
-    plant, function = problem.plant, problem.reference.function(problem.plant)
+    plant, function = problem.plant.face, problem.reference.function(problem.plant)
     times = np.linspace(0.0, problem.duration, _SAMPLES)
     reference = np.array([np.asarray(function(t)[0].full()).ravel() for t in times])
     values = {}
     for name in plant.names:
         at = plant.state.elements.index(name)
-        named = [*reference[:, at], problem.start_state[at], *problem.limits.states.get(name, ())]
+        named = [*reference[:, at], problem.start_output[at], *problem.limits.states.get(name, ())]
         values[name] = np.array([v for v in named if np.isfinite(v)])
     return values
 

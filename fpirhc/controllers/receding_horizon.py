@@ -31,8 +31,9 @@ from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidProblem, NotSupported
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.live_data import SCALE, STEEPEST, live_signals
+from fpirhc.horizon.nominal import feedforward, known_on_reference
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.stage_data import shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.optimisers.fixed_point import FixedPoint
@@ -76,6 +77,11 @@ class RecedingHorizon(Controller):
         """Optimiser, cost, start and margins of the plans, and the tracking law between plans."""
         return Planner(self.optimiser, self.cost, self.replanning.restarts, self.replanning.law, self.margins)
 
+    @property
+    def model_acts_at_once(self) -> bool:
+        """Whether the inputs of a plan are corrected by what its model has learned since."""
+        return self.follows_model
+
     def following_its_model(self) -> RecedingHorizon:
         """Return the controller that corrects the plan's inputs between plans, by what its model has learned since."""
         return replace(self, follows_model=True)
@@ -83,6 +89,16 @@ class RecedingHorizon(Controller):
     def with_optimiser(self, optimiser: Optimiser) -> RecedingHorizon:
         """Return the controller with another optimiser."""
         return replace(self, optimiser=optimiser)
+
+    def outputs_unusable(self, problem: Problem) -> str:
+        """Return why this way of replanning, or of failing, needs references of all states; empty where it does not."""
+        if self.replanning.law is not None:
+            return (
+                f"{type(self.replanning).__name__} tracks the planned motion of the model's states; use FromMeasurement"
+            )
+        if self.on_failure.uses_feedforward and not known_on_reference(problem.plant):
+            return f"{type(self.on_failure).__name__} needs references of states that no output gives; use HoldPlan"
+        return ""
 
     def check(self, problem: Problem) -> None:
         """Raise if the problem has no horizon or cost, or the optimiser does not support it.
@@ -130,7 +146,8 @@ def _optimal_control(problem: Problem) -> OptimalControl:
     assert problem.horizon is not None
     assert problem.cost is not None
     ahead = previewed_values(problem.plant, problem.signals)
-    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits, ahead)
+    limits, start = problem.limits, problem.start_state
+    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, limits, ahead, start)
 
 
 def _due_block(cycles: int) -> Block:
@@ -166,6 +183,8 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         own = own_values(problem, s)
         motion = () if preview is None else preview(*own)
         data = running_data(s.time, *motion, s.parameters, *_live_rows(problem, ocp, s))
+        if plant.outputs:
+            data = shifted_reference(plant, ocp.data, ocp.stages + 1)(data, s._plan_state, s.output, s.parameters)
         # The shift of the last cycle is added to the plan's inputs, so their rate counts from the last command without it.
         first = ocp.start(s._plan_state, s._command_before - s._command_shift_last)
         lower, upper = _minus(low, s._command_shift_last), _minus(high, s._command_shift_last)
@@ -223,11 +242,12 @@ def _stage_data(problem: Problem, live: int, *, previewed: bool = False) -> ca.F
 
 
 def _plan_reads(problem: Problem, ocp: OptimalControl) -> Layout:
-    """Time, state from which the plan starts, parameters, last command and its shift, derived numbers, own signals."""
+    """Time, start of the plan, parameters, last command and its shift, derived numbers, outputs, own signals."""
     plant = problem.plant
     last = like(plant.input, "_command_shift_last"), like(plant.input, "_command_before")
-    own = own_signals(problem)
-    return Layout((plant.time, like(plant.state, "_plan_state"), plant.parameter, *last, *_derived_signals(ocp), *own))
+    own, outputs = own_signals(problem), (plant.output,) if plant.outputs else ()
+    start = like(plant.state, "_plan_state")
+    return Layout((plant.time, start, *outputs, plant.parameter, *last, *_derived_signals(ocp), *own))
 
 
 def _first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> np.ndarray:
@@ -281,15 +301,17 @@ def _minus(ends: Sequence[float], shift: Expression) -> Expression:
 
 
 def _feedforward(problem: Problem) -> ca.Function:
-    """Function (time, own signals of the reference, parameters) -> input that the model needs; zero for a model without inverse."""
+    """Function (time, own signals of the reference, parameters) -> input that the model needs.
+
+    It is zero for a model without inverse, or with states without a reference.
+    """
     plant = problem.plant
     t, p = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
     own = [ca.MX.sym(signal.name, signal.size) for signal in own_signals(problem)]
     state, response = motion_of(problem)(t, *own)
-    if plant.controlled is None and len(plant.inputs) != len(plant.names):
-        needed = ca.MX.zeros(len(plant.inputs))
-    else:
-        needed = plant.inverse_function(state, response[list(plant.controlled_indices)], p)
+    invertible = plant.controlled is not None or len(plant.inputs) == len(plant.face.names)
+    known = invertible and known_on_reference(plant)
+    needed = feedforward(plant, state, response, p) if known else ca.MX.zeros(len(plant.inputs))
     return ca.Function("fpirhc_feedforward", [t, *own, p], [needed])
 
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import like
+from fpirhc.controllers.largest_response import largest_response
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.integrators import runge_kutta_4
 from fpirhc.plant.plant import Plant
@@ -141,10 +142,11 @@ class FromPlan(Replanning):
 
 def _tracked(problem: Problem, tracking: Tracking, start: Callable[[Signals], dict[str, Expression]]) -> Parts:
     plant = problem.plant
+    law = tracking.within(largest_response(problem))
     begin = _choose("plan_state", plant, start, ["_plan_state", "_target"])
     delay = Delay(like(plant.state, "_target_before"), "target")
-    after = [_propagate(plant, problem.period), tracking.law(plant, problem.period)]
-    return [begin], after, [tracking.update(plant, problem.period)], [delay, *tracking.delays(plant)]
+    after = [_propagate(plant, problem.period), law.law(plant, problem.period)]
+    return [begin], after, [law.update(plant, problem.period)], [delay, *law.delays(plant)]
 
 
 def _choose(name: str, plant: Plant, step: Callable[[Signals], dict[str, Expression]], writes: list[str]) -> Block:

@@ -15,6 +15,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller, compose_controller, compose_informed, controller_reads
 from fpirhc.controllers.believing import Believing, check_believed
 from fpirhc.controllers.contract import checked
+from fpirhc.controllers.face import on_face
 from fpirhc.controllers.mirror import with_measured_state
 from fpirhc.controllers.own_reference import with_reference
 from fpirhc.symbolic.block import Block, Composite
@@ -37,23 +38,28 @@ def compose_seeing(problem: Problem, controller: Controller) -> Composite:
     ready = checked(problem, controller)
     blocks, delays = ready.blocks(problem)
     blocks = with_reference(problem, blocks)
-    time, _, _, parameters, *given = controller_reads(problem, ready).signals
+    reads = controller_reads(problem, ready)
+    own_state = (problem.plant.state,) if problem.plant.outputs else ()  # an estimator gives outputs, and not the state
+    first, others = reads.signals[: 2 + len(own_state)], reads.signals[3 + len(own_state) :]
     check_believed(problem, ready)
     believing = _believing(problem)
     own = [believing.delay] if believing is not None else []
     every = [*seeing_blocks(problem), *with_measured_state(problem.plant, blocks)]
-    return compose_informed(problem, ready, Layout((time, raw, parameters, *given)), every, [*delays, *own])
+    return compose_informed(problem, ready, Layout((first[0], *own_state, raw, *others)), every, [*delays, *own])
 
 
 def raw_signal(problem: Problem) -> Signal | None:
     """Return the signal of the raw measurements that a step begins with; None where state and response are both measured."""
     if not problem.sensing.estimates:
         return None
-    return problem.sensing.raw(problem.plant, *_first(problem))
+    return problem.sensing.raw(problem.plant.face, *_first(problem))
 
 
 def seeing_blocks(problem: Problem) -> list[Block]:
-    """Return the blocks from the raw measurements to 'state' and 'realised'; none where both are measured."""
+    """Return the blocks from the raw measurements to 'state' and 'realised'; none where both are measured.
+
+    Of a plant with outputs these are estimated, 'output' and 'realised'.
+    """
     raw = raw_signal(problem)
     if raw is None:
         return []
@@ -62,16 +68,19 @@ def seeing_blocks(problem: Problem) -> list[Block]:
         return [believing.block]
     if problem.sensing.measured is not None:
         return _estimating_part(problem, raw, start)
-    return [problem.sensing.estimator.block(problem.plant, problem.period, start, raw)]
+    plant = problem.plant
+    return [on_face(plant, problem.sensing.estimator.block(plant.face, problem.period, start, raw))]
 
 
 def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """Return state and response that sensors without noise show at the start, shapes (nx,) and (n,)."""
+    """Return state, or outputs, and response that sensors without noise show at the start, shapes (nx,) and (n,)."""
     plant, reality = problem.plant, problem.symbolic_reality
     at = problem.real_start, problem.inputs_before, problem.real_parameters
     if reality is None:
-        return problem.start_state, plant.controlled_response_function(*at).full().ravel()
+        return problem.start_output, plant.controlled_response_function(*at).full().ravel()
     calm = np.zeros(len(problem.real_plant.names))
+    if plant.outputs:
+        return problem.start_output, reality.response_function(plant, seen=True)(*at, calm).full().ravel()
     state = reality.state_function(plant, seen=True)(*at, calm)
     return state.full().ravel(), reality.response_function(plant, seen=True)(*at, calm).full().ravel()
 

@@ -6,10 +6,17 @@ q^Des = q^(r),N + feedback of the tracking law;   u = inverse model of the defor
 from __future__ import annotations
 
 from fpirhc.controllers.base import closing_blocks, like, reference_block, rename
+from fpirhc.controllers.face import on_face
+from fpirhc.controllers.largest_response import largest_response
 from fpirhc.deformation.base import Deformation
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
+
+
+def bounded(problem: Problem, tracking: Tracking) -> Tracking:
+    """Return the law with its memory bounded by what the problem's limits can need."""
+    return tracking.within(largest_response(problem))
 
 
 def desired_blocks(problem: Problem, tracking: Tracking) -> list[Block]:
@@ -17,9 +24,9 @@ def desired_blocks(problem: Problem, tracking: Tracking) -> list[Block]:
     plant = problem.plant
     return [
         reference_block(problem),
-        rename("target", like(plant.state, "reference"), like(plant.state, "_target")),
+        rename("target", like(plant.output, "reference"), like(plant.output, "_target")),
         rename("nominal", plant.response_signal("_reference_response"), plant.response_signal("nominal")),
-        tracking.law(plant, problem.period),
+        on_face(plant, bounded(problem, tracking).law(plant.face, problem.period)),
     ]
 
 
@@ -27,5 +34,5 @@ def tracked_blocks(problem: Problem, tracking: Tracking, deformation: Deformatio
     """Return the blocks reference, tracking, deform, invert, limit, judge, running, tracking update, and what they remember."""
     plant = problem.plant
     closing, delays = closing_blocks(problem, deformation)
-    blocks = [*desired_blocks(problem, tracking), *closing, tracking.update(plant, problem.period)]
-    return blocks, [*delays, *tracking.delays(plant)]
+    update = on_face(plant, bounded(problem, tracking).update(plant.face, problem.period))
+    return [*desired_blocks(problem, tracking), *closing, update], [*delays, *tracking.delays(plant.face)]

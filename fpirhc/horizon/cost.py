@@ -31,12 +31,13 @@ class View:
 
     Args:
         state: the plant's state.
-        reference: nominal state.
+        reference: nominal state; of a plant with outputs, the nominal outputs and their derivatives.
         input: input of the stage.
         input_before: input of the stage before; NaN unless the cost uses it.
         feedforward: the model's input along the reference; NaN unless the cost uses it.
         parameters: of the model.
         time: s.
+        output: the model's outputs and their derivatives, view.output.bis; the state of a plant without outputs.
     """
 
     state: Named
@@ -46,6 +47,7 @@ class View:
     feedforward: Named
     parameters: Named
     time: Expression
+    output: Named
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,14 +131,17 @@ class Quadratic(Cost):
         deviation: weights of the inputs relative to the model's feedforward along the reference. It suits a wrong model better
             than `effort`, which biases the plan.
         rate: weights of the change of the inputs from stage to stage.
-        terminal: weights by state name, or LQRTerminal(); None: the state weights times the step.
+        terminal: weights by the name of a state or output, or LQRTerminal(); None: the weights of errors times the step.
+        outputs: weights of the errors of the outputs of a plant that has some, and of their derivatives (bis, bis', ...). Its
+            states have no reference, so `states` has no weights then.
     """
 
-    states: Mapping[str, float]
+    states: Mapping[str, float] = field(default_factory=dict)
     effort: Mapping[str, float] = field(default_factory=dict)
     deviation: Mapping[str, float] = field(default_factory=dict)
     rate: Mapping[str, float] = field(default_factory=dict)
     terminal: Mapping[str, float] | Terminal | None = None
+    outputs: Mapping[str, float] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
 
     @property
     def weighs_effort(self) -> bool:
@@ -145,9 +150,9 @@ class Quadratic(Cost):
 
     @property
     def tracked(self) -> Mapping[str, float]:
-        """The weights of `states`; those of `terminal` for states that only the end of the horizon weighs."""
+        """The weights of `states` or `outputs`; those of `terminal` for what only the end of the horizon weighs."""
         at_end = self.terminal if isinstance(self.terminal, Mapping) else {}
-        weights = {**at_end, **{n: w for n, w in self.states.items() if w > 0}}
+        weights = {**at_end, **{n: w for n, w in self._errors.items() if w > 0}}
         return {n: w for n, w in weights.items() if w > 0}
 
     @property
@@ -170,11 +175,13 @@ class Quadratic(Cost):
         terminal = self.terminal if isinstance(self.terminal, Mapping) else {}
         groups = {
             "states": (self.states, plant.state.elements),
+            "outputs": (self.outputs, plant.output.elements),
             "effort": (self.effort, plant.input.elements),
             "deviation": (self.deviation, plant.input.elements),
             "rate": (self.rate, plant.input.elements),
-            "terminal": (terminal, plant.state.elements),
+            "terminal": (terminal, plant.output.elements),
         }
+        self._check_kind(plant, mistakes)
         for what, (weights, valid) in groups.items():
             mistakes.unknown(f"{what}:", weights, valid)
             for name, weight in weights.items():
@@ -186,9 +193,29 @@ class Quadratic(Cost):
             mistakes.add("every weight is zero, so every plan is optimal; weigh at least one state")
         mistakes.raise_if_any()
 
+    def _check_kind(self, plant: Plant, mistakes: Mistakes) -> None:
+        """Add a mistake where weights of errors are not those of what has a reference."""
+        if self.outputs and not plant.outputs:
+            mistakes.add("outputs: the plant has no outputs; weigh its states, Quadratic(states=...)")
+        if plant.outputs and self.states:
+            mistakes.add(
+                f"states: the states of a plant with outputs have no reference; weigh {', '.join(plant.output.elements)}, "
+                "Quadratic(outputs=...), or write a CustomCost"
+            )
+        if plant.outputs and isinstance(self.terminal, Terminal):
+            mistakes.add(
+                f"terminal: {type(self.terminal).__name__} weighs the whole state, which has no reference on a plant with outputs; "
+                "give weights by the name of an output"
+            )
+
+    @property
+    def _errors(self) -> Mapping[str, float]:
+        """Weights of what has a reference."""
+        return self.outputs or self.states
+
     def stage(self, view: View) -> dict[str, Expression]:
         """Return the term 'states', and the terms 'effort', 'deviation', 'rate' where they have weights."""
-        terms = {"states": _squares(self.states, view.state, view.reference)}
+        terms = {"outputs" if self.outputs else "states": _squares(self._errors, view.output, view.reference)}
         if self.effort:
             terms["effort"] = total(w * view.input[n] ** 2 for n, w in self.effort.items())
         if self.deviation:
@@ -202,9 +229,9 @@ class Quadratic(Cost):
     ) -> Expression:
         """Return the terminal cost (x - x^N)' P (x - x^N)."""
         if self.terminal is None:
-            return step * _squares(self.states, view.state, view.reference)
+            return step * _squares(self._errors, view.output, view.reference)
         if isinstance(self.terminal, Mapping):
-            return _squares(self.terminal, view.state, view.reference)
+            return _squares(self.terminal, view.output, view.reference)
         error = view.state.vector[: plant.state.size] - view.reference.vector
         entries = nominal(self).derived(plant, linearise)
         live = is_live(self)

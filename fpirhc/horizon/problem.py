@@ -49,6 +49,7 @@ class OptimalControl:
         settings: paths of the live settings, whose numbers are among the data.
         live_bounds: paths of the live limits of inputs, which are arguments of a call.
         derive: function of the numbers of settings, by path, that returns the numbers that the cost computes from them.
+        inner: of a plant with outputs, for every state its place in the reference, or -1 and a value of its own; else empty.
         functions: Functions that were built for it; problems that differ in numbers of settings only share them.
     """
 
@@ -74,6 +75,7 @@ class OptimalControl:
     settings: tuple[str, ...] = ()
     live_bounds: tuple[str, ...] = ()
     derive: Callable[[Mapping[str, float]], dict[str, float]] | None = None
+    inner: tuple[tuple[int, float], ...] = ()
     functions: dict[object, ca.Function] = field(default_factory=dict, repr=False)
 
     @property

@@ -17,7 +17,7 @@ def check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mista
     """Add every mistake in the cost's names and weights, and in the user's functions of a stage."""
     cost, limits = nominal(cost), nominal(limits)
     view = _view_of_symbols(plant)
-    parts = (view.state, view.reference, view.input, view.input_before, view.feedforward, view.parameters)
+    parts = (view.state, view.output, view.reference, view.input, view.input_before, view.feedforward, view.parameters)
     symbols = (*(part.vector for part in parts), view.time)
     if cost is not None:
         try:
@@ -35,16 +35,19 @@ def check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mista
 
 def _view_of_symbols(plant: Plant) -> View:
     state, command, parameter = plant.state, plant.input, plant.parameter
+    x = Named(state.elements, ca.SX.sym("x", state.size), "state")
+    elements, what = plant.output.elements, "output" if plant.outputs else "state"
 
     def inputs(name: str) -> Named:
         return Named(command.elements, ca.SX.sym(name, command.size), "input")
 
     return View(
-        Named(state.elements, ca.SX.sym("x", state.size), "state"),
-        Named(state.elements, ca.SX.sym("reference", state.size), "state"),
+        x,
+        Named(elements, ca.SX.sym("reference", len(elements)), what),
         inputs("u"),
         inputs("before"),
         inputs("feedforward"),
         Named(parameter.elements, ca.SX.sym("p", parameter.size), "parameter"),
         ca.SX.sym("t"),
+        Named(elements, ca.SX.sym("y", len(elements)), what) if plant.outputs else x,
     )

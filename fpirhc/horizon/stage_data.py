@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import casadi as ca
 import numpy as np
 
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
+from fpirhc.horizon.nominal import feedforward
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Layout, Signal, scalar
@@ -24,7 +27,7 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
     margin = (Signal("margin", names, tuple(units[e] for e in names)),) if names else ()
     signals = (
         plant.time,
-        Signal("reference", plant.state.elements, plant.state.units),
+        Signal("reference", plant.output.elements, plant.output.units),
         Signal("feedforward", plant.input.elements, plant.input.units),
         plant.parameter,
         *free,
@@ -55,12 +58,10 @@ def stage_data(
     matrix = kind(reference.opaque or plant.inverse_opaque or looked_up)
     t, given = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
     p = given if signals is None else signals(t + horizon.step / 2, given)
-    motion = [matrix.sym("x", plant.state.size), matrix.sym("r", len(plant.names))] if previewed else []
+    motion = [matrix.sym("x", plant.output.size), matrix.sym("r", len(plant.face.names))] if previewed else []
     state, response = motion or reference.function(plant)(t)
-    if cost.uses_feedforward:
-        needed = plant.inverse_function(state, response[list(plant.controlled_indices)], p)
-    else:
-        needed = matrix.zeros(plant.input.size)
+    zero = matrix.zeros(plant.input.size)
+    needed = feedforward(plant, state, response, p) if cost.uses_feedforward else zero
     # The live rows come out of the same call where they follow these rows: joining tables would copy both.
     joined = bool(live) and not (horizon.blocks or horizon.terminal or horizon.margins)
     rows = [matrix.sym("live", live)] if joined else []
@@ -90,3 +91,35 @@ def stage_data(
         table = ca.vertcat(table, ca.repmat(settings[0], 1, nodes))
     names = ["t", *columns, "p", *(["live"] if live else [])]
     return ca.Function("fpirhc_horizon_data", [start, *tables, parameters, *settings], [table], names, ["data"])
+
+
+def shifted_reference(plant: Plant, layout: Layout, nodes: int) -> ca.Function:
+    """Function (data, state, measured outputs, parameters) -> data whose reference is that of the measured outputs.
+
+    A wrong model computes other outputs and derivatives than are measured, y^(k) - h_k(x, p) = d^(k). A plan takes d^(r) as zero,
+    as it is where a deformation makes the response of the plant that of the model, so
+
+        d^(k)(t + tau) = sum_{j >= k} d^(j)(t) tau^(j-k) / (j-k)!,    j < r.
+
+    The errors of the model's outputs plus d are those of the model's outputs where d is subtracted from the reference.
+
+    Args:
+        plant: the model, with outputs.
+        layout: of one stage's data.
+        nodes: number of columns of the data.
+    """
+    x, u, p = plant.symbols()
+    y, column, now = ca.SX.sym("y", plant.output.size), ca.SX.sym("data", layout.size), ca.SX.sym("now")
+    error = y - plant.output_function(x, ca.SX.zeros(u.numel()), p, ca.SX.zeros(len(plant.names)))
+    elements, later = plant.output.elements, column[layout.slice("time")] - now
+    place, difference = layout.slice("reference"), ca.SX.zeros(layout.size)
+    for k, element in enumerate(elements):
+        higher = [i for i, e in enumerate(elements) if e.startswith(element) and not e[len(element) :].strip("'")]
+        powers = [elements[i].count("'") - element.count("'") for i in higher]
+        terms = (error[i] * later**n / math.factorial(n) for i, n in zip(higher, powers, strict=True))
+        difference[place.start + k] = sum(terms, start=ca.SX(0))
+    one = ca.Function("fpirhc_shifted_column", [column, now, x, y, p], [ca.densify(column - difference)])
+    sizes = {"x": x.numel(), "y": y.numel(), "p": p.numel()}
+    data, arguments = ca.MX.sym("data", layout.size, nodes), [ca.MX.sym(name, size) for name, size in sizes.items()]
+    repeated = [ca.repmat(v, 1, nodes) for v in (data[layout.slice("time"), 0], *arguments)]
+    return ca.Function("fpirhc_shifted_reference", [data, *arguments], [one.map(nodes)(data, *repeated)])

@@ -25,6 +25,7 @@ from fpirhc.horizon.constraint_states import (
 from fpirhc.horizon.cost import Cost, Linearisation, View
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.live_data import live_signals, live_table, settings_in
+from fpirhc.horizon.nominal import feedforward, known_on_reference, nominal_motion, reference_state
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.reference_expansion import expand_along, input_curvature
 from fpirhc.horizon.stage_data import data_layout, stage_data
@@ -36,9 +37,25 @@ from fpirhc.task.reference import Reference
 
 
 def transcribe(
-    plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits, signals: ca.Function | None = None
+    plant: Plant,
+    reference: Reference,
+    horizon: Horizon,
+    cost: Cost,
+    limits: Limits,
+    signals: ca.Function | None = None,
+    start: np.ndarray | None = None,
 ) -> OptimalControl:
-    """Return the standard form of one horizon; `signals` are those of `stage_data`.
+    """Return the standard form of one horizon.
+
+    Args:
+        plant: the model.
+        reference: of its states or outputs.
+        horizon: stages and step.
+        cost: of a plan.
+        limits: of a plan.
+        signals: from outside, as `stage_data` takes them.
+        start: first state, shape (nx,), from which states without a reference are simulated to expand the cost along the reference;
+            None: zero.
 
     Raises:
         InvalidProblem: mistakes in the cost or the limits, or a cost that is not finite at the reference (the term is named).
@@ -50,7 +67,7 @@ def transcribe(
     binding, free = stage.binding, stage.before.numel()
     dynamics, stage_cost, terminal_cost = _stage_functions(stage, horizon.step)
     table = np.asarray(stage_data(plant, reference, horizon, cost, signals=signals)(0.0, plant.approximate).full())
-    nodes = _nodes(plant, horizon, table, (free, len(binding)))
+    nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
     settings = tuple(s.name().removeprefix(PREFIX) for s in stage.settings)
     values = {path: number.value for path, number in live_numbers(cost, limits).items()}
 
@@ -91,6 +108,7 @@ def transcribe(
         settings=settings,
         live_bounds=tuple(live_numbers(limits.inputs)),
         derive=derive,
+        inner=tuple(zip(plant.known_by_outputs, map(float, nodes[0][:, -1]), strict=False)) if plant.outputs else (),
         functions=functions,
     )
     return ocp.at(values)
@@ -170,6 +188,10 @@ def _reach(limits: Limits, plant: Plant) -> ca.DM:
 def _check_names(plant: Plant, horizon: Horizon, limits: Limits) -> None:
     mistakes = Mistakes("horizon")
     mistakes.unknown("terminal: state", horizon.terminal, plant.state.elements)
+    if plant.outputs and horizon.terminal:
+        mistakes.add(
+            "terminal: the states of a plant with outputs have no reference to meet; leave it out, or weigh the end"
+        )
     mistakes.unknown("margins: limit of state", horizon.margins, list(limits.states))
     for name in sorted(horizon.margins.keys() & {*limits.soft, *limits.prices}):
         mistakes.add(
@@ -225,13 +247,22 @@ def _view(
     feedforward = data["feedforward"] if cost.uses_feedforward else ca.SX.nan(len(inputs))
     return View(
         state=Named(plant.state.elements, s[:nx], "state"),
-        reference=Named(plant.state.elements, data["reference"], "state"),
+        reference=Named(plant.output.elements, data["reference"], "output" if plant.outputs else "state"),
         input=Named(inputs, u, "input"),
         input_before=Named(inputs, before, "input"),
         feedforward=Named(inputs, feedforward, "input"),
         parameters=Named(plant.parameter.elements, data["parameters"], "parameter"),
         time=data["time"],
+        output=_outputs(plant, s[:nx], data["parameters"]),
     )
+
+
+def _outputs(plant: Plant, x: Expression, p: Expression) -> Named:
+    """The model's outputs and their derivatives at a stage; the state without outputs."""
+    if not plant.outputs:
+        return Named(plant.state.elements, x, "state")
+    still = ca.SX.zeros(plant.input.size), ca.SX.zeros(len(plant.names))  # neither reaches these derivatives
+    return Named(plant.output.elements, plant.output_function(x, still[0], p, still[1]), "output")
 
 
 def _advance(plant: Plant, horizon: Horizon) -> ca.Function:
@@ -246,7 +277,8 @@ def _linearise(plant: Plant, reference: Reference, horizon: Horizon, advance: ca
     x_next = advance(x, u, p)
     jacobians = ca.Function("fpirhc_linear", [x, u, p], [ca.jacobian(x_next, x), ca.jacobian(x_next, u)])
     state, response = reference.function(plant)(0.0)
-    needed = plant.inverse_function(state, response[list(plant.controlled_indices)], plant.approximate)
+    needed = feedforward(plant, state, response, ca.DM(plant.approximate))
+    state = reference_state(plant, state)
     a, b = jacobians(state, needed, plant.approximate)
     return Linearisation(np.asarray(a.full()), np.asarray(b.full()), horizon.step)
 
@@ -272,13 +304,29 @@ def _scalar_terms(expressions: Mapping[str, Expression]) -> dict[str, Expression
 
 
 def _nodes(
-    plant: Plant, horizon: Horizon, data: np.ndarray, extra: tuple[int, int]
+    plant: Plant,
+    reference: Reference,
+    horizon: Horizon,
+    data: np.ndarray,
+    extra: tuple[int, int],
+    limits: Limits,
+    start: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States (the plant's, `extra` input and written entries), inputs and data along the reference from t = 0."""
+    """States (the plant's, `extra` input and written entries), inputs and data along the reference from t = 0.
+
+    States without a reference are simulated, with the inputs that the model needs for the nominal outputs.
+    """
     layout = data_layout(plant, horizon)
     along = {name: data[layout.slice(name)] for name in ("reference", "feedforward")}
-    states = np.vstack([along["reference"], along["feedforward"][: extra[0]], np.zeros((extra[1], data.shape[1]))])
-    return states, along["feedforward"][:, : horizon.stages], data
+    states, inputs = along["reference"], along["feedforward"]
+    if not known_on_reference(plant):
+        first = np.zeros(plant.state.size) if start is None else start
+        bounds = nominal(limits).input_bounds(plant)
+        states, inputs = nominal_motion(plant, reference, _advance(plant, horizon), first, bounds, data[0])
+    elif plant.outputs:
+        states = states[list(plant.known_by_outputs)]
+    states = np.vstack([states, inputs[: extra[0]], np.zeros((extra[1], data.shape[1]))])
+    return states, inputs[:, : horizon.stages], data
 
 
 def _check_finite(

@@ -27,7 +27,8 @@ from fpirhc.status import Status
 from fpirhc.symbolic.expression import FINITE, Matrix, is_finite
 from fpirhc.symbolic.layout import Layout
 
-FEASIBLE = 1e-4  # largest violation of a state bound that still counts as kept
+FEASIBLE = 1e-4  # largest violation of a state bound that still counts as kept, where an optimiser has no unit for it
+KEPT = 1e-6  # the same as a share of half the range, where it has one
 UNKNOWN_ITERATIONS = -1.0  # a solver that is called inside a graph does not report its iterations
 
 

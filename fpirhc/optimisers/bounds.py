@@ -87,6 +87,10 @@ class Limited:
         """Return d; 1 where there is no limit."""
         return ca.if_else(self.present, self.sign * (self.entries(p.inputs, p.states) - self._at), 1)
 
+    def outside(self, p: Expansion) -> ca.MX:
+        """Return the largest violation of a hard limit, as a share of its unit."""
+        return ca.fmax(ca.mmax(-self.distance(p) * self.hard / self.unit), 0)
+
     def both(self, values: ca.MX) -> ca.MX:
         """Return the sum of the lower and the upper side, (rows, N), where there is a limit."""
         present_values = ca.if_else(self.present, values, 0)

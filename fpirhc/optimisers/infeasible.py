@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.base import FEASIBLE
+from fpirhc.optimisers.scales import tolerated
 
 _EQUATION = 1e-6  # limits closer together than this are an equation
 _AT_LIMIT = 1e-3  # of its range: an input this near counts as at its limit
@@ -30,6 +30,7 @@ class Breach:
         side: 'above' or 'below'.
         beyond: shape (N + 1,), zero where the limit is kept; s_0 of a written entry counts as kept.
         equation: whether both sides are the same.
+        tolerated: violation that still counts as kept.
     """
 
     name: str
@@ -38,11 +39,12 @@ class Breach:
     side: str
     beyond: np.ndarray
     equation: bool
+    tolerated: float
 
     @property
     def stages(self) -> np.ndarray:
         """The nodes after the first one at which it is violated."""
-        return 1 + np.flatnonzero(self.beyond[1:] > FEASIBLE)
+        return 1 + np.flatnonzero(self.beyond[1:] > self.tolerated)
 
 
 def breaches(ocp: OptimalControl, states: np.ndarray) -> list[Breach]:
@@ -52,7 +54,7 @@ def breaches(ocp: OptimalControl, states: np.ndarray) -> list[Breach]:
         ocp: the problem.
         states: X, shape (ns, N + 1).
     """
-    violated = []
+    violated, most = [], tolerated(ocp)
     for k in np.flatnonzero(ocp.hard).tolist():
         low, high = ocp.state_lower[k], ocp.state_upper[k]
         with np.errstate(invalid="ignore"):  # a plan that is not finite is beyond no limit
@@ -62,7 +64,9 @@ def breaches(ocp: OptimalControl, states: np.ndarray) -> list[Breach]:
             if k >= ocp.state.size - ocp.written:
                 beyond[0] = 0
             equation = bool(high - low <= _EQUATION)
-            one = Breach(ocp.state.elements[k], ocp.state.units[k], float(limit), side, beyond, equation)
+            one = Breach(
+                ocp.state.elements[k], ocp.state.units[k], float(limit), side, beyond, equation, float(most[k])
+            )
             if one.stages.size:
                 violated.append(one)
     return sorted(violated, key=lambda b: -float(b.beyond[1:].max()))
@@ -99,7 +103,7 @@ def _sentence(ocp: OptimalControl, breach: Breach, stuck: list[str], others: lis
             f"lengthen it, or take '{breach.name.removesuffix(' at the end')}' out of Horizon(terminal=...)"
         )
     limit = f"'{breach.name}' {breach.side} {breach.limit:g}"
-    begins = breach.beyond[0] > FEASIBLE
+    begins = breach.beyond[0] > breach.tolerated
     start = f"begins {breach.beyond[0]:.3g} {breach.unit} beyond it".replace("  ", " ") if begins else "begins inside"
     if last == ocp.stages:
         left = f"{breach.beyond[-1]:.3g} {breach.unit}".strip()

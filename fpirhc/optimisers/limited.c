@@ -425,7 +425,8 @@ int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_rea
     ok = c.error < FINITE;
   }
   /* A call of few iterations may still get inside; one that has tried everything has not. */
-  status = c.violation > NEAR_LIMIT && (is_done(&c) || !REALTIME) ? INFEASIBLE : is_done(&c) ? CONVERGED : NOT_CONVERGED;
+  if (is_done(&c)) status = ok && outside(&m.limits, best) > KEPT_SHARE ? INFEASIBLE : CONVERGED;
+  else status = c.violation > NEAR_LIMIT && !REALTIME ? INFEASIBLE : NOT_CONVERGED;
   status = empty ? INFEASIBLE : !ok ? NON_FINITE : status;
   if (res[0])
     for (i = 0; i < N * NU; ++i)

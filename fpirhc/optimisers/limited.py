@@ -22,7 +22,7 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.split_stage import partial_count, split_hessian, stage_leaves
 from fpirhc.horizon.sweep import PIVOT
 from fpirhc.optimisers import limited_settings as numbers
-from fpirhc.optimisers.base import FEASIBLE, shift
+from fpirhc.optimisers.base import FEASIBLE, KEPT, shift
 from fpirhc.optimisers.bounds import BOUNDARY, ENOUGH, HAIR, STIFF
 from fpirhc.optimisers.guess import guess
 from fpirhc.optimisers.limited_graph import limited_graph
@@ -133,6 +133,7 @@ def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]
         "PIVOT": PIVOT,
         "FINITE": FINITE,
         "NEAR_LIMIT": FEASIBLE,
+        "KEPT_SHARE": KEPT,
         "DAMPING": repr(float(settings.damping)),
         "TOLERANCE": repr(float(settings.tolerance)),
         "FEASIBLE": repr(float(settings.feasible)),

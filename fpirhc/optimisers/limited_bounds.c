@@ -111,6 +111,15 @@ static Certificate certified(const Limits* limits, const Point* p, casadi_real z
   return c;
 }
 
+/* The largest violation of a hard limit, as a share of its unit. */
+static casadi_real outside(const Limits* limits, const Point* p) {
+  int side, i, r, k;
+  casadi_real worst = 0;
+  EACH_LIMIT(limits)
+    if (r >= NU) worst = larger(worst, -distance(limits, p, side, i, r) * hard[r - NU] / unit[r]);
+  return worst;
+}
+
 /* Pure: limits that are active by the sign of gamma z - d are equalities, the others are not there. */
 static void pure_terms(const Limits* limits, const Point* p, Duals* y, In g, Out weight, Out lean) {
   int side, i, r, k, closed = largest_gap(p) < 1e-6;

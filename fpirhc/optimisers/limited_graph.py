@@ -7,7 +7,7 @@ import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.sweep import Expansion, expand, expansion_shapes
-from fpirhc.optimisers.base import FEASIBLE, clip, sane, stationarity
+from fpirhc.optimisers.base import FEASIBLE, KEPT, clip, sane, stationarity
 from fpirhc.optimisers.certified import Certified, certify
 from fpirhc.optimisers.guess import guesses
 from fpirhc.optimisers.limited_memory import limited_memory
@@ -124,7 +124,7 @@ def _results(call: Call, s: State, memory: ca.MX, posed: ca.MX) -> list[ca.MX]:
         }
     )
     forgotten = ca.if_else(posed, ca.MX.zeros(layout.size), memory)
-    diagnostics = ca.vertcat(numbers, s["count"], _status(call, c, ok))
+    diagnostics = ca.vertcat(numbers, s["count"], _status(call, p, c, ok))
     return [plan, diagnostics, ca.if_else(ok, next_memory, forgotten)]
 
 
@@ -143,9 +143,10 @@ def _last_plan(call: Call, s: State) -> tuple[Expansion, Certified, ca.MX]:
     return p, c._replace(left=stationarity(ocp, p.inputs, slope, call.lower, call.upper)), usable
 
 
-def _status(call: Call, c: Certified, ok: ca.MX) -> ca.MX:
-    solved = ca.if_else(c.violation > FEASIBLE, int(Status.INFEASIBLE), int(Status.OK))
+def _status(call: Call, p: Expansion, c: Certified, ok: ca.MX) -> ca.MX:
+    solved = ca.if_else(call.limits.outside(p) > KEPT, int(Status.INFEASIBLE), int(Status.OK))
     # A call of few iterations may still get inside; one that has tried everything has not.
-    unsolved = int(Status.NOT_CONVERGED) if call.settings.realtime else ca.fmax(solved, int(Status.NOT_CONVERGED))
+    far = ca.logic_and(c.violation > FEASIBLE, not call.settings.realtime)
+    unsolved = ca.if_else(far, int(Status.INFEASIBLE), int(Status.NOT_CONVERGED))
     status = ca.if_else(ok, ca.if_else(call.is_done(c), solved, unsolved), int(Status.NON_FINITE))
     return ca.if_else(ca.mmax(call.lower - call.upper) > 0, int(Status.INFEASIBLE), status)

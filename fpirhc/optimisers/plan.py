@@ -11,10 +11,11 @@ import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
-from fpirhc.optimisers.base import FEASIBLE, Optimiser, judge
+from fpirhc.optimisers.base import Optimiser, judge
 from fpirhc.optimisers.improved import improved
 from fpirhc.optimisers.infeasible import reasons
 from fpirhc.optimisers.multipliers import fit_multipliers
+from fpirhc.optimisers.scales import tolerated
 from fpirhc.status import Status
 from fpirhc.summary import line, number, table
 
@@ -78,6 +79,7 @@ class Plan:
     def violations(self) -> tuple[str, ...]:
         """Return the five worst violations of state bounds in words, the first state first; empty when there are none."""
         ocp, violations = self.problem, []
+        most = tolerated(ocp)
         for k, (name, unit) in enumerate(zip(ocp.state.elements, ocp.state.units, strict=True)):
             low, high = ocp.state_lower[k], ocp.state_upper[k]
             for stage, value in enumerate(self.states[k]):
@@ -85,7 +87,7 @@ class Plan:
                     continue  # `overflow` names it
                 by = max(low - value, value - high)
                 means_something = stage > 0 or k < ocp.state.size - ocp.written
-                if by > FEASIBLE and means_something and ocp.hard[k]:
+                if by > most[k] and means_something and ocp.hard[k]:
                     side = f"below {low:g}" if value < low else f"above {high:g}"
                     violations.append((stage > 0, -by, f"'{name}' is {value:.6g} {unit}, {side}, at stage {stage}"))
         return tuple(text for _, _, text in sorted(violations)[:_WORST])

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
+from fpirhc.optimisers.base import FEASIBLE, KEPT
 
 _LEAST = 1e-3  # a smaller spread of the reference is no measure of a state
 _CAPACITY = 1e4  # largest multiplier of a hard limit, in units of cost per unit
@@ -66,6 +67,12 @@ def scales(ocp: OptimalControl) -> Scales:
     hard = ocp.hard[places]
     capacity = np.where(hard, _CAPACITY * cost / states[places], ocp.state_price[places])
     return Scales(inputs, states, cost, tuple(int(k) for k in places), capacity, hard)
+
+
+def tolerated(ocp: OptimalControl) -> np.ndarray:
+    """Return the violation of every state's limits that still counts as kept, shape (ns,)."""
+    half = _half(ocp.state_lower, ocp.state_upper)
+    return np.where(np.isfinite(half) & (half > KEPT), np.minimum(FEASIBLE, KEPT * half), FEASIBLE)
 
 
 def _answered_curvature(ocp: OptimalControl) -> np.ndarray:

@@ -1,6 +1,6 @@
-"""Derivatives of a plant's coordinates as functions of its state: the Lie derivatives y, y', y'', ... along its motion.
+"""Derivatives of a plant's coordinates and outputs as functions of its state: the Lie derivatives y, y', y'', ... along its motion.
 
-    y_0 = the coordinate,        y_{k+1} = dy_k/dx x'(x, u, p, w),
+    y_0 = the quantity,        y_{k+1} = dy_k/dx x'(x, u, p, w),
 
 with the input u and the forcing w held, as they are over a control cycle. A derivative that is a state or a response of the
 plant is that entry itself.
@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import casadi as ca
 
+from fpirhc.plant.outputs import Symbols, lie_derivatives, output_expression
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression
 
@@ -21,7 +22,7 @@ def derivatives_function(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.
 
     Args:
         plant: the plant.
-        wanted: (coordinate, number of the derivative) of every entry.
+        wanted: (coordinate or output, number of the derivative) of every entry.
     """
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
@@ -32,15 +33,17 @@ def derivatives_function(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.
 
 
 def input_reaches_at(plant: Plant, name: str, count: int) -> int | None:
-    """Return the first derivative of a coordinate that depends on an input at once; None where none up to `count` does."""
+    """Return the first derivative of a quantity that depends on an input at once; None where none up to `count` does."""
     x, u, p = plant.symbols()
     chain = _chain(plant, name, count, (x, u, p, ca.SX.sym("w", len(plant.names))))
     return next((k for k, y in enumerate(chain) if ca.depends_on(y, u)), None)
 
 
-def _chain(plant: Plant, name: str, count: int, symbols: tuple[ca.SX, ...]) -> list[Expression]:
-    """The coordinate and its first `count` derivatives."""
+def _chain(plant: Plant, name: str, count: int, symbols: Symbols) -> list[Expression]:
+    """The coordinate or output and its first `count` derivatives."""
     x, u, p, w = symbols
+    if name not in plant.coordinates:
+        return lie_derivatives(plant, output_expression(plant, name, x, p), count, (x, u, p, w))
     elements, place = plant.state.elements, plant.names.index(name)
     rate = plant.forced_derivative_function(x, u, p, w)
     chain: list[Expression] = []

@@ -22,11 +22,12 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import Mistakes, NotInvertible
+from fpirhc.errors import Mistakes, NotInvertible, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called
 from fpirhc.plant.algebraic import Algebraic
 from fpirhc.plant.inverse import inverse_by_newton, inverse_by_user, inverse_of_affine
+from fpirhc.plant.outputs import Output, check_outputs, face_of, lie_derivatives, output_expression
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_ranges, check_response
 from fpirhc.plant.plant_view import plant_facts, plant_table
@@ -34,7 +35,7 @@ from fpirhc.plant.structural_order import structural_order
 from fpirhc.summary import line
 from fpirhc.symbolic.layout import Expression, Named, Signal, scalar, vector
 
-__all__ = ["Parameter", "Plant", "derivative_unit", "structural_order"]
+__all__ = ["Output", "Parameter", "Plant", "derivative_unit", "structural_order"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +50,15 @@ class Plant(Checked):
             derivative below the highest order, each with its entries by name (`q.q1`).
         order: relative order r, one number or {coordinate: number}.
         controlled: coordinates on which a tracking law and a deformation act, as many as there are inputs; None: all. They must
-            be named where there are fewer inputs than coordinates.
+            be named where there are fewer inputs than coordinates. Where the plant has outputs they are outputs.
         inverse: optional function of (q, q', ..., r, p) that returns {input: command} for wanted responses r of the
             controlled coordinates. None: the inverse is derived where the response is affine in the inputs, and computed by
             Newton's method otherwise.
         ranges: physical range (lowest, highest) of states by name, such as {"level": (0.0, 2.0)}. A run whose plant leaves one ends
             there, by name; it limits nothing (see `Limits`).
         algebraic: quantities that equations tie to the state at every instant; the response has them as its last argument.
+        outputs: name -> Output(unit, function of (q, q', ..., p)): the quantities that follow a reference, where these are not the
+            coordinates themselves. Their relative orders are found from the symbols.
         time_unit: unit of time of the equations ('s', 'ms', 'day'), and so of every time and rate of the problem.
 
     Raises:
@@ -73,6 +76,7 @@ class Plant(Checked):
         default_factory=dict, kw_only=True, metadata={"setting": "where given"}
     )
     algebraic: Algebraic | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    outputs: Mapping[str, Output] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
     time_unit: str = field(default="s", kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
@@ -83,6 +87,55 @@ class Plant(Checked):
         check_ranges(self, mistakes)
         check_response(self, mistakes)
         mistakes.raise_if_any()
+        check_outputs(self, mistakes)
+        mistakes.raise_if_any()
+
+    @classmethod
+    def of_states(
+        cls,
+        *,
+        states: Mapping[str, str],
+        inputs: Mapping[str, str],
+        parameters: Mapping[str, Parameter],
+        rates: Callable[..., Mapping[str, Expression]],
+        outputs: Mapping[str, Output],
+        controlled: Sequence[str] | None = None,
+        inverse: Callable[..., Mapping[str, Expression]] | None = None,
+        ranges: Mapping[str, tuple[float, float]] | None = None,
+        algebraic: Algebraic | None = None,
+        time_unit: str = "s",
+    ) -> Plant:
+        """Return the plant x' = f(x, u, p), y = h(x, p): every state is a coordinate of order one, and the outputs have references.
+
+        Args:
+            states: name -> unit of every state.
+            inputs: name -> unit of every input.
+            parameters: name -> Parameter(approximate, exact, unit).
+            rates: function of (x, u, p) that returns {state: its derivative with respect to time}.
+            outputs: name -> Output(unit, function of (x, p)).
+            controlled: outputs on which a tracking law and a deformation act, as many as there are inputs; None: all.
+            inverse: optional function of (x, r, p) that returns {input: command} for wanted highest derivatives r of the controlled
+                outputs; see `Plant`.
+            ranges: physical range (lowest, highest) of states by name.
+            algebraic: quantities that equations tie to the state at every instant; see `Plant`.
+            time_unit: unit of time of the equations.
+
+        Raises:
+            InvalidProblem: all mistakes together.
+        """
+        return cls(
+            coordinates=states,
+            inputs=inputs,
+            parameters=parameters,
+            response=rates,
+            order=1,
+            controlled=controlled,
+            inverse=inverse,
+            ranges=ranges or {},
+            outputs=outputs,
+            algebraic=algebraic,
+            time_unit=time_unit,
+        )
 
     def __repr__(self) -> str:
         return line(self, *plant_facts(self))
@@ -101,6 +154,12 @@ class Plant(Checked):
         """Relative order of every coordinate."""
         order = self.order
         return tuple(order if isinstance(order, int) else order[c] for c in self.coordinates)
+
+    @property
+    def words(self) -> tuple[str, str]:
+        """What a coordinate and the response are called: "state" and "rates" where the plant is given by its states."""
+        by_states = bool(self.outputs) and set(self.orders) == {1}
+        return ("state", "rates") if by_states else ("coordinate", "response")
 
     @cached_property
     def state(self) -> Signal:
@@ -130,24 +189,68 @@ class Plant(Checked):
 
     @cached_property
     def controlled_names(self) -> tuple[str, ...]:
-        """The coordinates on which tracking and deformation act.
+        """The outputs, or without any the coordinates, on which tracking and deformation act.
 
         Raises:
-            NotInvertible: fewer inputs than coordinates, and `controlled` is None.
+            NotInvertible: another number of inputs, and `controlled` is None.
         """
         if self.controlled is not None:
             return tuple(self.controlled)
-        if len(self.inputs) != len(self.coordinates):
+        names, what = (tuple(self.outputs), "outputs") if self.outputs else (self.names, "coordinates")
+        if len(self.inputs) != len(names):
             raise NotInvertible(
-                f"{len(self.inputs)} input(s) cannot prescribe {len(self.coordinates)} coordinates: name the "
-                f"controlled ones, as many as there are inputs: Plant(..., controlled=({self.names[0]!r},))"
+                f"{len(self.inputs)} input(s) cannot prescribe {len(names)} {what}: name the "
+                f"controlled ones, as many as there are inputs: Plant(..., controlled=({names[0]!r},))"
             )
-        return self.names
+        return names
 
     @cached_property
     def controlled_indices(self) -> tuple[int, ...]:
-        """Places of the controlled coordinates among all coordinates."""
+        """Places of the controlled coordinates among all coordinates.
+
+        Raises:
+            NotSupported: the controlled quantities are outputs; those of a face are coordinates.
+        """
+        if self.outputs:
+            raise NotSupported(
+                f"{', '.join(self.controlled_names)} are outputs of the plant and no coordinates, which this part does not cover"
+            )
         return tuple(self.names.index(c) for c in self.controlled_names)
+
+    @cached_property
+    def face(self) -> Plant:
+        """The plant as reference, tracking law, judging and sensors take it: its coordinates are the outputs; else itself."""
+        return face_of(self) if self.outputs else self
+
+    @cached_property
+    def output(self) -> Signal:
+        """The signal of what is measured of the face: the state without outputs, else y, y', ... below each relative order."""
+        return replace(self.face.state, name="output") if self.outputs else self.state
+
+    @cached_property
+    def output_function(self) -> ca.Function:
+        """Function (state, input, parameters, forcing) -> y, y', ... of the face; without outputs the state."""
+        x, u, p = self.symbols()
+        w = ca.SX.sym("w", len(self.names))
+        chains = {
+            name: lie_derivatives(self, output_expression(self, name, x, p), order, (x, u, p, w))
+            for name, order in zip(self.face.names, self.face.orders, strict=True)
+            if self.outputs
+        }
+        entries = [chains[e.rstrip("'")][e.count("'")] for e in self.output.elements] if self.outputs else [x]
+        return ca.Function(
+            "fpirhc_outputs", [x, u, p, w], [ca.densify(ca.vertcat(*entries))], ["x", "u", "p", "w"], ["y"]
+        )
+
+    @cached_property
+    def known_by_outputs(self) -> tuple[int, ...]:
+        """For every entry of the state its place among y, y', ...; -1 where it is none of these, and so has no reference."""
+        x, u, p = self.symbols()
+        if not self.outputs:
+            return tuple(range(self.state.size))
+        entries = ca.vertsplit(self.output_function(x, u, p, ca.SX.zeros(len(self.names))))
+        equal = [[k for k, e in enumerate(entries) if ca.is_equal(e, x[i], 1)] for i in range(x.numel())]
+        return tuple(places[0] if places else -1 for places in equal)
 
     @cached_property
     def time(self) -> Signal:
@@ -164,8 +267,8 @@ class Plant(Checked):
         return tuple(self.derivative_unit(u, r) for u, r in zip(self.coordinates.values(), self.orders, strict=True))
 
     def response_signal(self, name: str) -> Signal:
-        """Return a signal that holds a highest derivative of every controlled coordinate."""
-        units = [self.response_units[k] for k in self.controlled_indices]
+        """Return a signal that holds a highest derivative of every controlled quantity."""
+        units = [self.face.response_units[k] for k in self.face.controlled_indices]
         return vector(name, self.controlled_names, units)
 
     @cached_property
@@ -212,7 +315,7 @@ class Plant(Checked):
         views = self.views(x, u, p)
         if self.algebraic is not None:
             views = (*views, self.algebraic.view(self.algebraic_function(x, u, p)))
-        responses = called("response", self.response, *views)
+        responses = called(self.words[1], self.response, *views)
         column = ca.vertcat(*(ca.SX(responses[c]) for c in self.names))
         return ca.Function("fpirhc_response", [x, u, p], [ca.densify(column)], ["x", "u", "p"], ["r"])
 
@@ -231,9 +334,18 @@ class Plant(Checked):
 
     @cached_property
     def controlled_response_function(self) -> ca.Function:
-        """Function (state, input, parameters) -> highest derivative of the controlled coordinates."""
+        """Function (state, input, parameters) -> highest derivative of the controlled coordinates or outputs."""
         x, u, p = self.symbols()
-        responses = self.response_function(x, u, p)[list(self.controlled_indices)]
+        if self.outputs:
+            calm, face = ca.SX.zeros(len(self.names)), self.face
+            orders = {name: face.orders[face.names.index(name)] for name in self.controlled_names}
+            chains = (
+                lie_derivatives(self, output_expression(self, name, x, p), order, (x, u, p, calm))
+                for name, order in orders.items()
+            )
+            responses = ca.densify(ca.vertcat(*(chain[-1] for chain in chains)))
+        else:
+            responses = self.response_function(x, u, p)[list(self.controlled_indices)]
         return ca.Function("fpirhc_controlled_response", [x, u, p], [responses], ["x", "u", "p"], ["r"])
 
     @cached_property
@@ -288,7 +400,7 @@ class Plant(Checked):
         views = []
         for k in range(max(self.orders)):
             holders = [c for c, r in zip(self.names, self.orders, strict=True) if r > k]
-            views.append(Named(holders, x[list(self.indices(k))], "coordinate"))
+            views.append(Named(holders, x[list(self.indices(k))], self.words[0]))
         return views
 
     def _parameters(self, p: Expression) -> Named:

@@ -22,8 +22,10 @@ if TYPE_CHECKING:
 
 def check_names(plant: Plant, mistakes: Mistakes) -> None:
     """Add every mistake in names, units, orders and the choice of controlled coordinates to `mistakes`."""
-    for what, group in (("coordinates", plant.coordinates), ("inputs", plant.inputs)):
-        if not group:
+    outputs = {name: one.unit for name, one in plant.outputs.items()}
+    quantities = "states" if plant.outputs and plant.order == 1 else "coordinates"
+    for what, group in ((quantities, plant.coordinates), ("inputs", plant.inputs), ("outputs", outputs)):
+        if not group and what != "outputs":
             mistakes.add(f"{what} are empty; name at least one, with its unit")
         for name, unit in group.items():
             if not isinstance(unit, str) or not unit:
@@ -36,13 +38,20 @@ def check_names(plant: Plant, mistakes: Mistakes) -> None:
         )
     every = [*plant.coordinates, *plant.inputs]
     for name in sorted({n for n in every if every.count(n) > 1}):
-        mistakes.add(f"'{name}' names both a coordinate and an input; rename one")
+        mistakes.add(f"'{name}' names both a {quantities.removesuffix('s')} and an input; rename one")
+    for name in sorted(plant.outputs.keys() & plant.inputs.keys()):
+        mistakes.add(f"'{name}' names both an output and an input; rename one")
     _check_order_numbers(plant, mistakes)
+    _check_controlled(plant, mistakes)
+
+
+def _check_controlled(plant: Plant, mistakes: Mistakes) -> None:
     if plant.controlled is not None:
-        mistakes.unknown("controlled: coordinate", plant.controlled, plant.coordinates)
+        what = "output" if plant.outputs else "coordinate"
+        mistakes.unknown(f"controlled: {what}", plant.controlled, plant.outputs or plant.coordinates)
         if len(plant.controlled) != len(plant.inputs):
             mistakes.add(
-                f"controlled names {len(plant.controlled)} coordinate(s), but {len(plant.inputs)} input(s) "
+                f"controlled names {len(plant.controlled)} {what}(s), but {len(plant.inputs)} input(s) "
                 "can prescribe exactly as many"
             )
 
@@ -59,7 +68,7 @@ def check_response(plant: Plant, mistakes: Mistakes) -> None:
     """Add every mistake of the response and of the orders to `mistakes`."""
     x, u, p = plant.symbols()
     arguments_of_step, symbols = plant.views(x, u, p), [x, u, p]
-    algebraic = plant.algebraic
+    algebraic, (quantity, function) = plant.algebraic, plant.words
     if algebraic is not None:
         check_algebraic(plant, algebraic, arguments_of_step, mistakes)
         symbols.append(ca.SX.sym("z", max(1, len(algebraic.names))))
@@ -67,24 +76,24 @@ def check_response(plant: Plant, mistakes: Mistakes) -> None:
     expected = len(arguments_of_step)
     if not takes(plant.response, expected):
         arguments = len(inspect.signature(plant.response).parameters)
-        lower = ["q", "v", "a"] + [f"d{k}" for k in range(3, 12)]
+        lower = ["x"] if function == "rates" else ["q", "v", "a"] + [f"d{k}" for k in range(3, 12)]
         mistakes.add(
-            f"response takes {arguments} argument(s); with order {max(plant.orders)} it is called as "
-            f"response({', '.join([*lower[: max(plant.orders)], 'u', 'p', *(['z'] if algebraic else [])])})"
+            f"{function} takes {arguments} argument(s); with order {max(plant.orders)} it is called as "
+            f"{function}({', '.join([*lower[: max(plant.orders)], 'u', 'p', *(['z'] if algebraic else [])])})"
         )
         return
     try:
-        response = named_results("response", called("response", plant.response, *arguments_of_step))
+        response = named_results(function, called(function, plant.response, *arguments_of_step))
     except FpirhcError as error:
         mistakes.add(str(error))
         return
-    mistakes.unknown("response: coordinate", response, plant.coordinates)
+    mistakes.unknown(f"{function}: {quantity}", response, plant.coordinates)
     for c, r in zip(plant.names, plant.orders, strict=True):
         if c not in response:
-            mistakes.add(f"response does not give the derivative {c}{chr(39) * r} of coordinate '{c}'; return it too")
+            mistakes.add(f"{function} does not give the derivative {c}{chr(39) * r} of {quantity} '{c}'; return it too")
             continue
         try:
-            scalar_expression(f"response of '{c}'", response[c], of=plant.response, symbols=symbols)
+            scalar_expression(f"{function} of '{c}'", response[c], of=plant.response, symbols=symbols)
         except FpirhcError as error:
             mistakes.add(str(error))
     if mistakes.none:
@@ -119,8 +128,8 @@ def _check_inverse(plant: Plant, inverse: Callable[..., Mapping[str, Expression]
 
 
 def _check_orders(plant: Plant, mistakes: Mistakes) -> None:
-    if plant.controlled is None and len(plant.inputs) != len(plant.coordinates):
-        return
+    if plant.outputs or (plant.controlled is None and len(plant.inputs) != len(plant.coordinates)):
+        return  # orders of outputs are found, not stated
     for k in plant.controlled_indices:
         name, stated = plant.names[k], plant.orders[k]
         order = structural_order(plant, name)

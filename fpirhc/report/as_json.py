@@ -21,6 +21,7 @@ def to_json(comparison: Comparison) -> str:
         "versions": dict(comparison.versions),
         "verdict": list(comparison.verdict),
         "outcome": str(comparison.outcome),
+        "information": list(comparison.information),
         "findings": [_finding(f) for f in comparison.findings],
         "null_test": None if comparison.null is None else _null_test(comparison.null),
         "controllers": {e.name: _entry(e) for e in comparison.entries},
@@ -72,6 +73,8 @@ def _entry(entry: Entry) -> dict[str, Any]:
         if entry.price is None
         else {"beside": entry.price.beside, "difference": entry.price.difference, "noise": entry.price.noise},
         "notes": list(entry.notes),
+        "measures": list(entry.information.uses) if entry.information else None,
+        "acts": entry.information.rate if entry.information else None,
         "stop": entry.run.stop,
         "compiled": entry.run.compiled,
     }

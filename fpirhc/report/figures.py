@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fpirhc.errors import OutputError
+from fpirhc.simulation.common_columns import shown_motion
 from fpirhc.simulation.drawing import (
     PALETTE,
     draw_bands,
@@ -53,10 +54,11 @@ def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
     axes = np.atleast_1d(figure.subplots(len(names), 1, sharex=True))
     times = np.arange(plan.problem.stages + 1) * plan.problem.step
     reference = plan.data[plan.problem.data.slice("reference")]
+    known = plant.known_by_outputs
     for k, (axis, name) in enumerate(zip(axes, names, strict=True)):
         is_state = k < plant.state.size
-        if is_state:
-            axis.plot(times, reference[k], "--", color="#777777", label="reference")
+        if is_state and known[k] >= 0:
+            axis.plot(times, reference[known[k]], "--", color="#777777", label="reference")
         for row, (one, colour) in enumerate(zip(solved, PALETTE, strict=False)):
             width = max(1.0, 3.0 - 0.7 * row)  # plans that agree lie on each other
             if is_state:
@@ -159,23 +161,25 @@ def _is_second_order(run: Run) -> bool:
 def _draw_trajectory(axis: Axes, run: Run) -> None:
     for k, name in enumerate(run.layout["error"].elements):
         draw_line(axis, run, f"reference.{name}", f"{name} nominal", PALETTE[k], "--")
-        draw_line(axis, run, f"state.{name}", f"{name} realised", PALETTE[k])
+        draw_line(axis, run, f"{shown_motion(run.layout)}.{name}", f"{name} realised", PALETTE[k])
     axis.set_xlabel(time_label(run))
 
 
 def _phase_names(run: Run) -> list[str]:
     """The judged coordinates whose first derivative is a state: a coordinate of order one has no phase plane."""
-    return [name for name in run.layout["error"].elements if f"{name}'" in run.layout["state"].elements]
+    return [
+        name for name in run.layout["error"].elements if f"{name}'" in run.layout[shown_motion(run.layout)].elements
+    ]
 
 
 def _draw_phase(axis: Axes, run: Run) -> None:
-    names = _phase_names(run)
+    names, motion = _phase_names(run), shown_motion(run.layout)
     for k, name in enumerate(names):
-        for signal, style in (("reference", "--"), ("state", "-")):
+        for signal, style in (("reference", "--"), (motion, "-")):
             x, y = run[f"{signal}.{name}"], run[f"{signal}.{name}'"]
             axis.plot(thinned(x), thinned(y), style, color=PALETTE[k], lw=1, label=literal(f"{name} {signal}"))
-    axis.set_xlabel(quantity_label(run, "state", names))
-    axis.set_ylabel(quantity_label(run, "state", [f"{name}'" for name in names]))
+    axis.set_xlabel(quantity_label(run, motion, names))
+    axis.set_ylabel(quantity_label(run, motion, [f"{name}'" for name in names]))
     axis.grid(visible=True, alpha=0.25)
 
 

@@ -97,8 +97,16 @@ def _table(comparison: Comparison) -> str:
     caption = f"Errors, effort and cost from t = {comparison.measure_from:g} {comparison.time_unit} on; seed {comparison.seed}."
     return (
         f"<section><h2>Controllers</h2><p>{caption} Marked are the best of: {_text(marked)}.</p>"
-        f"{wide_table(heads, rows + skipped, 'controllers and their metrics')}</section>"
+        f"{wide_table(heads, rows + skipped, 'controllers and their metrics')}{_information(comparison)}</section>"
     )
+
+
+def _information(comparison: Comparison) -> str:
+    """What the controllers are given, use, and when they act."""
+    if not comparison.information:
+        return ""
+    lines = "".join(f"<li>{_text(line)}</li>" for line in comparison.information)
+    return f"<p>What they measure, and how often:</p><ul id='information'>{lines}</ul>"
 
 
 def _row(entry: Entry, shown: Sequence[Column], best: Mapping[Column, float | None]) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fpirhc.report.reality_series import reality_charts
+from fpirhc.simulation.common_columns import shown_motion
 
 if TYPE_CHECKING:
     from fpirhc.simulation.run import Run
@@ -33,8 +34,9 @@ def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]
     ]
     for c in names:
         aims = [("set-point", longest, f"setpoint.{c}")] if "setpoint" in longest.layout else []
-        lines = [*aims, ("reference", longest, f"reference.{c}")] + [(e.name, e.run, f"state.{c}") for e in entries]
-        charts.append(_chart(c, first.unit(f"state.{c}"), lines, edges))
+        own = [(e.name, e.run, f"{shown_motion(e.run.layout)}.{c}") for e in entries]
+        lines = [*aims, ("reference", longest, f"reference.{c}"), *own]
+        charts.append(_chart(c, first.unit(f"reference.{c}"), lines, edges))
     for i in first.layout["command"].elements:
         lines = [(e.name, e.run, f"command.{i}") for e in entries]
         charts.append(_chart(f"command {i}", first.unit(f"command.{i}"), lines, edges))
@@ -60,7 +62,7 @@ def _tubes(entry: Entry, edges: np.ndarray) -> list[dict[str, Any]]:
     prediction, run = entry.prediction, entry.run
     if prediction is None or prediction.tube is None or not np.isfinite(prediction.tube).all():
         return []
-    state = "plant_state" if "plant_state" in run.layout else "state"
+    state = "plant_state" if "plant_state" in run.layout else "state"  # of which the band is
     places = {e: k for k, e in enumerate(run.layout[state].elements)}
     count, charts = min(run.cycles, len(prediction.tube)), []
     for c in (c for c in run.layout["error"].elements if c in places):

@@ -62,6 +62,8 @@ def show(comparison: Comparison, report: Path) -> None:
     _table(comparison).show(console)
     if sum(e.optimality is not None for e in comparison.entries) > 1:
         _plans(comparison).show(console)
+    for line in comparison.information:
+        say(console, line)
     for entry in comparison.entries:
         for note in entry.notes:
             say(console, f"{entry.name}: {note}")

@@ -69,7 +69,7 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
     if growth.max() > -_SURE:
         where = f"between {radii.min():.6g} and {worst:.6g} along the reference"
         return Answer(QUESTION, Verdict.UNKNOWN, f"{text} ({where})", _mend(grid, controller, loops), numbers)
-    against = [*_steep(grid, controller), *doubts]
+    against = [*([] if controller.deforms_target else _steep(grid, controller)), *doubts]
     if against:
         return Answer(
             QUESTION, Verdict.UNKNOWN, f"{text}, but {'; '.join(against)}", "See the questions named.", numbers
@@ -94,7 +94,9 @@ def box_converges(loops: Loops) -> Answer:
 
 def _mend(grid: ReviewGrid, controller: Controller, loops: Loops) -> str:
     if loops.ideal is not None and loops.ideal.radius >= 1:
-        stiff = stiff_advice(grid, controller.parameters(grid.problem.plant), planned=is_planned(controller))
+        advised = not grid.problem.plant.outputs  # its stages are looked at along references of states
+        believed = controller.parameters(grid.problem.plant)
+        stiff = stiff_advice(grid, believed, planned=is_planned(controller)) if advised else ""
         outer = "The outer loop does not converge even with the right model"
         return f"{outer}. {stiff}" if stiff else f"{outer}: lower its rate, or predict over the dead time."
     return "Change the gain to the recommended one; under dead time pair the deformation."

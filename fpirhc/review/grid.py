@@ -71,6 +71,7 @@ class ReviewGrid:
         """Return states of the reference with the plant's own inner states, shape (k, nx)."""
         plant = self.problem.plant
         states = np.asarray(self.problem.reference.function(plant).map(len(times))(times[None, :])[0].full()).T
+        states = np.full((len(times), plant.state.size), np.nan) if plant.outputs else states
         if self.inner:
             grid, motion = self._fine
             for place, column in zip(self.inner, motion.T, strict=True):
@@ -124,6 +125,7 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
     times = np.linspace(0.0, problem.duration, _POINTS)
     nominal = function.map(_POINTS)(times[None, :])
     states, responses = (np.asarray(v.full()).T for v in nominal)
+    states = np.full((_POINTS, plant.state.size), np.nan) if plant.outputs else states
     ranges = exact_ranges(plant, mismatch)
     lower, upper = (np.array([ranges[name][k] for name in plant.parameters]) for k in (0, 1))
     inner = inner_places(problem)
@@ -134,7 +136,9 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
         inner = ()
     else:
         states[:, list(inner)] = own
-    return ReviewGrid(problem, times, states, responses[:, list(plant.controlled_indices)], rows, inner, mismatch, real)
+    return ReviewGrid(
+        problem, times, states, responses[:, list(plant.face.controlled_indices)], rows, inner, mismatch, real
+    )
 
 
 def parameter_box(problem: Problem, mismatch: float) -> dict[str, tuple[float, float]]:

@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import FpirhcError
+from fpirhc.horizon.nominal import output_feedback
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.symbolic.expression import kind
 from fpirhc.task.limits import Limits
@@ -21,12 +22,16 @@ from fpirhc.task.problem import Problem
 
 _TOLERANCE = 1e-7
 _STEPS = 100_000
+_DECAYS = 20.0  # times in a run, by which the error of outputs at the start decays
+_FASTEST = 0.1  # of the cycle, the rate of this decay
 _SHORTEST = 2000  # steps of a run at least
 
 
 def inner_places(problem: Problem) -> tuple[int, ...]:
     """Return the places of the inner states among the states of the plant."""
     plant = problem.plant
+    if plant.outputs:
+        return tuple(range(plant.state.size))  # all are simulated, while the outputs follow their reference
     with_task = {*plant.controlled_names, *problem.judged_names}
     weighed = _weighed(problem)
     with_task |= {plant.state.elements[k].rstrip("'") for k in weighed}
@@ -65,11 +70,15 @@ def _integrator(problem: Problem, places: list[int], times: np.ndarray) -> ca.Fu
     matrix = kind(problem.reference.opaque or plant.inverse_opaque)
     t, p, inner = matrix.sym("t"), matrix.sym("p", plant.parameter.size), matrix.sym("z", len(places))
     nominal, response = problem.reference.function(plant)(t)
-    rows = [nominal[k] for k in range(plant.state.size)]
+    rows = [inner[0]] * plant.state.size if plant.outputs else [nominal[k] for k in range(plant.state.size)]
     for place, entry in zip(places, range(len(places)), strict=True):
         rows[place] = inner[entry]
     state = ca.vertcat(*rows)
-    command = plant.inverse_function(state, response[list(plant.controlled_indices)], p)
+    wanted = response[list(plant.face.controlled_indices)]
+    if plant.outputs:
+        decay = min(_DECAYS / problem.duration, _FASTEST / problem.period)
+        wanted = wanted + output_feedback(plant, state, nominal, p, decay)
+    command = plant.inverse_function(state, wanted, p)
     rate = plant.forced_derivative_function(state, command, p, np.zeros(len(plant.names)))[places]
     # Friction at a reversal is at rest until it is not: a step must not pass over the whole reversal.
     longest = max(problem.period, problem.duration / _SHORTEST)

@@ -15,6 +15,7 @@ from fpirhc.review.late import is_late, scaled
 from fpirhc.review.linear import LinearLoop, controlled_gain, linear_parameters, loop_matrices, response_slopes
 from fpirhc.review.plan_feedback import PlanGain, no_gain, plan_gains
 from fpirhc.review.stand_in import linear_stand_in
+from fpirhc.review.straight import straightened
 
 _WORK = 2e7  # entries^3 of all loops together: large ones are evaluated at fewer points
 _FEWEST = 3
@@ -72,15 +73,16 @@ def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
     places = _thinned(usable, int(_WORK / max(len(matrices.rest), 1) ** 3))
     gains = dict(zip(places, plan_gains_at(grid, plan, [float(grid.times[k]) for k in places], believed), strict=True))
 
-    slopes = response_slopes(plant)
+    straight = straightened(problem)
 
     def at(place: int, draw: int) -> LinearLoop:
         here = (grid.drawn_states[draw, place], grid.commands[draw, place])
+        slopes = straight.slopes_on(here[0], grid.draws[draw])
         own, model = (linear_parameters(slopes, *here, p, gains[place]) for p in (grid.draws[draw], believed))
         return matrices.at(own, model)
 
     first = (grid.states[places[0]], grid.commands[0, places[0]])
-    model = linear_parameters(slopes, *first, believed, gains[places[0]])
+    model = linear_parameters(straight.slopes_on(first[0], believed), *first, believed, gains[places[0]])
     ideal = loop_matrices(problem, without_deformation(stand_in)).at(model, model)
     drawn = [at(k, d) for k, d in _pairs(grid, places) if np.isfinite(grid.commands[d, k]).all()]
     late = [loop for edge in _late(grid) for loop in loops_at(edge, controller, places[:: max(1, len(places) // 2)])]
@@ -98,10 +100,11 @@ def loops_at(grid: ReviewGrid, controller: Controller, places: Sequence[int]) ->
     believed = controller.parameters(plant)
     stand_in, plan = linear_stand_in(problem, controller)
     feedbacks = plan_gains_at(grid, plan, [float(grid.times[k]) for k in places], believed)
-    matrices, slopes = loop_matrices(problem, stand_in), response_slopes(plant)
+    matrices, straight = loop_matrices(problem, stand_in), straightened(problem)
     loops = []
     for k, feedback in zip(places, feedbacks, strict=True):
         here = (grid.states[k], grid.commands[0, k])
+        slopes = straight.slopes_on(here[0], grid.draws[0])
         loops.append(matrices.at(*(linear_parameters(slopes, *here, p, feedback) for p in (grid.draws[0], believed))))
     return loops
 
@@ -161,6 +164,8 @@ def plan_gains_at(grid: ReviewGrid, plan: Planner | None, times: list[float], be
     problem = grid.problem
     if plan is None:
         return [no_gain(problem.plant)] * len(times)
+    if problem.plant.outputs:
+        raise NotSupported("the linear loop of a plan is not covered for outputs")
     cost = plan.cost or problem.cost
     assert problem.horizon is not None
     assert cost is not None

@@ -12,8 +12,9 @@ QUESTION = "Are the relative orders those of the plant?"
 def relative_orders(grid: ReviewGrid) -> Answer:
     """Return the structural order of every controlled coordinate; a sum below the size of the state leaves zero dynamics."""
     plant = grid.problem.plant
-    structural = {c: structural_order(plant, c) for c in plant.controlled_names}
-    declared = {c: plant.orders[k] for c, k in zip(plant.controlled_names, plant.controlled_indices, strict=True)}
+    face = plant.face
+    declared = {c: face.orders[k] for c, k in zip(plant.controlled_names, face.controlled_indices, strict=True)}
+    structural = declared if plant.outputs else {c: structural_order(plant, c) for c in plant.controlled_names}
     text = ", ".join(f"{c} {r}" for c, r in structural.items())
     inside = plant.state.size - sum(declared.values())
     text += (

@@ -84,12 +84,14 @@ class ControllerQuestion:
         order: place among the questions; the built-in ones come first.
         adaptive: whether it is asked about controllers with a deformation alone.
         doubts: whether a no makes it unknown that the deformation converges.
+        of_targets: whether it is also asked where the deformation acts on the target of an inner controller.
     """
 
     ask: Callable[[Case], Answer | None]
     order: int = 100
     adaptive: bool = True
     doubts: bool = False
+    of_targets: bool = False
 
 
 @cache

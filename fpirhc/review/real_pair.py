@@ -189,8 +189,10 @@ def _settling(problem: Problem, free: list[int]) -> Settling:
     calm = ca.SX.zeros(len(plant.names))
     wanted = ca.SX.sym("wanted", len(model.controlled_names))
     response = reality.response_function(model, seen=False)(x, u, p, calm)
-    residual = ca.vertcat(plant.derivative_function(x, u, p)[free], response - wanted)
-    unknown = ca.vertcat(x[free], u)
+    rate = plant.derivative_function(x, u, p)
+    # One by one: an empty selection of a column with one entry is that entry.
+    residual = ca.vertcat(*(rate[k] for k in free), response - wanted)
+    unknown = ca.vertcat(*(x[k] for k in free), u)
     newton = ca.Function("fpirhc_point", [x, u, p, wanted], [residual, ca.densify(ca.jacobian(residual, unknown))])
 
     def solve(state: np.ndarray, command: np.ndarray, responses: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

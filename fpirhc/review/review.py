@@ -23,6 +23,7 @@ from fpirhc.review.maps import largest_product
 from fpirhc.review.margins import margins_enough
 from fpirhc.review.neighbourhood import spectrum_near
 from fpirhc.review.nominal_runs import NominalRuns
+from fpirhc.review.of_outputs import review_of_outputs, verdict_of_outputs
 from fpirhc.review.orders import relative_orders
 from fpirhc.review.pays import pays
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, known_questions
@@ -55,6 +56,8 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
         NotInvertible: the inputs and the controlled coordinates differ in number.
     """
     grid = review_grid(problem, mismatch, seed)
+    if problem.plant.outputs:
+        return review_of_outputs(grid, controllers)
     general = [well_posed(grid), relative_orders(grid), inverse_exists(grid), commands_inside(grid)]
     reach = horizon_long_enough(grid)
     more = (question.ask(grid) for question in known_questions(ProblemQuestion))
@@ -73,10 +76,14 @@ def predict(problem: Problem, controller: Controller) -> Answer:
     """
     grid = review_grid(problem, 0.0, 0)
     own = replace(grid, draws=grid.draws[:1])  # the box does not matter
+    if problem.plant.outputs:
+        return verdict_of_outputs(own, controller)
     ready = resolved(own.problem, controller)
     general = [well_posed(own), inverse_exists(own), commands_inside(own)]
     loops = loops_along(own, ready)
     case = Case(own, ready, loops, NominalRuns(own.problem))
+    if ready.deforms_target:
+        return converges(own, ready, loops, _doubts(_doubtful(case)))
     suited = [*_speed_and_range(own, ready, loops), *_doubtful(case), free_of_two_cycles(own, ready, loops)]
     return converges(own, ready, loops, _doubts([*general, *suited]))
 
@@ -96,21 +103,42 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: N
     still = zero_dynamics(grid.problem, zero_dynamics_rate(grid), is_planned(ready), loops)
     outer = [rates_inside(grid, ready, loops), still]
     case = Case(grid, ready, loops, runs)
-    inner = [] if not ready.deformation.adapts else _of_map(case, general)
+    of_map = _of_target if ready.deforms_target else _of_map
+    inner = of_map(case, general) if ready.deformation.adapts else []
     return (*inner, *outer, margins_enough(grid.problem, loops, adapts=ready.deformation.adapts), *_more(case))
 
 
 def _more(case: Case) -> list[Answer]:
     """Answers to the questions that are found by discovery."""
-    asked = (q for q in known_questions(ControllerQuestion) if case.controller.deformation.adapts or not q.adaptive)
+    asked = (q for q in known_questions(ControllerQuestion) if _concerns(q, case.controller))
     answers = (question.ask(case) for question in asked if not question.doubts)
     return [answer for answer in answers if answer is not None]
 
 
 def _doubtful(case: Case) -> list[Answer]:
     """Answers whose no speaks against convergence."""
-    answers = (q.ask(case) for q in known_questions(ControllerQuestion) if q.doubts)
+    answers = (q.ask(case) for q in known_questions(ControllerQuestion) if q.doubts and _concerns(q, case.controller))
     return [answer for answer in answers if answer is not None]
+
+
+def _concerns(question: ControllerQuestion, controller: Controller) -> bool:
+    """Whether a question is asked about a controller."""
+    adapts = controller.deformation.adapts
+    return not question.adaptive or (adapts and (question.of_targets or not controller.deforms_target))
+
+
+def _of_target(case: Case, general: list[Answer]) -> list[Answer]:
+    """Answers about a map on targets: those of its linear loop. The gains of other questions are those of responses."""
+    del general
+    covered = Answer(
+        "Is the map's gain admissible?",
+        Verdict.UNKNOWN,
+        "not covered: the map acts on targets, and its limit depends on the slopes of the settled plant; the linear loop has those "
+        "at the reference",
+    )
+    doubtful = _doubtful(case)
+    verdict = converges(case.grid, case.controller, case.loops, _doubts(doubtful))
+    return [verdict, box_converges(case.loops), covered, *doubtful]
 
 
 def _of_map(case: Case, general: list[Answer]) -> list[Answer]:

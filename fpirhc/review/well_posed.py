@@ -52,4 +52,6 @@ def _simulated(grid: ReviewGrid) -> str:
     names = [grid.problem.plant.state.elements[k] for k in grid.inner]
     if not names:
         return ""
-    return f"; {', '.join(names)} ha{'s' if len(names) == 1 else 've'} no task and {'is' if len(names) == 1 else 'are'} simulated"
+    lacking = "reference" if grid.problem.plant.outputs else "task"
+    has, are = ("has", "is") if len(names) == 1 else ("have", "are")
+    return f"; {', '.join(names)} {has} no {lacking} and {are} simulated"

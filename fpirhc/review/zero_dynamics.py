@@ -14,10 +14,10 @@ import numpy as np
 from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.linear import response_slopes
 from fpirhc.review.loops import Loops
 from fpirhc.review.neutral import NEUTRAL
 from fpirhc.review.state_matrix import state_matrices
+from fpirhc.review.straight import straightened
 from fpirhc.task.problem import Problem
 
 QUESTION = "Are the zero dynamics stable?"
@@ -26,7 +26,7 @@ _STILL = 1e-4  # growth over the run, as a share, below which a mode is neutral
 
 def zero_dynamics_rate(grid: ReviewGrid) -> float | None:
     """Return the largest real part of the zero dynamics along the reference, per unit of time; None where there are none."""
-    if not _inside(grid.problem.plant):
+    if not _inside(straightened(grid.problem).plant):
         return None
     modes = zero_dynamics_modes(grid, [k for k in range(len(grid.times)) if np.isfinite(grid.commands[0, k]).all()])
     return max((float(one.real.max()) for one in modes), default=float("nan"))
@@ -34,11 +34,12 @@ def zero_dynamics_rate(grid: ReviewGrid) -> float | None:
 
 def zero_dynamics_modes(grid: ReviewGrid, places: Sequence[int]) -> list[np.ndarray]:
     """Return the eigenvalues of the zero dynamics at points of the reference, per unit of time; none where all is controlled."""
-    plant, slopes = grid.problem.plant, response_slopes(grid.problem.plant)
-    inside = _inside(plant)
+    straight = straightened(grid.problem)
+    plant, exact, inside = straight.plant, grid.problem.plant.exact, _inside(straight.plant)
     if not inside:
         return [np.zeros(0)] * len(places)
-    return [_modes(plant, slopes(grid.states[k], grid.commands[0, k], plant.exact), inside) for k in places]
+    points = [(grid.states[k], grid.commands[0, k]) for k in places]
+    return [_modes(plant, straight.slopes_on(x, exact)(x, u, exact), inside) for x, u in points]
 
 
 def _inside(plant: Plant) -> list[int]:

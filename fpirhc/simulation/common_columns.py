@@ -10,7 +10,14 @@ import numpy as np
 
 from fpirhc.symbolic.layout import Layout, Signal
 
-_SAME = {"plant_state": "state", "plant_realised": "realised"}
+_SAME = {"plant_state": "state", "plant_output": "output", "plant_realised": "realised"}
+
+_MOTION = (
+    "plant_output",
+    "output",
+    "plant_state",
+    "state",
+)  # where the judged motion is logged: the first that a run has
 
 
 def with_common_columns(layout: Layout, log: np.ndarray) -> tuple[Layout, np.ndarray]:
@@ -30,8 +37,18 @@ def with_common_columns(layout: Layout, log: np.ndarray) -> tuple[Layout, np.nda
     return layout + Layout(tuple(signal for signal, _ in added)), np.hstack([log, *(values for _, values in added)])
 
 
+def judged_motion(layout: Layout) -> str:
+    """Return the name of the signal of the plant's own motion that is judged: its outputs, or its state."""
+    return next(name for name in _MOTION if name in layout)
+
+
+def shown_motion(layout: Layout) -> str:
+    """Return the name of the signal that the controller is given of what is judged: 'output' or 'state'."""
+    return "output" if "output" in layout else "state"
+
+
 def _true_error(layout: Layout, log: np.ndarray) -> np.ndarray:
-    state = layout["plant_state" if "plant_state" in layout else "state"]
+    state = layout[judged_motion(layout)]
     if "reference" not in layout:
         return log[:, layout.slice("error")]  # a controller of a user's own that logs its error alone
     places = [state.elements.index(name) for name in layout["error"].elements]

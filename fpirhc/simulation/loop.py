@@ -6,18 +6,22 @@ held since t_{k-1}; the controller turns them into a command; the plant moves on
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, Response, error_signal, like
+from fpirhc.controllers.base import Controller, Response, error_signal, like, rename
 from fpirhc.controllers.contract import checked
+from fpirhc.controllers.face import measured_signals, on_face
 from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.own_reference import given_signals, own_signals
+from fpirhc.controllers.plausible import plausible_range
 from fpirhc.controllers.seeing import compose_seeing, first_estimates, seeing_blocks
+from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, measures_all, sending_block
 from fpirhc.simulation.outside_blocks import outside_blocks, real_name
@@ -28,6 +32,7 @@ from fpirhc.symbolic.live import PREFIX, nominal
 from fpirhc.task.dead_time import delay_block
 from fpirhc.task.problem import Problem
 
+Shown: TypeAlias = tuple[tuple[Signal, ...], Signal]  # signals of the motion, and of the response
 REALITY_STATE = "reality_state"  # signal of the state of a reality, in its own coordinates
 
 
@@ -50,7 +55,10 @@ def close_loop(problem: Problem, controller: Controller, live: LiveSettings | No
 
 def _closed(problem: Problem, controller: Controller, live: LiveSettings | None) -> Composite:
     ready = checked(problem, controller)
-    acting = Gate(nominal(problem), compose_seeing(problem, ready), trusted=("time", "memory"))
+    task = nominal(problem)
+    # What a body outside measures may be wrong; what the loop computes itself is a result, however far it goes.
+    plausible = plausible_range(task) if problem.foreign is not None else {}
+    acting = Gate(task, compose_seeing(problem, ready), trusted=("time", "memory"), plausible=plausible)
     disturbed = disturbance_signals(problem)
     seeing = _sense_blocks(problem, ready.response(problem), predicts="state_ahead" in acting.inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
@@ -142,66 +150,78 @@ def _clock_block(time: Signal, period: float) -> Block:
 
 
 def _sense_blocks(problem: Problem, other: Response | None, *, predicts: bool) -> list[Block]:
-    """State and response as the controller is given them; where these are not the plant's own, also the true ones and the error."""
+    """Motion and response as the controller is given them; where these are not the plant's own, also the true ones and error."""
     plant, response = problem.plant, other or _own_response(problem, seen=False)
     if problem.sees_plant:
-        sense = [_sense_block(problem, plant.state, response)]
-        return [*sense, _truth_block(problem, plant.state)] if predicts or problem.dead_time.inputs else sense
+        sense = [_sense_block(problem, measured_signals(plant), response)]
+        return [*sense, _truth_block(problem, plant.output)] if predicts or problem.dead_time.inputs else sense
     true, shown = _true_blocks(problem, response)
     if problem.sensing.ideal and not problem.dead_time.measurement:
         return true  # with coordinates measured in place of others
     return [*true, *_late_blocks(problem, shown)]
 
 
-def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], tuple[Signal, Signal]]:
-    """Blocks of the true state, response and error; and the signals that sensors see."""
-    plant = problem.plant
-    hidden = like(plant.state, "_seen_state"), like(response.signal, "_seen")
+def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], Shown]:
+    """Blocks of the true motion, response and error; and the signals that sensors see."""
+    motion = measured_signals(problem.plant)
+    hidden = tuple(like(s, f"_seen_{s.name}") for s in motion), like(response.signal, "_seen")
     if problem.foreign is not None and not measures_all(problem):
         return [_sense_block(problem, hidden[0], Response(hidden[1], response.function))], hidden
-    true = like(plant.state, "plant_state"), like(response.signal, "plant_realised")
+    true = tuple(like(s, f"plant_{s.name}") for s in motion), like(response.signal, "plant_realised")
     sense = _sense_block(problem, true[0], Response(true[1], response.function))
-    blocks = [sense, _truth_block(problem, true[0])]
+    blocks = [sense, _truth_block(problem, true[0][-1])]
     if problem.symbolic_reality is None or not problem.symbolic_reality.seen:
         return blocks, true
     direct = problem.sensing.ideal and not problem.dead_time.measurement
-    shown = (plant.state, response.signal) if direct else hidden
+    shown = (motion, response.signal) if direct else hidden
     function = _own_response(problem, seen=True).function
     return [*blocks, _seen_block(problem, shown, function)], shown
 
 
-def _late_blocks(problem: Problem, shown: tuple[Signal, Signal]) -> list[Block]:
-    """Blocks of sensors and their dead time, from what the sensors see to what the controller is given."""
+def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
+    """Blocks of sensors and their dead time, from what the sensors see to what the controller is given.
+
+    Sensors are those of the outputs where the plant has some; its state then comes with the dead time alone.
+    """
     plant, behind, sensing = problem.plant, problem.dead_time.measurement / problem.period, problem.sensing
     first, resting = first_estimates(problem)
+    starts = (problem.start_state, first) if plant.outputs else (first,)
+    states = [*zip(shown[0], measured_signals(plant), starts, strict=True)]
     if not sensing.ideal:
-        sensors = sensing.blocks(plant, first, behind, shown, resting)
+        *others, (seen, _, _) = states
+        sensors = [*_late_states(others, behind), *sensing.blocks(plant.face, first, behind, (seen, shown[1]), resting)]
         if sensing.estimates:
             return sensors
-        raw = sensing.raw(plant, first, behind, resting)
-        return [*sensors, sensing.estimator.block(plant, problem.period, first, raw)]
-    state = replace(plant.state, start=tuple(map(float, first)))
+        raw = sensing.raw(plant.face, first, behind, resting)
+        return [*sensors, on_face(plant, sensing.estimator.block(plant.face, problem.period, first, raw))]
     realised = replace(shown[1], name="realised", start=tuple(map(float, resting)))
+    return [*_late_states(states, behind), delay_block("see_response", shown[1], realised, [behind] * realised.size)]
+
+
+def _late_states(states: Sequence[tuple[Signal, Signal, np.ndarray]], behind: float) -> list[Block]:
+    """Blocks of the dead time from true signals to measured ones, with the values before the run."""
+    if not behind:
+        return [rename(f"see_{to.name}", true, to) for true, to, _ in states]
     return [
-        delay_block("see_state", shown[0], state, [behind] * plant.state.size),
-        delay_block("see_response", shown[1], realised, [behind] * realised.size),
+        delay_block(f"see_{to.name}", true, replace(to, start=tuple(map(float, start))), [behind] * to.size)
+        for true, to, start in states
     ]
 
 
-def _truth_block(problem: Problem, state: Signal) -> Block:
-    """Block (time, true state) -> true error of the judged coordinates."""
+def _truth_block(problem: Problem, motion: Signal) -> Block:
+    """Block (time, true state or outputs) -> true error of the judged ones."""
     plant = problem.plant
-    places = [plant.state.elements.index(c) for c in problem.judged_names]
+    places = [plant.output.elements.index(c) for c in problem.judged_names]
     writes = Layout((error_signal(problem, "true_error"),))
     if own_signals(problem):
-        reads = Layout((like(plant.state, "reference"), state))
-        return Block("truth", reads, writes, lambda s: {"true_error": (s.reference - getattr(s, state.name))[places]})
+        reads = Layout((like(plant.output, "reference"), motion))
+        return Block("truth", reads, writes, lambda s: {"true_error": (s.reference - getattr(s, motion.name))[places]})
     function = problem.reference.function(plant)
 
     def step(s: Signals) -> dict[str, Expression]:
-        return {"true_error": (function(s.time)[0] - getattr(s, state.name))[places]}
+        return {"true_error": (function(s.time)[0] - getattr(s, motion.name))[places]}
 
-    return Block("truth", Layout((plant.time, state)), writes, step, opaque=problem.reference.opaque)
+    return Block("truth", Layout((plant.time, motion)), writes, step, opaque=problem.reference.opaque)
 
 
 def _own_response(problem: Problem, *, seen: bool) -> Response:
@@ -209,6 +229,10 @@ def _own_response(problem: Problem, *, seen: bool) -> Response:
     plant = problem.plant
     if problem.symbolic_reality is not None:
         return Response(plant.response_signal("realised"), problem.symbolic_reality.response_function(plant, seen=seen))
+    if plant.outputs:
+        orders = dict(zip(plant.face.names, plant.face.orders, strict=True))
+        function = derivatives_function(plant, [(name, orders[name]) for name in plant.controlled_names])
+        return Response(plant.response_signal("realised"), function)
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
     response = plant.controlled_response_function(x, u, p) + w[list(plant.controlled_indices)]
@@ -223,39 +247,41 @@ def _real_signals(problem: Problem) -> tuple[Signal, ...]:
     return (*signals, _forcing(plant, "_forcing_before"))
 
 
-def _sense_block(problem: Problem, state: Signal, response: Response) -> Block:
-    """Block -> the true state, and the true response just before this cycle's command; with a reality also its state.
+def _sense_block(problem: Problem, motion: Sequence[Signal], response: Response) -> Block:
+    """Block -> the true state and outputs, and the true response just before this cycle's command; with a reality also its state.
 
     The response is computed here and not at the end of the last cycle, because it shares its costly terms with the first
-    Runge-Kutta evaluation of this cycle.
+    Runge-Kutta evaluation of this cycle. Outputs are those of the moving plant, with its exact parameters.
     """
     if problem.foreign is not None:
-        return foreign_block(problem, state, response.signal)
+        return foreign_block(problem, motion[0], response.signal)
     reality = problem.symbolic_reality
-    reads, writes = _real_signals(problem), (state, response.signal)
+    reads, writes = _real_signals(problem), (*motion, response.signal)
     state_of = None if reality is None else reality.state_function(problem.plant, seen=False)
+    outputs_of = problem.plant.output_function if reality is None else reality.output_function(problem.plant)
     own = () if reality is None else (like(reality.plant.state, REALITY_STATE),)
 
     def step(s: Signals) -> dict[str, Expression]:
         now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
-        measured = response.function(*now)
+        values = {response.signal.name: response.function(*now)}
+        values |= {signal.name: outputs_of(*now) for signal in motion[1:]}
         if state_of is None:
-            return {state.name: s._state_before, response.signal.name: measured}
-        return {state.name: state_of(*now), response.signal.name: measured, REALITY_STATE: s._state_before}
+            return {motion[0].name: s._state_before, **values}
+        return {motion[0].name: state_of(*now), REALITY_STATE: s._state_before, **values}
 
     return Block("sense", Layout(reads), Layout((*writes, *own)), step)
 
 
-def _seen_block(problem: Problem, shown: tuple[Signal, Signal], response: ca.Function) -> Block:
+def _seen_block(problem: Problem, shown: Shown, response: ca.Function) -> Block:
     """Block -> the state and the response that are measured in place of the true ones."""
     assert problem.symbolic_reality is not None
     state = problem.symbolic_reality.state_function(problem.plant, seen=True)
 
     def step(s: Signals) -> dict[str, Expression]:
         now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
-        return {shown[0].name: state(*now), shown[1].name: response(*now)}
+        return {shown[0][0].name: state(*now), shown[1].name: response(*now)}
 
-    return Block("seen", Layout(_real_signals(problem)), Layout(shown), step)
+    return Block("seen", Layout(_real_signals(problem)), Layout((*shown[0], shown[1])), step)
 
 
 def _actuate(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:

@@ -98,15 +98,15 @@ def lyapunov_view(problem: Problem, controller: Controller, run: Run) -> Lyapuno
 
 def _feedbacks(problem: Problem, controller: Controller) -> list[Feedback]:
     """The law's feedback for every controlled coordinate; empty without a law, and for a law without constant gains."""
-    law, plant = controller.law, problem.plant
+    law, plant = controller.law, problem.plant.face
     feedbacks = [law.feedback(plant.orders[k]) for k in plant.controlled_indices] if law is not None else []
     return [one for one in feedbacks if one is not None] if None not in feedbacks else []
 
 
 def _signals(problem: Problem, laws: Sequence[Feedback], rate: float, run: Run) -> tuple[np.ndarray, np.ndarray]:
     """S and h. The logged feedback is rate S plus the terms of S' below the highest derivative."""
-    plant = problem.plant
-    errors, feedback = run["reference"] - run["state"], run["desired"] - run["nominal"]
+    plant, seen = problem.plant.face, problem.plant.output.name
+    errors, feedback = run["reference"] - run[seen], run["desired"] - run["nominal"]
     surface = []
     for k, (index, law) in enumerate(zip(plant.controlled_indices, laws, strict=True)):
         name, order, degree = plant.names[index], plant.orders[index], len(law.gains) - 1

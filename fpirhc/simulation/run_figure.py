@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from fpirhc.simulation.common_columns import shown_motion
 from fpirhc.simulation.drawing import (
     PALETTE,
     draw_bands,
@@ -28,7 +29,7 @@ def run_figure(run: Run) -> Figure:
     axes = figure.subplots(4, 1, sharex=True)
     for k, name in enumerate(names):
         draw_line(axes[0], run, f"error.{name}", name, PALETTE[k])
-        draw_line(axes[1], run, f"state.{name}", name, PALETTE[k])
+        draw_line(axes[1], run, f"{shown_motion(run.layout)}.{name}", name, PALETTE[k])
         draw_line(axes[1], run, f"reference.{name}", f"{name} reference", PALETTE[k], "--")
         if "setpoint" in run.layout:
             draw_line(axes[1], run, f"setpoint.{name}", f"{name} set-point", PALETTE[k], ":")
@@ -38,7 +39,7 @@ def run_figure(run: Run) -> Figure:
     draw_responses(axes[3], run, first)
     labels = (
         f"error of {quantity_label(run, 'error', names)}",
-        quantity_label(run, "state", names),
+        quantity_label(run, shown_motion(run.layout), names),
         quantity_label(run, "command", run.layout["command"].elements),
         f"responses of {quantity_label(run, 'desired', [first])}",
     )

@@ -32,7 +32,8 @@ def judgements(problem: Problem, controller: Controller, layout: Layout, log: np
     if problem.cost is not None and problem.horizon is not None:
         judged.append(_costs(problem, layout, log))
     gain = controller.deformation.effective_gain()
-    if gain != 0 and log.shape[0] and controller.response(problem) is None:
+    of_responses = controller.response(problem) is None and not controller.deforms_target
+    if gain != 0 and log.shape[0] and of_responses:
         factors = _contraction(problem, controller, layout, log)
         judged += [(scalar("contraction"), factors[:, None])] if np.isfinite(factors).all() else []
     return judged
@@ -90,7 +91,7 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
     assert problem.cost is not None
     plant = problem.plant
     one_cycle = replace(problem.horizon, stages=1, step=problem.period, terminal=(), blocks=(), margins={})
-    ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits)
+    ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits, start=problem.start_state)
     own, outside = bool(own_signals(problem)), real_values(plant, problem.signals)
     data_of = stage_data(plant, problem.reference, one_cycle, problem.cost, signals=outside, previewed=own)
     states = log[:, layout.slice("plant_state")]

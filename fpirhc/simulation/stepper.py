@@ -96,9 +96,14 @@ class Stepper:
         Raises:
             InvalidProblem: an unknown name or a wrong interval in `plausible`.
             InvalidName: a live setting that does not exist.
-            NotSupported: an optimiser without a bound of its time; a setting that cannot be live.
+            NotSupported: outputs behind an estimator; an optimiser without a bound of its time; a setting that cannot be live.
             CompileError: the compiler fails on a controller with live settings.
         """
+        if problem.plant.outputs and problem.sensing.estimates:
+            raise NotSupported(
+                "a stepper behind an estimator is not covered for outputs: it would be given raw measurements and the state; leave "
+                "the estimator out, and give it `output`"
+            )
         self._live = live_settings(problem, controller, live)
         ready = checked(problem, self._live.controller)
         if bounded:
@@ -131,6 +136,7 @@ class Stepper:
         realised: np.ndarray,
         memory: np.ndarray,
         *,
+        output: np.ndarray | None = None,
         taken: float | None = None,
         settings: Numbers | None = None,
         setpoints: SetpointsNow | None = None,
@@ -143,6 +149,7 @@ class Stepper:
             realised: the measured response of the controlled coordinates to the last command; any finite value in the first cycle,
                 and for a controller that does not adapt.
             memory: from `start` or from the step before.
+            output: the measured outputs and their derivatives of a plant that has outputs, as `Plant.output` lays them out.
             taken: time stamp of the sample, s; None: it was taken at `time`. Read with `max_age` only.
             settings: numbers of live settings from this step on, by path. Checks and derived numbers are computed in Python before
                  the step, a tenth of a millisecond for gains and some tens for the weights of a horizon; see `change`.
@@ -161,10 +168,8 @@ class Stepper:
         except IndexError:
             _refuse_thread()
         try:
-            if settings:
-                self.change(settings)
-            if setpoints:
-                self.aim(setpoints)
+            if settings or setpoints or isinstance(time, bool):
+                self._take(time, settings, setpoints)
             try:
                 # A view takes arrays of float64 of its own shape and nothing else; numpy's assignment broadcasts, and is slower.
                 self._time[0] = time
@@ -175,8 +180,8 @@ class Stepper:
                 self._accept(time, state, realised, memory)
             if self._memory[0] != self._fingerprint:
                 self._inspect()
-            if self._ages:
-                self._taken[0] = one_number("taken", time if taken is None else taken)
+            if self._ages or self.outputs:
+                self._take_more(time, taken, output)
             if self._may_fail:
                 self._command[0] = _NOT_WRITTEN
             try:
@@ -215,9 +220,9 @@ class Stepper:
         if self.estimates:
             return self.step(time, measured, _NOTHING, memory, taken=taken, settings=settings, setpoints=setpoints)
         column = numbers_of("measured", measured, len(self.measures))
-        size = len(self._state)
+        state, seen, realised = np.split(column, [len(self._state), len(self._state) + self.outputs])
         return self.step(
-            time, column[:size], column[size:], memory, taken=taken, settings=settings, setpoints=setpoints
+            time, state, realised, memory, output=seen, taken=taken, settings=settings, setpoints=setpoints
         )
 
     def change(self, settings: Numbers) -> bool:
@@ -311,12 +316,32 @@ class Stepper:
         raw = raw_signal(self._live.problem)
         self.estimates = raw is not None  # whether the step begins with raw measurements
         sample = ("state", "realised") if raw is None else (raw.name,)
+        self.outputs = (
+            self._live.problem.plant.output.size if self._live.problem.plant.outputs else 0
+        )  # entries of `output`
+        self._output = _view(arguments["output"] if self.outputs else _NOTHING)
         self._memory, self._time, self._state, *rest = (_view(arguments[n]) for n in ("memory", "time", *sample))
         self._realised = rest[0] if rest else _view(_NOTHING)
         self._memory_array = arguments["memory"]
         self._taken = _view(arguments["taken"]) if self._ages else self._time
         self._command = _view(command)
         self._fingerprint = float(self.memory[FINGERPRINT].start[0])
+
+    def _take(self, time: object, settings: Numbers | None, setpoints: SetpointsNow | None) -> None:
+        """Put numbers in force, and refuse a truth value as time."""
+        if settings:
+            self.change(settings)
+        if setpoints:
+            self.aim(setpoints)
+        if isinstance(time, bool):
+            one_number("time", time)
+
+    def _take_more(self, time: float, taken: float | None, output: np.ndarray | None) -> None:
+        """Take the time stamp of the sample, and measured outputs, where the step reads them."""
+        if self._ages:
+            self._taken[0] = one_number("taken", time if taken is None else taken)
+        if self.outputs:
+            self._output[:] = numbers_of("output", output, self.outputs)
 
     def _accept(self, time: object, state: object, realised: object, memory: object) -> None:
         """Take arguments that are no arrays of float64, or say what is wrong with them."""
@@ -377,7 +402,9 @@ _NOT_WRITTEN = float("nan")  # the gate's command is finite: what is still NaN w
 def _measures(problem: Problem) -> tuple[str, ...]:
     """Names of what a step is given: the state and the responses, or what the sensors show."""
     raw = raw_signal(problem)
-    return (*problem.plant.state.elements, *response_names(problem.plant)) if raw is None else raw.elements
+    plant = problem.plant
+    outputs = plant.output.elements if plant.outputs else ()
+    return (*plant.state.elements, *outputs, *response_names(plant.face)) if raw is None else raw.elements
 
 
 def _view(array: np.ndarray) -> _View:

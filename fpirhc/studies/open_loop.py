@@ -54,7 +54,8 @@ def solve_first(task: Task, names: Sequence[str], tolerance: float) -> list[Solv
         raise InvalidName(f"optimiser '{unknown[0]}' is unknown.{nearest(unknown[0], [*choices, 'all'])}")
     plant = problem.plant
     ahead = previewed_values(plant, problem.signals)
-    ocp = transcribe(plant, problem.reference, problem.horizon, problem.cost, problem.limits, ahead)
+    limits, start = problem.limits, problem.start_state
+    ocp = transcribe(plant, problem.reference, problem.horizon, problem.cost, limits, ahead, start)
     data_of = stage_data(plant, problem.reference, problem.horizon, problem.cost, signals=ahead)
     data = np.asarray(data_of(0.0, plant.approximate).full())
     first = np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel()

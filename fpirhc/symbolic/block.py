@@ -60,6 +60,7 @@ class Block:
         opaque: whether the step holds operations that scalar expressions cannot (solver calls, table look-up, short circuits);
             the block is then built with MX.
         derived: function of the numbers of all settings, by path, that returns what follows from them; None: nothing does.
+        inside: the composed step that the block runs, where it is nothing but the guard of one.
     """
 
     name: str
@@ -69,6 +70,7 @@ class Block:
     memory: Layout = field(default_factory=Layout)
     opaque: bool = False
     derived: Callable[[Values], Derived] | None = None
+    inside: Composite | None = None
 
     @property
     def function(self) -> ca.Function:

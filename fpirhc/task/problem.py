@@ -15,6 +15,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Duration
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
+from fpirhc.horizon.regular_gain import singular_gain
 from fpirhc.horizon.stage_check import check_stage
 from fpirhc.plant.algebraic import unsolved
 from fpirhc.plant.integrators import Integrator, RungeKutta4
@@ -57,7 +58,7 @@ class Problem(Checked):
             and they act until the first command arrives. An input that is not named has the value of `DeadTime(before=...)`, or
             else zero, moved into its limits.
         measure_from: time from which metrics count; the transient before it is left out.
-        judged: coordinates whose errors are logged and measured; None: the controlled ones.
+        judged: coordinates, or outputs of a plant that has some, whose errors are logged and measured; None: the controlled ones.
         reality: what a run moves, where it is not `plant` with its exact parameters: another plant (`Reality`), or an object
             outside (`Foreign`). `plant` is then the model alone.
         signals: values over time of every signal from outside that the plants declare, by name: `Known`, `Unknown` or `Believed`.
@@ -92,7 +93,9 @@ class Problem(Checked):
         _check_start(self, mistakes)
         plant = self.plant
         _check_input_before(self, mistakes)
-        mistakes.unknown("judged: coordinate", self.judged or (), plant.coordinates)
+        mistakes.unknown(
+            "judged: output" if plant.outputs else "judged: coordinate", self.judged or (), plant.face.coordinates
+        )
         disturbed = [*plant.inputs, *(() if self.foreign else self.real_plant.coordinates)]
         mistakes.unknown("disturbances: input or coordinate", self.disturbances, disturbed)
         instants, random = np.array([0.0, self.period]), np.random.default_rng(0)
@@ -101,9 +104,9 @@ class Problem(Checked):
             *((lambda one=one: one.values(instants, random)) for one in self.disturbances.values()),
             lambda: self.limits.check(plant),
             lambda: self.reference.function(plant),
-            lambda: check_steps(plant, self.limits, self.reference.set_points),
+            lambda: check_steps(plant.face, self.limits, self.reference.set_points),
             lambda: self.dead_time.check(plant, self.period),
-            lambda: self.sensing.check(plant),
+            lambda: self.sensing.check(plant.face),
             lambda: self.symbolic_reality.check(plant) if self.symbolic_reality else None,
             lambda: self.foreign.check(plant, self.sensing.measures(plant)) if self.foreign else None,
         )
@@ -115,6 +118,8 @@ class Problem(Checked):
         mistakes.raise_if_any()
         check_stage(plant, self.cost, self.limits, mistakes)
         _check_inverse(self, mistakes)
+        mistakes.raise_if_any()
+        _check_outputs(self, mistakes)
         mistakes.raise_if_any()
         if self.symbolic_reality is not None:
             self.symbolic_reality.check_motion(self.real_start, self.inputs_before, self.real_integrator, self.period)
@@ -221,6 +226,18 @@ class Problem(Checked):
         values = [stated.get(name, rest) for name, rest in zip(self.plant.inputs, resting, strict=True)]
         return np.array(values, dtype=float)
 
+    @cached_property
+    def start_output(self) -> np.ndarray:
+        """First value of the outputs and their derivatives, of the plant that moves; without outputs the first state."""
+        if not self.plant.outputs:
+            return self.start_state
+        if self.symbolic_reality is not None:
+            function = self.symbolic_reality.output_function(self.plant)
+        else:
+            function = self.plant.output_function
+        calm = np.zeros(len(self.real_plant.names))
+        return np.asarray(function(self.real_start, self.inputs_before, self.real_parameters, calm).full()).ravel()
+
     @property
     def response_delay(self) -> float:
         """Cycles from a request to its estimated response, beyond the one cycle of every loop: `Paired(map, cycles=...)`.
@@ -228,12 +245,12 @@ class Problem(Checked):
         It is the sum of dead time and estimator, for the slowest input and coordinate.
         """
         waiting = max(self.dead_time.inputs.values(), default=0.0) + self.dead_time.measurement
-        return waiting / self.period + self.sensing.delay(self.plant, self.period)
+        return waiting / self.period + self.sensing.delay(self.plant.face, self.period)
 
     @property
     def warm_up_cycles(self) -> int:
         """Number of the first cycle whose realised response may be used; no deformation acts before it."""
-        return self.sensing.warm_up_cycles(self.plant, self.dead_time.measurement / self.period)
+        return self.sensing.warm_up_cycles(self.plant.face, self.dead_time.measurement / self.period)
 
 
 def _check_times(problem: Problem, mistakes: Mistakes) -> None:
@@ -279,7 +296,7 @@ def _check_start(problem: Problem, mistakes: Mistakes) -> None:
     mistakes.unknown("start: state", problem.start, plant.state.elements)
     for c in plant.names:
         if c not in problem.start:
-            mistakes.add(f"start: coordinate '{c}' has no first value; add '{c}': ...")
+            mistakes.add(f"start: {plant.words[0]} '{c}' has no first value; add '{c}': ...")
     for name, value in problem.start.items():
         if not isinstance(value, int | float) or not math.isfinite(value):
             mistakes.add(f"start: '{name}' must be a finite number, got {value!r}")
@@ -300,6 +317,35 @@ def _check_input_before(problem: Problem, mistakes: Mistakes) -> None:
             mistakes.add(f"input_before: '{name}' is {value!r}, but dead_time has before={other!r}; state it once")
 
 
+def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
+    """Add what speaks against outputs in this problem."""
+    plant = problem.plant
+    if not plant.outputs:
+        return
+    if problem.foreign is not None:
+        mistakes.add(
+            "reality: a foreign reality measures coordinates of the model, and a plant with outputs has more to measure; "
+            "write the outputs as coordinates"
+        )
+    if problem.signals:
+        mistakes.add(
+            f"signals: {', '.join(problem.signals)} from outside have derivatives of their own in those of outputs, which is not "
+            "covered; leave them out, or write the outputs as coordinates"
+        )
+    if problem.sensing.measured is not None or problem.sensing.belief is not None:
+        mistakes.add("sensing: believed states are not covered for outputs; leave measured and belief out")
+    if len(plant.inputs) == len(plant.controlled or plant.outputs):
+        bounds = nominal(problem.limits).input_bounds(plant)
+        start, ends = (
+            tuple(map(float, problem.start_state)),
+            (tuple(map(float, bounds[0])), tuple(map(float, bounds[1]))),
+        )
+        times = problem.period, problem.cycles
+        singular = singular_gain(plant, problem.reference, problem.integrator, start, ends, times)
+        if singular:
+            mistakes.add(f"outputs: {singular}")
+
+
 def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
     """Add a mistake where the response is not finite at the start, or cannot be solved for the inputs there."""
     plant = problem.plant
@@ -308,7 +354,7 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
         why = unsolved(plant, problem.start_state, problem.inputs_before, values)
         if why:
             mistakes.add(f"algebraic states at the start ({which} parameters): {why}")
-    if not mistakes.none or (plant.controlled is None and len(plant.inputs) != len(plant.coordinates)):
+    if not mistakes.none or (plant.controlled is None and len(plant.inputs) != len(plant.face.coordinates)):
         return
     x, u, p = plant.symbols()
     response = plant.controlled_response_function(x, u, p)

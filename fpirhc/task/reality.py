@@ -88,6 +88,12 @@ class Reality(Checked):
             )
         for name, unit in model.coordinates.items():
             _check_output(self, model, name, unit, mistakes)
+        if model.outputs and self.seen:
+            mistakes.add(
+                "seen: what is measured of a model with outputs are the outputs of the same names; write the sensor there"
+            )
+        for name in model.outputs:
+            _check_expression(self, model, name, mistakes)
         mistakes.raise_if_any()
 
     def state_function(self, model: Plant, *, seen: bool) -> ca.Function:
@@ -103,8 +109,15 @@ class Reality(Checked):
 
     def response_function(self, model: Plant, *, seen: bool) -> ca.Function:
         """Function (state, input, parameters, forcing) of the reality -> the model's controlled responses."""
+        if model.outputs:
+            orders = dict(zip(model.face.names, model.face.orders, strict=True))
+            return derivatives_function(self.plant, [(name, orders[name]) for name in model.controlled_names])
         names = self._names(model, seen=seen)
         return derivatives_function(self.plant, [(names[k], model.orders[k]) for k in model.controlled_indices])
+
+    def output_function(self, model: Plant) -> ca.Function:
+        """Function (state, input, parameters, forcing) of the reality -> the model's outputs and their derivatives."""
+        return derivatives_function(self.plant, [(e.rstrip("'"), e.count("'")) for e in model.output.elements])
 
     def start_state(self, model: Plant, start: np.ndarray, command: np.ndarray) -> np.ndarray:
         """Return the first state of the reality, shape (its nx,).
@@ -186,7 +199,9 @@ class Reality(Checked):
         differences += [f"{own} measured in place of {c}" for c, own in self.seen.items()]
         if not differences and plant.names != model.names:
             differences = ["its coordinates in another order"]
-        if not differences and (plant.controlled or plant.names) != model.controlled_names:
+        if tuple(plant.outputs) != tuple(model.outputs):
+            differences.append("other outputs")
+        if not differences and (plant.controlled or tuple(plant.outputs) or plant.names) != model.controlled_names:
             differences = [
                 f"other controlled coordinates (write controlled={model.controlled_names!r} in its plant too)"
             ]
@@ -234,5 +249,26 @@ def _check_output(reality: Reality, model: Plant, name: str, unit: str, mistakes
             f"its derivative {own}{chr(39) * at_once} jumps with the command, but it is a state of the model, where '{name}' has "
             f"the order {order}; give the model this order, or the reality a coordinate of its own"
         )
-    elif name in (model.controlled or model.names) and structural_order(plant, own) is None:
+    elif not model.outputs and name in (model.controlled or model.names) and structural_order(plant, own) is None:
         mistakes.add(f"no input reaches its coordinate '{own}', however often it is differentiated")
+
+
+def _check_expression(reality: Reality, model: Plant, name: str, mistakes: Mistakes) -> None:
+    """Add what is wrong with the reality's output, or coordinate, of the name of an output of the model."""
+    plant, unit = reality.plant, model.outputs[name].unit
+    units = {**plant.coordinates, **{n: one.unit for n, one in plant.outputs.items()}}
+    if name not in units:
+        mistakes.add(
+            f"it has no output '{name}', which the model has and which is judged; give its plant this output too. Its coordinates "
+            f"and outputs: {', '.join(units)}"
+        )
+        return
+    if units[name] != unit:
+        mistakes.add(f"its '{name}' is in {units[name]}, the model's in {unit}; write both in one unit")
+    order = model.face.orders[model.face.names.index(name)]
+    at_once = input_reaches_at(plant, name, order - 1)
+    if at_once is not None:
+        mistakes.add(
+            f"its derivative {name}{chr(39) * at_once} jumps with the command, but '{name}' has the relative order {order} in the "
+            "model; give the model this order, or the reality an actuator"
+        )

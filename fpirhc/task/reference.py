@@ -45,15 +45,15 @@ class Reference(Checked, ABC):
         """Return {coordinate: expression of t}."""
 
     def function(self, plant: Plant) -> ca.Function:
-        """Function t -> (nominal state (nx), nominal response (n)).
+        """Function t -> (nominal state (nx), nominal response (n)); of a plant with outputs these are those of its face.
 
         Raises:
             InvalidProblem: a coordinate is missing, unknown, or not a scalar.
         """
-        matrix = kind(self.opaque)
+        matrix, what, plant = kind(self.opaque), "output" if plant.outputs else "coordinate", plant.face
         t = matrix.sym("t")
         motion = {name: matrix(value) for name, value in self.coordinates(t).items()}
-        _check(plant, motion)
+        _check(plant, motion, what)
         derivatives = {c: _differentiate(motion[c], t, r) for c, r in zip(plant.names, plant.orders, strict=True)}
         state = [derivatives[e.rstrip("'")][e.count("'")] for e in plant.state.elements]
         response = [derivatives[c][r] for c, r in zip(plant.names, plant.orders, strict=True)]
@@ -196,12 +196,12 @@ def _differentiate(value: Expression, t: Expression, order: int) -> list[Express
     return derivatives
 
 
-def _check(plant: Plant, motion: Mapping[str, Expression]) -> None:
+def _check(plant: Plant, motion: Mapping[str, Expression], what: str) -> None:
     mistakes = Mistakes("reference")
-    mistakes.unknown("coordinate", motion, plant.coordinates)
+    mistakes.unknown(what, motion, plant.coordinates)
     for c in plant.names:
         if c not in motion:
-            mistakes.add(f"coordinate '{c}' has no nominal motion; add '{c}' to the reference")
+            mistakes.add(f"{what} '{c}' has no nominal motion; add '{c}' to the reference")
         elif motion[c].numel() != 1:
-            mistakes.add(f"coordinate '{c}' must be one scalar, got shape {motion[c].shape}")
+            mistakes.add(f"{what} '{c}' must be one scalar, got shape {motion[c].shape}")
     mistakes.raise_if_any()

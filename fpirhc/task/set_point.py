@@ -84,6 +84,7 @@ class Setpoint(Reference):
         Raises:
             InvalidProblem: a coordinate is missing or unknown, or its order is above that of the filter.
         """
+        plant = plant.face
         self._check_names(plant)
         t = ca.SX.sym("t")
         state, response = arranged(plant, [self._along_values(name, m, t) for name, m in self._orders(plant).items()])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
@@ -42,6 +44,16 @@ class Tracking(Checked, ABC):
     def feedback(self, order: int) -> Feedback | None:  # noqa: ARG002
         """The law for a coordinate of that relative order; None where its gains are not constant."""
         return None
+
+    def within(self, largest: Sequence[float]) -> Self:  # noqa: ARG002
+        """Return the law for inputs with limits: what it remembers forgets a demand that no limits could meet.
+
+        By default the law itself.
+
+        Args:
+            largest: response of every controlled coordinate that the limits allow; infinite where they are not finite.
+        """
+        return self
 
     @abstractmethod
     def law(self, plant: Plant, period: float) -> Block:

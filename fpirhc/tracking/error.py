@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import casadi as ca
 
@@ -12,6 +14,36 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.symbolic.live import is_live
+
+ROOM = 10.0  # times the largest response that a law may ask for, because a model may be wrong by a factor
+
+
+@dataclass(frozen=True)
+class Useful:
+    """What the integral of an error may ask for.
+
+    Args:
+        integral: its gain g_0.
+        error: the gain g_1 of the error itself.
+        largest: response that the limits of the inputs allow, L; infinite where they are not finite.
+    """
+
+    integral: float
+    error: float
+    largest: float
+
+    def next(self, integral: Expression, error: Expression, period: float) -> Expression:
+        """The integral one cycle later.
+
+        The error counts where |g_0 e_int + g_1 e| <= 10 L; so it takes the integral back as soon as the two are of opposite signs.
+        An integral with |g_0 e_int| > 20 L, such as one that began at an absurd sample, is forgotten.
+        """
+        if math.isinf(self.largest):
+            return integral + period * error
+        most = ROOM * self.largest
+        counted = ca.if_else(ca.fabs(self.integral * integral + self.error * error) <= most, error, 0)
+        later = integral + period * counted
+        return ca.if_else(ca.fabs(self.integral * later) <= 2 * most, later, 0)
 
 
 def law_signals(plant: Plant) -> tuple[Layout, Layout]:
@@ -27,12 +59,22 @@ def law_signals(plant: Plant) -> tuple[Layout, Layout]:
     return Layout(reads), Layout(writes)
 
 
-def integral_update(plant: Plant, period: float) -> Block:
-    """Block that integrates the error, except while the command is clipped."""
+def integral_update(plant: Plant, period: float, useful: Sequence[Useful] = ()) -> Block:
+    """Block that integrates the error, except while the command is clipped, and where it asks for what no limits could meet.
+
+    Args:
+        plant: whose errors are integrated.
+        period: of the control cycle, s.
+        useful: what the integral of every controlled coordinate may ask for; empty: anything.
+    """
     reads = (error_signal(plant), scalar("clipped"), integral_signal(plant, "_integral_used"))
 
     def step(s: Signals) -> dict[str, Expression]:
-        return {"integral": s._integral_used + period * ca.if_else(s.clipped, 0, s._target_error)}
+        error = ca.if_else(s.clipped, 0, s._target_error)
+        if not useful:
+            return {"integral": s._integral_used + period * error}
+        columns = zip(useful, ca.vertsplit(s._integral_used), ca.vertsplit(error), strict=True)
+        return {"integral": ca.vertcat(*(one.next(i, e, period) for one, i, e in columns))}
 
     return Block("tracking_update", Layout(reads), Layout((integral_signal(plant, "integral"),)), step)
 

@@ -13,7 +13,10 @@ References:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, field
+from typing import Self
 
 import casadi as ca
 
@@ -24,7 +27,15 @@ from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.layout import Expression
 from fpirhc.tracking.base import Feedback, Tracking
-from fpirhc.tracking.error import bumpless, error_chains, gains_before, integral_delay, integral_update, law_signals
+from fpirhc.tracking.error import (
+    Useful,
+    bumpless,
+    error_chains,
+    gains_before,
+    integral_delay,
+    integral_update,
+    law_signals,
+)
 
 
 @dataclass(frozen=True)
@@ -35,6 +46,8 @@ class Exponential(Tracking):
         rate: Lambda, 1/s. The digital loop needs rate x period well below 0.667 for n = 2 (0.412 for n = 4).
         integral: whether the integral of the error is fed back (it removes constant offsets and adds an undershoot).
         bumpless: whether the integral starts so that the first desired response is the nominal one.
+        largest: response of every controlled coordinate beyond ten times of which an error is not integrated, and an integral does
+            not grow or start a run; infinite for no bound. Empty: what the limits of the inputs allow.
 
     Raises:
         InvalidValue: a rate that is not positive.
@@ -43,6 +56,7 @@ class Exponential(Tracking):
     rate: float
     integral: bool = True
     bumpless: bool = True
+    largest: Sequence[float] = field(default=(), metadata={"setting": "where given"})
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rate) and self.rate > 0):
@@ -61,6 +75,14 @@ class Exponential(Tracking):
     def feedback(self, order: int) -> Feedback:
         """The gains for that order."""
         return Feedback(self.gains(order), self.integral, self.bumpless, self.rate)
+
+    def within(self, largest: Sequence[float]) -> Self:
+        """Return the law with these largest responses, unless the user has set them."""
+        if self.largest:
+            return self
+        other = copy(self)  # not `replace`, which would check numbers that are live
+        object.__setattr__(other, "largest", tuple(largest))
+        return other
 
     def law(self, plant: Plant, period: float) -> Block:
         """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
@@ -85,12 +107,19 @@ class Exponential(Tracking):
         return Block("tracking", reads, writes, step, gains_before(plant, first_gains))
 
     def update(self, plant: Plant, period: float) -> Block:
-        """Block that integrates the error, except while the command is clipped."""
-        return integral_update(plant, period)
+        """Block that integrates the error, except while the command is clipped, and within its bounds."""
+        return integral_update(plant, period, self._useful(plant))
 
     def delays(self, plant: Plant) -> tuple[Delay, ...]:
         """The delay of the integral of the error."""
         return integral_delay(plant)
+
+    def _useful(self, plant: Plant) -> list[Useful]:
+        """What the integrals may ask for; nothing where they are not fed back."""
+        if not (self.integral and self.largest):
+            return []
+        gains = [self.gains(plant.orders[k])[:2] for k in plant.controlled_indices]
+        return [Useful(integral, error, most) for (integral, error), most in zip(gains, self.largest, strict=True)]
 
     def _feedback(self, integral: Expression, chain: list[Expression]) -> Expression:
         terms = [integral, *chain] if self.integral else chain

@@ -25,7 +25,10 @@ References:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, field
+from typing import Self
 
 import casadi as ca
 import numpy as np
@@ -37,7 +40,7 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.tracking.base import Tracking
-from fpirhc.tracking.error import error_chains, integral_delay, integral_update, law_signals
+from fpirhc.tracking.error import ROOM, Useful, error_chains, integral_delay, integral_update, law_signals
 
 MOST = 20_000  # cycles of memory: the memory has a fixed size
 _REACH = 20.0  # memory x rate by default
@@ -54,6 +57,8 @@ class Fractional(Tracking):
         rate: Lambda, 1/s.
         order: beta, between 0 and 2, both excluded.
         memory: length of the sum, s; at least 1 / rate. None: 20 / rate.
+        largest: response of every controlled coordinate; an S with rate |S| beyond ten times of it is not remembered, and the last
+            one stands for it. Infinite for no bound. Empty: what the limits of the inputs allow.
 
     Raises:
         InvalidValue: a rate, order or memory outside its range; when the loop is built, a memory of more than 20 000 cycles.
@@ -62,6 +67,7 @@ class Fractional(Tracking):
     rate: float
     order: float
     memory: float | None = None
+    largest: Sequence[float] = field(default=(), metadata={"setting": "where given"})
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rate) and self.rate > 0):
@@ -104,6 +110,14 @@ class Fractional(Tracking):
         """Lambda."""
         return self.rate
 
+    def within(self, largest: Sequence[float]) -> Self:
+        """Return the law with these largest responses, unless the user has set them."""
+        if self.largest:
+            return self
+        other = copy(self)  # not `replace`, which would check numbers that are live
+        object.__setattr__(other, "largest", tuple(largest))
+        return other
+
     def law(self, plant: Plant, period: float) -> Block:
         """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
         cycles, size = self.cycles(period), len(plant.controlled_names)
@@ -116,7 +130,9 @@ class Fractional(Tracking):
             errors = error_chains(plant, s._target - s.state)
             running = s.warm_up > 0.5
             integral = ca.if_else(running, s._integral_before, 0)
-            decaying, drift = self._decaying(integral, errors)
+            measured, drift = self._decaying(integral, errors)
+            last = s.decay_first + ca.vertcat(*(s.decay_past[cycles * k] for k in range(size)))
+            decaying = self._useful_decay(measured, ca.if_else(running, last, 0))
             first = ca.if_else(running, s.decay_first, decaying)
             past_now = ca.if_else(running, s.decay_past, 0)
             queues = [_pushed(past_now[cycles * k : cycles * (k + 1)], decaying[k] - first[k]) for k in range(size)]
@@ -134,12 +150,31 @@ class Fractional(Tracking):
         return Block("tracking", reads, writes, step, memory, opaque=True)
 
     def update(self, plant: Plant, period: float) -> Block:
-        """Block that integrates the error, except while the command is clipped."""
-        return integral_update(plant, period)
+        """Block that integrates the error, except while the command is clipped, and within its bounds."""
+        return integral_update(plant, period, self._useful(plant))
 
     def delays(self, plant: Plant) -> tuple[Delay, ...]:
         """The delay of the integral of the error; the block of the law holds the rest of the memory."""
         return integral_delay(plant)
+
+    def _useful(self, plant: Plant) -> list[Useful]:
+        """What the integrals may ask for by way of rate S."""
+        if not self.largest:
+            return []
+        gains = [(*self.gains(plant.orders[k]), 1.0)[:2] for k in plant.controlled_indices]
+        return [Useful(self.rate * i, self.rate * e, most) for (i, e), most in zip(gains, self.largest, strict=True)]
+
+    def _useful_decay(self, measured: Expression, last: Expression) -> Expression:
+        """S, or the last one where S asks for more than ten times what limits allow: one sample would stay for the whole memory."""
+        entries = (
+            [
+                one if math.isinf(most) else ca.if_else(ca.fabs(self.rate * one) > ROOM * most, before, one)
+                for one, before, most in zip(ca.vertsplit(measured), ca.vertsplit(last), self.largest, strict=True)
+            ]
+            if self.largest
+            else ca.vertsplit(measured)
+        )
+        return ca.vertcat(*entries)
 
     def _decaying(self, integral: Expression, errors: list[list[Expression]]) -> tuple[Expression, Expression]:
         """S, and its derivative without e^(n)."""

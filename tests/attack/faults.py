@@ -119,5 +119,6 @@ LASTING = (
     Fault("actuator of the opposite sign", actuator=lambda u, low, high: -u, length=15),
     Fault("parameter jumps", heavier=1.3, length=10**6),
 )
-AT_START = tuple(replace(f, name=f"at the start, {f.name}", first=FIRST, length=3, single=False) for f in SINGLE)
+_EARLY = (*SINGLE, *(f for f in LASTING if "spikes" in f.name))
+AT_START = tuple(replace(f, name=f"at the start, {f.name}", first=FIRST, length=3, single=False) for f in _EARLY)
 FAULTS = (*SINGLE, *LASTING, *AT_START)

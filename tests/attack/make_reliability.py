@@ -1,44 +1,31 @@
-"""Runs every attack and writes the figures to docs/reliability.md: `python tests/attack/make_reliability.py`."""
+"""Runs every attack and writes the figures to docs/reliability.md: `python tests/attack/make_reliability.py`.
+
+`python tests/attack/make_reliability.py files commands` runs these sections only and leaves the others of the page as they are.
+"""
 
 from __future__ import annotations
 
 import sys
 import tempfile
+import warnings
 from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]  # also for processes that are started
 PAGE = ROOT / "docs" / "reliability.md"
-FLIPS, KILLS = 400, 30
-
-TEXT = """# Reliability
+FLIPS, KILLS, MISTAKES, LINES = 400, 30, 10_000, 1000
+HEAD = """# Reliability
 
 What a machine must survive, attacked and counted. This page is made by `python tests/attack/make_reliability.py`; the tests in
 `tests/attack` run a share of it, and all of it with `-m slow`.
-
-| attack | tried | raw errors | commands not finite or outside limits | controllers frozen | not equal to the tick left out |
-|---|---|---|---|---|---|
-{rows}
-
-{controllers} shipped controllers of {problems} problems, each through a `Stepper`, for 80 cycles and the faults of
-`tests/attack/faults.py`. A controller is frozen when it still skips every cycle, or does not move its command, long
-after the fault has ended. A single bad sample must give the same commands, bit for bit, as the tick left out. After
-{lost} faults the simulated plant itself has left its domain (a tank below its bottom); these are not judged for freezing.
-
-| attack on files | tried | unnoticed or failed |
-|---|---|---|
-| one flipped bit in a compiled library or its checksum | {flips} | {unnoticed} |
-| a process killed while it compiles; the next one needs the library | {kills} | {failed} |
-
-{wrong}
 """
 
 
-def main() -> None:
-    """Run everything and write the page."""
+def loop() -> str:
+    """Faults of sensors, actuators, clocks and memories, for every shipped controller."""
     from attack.faults import FAULTS
-    from attack.files import flipped_bits, killed_compilations
     from attack.harness import PROBLEMS, Bench, shipped
 
     tried, raw, outside, frozen, differs = (Counter[str]() for _ in range(5))
@@ -54,23 +41,126 @@ def main() -> None:
             differs[fault.name] += outcome.differs
             lost += bench.lost
             if outcome.wrong:
-                wrong.append(f"- {label}, {fault.name}: {outcome.wrong}")
+                wrong.append(f"{label}, {fault.name}: {outcome.wrong}")
         print(label, flush=True)
     counters = (tried, raw, outside, frozen, differs)
-    rows = []
+    rows = [["attack", "tried", "raw errors", "commands not finite or outside limits", "controllers frozen"]]
+    rows[0].append("not equal to the tick left out")
     for fault in FAULTS:
-        numbers = [str(c[fault.name]) for c in counters[:4]] + [str(differs[fault.name]) if fault.single else "–"]
-        rows.append(f"| {fault.name} | {' | '.join(numbers)} |")
-    rows.append("| **all** | " + " | ".join(f"**{sum(c.values())}**" for c in counters) + " |")
+        rows.append([fault.name, *(str(c[fault.name]) for c in counters[:4])])
+        rows[-1].append(str(differs[fault.name]) if fault.single else "–")
+    rows.append(["**all**", *(f"**{sum(c.values())}**" for c in counters)])
+    return f"""{_table(rows)}
+
+{controllers} shipped controllers of {len(PROBLEMS)} problems, each through a `Stepper`, for 80 cycles and the faults of
+`tests/attack/faults.py`. A controller is frozen when it still skips every cycle, or does not move its command, long
+after the fault has ended. A single bad sample must give the same commands, bit for bit, as the tick left out. After
+{lost} faults the simulated plant itself has left its domain (a tank below its bottom); these are not judged for freezing.
+
+{_what_went(wrong)}"""
+
+
+def files() -> str:
+    """Flipped bits of everything that is read again, and killed compilations."""
+    from attack.artefacts import ARTEFACTS, flipped
+    from attack.files import flipped_bits, killed_compilations
+
+    rows = [["attack", "tried", "raw errors", "unnoticed or failed"]]
+    wrong: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
+        for name in ARTEFACTS:
+            result = flipped(name, Path(folder) / name, FLIPS, seed=1)
+            rows.append([f"one flipped bit in a {name}", str(FLIPS), str(len(result.raw)), str(result.unnoticed)])
+            wrong += result.raw
         unnoticed = flipped_bits(Path(folder) / "flips", FLIPS, seed=1)
+        rows.append(["one flipped bit in a compiled library or its checksum", str(FLIPS), "0", str(unnoticed)])
         failed = killed_compilations(Path(folder) / "kills", KILLS, seed=1)
-    facts = {"controllers": controllers, "problems": len(PROBLEMS), "lost": lost, "flips": FLIPS, "kills": KILLS}
-    words = "\n".join(["What went wrong:", "", *wrong]) if wrong else "Nothing went wrong."
-    PAGE.write_text(
-        TEXT.format(rows="\n".join(rows), unnoticed=unnoticed, failed=failed, wrong=words, **facts), encoding="utf-8"
+        what = "a process killed while it compiles; the next one needs the library"
+        rows.append([what, str(KILLS), "0", str(failed)])
+    return f"{_table(rows)}\n\n{_what_went(wrong)}"
+
+
+def strangers() -> str:
+    """Libraries that another user may have planted."""
+    from attack.strangers import planted_and_run
+
+    with tempfile.TemporaryDirectory() as folder:
+        ran = planted_and_run(Path(folder))
+    return _table([["planted in the cache", "code of others run"], *([way, str(int(run))] for way, run in ran.items())])
+
+
+def studies() -> str:
+    """A study that is killed again and again."""
+    from attack.studies import killed_studies
+
+    with tempfile.TemporaryDirectory() as folder:
+        kills = killed_studies(Path(folder) / "study", KILLS, seed=1)
+    return _table(
+        [
+            ["kills of a running study", "results lost", "results doubled", "results with other numbers"],
+            [str(kills.tried), str(kills.lost), str(kills.doubled), str(kills.changed)],
+        ]
     )
 
 
+def commands() -> str:
+    """Random command lines."""
+    from attack.commands import prepared, random_line, raw_end
+
+    with tempfile.TemporaryDirectory() as folder, prepared(Path(folder) / "work"):
+        ends = [raw_end(random_line(seed)) for seed in range(LINES)]
+    wrong = [end for end in ends if end]
+    rows = [["random command lines", "tracebacks, or codes that are not documented"], [str(LINES), str(len(wrong))]]
+    return f"{_table(rows)}\n\n{_what_went(wrong)}"
+
+
+def problems() -> str:
+    """Problem files with mistakes."""
+    import pytest
+    from test_mistakes import raw_error
+
+    warnings.simplefilter("ignore")
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        ends = [raw_error(Path(folder) / "mine.py", 1000 + k, patch) for k in range(MISTAKES)]
+    wrong = [end for end in ends if end]
+    rows = [["problem files with one to three mistakes", "raw errors"], [str(MISTAKES), str(len(wrong))]]
+    return f"{_table(rows)}\n\n{_what_went(wrong)}"
+
+
+SECTIONS: dict[str, tuple[str, Callable[[], str]]] = {
+    "loop": ("The loop", loop),
+    "files": ("Files and processes", files),
+    "strangers": ("Other users", strangers),
+    "studies": ("Studies", studies),
+    "commands": ("The command line", commands),
+    "problems": ("Problem files", problems),
+}
+
+
+def main(names: Sequence[str]) -> None:
+    """Run the named sections, or all, and write the page after each."""
+    for name in names or SECTIONS:
+        title, make = SECTIONS[name]
+        texts = {**_written(), title: make()}
+        parts = [f"## {title}\n\n{texts[title]}\n" for title, _ in SECTIONS.values() if title in texts]
+        PAGE.write_text("\n".join([HEAD, *parts]), encoding="utf-8")
+        print(title, flush=True)
+
+
+def _written() -> dict[str, str]:
+    """The sections of the page as it is, by title."""
+    parts = PAGE.read_text(encoding="utf-8").split("\n## ")[1:] if PAGE.exists() else []
+    return {title: text.strip() for title, _, text in (part.partition("\n") for part in parts)}
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    lines = [f"| {' | '.join(row)} |" for row in rows]
+    return "\n".join([lines[0], "|---" * len(rows[0]) + "|", *lines[1:]])
+
+
+def _what_went(wrong: Sequence[str]) -> str:
+    return "\n".join(["What went wrong:", "", *(f"- {one}" for one in wrong)]) if wrong else "Nothing went wrong."
+
+
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 import fpirhc as fp
+from attack.artefacts import ARTEFACTS, flipped
+from attack.commands import prepared, random_line, raw_end
 from attack.faults import FAULTS
 from attack.files import flipped_bits, killed_compilations
 from attack.harness import PROBLEMS, Bench, shipped
+from attack.strangers import planted_and_run
+from attack.studies import killed_studies
 from fpirhc.symbolic.native import find_compiler
 
 QUICK = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"), ("noisy_motor", None))
@@ -47,3 +53,48 @@ def test_every_flipped_bit_and_every_kill(tmp_path):
     """400 flipped bits, and 30 compilations that are killed: the next process has right numbers."""
     assert flipped_bits(tmp_path / "flips", 400, seed=1) == 0
     assert killed_compilations(tmp_path / "kills", 30, seed=1) == 0
+
+
+@pytest.mark.parametrize("name", ARTEFACTS)
+def test_flipped_bits_of_files_are_noticed(name, tmp_path):
+    """A saved run, a ledger or a baseline with a flipped bit is refused by name, or reads as it was written."""
+    result = flipped(name, tmp_path / "flips", 40, seed=0)
+    assert (result.raw, result.unnoticed) == ((), 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ARTEFACTS)
+def test_every_flipped_bit_of_files(name, tmp_path):
+    """400 flips of each."""
+    result = flipped(name, tmp_path / "flips", 400, seed=1)
+    assert (result.raw, result.unnoticed) == ((), 0)
+
+
+@needs_compiler
+@pytest.mark.skipif(os.name != "posix", reason="owners and modes of files are those of POSIX")
+def test_no_planted_library_runs(tmp_path):
+    """In whatever way another user could have written it."""
+    assert {way: ran for way, ran in planted_and_run(tmp_path).items() if ran} == {}
+
+
+@pytest.mark.slow
+def test_a_study_survives_its_kills(tmp_path):
+    """Thirty kills: no result is lost, doubled, or another one."""
+    assert killed_studies(tmp_path / "study", 30, seed=1).wrong == 0
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_random_command_lines(tmp_path):
+    """Each ends with a documented code, and without a traceback."""
+    with prepared(tmp_path / "work"):
+        ends = [raw_end(random_line(seed)) for seed in range(5000, 5020)]
+    assert [end for end in ends if end] == []
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_thousand_random_command_lines(tmp_path):
+    """The same."""
+    with prepared(tmp_path / "work"):
+        ends = [raw_end(random_line(seed)) for seed in range(1000)]
+    assert [end for end in ends if end] == []

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, invert_block
-from fpirhc.controllers.tracked import desired_blocks
+from fpirhc.controllers.tracked import bounded, desired_blocks
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue
@@ -86,7 +86,7 @@ class AccelerationFeedback(Controller):
             self._feedback_block(problem),
             invert_block(plant),
             *closing,
-            self.tracking.update(plant, problem.period),
+            bounded(problem, self.tracking).update(plant, problem.period),
         ]
         return blocks, [*delays, *self.tracking.delays(plant)]
 

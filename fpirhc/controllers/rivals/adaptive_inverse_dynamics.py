@@ -12,7 +12,7 @@ from scipy.linalg import solve_continuous_lyapunov
 from fpirhc.controllers.base import Controller, closing_blocks, fed, like
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
 from fpirhc.controllers.rivals.reference_model import companion
-from fpirhc.controllers.tracked import desired_blocks
+from fpirhc.controllers.tracked import bounded, desired_blocks
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.learning.rules.base import Pair, Rule
@@ -74,7 +74,7 @@ class AdaptiveInverseDynamics(Controller):
             *desired_blocks(problem, self.tracking),
             self._learn_block(problem),
             *(fed(block, "parameters", believed) for block in closing),
-            self.tracking.update(plant, problem.period),
+            bounded(problem, self.tracking).update(plant, problem.period),
         ]
         return blocks, [*delays, *learning_delays(), *self.tracking.delays(plant)]
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like
 from fpirhc.controllers.demands import command_demand
-from fpirhc.controllers.tracked import desired_blocks
+from fpirhc.controllers.tracked import bounded, desired_blocks
 from fpirhc.deformation.base import Deformation, Demand, Mirror
 from fpirhc.errors import Mistakes
 from fpirhc.members import Example
@@ -96,7 +96,7 @@ class ForceMRAC(Controller):
             *desired_blocks(problem, self.tracking),
             self._force_block(plant, problem.warm_up_cycles),
             *closing,
-            self.tracking.update(plant, problem.period),
+            bounded(problem, self.tracking).update(plant, problem.period),
         ]
         return blocks, [*delays, *self.tracking.delays(plant)]
 

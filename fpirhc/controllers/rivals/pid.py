@@ -21,6 +21,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import casadi as ca
+import numpy as np
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block, rename
 from fpirhc.deformation.base import Deformation
@@ -30,9 +31,10 @@ from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.layout import Expression, Layout, scalar
-from fpirhc.symbolic.live import is_live
+from fpirhc.symbolic.live import is_live, nominal
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.error import (
+    Useful,
     bumpless,
     error_chains,
     error_signal,
@@ -114,9 +116,18 @@ class PID(Controller):
             rename("desired", response, plant.response_signal("desired")),
             self._law(problem),
             *closing,
-            integral_update(plant, problem.period),
+            integral_update(plant, problem.period, self._useful(problem)),
         ]
         return blocks, [*delays, *integral_delay(plant)]
+
+    def _useful(self, problem: Problem) -> list[Useful]:
+        """What the integrals may ask for: commands inside the limits of their inputs, by those of the build."""
+        sizes = np.fmax(*map(np.abs, nominal(problem).limits.input_bounds(problem.plant)))
+        names = problem.plant.controlled_names
+        return [
+            Useful(self.integral.get(n, 0.0), self.proportional[n], float(size) if size > 0 else math.inf)
+            for n, size in zip(names, sizes, strict=False)
+        ]
 
     def _law(self, problem: Problem) -> Block:
         """Block (state, reference, integral, warm_up) -> command, and the model's response to it (for readers of a log)."""

@@ -74,6 +74,11 @@ class Estimating(Controller):
         """True: the parameters of the model change during a run."""
         return True
 
+    @property
+    def model_acts_at_once(self) -> bool:
+        """Whether a new estimate changes the command in every cycle."""
+        return self.at_once or self.controller.model_acts_at_once
+
     def linear_around(self, inner: Controller) -> Controller:
         """Return the inner controller: near the reference the parameters are those of the start."""
         return inner

@@ -55,7 +55,7 @@ function draw({ box, spec }) {
       label: s.name,
       stroke: colors[s.name] || RESPONSES[s.name] || ink,
       width: 1.2,
-      dash: s.name === "reference" ? [5, 4] : undefined,
+      dash: { reference: [5, 4], "set-point": [1, 3] }[s.name],
       value: (_, v) => (v === null || v === undefined ? "" : v.toPrecision(4)),
     }))
   );

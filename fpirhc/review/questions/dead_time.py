@@ -52,7 +52,7 @@ def bears_wrong_dead_time(case: Case) -> Answer | None:
     return Answer(TEXT, verdict, text, _CHANGE, numbers)
 
 
-QUESTION = ControllerQuestion(bears_wrong_dead_time, order=20)
+QUESTION = ControllerQuestion(bears_wrong_dead_time, order=20, of_targets=True)
 
 
 def _borne(case: Case) -> tuple[int, tuple[int, float] | None]:

@@ -58,7 +58,7 @@ def leaves_right_model_alone(case: Case) -> Answer:
     return Answer(QUESTION_TEXT, verdict, text, change, numbers | more)
 
 
-QUESTION = ControllerQuestion(leaves_right_model_alone, order=10)
+QUESTION = ControllerQuestion(leaves_right_model_alone, order=10, of_targets=True)
 
 
 def _cures_more(nominal: NominalRun | None, predicted: float | None) -> bool:

@@ -40,4 +40,4 @@ def real_pair_converges(case: Case) -> Answer | None:
     return Answer(TEXT, Verdict.UNKNOWN if adapted < 1 + NEUTRAL else Verdict.NO, text, change, numbers)
 
 
-QUESTION = ControllerQuestion(real_pair_converges, order=5, doubts=True)
+QUESTION = ControllerQuestion(real_pair_converges, order=5, doubts=True, of_targets=True)

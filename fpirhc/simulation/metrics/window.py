@@ -32,8 +32,8 @@ def by_name(names: Sequence[str], values: np.ndarray) -> dict[str, float]:
 
 
 def coordinate_unit(problem: Problem, coordinate: str) -> str:
-    """Return the unit of a coordinate."""
-    return problem.plant.coordinates[coordinate]
+    """Return the unit of a judged coordinate or output."""
+    return problem.plant.face.coordinates[coordinate]
 
 
 def input_unit(problem: Problem, name: str) -> str:

@@ -25,6 +25,7 @@ from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, judged_run, simulator
 from fpirhc.studies.comparison.changes import scales
 from fpirhc.studies.comparison.entry_facts import has_exact_model, plan_every, weighed
+from fpirhc.studies.comparison.information import Information, information, sentences
 from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import Optimality, measure_optimality
 from fpirhc.studies.comparison.outcome import Finding, Outcome
@@ -76,6 +77,7 @@ class Entry:
         plan_every: cycles from plan to plan; 1 for a controller that does not plan.
         price: its time per cycle beside that of its pair.
         no_bound: why it is no bound, for an exact model that an adapted controller beats.
+        information: what it measures and when it acts; None: not asked.
     """
 
     name: str
@@ -95,6 +97,7 @@ class Entry:
     plan_every: int = 1
     price: Price | None = None
     no_bound: tuple[str, ...] = ()
+    information: Information | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +120,7 @@ class Comparison:
         pictures: pictures of the problem for the report.
         null: what adaptation does where there is nothing to adapt, for the first pair; None without one.
         time_unit: unit of time of the problem.
+        information: what the controllers are given, what each uses, and when each acts, in sentences.
     """
 
     problem: str
@@ -134,6 +138,7 @@ class Comparison:
     pictures: tuple[Picture, ...] = ()
     null: NullTest | None = None
     time_unit: str = "s"
+    information: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> tuple[str, ...]:
@@ -162,7 +167,7 @@ class Comparison:
             for e in self.entries
         ]
         head = ("controller", *(c.heading for c in shown), "cycle [us]", "worst status")
-        notes = self.verdict if self.null is None else (*self.verdict, self.null.text)
+        notes = (*self.verdict, *(() if self.null is None else (self.null.text,)), *self.information)
         return table(self.title, head, rows, notes)
 
     def __getitem__(self, name: str) -> Entry:
@@ -236,6 +241,7 @@ def compare(
         pictures=task.pictures,
         null=null_of_pair(task.problem, judged[0].pair, entries, loops, sizes, seed=seed),
         time_unit=task.problem.time_unit,
+        information=sentences(task.problem, {e.name: e.information for e in entries if e.information}),
     )
 
 
@@ -303,7 +309,7 @@ def _entry(
     report(0, problem.cycles)
     loops[name] = simulator(problem, ready, compiled=compiled)
     run = judged_run(loops[name], seed=seed, name=name, progress=report)
-    adaptive = ready.deformation.adapts
+    adaptive, every = ready.deformation.adapts, plan_every(problem, ready)
     view = lyapunov_view(problem, ready, run)
     metrics = measure(problem, run, task.metrics)
     return Entry(
@@ -321,7 +327,8 @@ def _entry(
         weighed=weighed(problem, ready),
         exact=has_exact_model(problem, ready),
         learns=ready.learns,
-        plan_every=plan_every(problem, ready),
+        plan_every=every,
+        information=information(problem, ready, loops[name].loop, every),
     )
 
 

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from fpirhc.simulation.common_columns import judged_motion
 from fpirhc.simulation.metrics.window import by_name
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.studies.comparison.changes import ROUNDING, Change, major, outcome_of
@@ -104,14 +105,14 @@ def _null_problem(problem: Problem) -> Problem:
 
 
 def _errors(loop: Simulator, null: Problem, seed: int) -> dict[str, float]:
-    """Rms error of the plant's own state over the measured cycles."""
+    """Rms error of the plant's own state, or outputs, over the measured cycles."""
     run = loop.run(seed=seed, variant=null, disturbed=False)
-    states = run["plant_state"] if "plant_state" in run.layout else run["state"]
+    states = run[judged_motion(run.layout)]
     names = null.judged_names
     measured = run.time >= null.measure_from - 0.5 * null.period
     if run.stop is not None or not measured.any():
         return dict.fromkeys(names, math.nan)
-    places = [null.plant.state.elements.index(name) for name in names]
+    places = [null.plant.output.elements.index(name) for name in names]
     nominal = null.reference.function(null.plant).map(int(measured.sum()))(run.time[measured][None, :])[0]
     errors = np.asarray(nominal.full()).T[:, places] - states[measured][:, places]
     with np.errstate(over="ignore"):
@@ -148,12 +149,14 @@ def _sentence(
     if any(math.isnan(c.after) for c in changes.values()):
         return f"{head}failed, {adaptive} does not finish where {plain} does, with nothing to adapt."
     shown = sorted(changes.values(), key=lambda c: -c.ratio if c.ratio == c.ratio else 0.0)
-    numbers = ", ".join(f"{c.name} {c.before:.3g} -> {c.after:.3g} {null.plant.coordinates[c.name]}" for c in shown)
+    numbers = ", ".join(
+        f"{c.name} {c.before:.3g} -> {c.after:.3g} {null.plant.face.coordinates[c.name]}" for c in shown
+    )
     if outcome in (Outcome.BETTER, Outcome.NO_DIFFERENCE):
         tiny = all(c.size < ROUNDING for c in changes.values())
         return f"{head}passed, {adaptive} is not worse than {plain} ({'rounding only' if tiny else numbers})."
     if cured is not None:
-        costs = ", ".join(f"{n} {cured[n]:.3g} {null.plant.coordinates[n]}" for n in changes)
+        costs = ", ".join(f"{n} {cured[n]:.3g} {null.plant.face.coordinates[n]}" for n in changes)
         return (
             f"{head}{adaptive} makes a small error of its own ({numbers}); it is smaller than that of {plain} with the wrong model "
             f"({costs})."

@@ -8,9 +8,10 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
+from fpirhc.controllers.own_reference import own_signals
 from fpirhc.errors import FpirhcError
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.stage_data import shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.simulation.run import Run
@@ -44,15 +45,15 @@ def measure_optimality(
 ) -> Optimality | None:
     """Return the excess cost of sampled plans.
 
-    The result is None where plans do not start from a state in the run, where no plan was solved, and for a controller that
-    learns, because the models of its plans are not in the run. A negative excess is that of another local optimum, which the
-    controller reached and the solve from rest did not.
+    The result is None where plans do not start from a state in the run, where no plan was solved, for a controller that learns,
+    because the models of its plans are not in the run, and towards set-points, because what its plans knew of them is not either.
+    A negative excess is that of another local optimum, which the controller reached and the solve from rest did not.
     """
     ready = checked(problem, controller)
     planner, feeds = ready.planner, ready.feeds
     if planner is None or not planner.restarts or problem.horizon is None or run.cycles < 2:
         return None
-    if ready.learns or "parameters" in feeds:
+    if ready.learns or "parameters" in feeds or own_signals(problem):
         return None
     times, states = (run[feeds[n] if feeds.get(n) in run.layout.names else n] for n in ("time", "state"))
     model = ready.model_plant(problem)
@@ -66,12 +67,14 @@ def measure_optimality(
     assert planned.horizon is not None
     assert planned.cost is not None
     ahead = previewed_values(model, told)
-    ocp = transcribe(planned.plant, planned.reference, planned.horizon, planned.cost, planned.limits, ahead)
+    limits, start = planned.limits, planned.start_state
+    ocp = transcribe(planned.plant, planned.reference, planned.horizon, planned.cost, limits, ahead, start)
     try:
         solve = _Solver(ocp, compiled)
     except FpirhcError:
         return None
     data_of = stage_data(planned.plant, planned.reference, planned.horizon, planned.cost, signals=ahead)
+    of_measured = shifted_reference(planned.plant, ocp.data, ocp.stages + 1) if planned.plant.outputs else None
     stride = cycles_per_stage(problem.horizon, problem.period)
     plans = np.arange(stride, run.cycles, stride)
     rows = plans[np.unique(np.linspace(0, plans.size - 1, SAMPLES).astype(int))] if plans.size else plans
@@ -82,6 +85,8 @@ def measure_optimality(
         shift = run["command_shift"][row - 1]
         first = ocp.start(states[row], run["command"][row - 1] - shift).full().ravel()
         data = np.asarray(data_of(times[row], parameters[row]).full())
+        if of_measured is not None:
+            data = np.asarray(of_measured(data, states[row], run["output"][row], parameters[row]).full())
         best = solve(first, data, ocp.input_lower - shift, ocp.input_upper - shift)
         cost_of_plan = run["solve.cost"][row]
         if best is not None and run["status"][row] <= Status.NOT_CONVERGED:

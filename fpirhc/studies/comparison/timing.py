@@ -110,16 +110,22 @@ class _Replay:
 
 
 def _samples(stepper: Stepper, run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """States and responses of a run; raw measurements, and nothing, for a step that estimates."""
+    """States, with outputs where there are some, and responses of a run; raw measurements and nothing for one that estimates."""
     if not stepper.estimates:
-        return run["state"], run["realised"]
+        state = run["state"]
+        return (np.hstack([state, run["output"]]) if "output" in run.layout else state), run["realised"]
     measured = raw_measurements(run)
     return measured, measured[:, :0]
 
 
 def _step_of(stepper: Stepper) -> Callable[[float, np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    if not stepper.estimates:
+    if not stepper.estimates and not stepper.outputs:
         return stepper.step
+    if stepper.outputs:
+        size = stepper.outputs
+        return lambda now, seen, realised, memory: stepper.step(
+            now, seen[:-size], realised, memory, output=seen[-size:]
+        )
     return lambda now, measured, _, memory: stepper.step_measured(now, measured, memory)
 
 
@@ -127,10 +133,10 @@ def measure_cycle(problem: Problem, controller: Controller, run: Run, *, compile
     """Replay the run's measurements through the controller, one call per cycle, and return the times.
 
     The replay repeats the computations of the run: the controller starts afresh and has the same measurements.
-    The result is None for a run of fewer than two cycles.
+    The result is None for a run of fewer than two cycles, and for outputs behind an estimator, which a stepper does not cover.
     """
     cycles = min(run.cycles, REPLAYED)
-    if cycles < 2:
+    if cycles < 2 or (problem.plant.outputs and problem.sensing.estimates):
         return None
     stepper = Stepper(problem, controller, compiled=compiled, bounded=False)
     memory = stepper.start()

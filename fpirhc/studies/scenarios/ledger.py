@@ -1,6 +1,7 @@
 """An append-only file of results that survives being killed at any moment.
 
 Every line is one JSON object. The first line is a header with the conditions of the results; a file with another header is refused.
+The last entry of a line is its checksum, 'sum', so that a damaged digit is noticed; a file of an older version has none at all.
 Every line is on the disk before `append` returns. A last line that is torn was never acknowledged: it is cut off, and its
 result is computed again. Only one process may have the file open.
 """
@@ -11,12 +12,15 @@ import contextlib
 import json
 import os
 import sys
+import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, Self
 
 from fpirhc.errors import InvalidField, OutputError
 from fpirhc.fields.checked import Checked, field_names
+
+_SUM = "sum"  # entry with the checksum of a line
 
 
 class Ledger:
@@ -67,7 +71,7 @@ class Ledger:
         self.close()
 
     def _write(self, value: Mapping[str, Any]) -> None:
-        line = json.dumps(value, allow_nan=False, separators=(",", ":")).encode() + b"\n"
+        line = _text({**value, _SUM: _sum(value)}).encode() + b"\n"
         try:
             written = self._file.write(line)
             while written < len(line):
@@ -90,10 +94,19 @@ class Ledger:
             self._write(header)
             _sync_folder(self._path.parent)
             return []
+        summed = _SUM in lines[0]
+        for number, line in enumerate(lines, 1):
+            if number > 1:
+                self._check(number, line)
+            if summed and line.pop(_SUM, "") != _sum(line):
+                what = (
+                    "remove the line, and its result is computed again"
+                    if number > 1
+                    else "remove the file to begin again"
+                )
+                raise OutputError(f"'{self._path}', line {number} is damaged: its checksum does not fit; {what}")
         if lines[0] != header:
             raise OutputError(_refusal(self._path, lines[0], header))
-        for number, line in enumerate(lines[1:], 2):
-            self._check(number, line)
         return lines[1:]
 
     def _check(self, number: int, line: Mapping[str, Any]) -> None:
@@ -117,6 +130,15 @@ class Ledger:
             if not isinstance(value, dict):
                 raise OutputError(f"'{self._path}', line {number} is damaged; remove the file to begin again")
             yield value
+
+
+def _text(value: Mapping[str, Any]) -> str:
+    return json.dumps(value, allow_nan=False, separators=(",", ":"))
+
+
+def _sum(value: Mapping[str, Any]) -> str:
+    """Checksum of an object, eight hexadecimal digits; numbers are read and written alike to the last bit."""
+    return f"{zlib.crc32(json.dumps(value, separators=(',', ':')).encode()):08x}"
 
 
 def _refusal(path: Path, header: dict[str, Any], wanted: dict[str, Any]) -> str:

@@ -20,11 +20,11 @@ def ranges(problem: Problem) -> dict[str, float]:
     The error at the start stands for it where that is larger, and 1 where both are zero.
     """
     plant = problem.plant
-    places = [plant.state.elements.index(c) for c in problem.judged_names]
+    places = [plant.output.elements.index(c) for c in problem.judged_names]
     function = problem.reference.function(plant)
     times = np.linspace(0.0, problem.duration, _SAMPLES)
     states = np.asarray(function.map(_SAMPLES)(times[None, :])[0].full())[places]
-    sizes = np.maximum(np.ptp(states, axis=1), np.abs(states[:, 0] - problem.start_state[places]))
+    sizes = np.maximum(np.ptp(states, axis=1), np.abs(states[:, 0] - problem.start_output[places]))
     return {c: float(s) if s > 0 else 1.0 for c, s in zip(problem.judged_names, sizes, strict=True)}
 
 

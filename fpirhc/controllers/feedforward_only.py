@@ -1,0 +1,76 @@
+"""The model's command for the reference, without any feedback: u = model^-1(x^N, r^N).
+
+For a plant that settles by itself it is the inverse of the model's static map, which is the usual inner controller of a `Cascade`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
+from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import NotInvertible
+from fpirhc.members import Example
+from fpirhc.status import Status
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals, is_finite
+from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.task.problem import Problem
+
+_SEEN = "_seen_status"
+
+
+@dataclass(frozen=True)
+class FeedforwardOnly(Controller):
+    """The model's inverse at the reference's state and response; nothing that is measured is used."""
+
+    @property
+    def deformation(self) -> Deformation:
+        """Identity(): no request is iterated."""
+        return Identity()
+
+    def check(self, problem: Problem) -> None:
+        """Raise if the model has no inverse.
+
+        Raises:
+            NotInvertible: inputs and controlled coordinates differ in number.
+        """
+        if len(problem.plant.controlled_names) != len(problem.plant.inputs):
+            raise NotInvertible("FeedforwardOnly needs as many controlled coordinates as inputs")
+
+    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+        """Return the blocks reference, feedforward, limit, judge, running."""
+        closing, delays = commanding_blocks(problem, [scalar(_SEEN)])
+        return [reference_block(problem), self._block(problem), *closing], delays
+
+    def _block(self, problem: Problem) -> Block:
+        """Block (reference, state, parameters) -> command, and the response that the model expects of it."""
+        plant, wanted = problem.plant, problem.plant.response_signal("_reference_response")
+        inverse, response = plant.inverse_function, plant.controlled_response_function
+
+        def step(s: Signals) -> dict[str, Expression]:
+            command = inverse(s.reference, s._reference_response, s.parameters)
+            finite = is_finite(
+                s.state
+            )  # a bad measurement changes no command here, and is a bad measurement all the same
+            return {
+                "nominal": s._reference_response,
+                "desired": s._reference_response,
+                "command_unclipped": command,
+                "_deformed_unclipped": ca.if_else(
+                    finite, response(s.state, command, s.parameters), s._reference_response
+                ),
+                _SEEN: ca.if_else(finite, int(Status.OK), int(Status.NON_FINITE)),
+            }
+
+        responses = [plant.response_signal(name) for name in ("nominal", "desired", "_deformed_unclipped")]
+        reads = (like(plant.state, "reference"), wanted, plant.state, plant.parameter)
+        writes = Layout((*responses, like(plant.input, "command_unclipped"), scalar(_SEEN)))
+        return Block("feedforward", Layout(reads), writes, step, opaque=plant.inverse_opaque)
+
+
+# Open loop: what is left is the dead time of the problem.
+EXAMPLES = (Example(problem="heat_exchanger", controller="static inverse", left=0.4, changes={"reality": None}),)

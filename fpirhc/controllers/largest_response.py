@@ -1,0 +1,58 @@
+"""The largest response that the limits of the inputs allow: the scale beyond which a demand is no demand but a fault.
+
+    L_i = max over the reference and the start of   |f_i(x, c)| + sum_k max |f_i(x, c with u_k at a limit) - f_i(x, c)|
+
+with the model f and the middle c of the limits; exact for a model that is affine in its inputs. Laws and maps compare what they
+remember with multiples of it, so that one absurd but finite sample does not stay with them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fpirhc.controllers.reference_states import reference_states
+from fpirhc.symbolic.live import nominal
+from fpirhc.task.problem import Problem
+
+_SAMPLES = 100  # instants at which the reference is looked at
+
+
+def largest_response(problem: Problem) -> tuple[float, ...]:
+    """Return L of every controlled coordinate, by the limits of the build; infinite where an input has no finite limits.
+
+    For outputs it is infinite too: the states that belong to their reference are not known before a run.
+    """
+    task = nominal(problem)
+    plant = task.plant
+    lower, upper = task.limits.input_bounds(plant)
+    free = (float("inf"),) * len(plant.controlled_names)
+    if plant.outputs or not np.isfinite(upper - lower).all():
+        return free
+    states, middle = _states(task), (lower + upper) / 2
+    corners = [middle] + [_with(middle, k, v) for k in range(middle.size) for v in (lower[k], upper[k])]
+    still, *moved = (_responses(task, states, corner) for corner in corners)
+    with np.errstate(all="ignore"):
+        reach = [
+            np.fmax(abs(low - still), abs(high - still)) for low, high in zip(moved[::2], moved[1::2], strict=True)
+        ]
+        sizes = abs(still) + sum(reach)
+    finite = np.where(np.isfinite(sizes), sizes, 0.0).max(axis=1)
+    return tuple(float(v) if v > 0 else float("inf") for v in finite)
+
+
+def _states(task: Problem) -> np.ndarray:
+    """States along the reference, and the start, shape (nx, number)."""
+    states = reference_states(task, _SAMPLES)
+    return np.hstack([states, np.asarray(task.start_state)[:, None]])
+
+
+def _responses(task: Problem, states: np.ndarray, command: np.ndarray) -> np.ndarray:
+    count = states.shape[1]
+    repeated = (np.repeat(v[:, None], count, axis=1) for v in (command, task.plant.approximate))
+    return np.asarray(task.plant.controlled_response_function.map(count)(states, *repeated).full())
+
+
+def _with(command: np.ndarray, k: int, value: float) -> np.ndarray:
+    other = command.copy()
+    other[k] = value
+    return other

@@ -1,0 +1,156 @@
+"""Outputs y = h(x, p): quantities that are controlled or judged and are expressions of the state.
+
+The derivatives of an output are Lie derivatives along the plant's motion, with the input held,
+
+    y_0 = h(x, p),    y_{k+1} = dy_k/dx x'(x, u, p, w),
+
+and its relative order r is the first k for which y_k depends on an input, decided from the symbols. The *face* of a plant is a
+light plant whose coordinates are the outputs, y^(r) = u, with the state (y, y', ..., y^(r-1)). Reference, tracking law, judging and
+sensors take the face; inverse, response and horizon take the plant.
+
+References:
+    A. Isidori, Nonlinear Control Systems, 3rd ed., Springer 1995, ch. 4 and 5.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import casadi as ca
+
+from fpirhc.errors import FpirhcError, Mistakes
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.expected import takes
+from fpirhc.fields.user_code import called, scalar_expression
+from fpirhc.symbolic.layout import Expression, Named
+
+if TYPE_CHECKING:
+    from fpirhc.plant.plant import Plant
+
+Symbols = tuple[ca.SX, ca.SX, ca.SX, ca.SX]
+
+
+@dataclass(frozen=True, eq=False)
+class Output(Checked):
+    """One output of a plant: y = h(q, q', ..., p), or h(x, p) of a plant that is given by its states.
+
+    Args:
+        unit: of the output.
+        expression: function of the arguments of the response without the inputs; it returns one scalar.
+    """
+
+    unit: str
+    expression: Callable[..., Expression]
+
+
+def output_expression(plant: Plant, name: str, x: Expression, p: Expression) -> Expression:
+    """Return h(x, p) of one output.
+
+    Raises:
+        InvalidProblem: the function fails, or does not return one scalar.
+    """
+    what, expression = f"outputs: '{name}'", plant.outputs[name].expression
+    value = called(what, expression, *plant._derivatives(x), plant._parameters(p))
+    return scalar_expression(what, value, of=expression, symbols=(x, p))
+
+
+def lie_derivatives(plant: Plant, value: Expression, count: int, symbols: Symbols) -> list[Expression]:
+    """Return an expression of the state and its first `count` derivatives along the motion.
+
+    Args:
+        plant: the plant.
+        value: expression of x and p.
+        count: number of derivatives.
+        symbols: x, u, p, and the forcing w.
+    """
+    x, u, p, w = symbols
+    rate, chain = plant.forced_derivative_function(x, u, p, w), [value]
+    for _ in range(count):
+        chain.append(ca.jtimes(chain[-1], x, rate))
+    return chain
+
+
+def output_order(plant: Plant, name: str) -> int | None:
+    """Return the relative order of an output: the first derivative that depends on an input; None where none does."""
+    x, u, p = plant.symbols()
+    w = ca.SX.zeros(len(plant.names))
+    rate, value = plant.forced_derivative_function(x, u, p, w), output_expression(plant, name, x, p)
+    for order in range(1, plant.state.size + 1):
+        value = ca.jtimes(value, x, rate)
+        if ca.jacobian_sparsity(value, u).nnz():
+            return order
+    return None
+
+
+def face_of(plant: Plant) -> Plant:
+    """Return the light plant whose coordinates are the outputs.
+
+    An output that no input reaches has the order one.
+    """
+    orders = {name: output_order(plant, name) or 1 for name in plant.outputs}
+    return light_plant(plant, {name: one.unit for name, one in plant.outputs.items()}, orders, plant.controlled_names)
+
+
+def light_plant(
+    plant: Plant, coordinates: Mapping[str, str], order: Mapping[str, int], controlled: Sequence[str]
+) -> Plant:
+    """Return the plant y^(r) = u of some quantities, each controlled one with an input of its own.
+
+    Args:
+        plant: of which they are; its inputs stay, in their order.
+        coordinates: name -> unit.
+        order: name -> relative order.
+        controlled: as many names as there are inputs.
+    """
+    inputs = dict(zip(controlled, plant.inputs, strict=True))
+
+    def response(*arguments: Named) -> dict[str, Expression]:
+        u = arguments[-2]
+        return {name: u[inputs[name]] if name in inputs else ca.SX(0) for name in coordinates}
+
+    names = [f"d{k}" for k in range(max(order.values()))] + ["u", "p"]
+    kind = inspect.Parameter.POSITIONAL_ONLY
+    vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(n, kind) for n in names])
+    return replace(
+        plant,
+        coordinates=dict(coordinates),
+        parameters={},
+        response=response,
+        order=dict(order),
+        controlled=tuple(controlled),
+        inverse=None,
+        ranges={},
+        outputs={},
+        algebraic=None,
+    )
+
+
+def check_outputs(plant: Plant, mistakes: Mistakes) -> None:
+    """Add every mistake of the outputs to `mistakes`."""
+    for name, one in plant.outputs.items():
+        expected = max(plant.orders) + 1
+        if not takes(one.expression, expected):
+            first = ["x"] if plant.words[0] == "state" else ["q", "v", "a", *(f"d{k}" for k in range(3, 12))]
+            names = ", ".join([*first[: expected - 1], "p"])
+            mistakes.add(
+                f"outputs: the expression of '{name}' is called as function({names}); it takes other arguments"
+            )
+            continue
+        try:
+            _check_one(plant, name, mistakes)
+        except FpirhcError as error:
+            mistakes.add(str(error))
+
+
+def _check_one(plant: Plant, name: str, mistakes: Mistakes) -> None:
+    x, _, p = plant.symbols()
+    value = ca.SX(output_expression(plant, name, x, p))
+    if name in plant.coordinates and not ca.is_equal(value, x[plant.state.elements.index(name)], 1):
+        mistakes.add(f"outputs: '{name}' has the name of a coordinate, but is another expression; rename the output")
+        return
+    controlled = plant.controlled is None or name in plant.controlled
+    if controlled and output_order(plant, name) is None:
+        mistakes.add(f"outputs: no input reaches '{name}', however often it is differentiated; control another output")

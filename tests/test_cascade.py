@@ -1,0 +1,237 @@
+"""A fixed-point iteration on the target of an inner controller: pairing, stability, limits, and what may stand inside."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.errors import InvalidValue, NotContractive, NotSupported
+from fpirhc.task.set_point import Setpoint
+
+TASK = fp.load_problem("problems/heat_exchanger.py")
+STATIC = fp.FeedforwardOnly()
+
+
+def affine(gain: float) -> fp.Affine:
+    """The affine map with this effective gain."""
+    return fp.Affine(gain=-2 * gain)
+
+
+def rms(problem: fp.Problem, controller: Any) -> tuple[float, float]:
+    """Rms error of the output and largest step of the command, without the transient."""
+    run = fp.simulate(problem, controller, seed=1, compiled=False)
+    assert run.stop is None
+    measured = run.time >= problem.measure_from
+    error, command = run["error"][measured], run["command"][measured]
+    return float(np.sqrt(np.mean(error**2))), float(np.abs(np.diff(command, axis=0)).max())
+
+
+def test_paired_through_the_model_every_gain_serves():
+    """A map with slopes from .15 to 2.15 behind a lag and a dead time: up to twelve times better than without, and quiet."""
+    without, _ = rms(TASK.problem, STATIC)
+    for gain, share in ((0.05, 0.2), (0.1, 0.13), (0.2, 0.11), (0.5, 0.1), (0.9, 0.1)):
+        error, step = rms(TASK.problem, fp.Cascade(STATIC, affine(gain)))
+        assert error < share * without, gain
+        assert step < 0.01, gain
+
+
+def test_with_the_last_target_only_a_small_gain_serves():
+    """The iteration goes on while the output is under way: from .2 it is a limit cycle, worse than no iteration."""
+    without, _ = rms(TASK.problem, STATIC)
+    assert rms(TASK.problem, fp.Cascade(STATIC, affine(0.05), paired=None))[0] < 0.125 * without
+    for gain in (0.2, 0.5):
+        error, step = rms(TASK.problem, fp.Cascade(STATIC, affine(gain), paired=None))
+        assert error > without
+        assert step > 0.2
+
+
+@pytest.mark.parametrize(("lag", "dead_time"), [(10.0, 5.0), (40.0, 5.0), (20.0, 3.0), (20.0, 8.0)])
+def test_a_wrong_lag_or_dead_time_changes_little(lag, dead_time):
+    """Half or twice the lag, 3 or 8 s of dead time in place of 5."""
+    error, step = rms(TASK.problem, fp.Cascade(STATIC, affine(0.5), fp.ThroughModel(lag=lag, dead_time=dead_time)))
+    assert error < 0.2 * rms(TASK.problem, STATIC)[0]
+    assert step < 0.01
+
+
+def test_the_shift_is_that_of_the_recursion_by_hand():
+    """Logged outputs through the formulas in numpy: reference and shift in force, undeformed target, map."""
+    run = fp.simulate(TASK.problem, fp.Cascade(STATIC, affine(0.4)), seed=1, compiled=False)
+    decay, gain = np.exp(-1 / 20), 0.4
+    reference, shifts = run["reference.outlet"], [0.0] * 6
+    shift, in_force = 0.0, 0.3 - reference[0]
+    for k in range(400):
+        target_in_force = reference[max(k - 5, 0)] + in_force
+        if k:
+            shift = shift - gain * (run["state.outlet"][k] - target_in_force + shift)
+        assert run["shift.outlet"][k] == pytest.approx(shift, abs=1e-12)
+        assert run["target.outlet"][k] == pytest.approx(reference[k] + shift, abs=1e-12)
+        shifts = [shift, *shifts[:5]]
+        in_force = decay * in_force + (1 - decay) * shifts[5]
+
+
+def linear(slope: float, **changes: Any) -> fp.Problem:
+    """Y' = (slope u - y) / 5 s with the model y' = (u - y) / 5 s, a set-point of one, cycles of 4 s."""
+    plant = fp.Plant(
+        coordinates={"y": "K"},
+        inputs={"u": "1"},
+        order=1,
+        response=lambda q, u, p: {"y": (p.slope * u.u - q.y) / 5.0},
+        parameters={"slope": fp.Parameter(approximate=1.0, exact=slope, unit="K")},
+    )
+    values = {
+        "plant": plant,
+        "reference": fp.Trajectory(lambda t: {"y": 1.0 + 0 * t}),
+        "start": {"y": 0.0},
+        "period": 4.0,
+        "duration": 1600.0,
+        "integrator": fp.RungeKutta4(8),
+    }
+    return fp.Problem(**{**values, **changes})
+
+
+@pytest.mark.parametrize("gain", [0.3, 0.6, 1.0])
+def test_the_limit_is_that_of_the_theory(gain):
+    """Sampled: slope < 1 + (2 - a) (1 + rho) / (a (1 - rho)); 2 % below the shift settles, 2 % above it grows."""
+    decay = np.exp(-4.0 / 5.0)
+    limit = 1 + (2 - gain) * (1 + decay) / (gain * (1 - decay))
+    for share, settles in ((0.98, True), (1.02, False)):
+        run = fp.simulate(linear(share * limit), fp.Cascade(STATIC, affine(gain)), seed=1, compiled=False)
+        early, late = (np.abs(run["error.y"][k : k + 40]).max() for k in (40, 360))
+        assert bool(late < early) is settles, (share, early, late)
+
+
+def test_a_right_model_leaves_the_target_alone():
+    """The model's target in force is the output, so there is nothing to iterate on."""
+    run = fp.simulate(linear(1.0), fp.Cascade(STATIC, affine(0.8)), seed=1, compiled=False)
+    assert np.abs(run["shift"]).max() < 1e-6  # of the integrator
+    assert run["state.y"][-1] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_output_settles_at_the_reference_whatever_the_map_is():
+    """In the steady state the target in force is the target, so the shift rests only where output and reference agree."""
+    for slope in (0.3, 0.7, 1.8):
+        for deformation in (affine(0.5), fp.Sigmoid(gain=-0.8)):
+            run = fp.simulate(linear(slope), fp.Cascade(STATIC, deformation), seed=1, compiled=False)
+            assert run["error.y"][-1] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_target_out_of_reach_does_not_wind_the_shift_up():
+    """The reference is beyond the limit of the valve for 800 s; afterwards the output is as near as if it had never been."""
+
+    def reference(t: Any) -> dict[str, Any]:
+        return {"y": ca.if_else(ca.logic_and(t > 400, t < 1200), 3.0, 1.0)}
+
+    limited = linear(0.7, limits=fp.Limits(inputs={"u": (0.0, 2.0)}), reference=fp.Trajectory(reference))
+    run = fp.simulate(limited, fp.Cascade(STATIC, affine(0.5)), seed=1, compiled=False)
+    out = (run.time > 500) & (run.time < 1200)
+    assert run["state.y"][out] == pytest.approx(1.4, abs=1e-3)
+    assert np.abs(run["shift"]).max() < 2.0
+    assert np.abs(run["error.y"][run.time > 1320]).max() < 1e-2
+
+
+def test_a_receding_horizon_inside_follows_the_shifted_target():
+    """A plan with a wrong model keeps an offset; the cascade takes it away. Errors are those of the reference."""
+    horizon = {"horizon": fp.Horizon(stages=6, step=4.0), "cost": fp.Quadratic(states={"y": 1.0}, effort={"u": 0.05})}
+    problem = linear(0.6, **horizon, duration=800.0)
+    inner = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-6))
+    offset = fp.simulate(problem, inner, seed=1, compiled=False)
+    run = fp.simulate(problem, fp.Cascade(inner, affine(0.5)), seed=1, compiled=False)
+    assert abs(offset["error.y"][-1]) > 0.2
+    assert run["error.y"][-1] == pytest.approx(0.0, abs=1e-4)
+    assert run["error.y"][-1] == pytest.approx(run["reference.y"][-1] - run["state.y"][-1], abs=1e-12)
+    assert run["target.y"][-1] > 1.2
+
+
+def test_set_points_and_a_stepper():
+    """Set-points pass through to the target; by hand the commands are those of the loop."""
+    problem = linear(0.6, reference=Setpoint({"y": [(0.0, 1.0), (200.0, 2.0)]}, rate=0.1), duration=400.0)
+    controller = fp.Cascade(STATIC, affine(0.5))
+    run = fp.simulate(problem, controller, seed=1, compiled=False)
+    assert run["error.y"][-1] == pytest.approx(0.0, abs=1e-3)
+    stepper = fp.Stepper(problem, controller, compiled=False)
+    memory = stepper.start()
+    for k in range(100):
+        point = {"y": float(run["setpoint.y"][k])}
+        command, memory = stepper.step(run.time[k], run["state"][k], run["realised"][k], memory, setpoints=point)
+        assert np.array_equal(command, run["command"][k])
+
+
+def test_two_channels_have_lags_of_their_own():
+    """Each target passes its own lag; a wrong gain of either is taken away."""
+    plant = fp.Plant(
+        coordinates={"a": "K", "b": "K"},
+        inputs={"u": "1", "v": "1"},
+        order=1,
+        response=lambda q, u, p: {"a": (p.first * u.u + 0.2 * u.v - q.a) / 5, "b": (p.second * u.v - q.b) / 40},
+        parameters={
+            "first": fp.Parameter(approximate=1.0, exact=0.6, unit="K"),
+            "second": fp.Parameter(approximate=1.0, exact=1.7, unit="K"),
+        },
+    )
+    problem = linear(
+        1.0,
+        plant=plant,
+        start={"a": 0.0, "b": 0.0},
+        reference=fp.Trajectory(lambda t: {"a": 1 + 0 * t, "b": 0 * t - 1}),
+    )
+    run = fp.simulate(
+        problem, fp.Cascade(STATIC, affine(0.6), fp.ThroughModel(lag=(5.0, 40.0))), seed=1, compiled=False
+    )
+    assert run["error"][-1] == pytest.approx([0.0, 0.0], abs=1e-5)
+
+
+BAD: dict[str, tuple[Any, type[Exception], str]] = {
+    "wrong sign": (fp.Cascade(STATIC, fp.Affine(gain=0.5)), NotContractive, "use the other sign"),
+    "paired inside": (fp.Cascade(STATIC, fp.Paired(affine(0.5), cycles=3)), NotSupported, "Paired pairs by itself"),
+    "model-referenced inside": (fp.Cascade(STATIC, fp.ModelReferenced(affine(0.5))), NotSupported, "already compares"),
+    "two lags": (
+        fp.Cascade(STATIC, affine(0.5), fp.ThroughModel(lag=(5.0, 3.0))),
+        InvalidValue,
+        "1 controlled coordinates",
+    ),
+    "too late": (fp.Cascade(STATIC, affine(0.5), fp.ThroughModel(dead_time=1e5)), InvalidValue, "more than 1000"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_cannot_work_is_refused(name):
+    """Before a run, with the remedy."""
+    controller, error, text = BAD[name]
+    with pytest.raises(error, match=text):
+        fp.simulate(linear(0.6), controller, seed=1)
+
+
+def test_a_model_that_does_not_settle_needs_a_stated_lag():
+    """An integrating model has no time constant; one that is stated is taken."""
+    plant = replace(linear(0.6).plant, response=lambda q, u, p: {"y": p.slope * u.u + 0 * q.y})
+    problem = linear(0.6, plant=plant)
+    with pytest.raises(InvalidValue, match=r"does not settle.*ThroughModel\(lag=...\)"):
+        fp.simulate(problem, fp.Cascade(STATIC, affine(0.5)), seed=1)
+    with pytest.raises(InvalidValue, match="finite times of at least 0"):
+        fp.ThroughModel(lag=-1.0)
+    inner = fp.ComputedTorque(fp.Exponential(rate=0.05))
+    run = fp.simulate(problem, fp.Cascade(inner, affine(0.3), fp.ThroughModel(lag=10.0)), seed=1, compiled=False)
+    assert run["error.y"][-1] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_review_has_the_linear_loop_of_a_cascade():
+    """Its slowest mode is the largest root of the sampled loop by hand; questions about gains of responses are not covered."""
+    problem, gain = linear(0.6), 0.3
+    answers = {
+        a.question: a
+        for a in fp.review(problem, {"c": fp.Cascade(STATIC, affine(gain))}, mismatch=0.0, seed=1).controllers["c"]
+    }
+    decay = np.exp(-4.0 / 5.0)
+    # States: output, shift in force, shift of the last cycle.
+    shift = np.array([-gain, gain, 1 - gain])
+    loop = np.array([[decay, 0, 0], [0, decay, 0], [0, 0, 0]]) + np.outer([(1 - decay) * 0.6, 1 - decay, 1], shift)
+    verdict = answers["Does the deformation converge?"]
+    assert verdict.verdict == "yes"
+    assert verdict.numbers["radius"] == pytest.approx(np.abs(np.linalg.eigvals(loop)).max(), rel=1e-4)
+    assert "not covered" in answers["Is the map's gain admissible?"].evidence
+    assert "Do the eigenvalues of the response Jacobian have one sign?" not in answers

@@ -1,0 +1,107 @@
+"""Every comparison says what its controllers measure and how often they act."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import pytest
+from plants import linear
+
+import fpirhc as fp
+from fpirhc.controllers.contract import Controller
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.report.as_json import to_json
+from fpirhc.report.html import render
+from fpirhc.studies.comparison.compare import Comparison
+
+PLAN = fp.FixedPoint(iterations=1, tolerance=1e-3)
+TRACK = fp.Exponential(rate=4.0)
+FILTER = fp.DisturbanceKalman({"y": 10.0}, {"y": 1e-3, "y'": 1e-2})
+SEES_RESPONSE = replace(FILTER, measured={**FILTER.measured, "y''": 0.1})
+CONTROLLERS: dict[str, Controller] = {
+    "CTC": fp.ComputedTorque(TRACK),
+    "CTC+FPI": fp.ComputedTorque(TRACK, fp.Affine(gain=-0.5)),
+    "RHC": fp.RecedingHorizon(PLAN),
+    "RHC+FPI": fp.RecedingHorizon(PLAN, fp.Affine(gain=-0.5)),
+    "offset-free": fp.Estimating(fp.RecedingHorizon(PLAN), FILTER),
+    "offset-free, at once": fp.Estimating(fp.RecedingHorizon(PLAN), SEES_RESPONSE, at_once=True),
+}
+EXPECTED = {
+    "CTC": (("y", "y'"), "in every cycle"),
+    "CTC+FPI": (("y", "y'", "y''"), "in every cycle"),
+    "RHC": (("y", "y'"), "with a new plan every 5 cycles"),
+    "RHC+FPI": (
+        ("y", "y'", "y''"),
+        "with a new plan every 5 cycles, between plans its deformation acts in every cycle",
+    ),
+    "offset-free": (("y", "y'"), "with a new plan every 5 cycles, in which a new estimate takes effect"),
+    "offset-free, at once": (
+        ("y", "y'", "y''"),
+        "with a new plan every 5 cycles, between plans its newest estimate acts in every cycle",
+    ),
+}
+
+
+def compared(names: list[str], **changes: Any) -> Comparison:
+    settings: dict[str, Any] = {
+        "plant": linear(1.0, 0.8),
+        "reference": fp.Trajectory(lambda t: {"y": 0.3 * ca.sin(2 * t)}),
+        "start": {"y": 0.0, "y'": 0.6},
+        "period": 0.01,
+        "duration": 0.3,
+        "horizon": fp.Horizon(stages=5, step=0.05),
+        "cost": fp.Quadratic(states={"y": 1e2, "y'": 1.0}, deviation={"u": 0.1}),
+    }
+    problem = fp.Problem(**(settings | changes))
+    task = Task("line", Path("line.py"), "A line", "", problem, {n: CONTROLLERS[n] for n in names})
+    return fp.compare(task, seed=0, compiled=False)
+
+
+@pytest.fixture(scope="module")
+def everything() -> Comparison:
+    return compared(list(CONTROLLERS))
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_what_a_controller_uses_and_when_it_acts(everything, name):
+    """A measurement counts where the command depends on it; plans have their rate, and what acts between them is named."""
+    known = everything[name].information
+    assert known is not None
+    assert (known.uses, known.rate) == EXPECTED[name]
+
+
+def test_lines_stand_in_every_form_of_a_comparison(everything):
+    """On the page, in JSON and in a notebook: what all are given, then groups of what differs."""
+    first, *others = everything.information
+    assert first == "all controllers are given y, y', y'' in every cycle of 0.01 s"
+    assert "CTC, RHC, offset-free: use y, y'" in others
+    assert "CTC+FPI, RHC+FPI, offset-free, at once: use y, y', y''" in others
+    assert "CTC, CTC+FPI: act in every cycle" in others
+    document = json.loads(to_json(everything))
+    assert document["information"] == list(everything.information)
+    assert document["controllers"]["RHC"]["measures"] == ["y", "y'"]
+    page = render(everything)
+    assert "with a new plan every 5 cycles, between plans its deformation acts in every cycle" in page
+    assert "all controllers are given" in everything._repr_html_()
+
+
+def test_equal_controllers_share_one_line():
+    """Where nothing differs, one line says so."""
+    lines = compared(["CTC"]).information
+    assert lines[1:] == ("every controller uses y, y'", "every controller acts in every cycle")
+
+
+def test_estimated_and_believed_states_are_said():
+    """The position is measured late, the rest is estimated and believed."""
+    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["y"], belief=fp.ModelStates())
+    lines = compared(["CTC"], sensing=sensing, dead_time=fp.DeadTime(measurement=0.02)).information
+    assert lines[0] == (
+        "all controllers are given y in every cycle of 0.01 s, 0.02 s late; PositionDifference estimates the response from them"
+    )
+    filter = fp.KalmanFilter(measured={"y": 1e-3}, noise={"y": 1.0})
+    believed = compared(["CTC"], sensing=replace(sensing, belief=filter)).information
+    assert believed[0].endswith("; y, y' are believed (KalmanFilter)")
