@@ -116,3 +116,20 @@ def test_limits_that_contradict_one_another_are_named_together():
 def test_limits_that_cannot_be_meant_are_refused_before_any_solve(make: Callable[[], dict[str, tuple[float, float]]]):
     with pytest.raises(InvalidProblem, match=r"lower 1.0 above upper -1.0; swap them|'speed'"):
         plan_of((0.0, 0.0), make(), 5)
+
+
+def test_a_run_whose_plans_cannot_keep_a_limit_says_so_when_it_is_shown():
+    """A start outside a limit does not stop a run: its text names the outcome, how often, and since when."""
+    problem = fp.Problem(
+        plant=SLEDGE,
+        start={"y": 1.3, "y'": 0.0},
+        reference=fp.Trajectory(lambda t: {"y": 0 * t}),
+        period=STEP,
+        duration=0.3,
+        limits=fp.Limits(inputs={"u": (-1.0, 1.0)}, states={"y": (-5.0, 1.0)}),
+        horizon=fp.Horizon(stages=12, step=STEP),
+        cost=fp.Quadratic(states={"y": 1.0, "y'": 0.1}, effort={"u": 0.01}),
+    )
+    run = fp.simulate(problem, fp.RecedingHorizon(fp.FixedPoint(iterations=20, tolerance=1e-6)), seed=0)
+    assert run.stop is None
+    assert "HELD in 3 cycles, first at 0 s" in repr(run)  # the policy's name for every plan that is not usable as it is

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from fpirhc.errors import InvalidName, nearest
+from fpirhc.status import Status
 from fpirhc.summary import line, number, table
 from fpirhc.symbolic.layout import Layout
 
@@ -61,7 +62,20 @@ class Run:
     def _facts(self) -> tuple[str, ...]:
         how = "compiled C" if self.compiled else "virtual machine"
         ended = f"ended early: {self.stop}" if self.stop else "complete"
-        return f"{self.cycles} cycles of {self.period:g} {self.time_unit}", f"seed {self.seed}", how, ended
+        about = f"{self.cycles} cycles of {self.period:g} {self.time_unit}", f"seed {self.seed}", how, ended
+        return *about, *self._faults()
+
+    def _faults(self) -> tuple[str, ...]:
+        """What was worse in some cycles than a plan that had not converged, with the first time."""
+        if "status" not in self.layout or not self.cycles:
+            return ()
+        statuses, faults = self["status"].ravel().astype(int), []
+        for status in sorted(map(Status, set(statuses.tolist())), key=lambda s: s.severity):
+            if status.severity > Status.NOT_CONVERGED.severity:
+                at = np.flatnonzero(statuses == status)
+                first = f"{at[0] * self.period:g} {self.time_unit}"
+                faults.append(f"{status.name} in {at.size} cycles, first at {first}")
+        return tuple(faults)
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name in self.layout:
