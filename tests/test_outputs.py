@@ -459,10 +459,52 @@ def test_set_points_of_an_output_are_filtered_and_followed() -> None:
     assert abs(planned_run["output.depth"][-1] - 50.0) < 0.05
 
 
+def test_a_scale_that_is_chosen_covers_an_output() -> None:
+    """The scale follows from the nominal run, because nobody gives references of the states."""
+    law = fp.Exponential(rate=1.0)
+    errors = [
+        depth_error(sedated(hill(5.5)), fp.ComputedTorque(law, m)) for m in (fp.Identity(), fp.Sigmoid(gain=-4.0))
+    ]
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_algebraic_states_and_outputs_go_together() -> None:
+    """A quantity that an equation ties to the state enters the rates, and the output is that of the plant without it."""
+    through = replace(
+        hill(5.5),
+        response=lambda x, u, p, z: {"C": u.u - z.lost, "E": 0.5 * (x.C - x.E)},
+        algebraic=fp.Algebraic(
+            {"lost": "mg/l/min"}, lambda x, u, p, z: {"lost": z.lost - x.C}, lambda x, u, p: {"lost": 0 * x.C}
+        ),
+    )
+    one, other = (simulated(sedated(p), fp.ComputedTorque(fp.Exponential(rate=1.0))) for p in (hill(5.5), through))
+    assert np.allclose(one["output.depth"], other["output.depth"], rtol=1e-9)
+
+
 def test_a_deviation_needs_references_of_all_states() -> None:
     cost = fp.Quadratic(outputs={"depth": 1.0}, deviation={"u": 1e-3})
     with pytest.raises(FpirhcError, match="needs the states C, E"):
         simulated(planned(cost=cost), fp.RecedingHorizon(OPTIMISER))
+
+
+@pytest.mark.parametrize(
+    ("name", "described"), [("CTC", 0.142), ("CTC+FPI", 0.0126), ("RHC", 0.108), ("RHC+FPI", 0.00684)]
+)
+def test_the_shipped_anaesthesia_does_what_its_description_says(name: str, described: float) -> None:
+    task = fp.load_problem("anaesthesia")
+    run = simulated(task.problem, task.controllers[name])
+    assert fp.measure(task.problem, run).rms_error["bis"] == pytest.approx(described, rel=0.02)
+
+
+def test_the_patients_kinetics_conserve_the_drug() -> None:
+    """What is infused is in the compartments or has been cleared: V1 C1 + V2 C2 + V3 C3 changes by u - CL C1."""
+    age, weight, height = 61.0, 77.0, 175.0
+    lean = 1.1 * weight - 128 * (weight / height) ** 2
+    clearance = 1.89 + 0.0456 * (weight - 77) - 0.0681 * (lean - 59) + 0.0264 * (height - 177)
+    volumes = np.array([4.27, 18.9 - 0.391 * (age - 53), 238.0])
+    plant, x = fp.load_problem("anaesthesia").problem.plant, np.array([3.0, 1.0, 0.4, 2.0])
+    rates = plant.derivative_function(x, 20.0, plant.exact).full().ravel()
+    assert volumes @ rates[:3] == pytest.approx(20.0 - clearance * x[0], rel=1e-12)
 
 
 # Reviews

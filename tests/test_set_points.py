@@ -373,6 +373,20 @@ def test_unannounced_steps_of_two_mass():
     assert jumps["RHC+FPI"] < 0.3 * jumps["RHC"]
 
 
+@pytest.mark.parametrize("controller", ["CTC+FPI (eq 6)", "RHC+FPI"])
+def test_set_points_of_outputs(controller):
+    """Outputs that are the coordinates are led as the coordinates are, bit by bit."""
+    plain = two_mass(0.15)
+    assert isinstance(plain.cost, fp.Quadratic)
+    same = {"q1": fp.Output("m", lambda q, v, p: q.q1), "q2": fp.Output("m", lambda q, v, p: q.q2)}
+    cost = replace(plain.cost, states={}, outputs=plain.cost.states)
+    outputs = replace(plain, plant=replace(plain.plant, outputs=same), cost=cost)
+    runs = [fp.simulate(p, TWO_MASS.controllers[controller], seed=0, compiled=False) for p in (plain, outputs)]
+    for signal in ("state", "command", "reference", "setpoint", "true_error", "cost"):
+        if signal in runs[0].layout:
+            np.testing.assert_array_equal(runs[0][signal], runs[1][signal])
+
+
 def test_plans_towards_set_points_have_no_gap():
     """The nominal motion knows steps that the plans did not know: their cost is not compared with an optimum along it."""
     problem, controller = two_mass(0.03), TWO_MASS.controllers["RHC"]

@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.contraction import step_for_basin
+from fpirhc.controllers.reference_states import reference_states
 from fpirhc.deformation.base import Demand
 from fpirhc.errors import InvalidValue
 from fpirhc.task.problem import Problem
@@ -77,10 +78,11 @@ def _largest_error(problem: Problem) -> float:
     """Largest |r^N - response(x^N, 0)| of the model along the reference, over the samples where it is finite."""
     plant = problem.plant
     times = np.linspace(0.0, problem.duration, _SAMPLES)
-    states, responses = (np.asarray(v.full()) for v in problem.reference.function(plant).map(_SAMPLES)(times[None, :]))
+    states = reference_states(problem, _SAMPLES)
+    responses = np.asarray(problem.reference.function(plant).map(_SAMPLES)(times[None, :])[1].full())
     model, still = np.repeat(plant.approximate[:, None], _SAMPLES, axis=1), np.zeros((plant.input.size, _SAMPLES))
     free = np.asarray(plant.controlled_response_function.map(_SAMPLES)(states, still, model).full())
-    sizes = np.linalg.norm(responses[list(plant.controlled_indices)] - free, axis=0)
+    sizes = np.linalg.norm(responses[list(plant.face.controlled_indices)] - free, axis=0)
     return float(sizes[np.isfinite(sizes)].max(initial=0.0))
 
 

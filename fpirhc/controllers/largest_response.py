@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fpirhc.controllers.reference_states import reference_states
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem
 
@@ -41,9 +42,8 @@ def largest_response(problem: Problem) -> tuple[float, ...]:
 
 def _states(task: Problem) -> np.ndarray:
     """States along the reference, and the start, shape (nx, number)."""
-    times = np.linspace(0.0, task.duration, _SAMPLES)
-    states = task.reference.function(task.plant).map(_SAMPLES)(times[None, :])[0]
-    return np.hstack([np.asarray(states.full()), np.asarray(task.start_state)[:, None]])
+    states = reference_states(task, _SAMPLES)
+    return np.hstack([states, np.asarray(task.start_state)[:, None]])
 
 
 def _responses(task: Problem, states: np.ndarray, command: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ along their reference, from the start, with the input inside its limits, and the
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -24,16 +25,19 @@ _NOTHING = 1e-9  # share of the largest gain that counts as none
 _SMALL = 1e-2  # share of the largest gain before a run that is not finite
 
 
+Bounds: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
+
+
 @lru_cache(maxsize=8)  # studies make many problems of one plant and reference
-def singular_gain(
+def nominal_run(
     plant: Plant,
     reference: Reference,
     integrator: Integrator,
     start: tuple[float, ...],
-    bounds: tuple[tuple[float, ...], tuple[float, ...]],
+    bounds: Bounds,
     times: tuple[float, int],
-) -> str:
-    """Return a sentence that says where the gain vanishes or changes its sign, and its values; empty where it does not.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return states (nx, m) and inputs (nu, m) of the model while its outputs follow their reference, in the first 20 000 cycles.
 
     Args:
         plant: the model, with outputs and as many inputs as controlled ones.
@@ -45,24 +49,33 @@ def singular_gain(
     """
     period, cycles = times[0], min(times[1], _CYCLES)
     x, u, p = plant.symbols()
-    response = plant.controlled_response_function(x, u, p)
-    gain = ca.Function("fpirhc_output_gain", [x, u, p], [ca.densify(ca.det(ca.jacobian(response, u)))])
     advance, w = integrator.step(plant, period), np.zeros(len(plant.names))
     xm, um, pm = (ca.MX.sym(n, v.numel()) for n, v in (("x", x), ("u", u), ("p", p)))
     step = ca.Function("fpirhc_advance", [xm, um, pm], [advance(xm, um, pm, w)])
     rate = min(_DECAYS / (period * times[1]), _FASTEST / period)
-    states, inputs = nominal_motion(
-        plant,
-        reference,
-        step,
-        np.array(start),
-        (np.array(bounds[0]), np.array(bounds[1])),
-        period * np.arange(cycles),
-        rate,
-    )
-    believed = np.repeat(plant.approximate[:, None], cycles, axis=1)
-    gains = np.asarray(gain.map(cycles)(states, inputs, believed).full()).ravel()
-    return _judged(plant, gains, states, period)
+    ends = np.array(bounds[0]), np.array(bounds[1])
+    return nominal_motion(plant, reference, step, np.array(start), ends, period * np.arange(cycles), rate)
+
+
+def singular_gain(
+    plant: Plant,
+    reference: Reference,
+    integrator: Integrator,
+    start: tuple[float, ...],
+    bounds: Bounds,
+    times: tuple[float, int],
+) -> str:
+    """Return a sentence that says where the gain vanishes or changes its sign, and its values; empty where it does not.
+
+    The arguments are those of `nominal_run`.
+    """
+    states, inputs = nominal_run(plant, reference, integrator, start, bounds, times)
+    x, u, p = plant.symbols()
+    response, count = plant.controlled_response_function(x, u, p), states.shape[1]
+    gain = ca.Function("fpirhc_output_gain", [x, u, p], [ca.densify(ca.det(ca.jacobian(response, u)))])
+    believed = np.repeat(plant.approximate[:, None], count, axis=1)
+    gains = np.asarray(gain.map(count)(states, inputs, believed).full()).ravel()
+    return _judged(plant, gains, states, times[0])
 
 
 def _judged(plant: Plant, gains: np.ndarray, states: np.ndarray, period: float) -> str:

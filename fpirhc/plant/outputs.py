@@ -124,6 +124,7 @@ def light_plant(
         inverse=None,
         ranges={},
         outputs={},
+        algebraic=None,
     )
 
 

@@ -102,6 +102,7 @@ class Plant(Checked):
         controlled: Sequence[str] | None = None,
         inverse: Callable[..., Mapping[str, Expression]] | None = None,
         ranges: Mapping[str, tuple[float, float]] | None = None,
+        algebraic: Algebraic | None = None,
         time_unit: str = "s",
     ) -> Plant:
         """Return the plant x' = f(x, u, p), y = h(x, p): every state is a coordinate of order one, and the outputs have references.
@@ -116,6 +117,7 @@ class Plant(Checked):
             inverse: optional function of (x, r, p) that returns {input: command} for wanted highest derivatives r of the controlled
                 outputs; see `Plant`.
             ranges: physical range (lowest, highest) of states by name.
+            algebraic: quantities that equations tie to the state at every instant; see `Plant`.
             time_unit: unit of time of the equations.
 
         Raises:
@@ -131,6 +133,7 @@ class Plant(Checked):
             inverse=inverse,
             ranges=ranges or {},
             outputs=outputs,
+            algebraic=algebraic,
             time_unit=time_unit,
         )
 

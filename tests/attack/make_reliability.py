@@ -65,7 +65,8 @@ def files() -> str:
     from attack.artefacts import ARTEFACTS, flipped
     from attack.files import flipped_bits, killed_compilations
 
-    rows, wrong = [["attack", "tried", "raw errors", "unnoticed or failed"]], list[str]()
+    rows = [["attack", "tried", "raw errors", "unnoticed or failed"]]
+    wrong: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         for name in ARTEFACTS:
             result = flipped(name, Path(folder) / name, FLIPS, seed=1)
