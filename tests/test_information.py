@@ -105,3 +105,18 @@ def test_estimated_and_believed_states_are_said():
     filter = fp.KalmanFilter(measured={"y": 1e-3}, noise={"y": 1.0})
     believed = compared(["CTC"], sensing=replace(sensing, belief=filter)).information
     assert believed[0].endswith("; y, y' are believed (KalmanFilter)")
+
+
+def test_outputs_are_measured_beside_the_state():
+    """Of a plant with outputs, these and their response are given; a controller without adaptation does not use the response."""
+    task = fp.load_problem("anaesthesia")
+    short = replace(task.problem, duration=20 * task.problem.period, measure_from=0.0)
+    comparison = fp.compare(replace(task, problem=short), seed=0, controllers=["CTC", "CTC+FPI"], compiled=False)
+    assert not comparison.skipped
+    known = [comparison[name].information for name in ("CTC", "CTC+FPI")]
+    assert all(known)
+    uses = [one.uses for one in known if one]
+    face = short.plant.face
+    responses = {name + "'" * order for name, order in zip(face.names, face.orders, strict=True)}
+    assert set(face.names) <= set(uses[0])
+    assert set(uses[1]) - set(uses[0]) == responses

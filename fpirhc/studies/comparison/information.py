@@ -14,7 +14,7 @@ from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.block import Composite
 from fpirhc.task.problem import Problem
 
-_SAMPLE = ("state", "realised", "measured", "arrived")
+_SAMPLE = ("state", "output", "realised", "measured", "arrived")
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,10 @@ def sentences(problem: Problem, known: Mapping[str, Information]) -> tuple[str, 
 
 
 def _given(problem: Problem) -> str:
-    plant, sensing = problem.plant, problem.sensing
+    plant, sensing = problem.plant.face, problem.sensing
     names = sensing.measures(plant) if sensing.estimates else (*plant.state.elements, *response_names(plant))
+    if problem.plant.outputs:  # the state too, as it is believed
+        names = (*problem.plant.state.elements, *(n for n in names if n not in problem.plant.state.elements))
     text = f"all controllers are given {', '.join(names)} in every cycle of {problem.period:g} {problem.time_unit}"
     late = problem.dead_time.measurement
     text += f", {late:g} {problem.time_unit} late" if late else ""
@@ -97,9 +99,9 @@ def _used(problem: Problem, loop: Composite) -> tuple[str, ...]:
     for place, signal in enumerate(inside.reads.signals, start=1):
         if signal.name not in _SAMPLE:
             continue
-        names = response_names(problem.plant) if signal.name == "realised" else signal.elements
+        names = response_names(problem.plant.face) if signal.name == "realised" else signal.elements
         columns = {k for result in (0, 2) for k in inside.function.jac_sparsity(result, place).get_triplet()[1]}
-        used += [names[k] for k in sorted(columns)]
+        used += [names[k] for k in sorted(columns) if names[k] not in used]
     return tuple(used)
 
 
