@@ -21,6 +21,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError, InvalidProblem, NotInvertible, NotSupported
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
+from fpirhc.simulation.loop import close_loop
 
 TRACK = fp.Exponential(rate=6.0)
 TWO_MASS = fp.load_problem("two_mass")
@@ -51,6 +52,13 @@ def test_outputs_that_are_coordinates_change_no_signal(name: str) -> None:
     assert equal(plain, run) == []
     assert np.array_equal(run["output"], plain["state"])
     assert set(run.layout.names) - set(plain.layout.names) == {"output", "plant_output"}
+
+
+@pytest.mark.parametrize("name", ["CTC", "CTC+FPI (eq 6)"])
+def test_outputs_that_are_coordinates_need_no_more_operations(name: str) -> None:
+    """Operations of one cycle, which do not depend on the machine as times do."""
+    plain, outputs = (close_loop(p, TWO_MASS.controllers[name]).function for p in (SHORT, on_outputs(SHORT)))
+    assert outputs.n_instructions() <= plain.n_instructions() + 4  # four outputs more are written
 
 
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -388,6 +396,12 @@ def test_a_mistake_is_named(mistake: str) -> None:
     make, words = WRONG[mistake]
     with pytest.raises(InvalidProblem, match=words):
         make()
+
+
+def test_a_plant_shows_its_outputs() -> None:
+    plant = hill(5.5)
+    assert "depth of relative order 2" in repr(plant)
+    assert "output, relative order 2" in plant._repr_html_()
 
 
 def test_fewer_inputs_than_outputs_need_the_controlled_ones() -> None:

@@ -11,7 +11,12 @@ if TYPE_CHECKING:
 
 
 def plant_facts(plant: Plant) -> tuple[str, ...]:
-    """Return what sums up a plant: its coordinates with their orders, its inputs, the number of its parameters."""
+    """Return what sums up a plant: its coordinates or outputs with their orders, its inputs, the number of its parameters."""
+    if plant.outputs:
+        face = zip(plant.face.names, plant.face.orders, strict=True)
+        shown = ", ".join(f"{name} of relative order {order}" for name, order in face)
+        states = f"{plant.state.size} states"
+        return f"outputs {shown}", states, f"inputs {', '.join(plant.inputs)}", f"{len(plant.parameters)} parameters"
     orders = ", ".join(f"{name} of order {order}" for name, order in zip(plant.names, plant.orders, strict=True))
     return orders, f"inputs {', '.join(plant.inputs)}", f"{len(plant.parameters)} parameters"
 
@@ -22,6 +27,8 @@ def plant_table(plant: Plant) -> str:
         (name, f"coordinate, order {order}", unit, "", "")
         for (name, unit), order in zip(plant.coordinates.items(), plant.orders, strict=True)
     ]
+    face = zip(plant.face.coordinates.items(), plant.face.orders, strict=True) if plant.outputs else ()
+    rows += [(name, f"output, relative order {order}", unit, "", "") for (name, unit), order in face]
     rows += [(name, "input", unit, "", "") for name, unit in plant.inputs.items()]
     rows += [
         (
