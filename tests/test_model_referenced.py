@@ -115,8 +115,8 @@ def adaptive_problems() -> list[str]:
     collected = []
     for name in sorted(shipped_problems()):
         module: Any = fp.load_problem(name)
-        adaptive = resolved(module.problem, module.controllers[module.headline[1]]).deformation
-        collected += [] if isinstance(adaptive, fp.Identity) else [name]
+        adaptive = resolved(module.problem, module.controllers[module.headline[1]])
+        collected += [name] if adaptive.deformation.adapts and adaptive.deforms_response else []
     return collected
 
 

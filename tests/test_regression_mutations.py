@@ -107,8 +107,8 @@ def shorter_horizon(module):
             patch.setattr(
                 owner,
                 name,
-                lambda plant, reference, horizon, cost, *more, _do=ordinary: _do(
-                    plant, reference, replace(horizon, stages=horizon.stages - 1), cost, *more
+                lambda plant, reference, horizon, cost, *more, _do=ordinary, **named: _do(
+                    plant, reference, replace(horizon, stages=horizon.stages - 1), cost, *more, **named
                 ),
             )
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import cast
 
 import numpy as np
@@ -251,14 +251,15 @@ def _refuse_lost(composite: Composite, paths: Sequence[str]) -> None:
 
 
 def _differences(before: object, after: object, path: str = "") -> Iterator[str]:
-    """Paths of the numbers that were chosen: None before, a number after."""
+    """Paths of the numbers that were chosen, None before and a number after, without those that decide what the loop is made of."""
     if before is after:
         return
     if before is None:
         if isinstance(after, int | float) and not isinstance(after, bool):
             yield path
         return
-    for name in names_in(after):
+    structure = {f.name for f in fields(after) if f.metadata.get("structure")} if is_dataclass(after) else set()
+    for name in (n for n in names_in(after) if n not in structure):
         inner = getattr(before, name, None) if not isinstance(before, Mapping | Sequence) else None
         if not isinstance(after, Mapping | Sequence):
             yield from _differences(inner, getattr(after, name), f"{path}.{name}".lstrip("."))

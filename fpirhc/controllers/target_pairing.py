@@ -16,7 +16,7 @@ the iteration then goes on while the output is still under way.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
@@ -44,8 +44,8 @@ class ThroughModel(Checked):
         InvalidValue: a negative or infinite time.
     """
 
-    lag: float | tuple[float, ...] | None = None
-    dead_time: float | None = None
+    lag: float | tuple[float, ...] | None = field(default=None, metadata={"structure": True})
+    dead_time: float | None = field(default=None, metadata={"structure": True})
 
     def __post_init__(self) -> None:
         times = [

@@ -170,7 +170,8 @@ def _reached(loop: LinearLoop, cycles: int, deviations: np.ndarray) -> np.ndarra
     memory[loop.state, np.arange(len(loop.state))] = 1.0
     sums, total = [], np.zeros_like(deviations)
     for late in range(cycles):
-        total[late:] += np.abs(deviations[: len(deviations) - late] @ memory[loop.state].T)
+        if late < len(deviations):
+            total[late:] += np.abs(deviations[: len(deviations) - late] @ memory[loop.state].T)
         sums.append(total.max(axis=0))
         memory = loop.dynamics @ memory
     return np.array(sums)

@@ -97,6 +97,12 @@ def response_names(plant: Plant) -> tuple[str, ...]:
     return tuple(plant.names[k] + "'" * plant.orders[k] for k in plant.controlled_indices)
 
 
+def names_of_responses(plant: Plant, signal: Signal) -> tuple[str, ...]:
+    """Names of the entries of a signal of responses: highest derivatives of coordinates, and others as they are."""
+    orders = dict(zip(plant.names, plant.orders, strict=True))
+    return tuple(e + "'" * orders.get(e, 0) for e in signal.elements)
+
+
 def spline_weights(order: int) -> Array:
     """Weights A(n, j) / n! of the last n held values of y^(n) in the n-th difference of y over T^n."""
     row = np.ones(1)

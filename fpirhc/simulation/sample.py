@@ -18,7 +18,7 @@ def raw_measurements(run: Run) -> np.ndarray:
     for name in ("arrived", "measured"):
         if name in run.layout:
             return np.ascontiguousarray(run[name])
-    return np.hstack([run["state"], run["realised"]])
+    return np.hstack([run[name] for name in ("state", "output", "realised") if name in run.layout])
 
 
 def numbers(name: str, value: object, size: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from fpirhc.controllers.own_reference import given_signals
 from fpirhc.controllers.plausible import plausible_range
 from fpirhc.controllers.seeing import compose_seeing, raw_signal
 from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidName, InvalidShape, InvalidValue, NotSupported
-from fpirhc.sensing.base import response_names
+from fpirhc.sensing.base import names_of_responses
 from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, Watch, machine_step
 from fpirhc.simulation.sample import numbers as numbers_of
 from fpirhc.simulation.sample import one_number
@@ -119,7 +119,7 @@ class Stepper:
         self._bind(
             backend.function if backend else self._composite.function, ready.parameters(ready.model_plant(problem))
         )
-        self.measures = _measures(problem)  # names of the raw measurements
+        self.measures = _measures(problem, ready)  # names of the raw measurements
         self.refused, self.why_refused = 0, ""
         self.numbers: dict[str, float] = self._live.start
         self._force(self.numbers)
@@ -407,12 +407,14 @@ _NOTHING = np.zeros(0)
 _NOT_WRITTEN = float("nan")  # the gate's command is finite: what is still NaN was not written
 
 
-def _measures(problem: Problem) -> tuple[str, ...]:
+def _measures(problem: Problem, controller: Controller) -> tuple[str, ...]:
     """Names of what a step is given: the state and the responses, or what the sensors show."""
-    raw = raw_signal(problem)
-    plant = problem.plant
+    raw, plant, own = raw_signal(problem), problem.plant, controller.response(problem)
+    if raw is not None:
+        return raw.elements
     outputs = plant.output.elements if plant.outputs else ()
-    return (*plant.state.elements, *outputs, *response_names(plant.face)) if raw is None else raw.elements
+    responses = plant.response_signal("realised") if own is None else own.signal
+    return (*plant.state.elements, *outputs, *names_of_responses(plant.face, responses))
 
 
 def _view(array: np.ndarray) -> _View:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from fpirhc.controllers.base import Controller
-from fpirhc.sensing.base import response_names
+from fpirhc.sensing.base import names_of_responses, response_names
 from fpirhc.symbolic.block import Composite
 from fpirhc.task.problem import Problem
 
@@ -99,7 +99,7 @@ def _used(problem: Problem, loop: Composite) -> tuple[str, ...]:
     for place, signal in enumerate(inside.reads.signals, start=1):
         if signal.name not in _SAMPLE:
             continue
-        names = response_names(problem.plant.face) if signal.name == "realised" else signal.elements
+        names = names_of_responses(problem.plant.face, signal) if signal.name == "realised" else signal.elements
         columns = {k for result in (0, 2) for k in inside.function.jac_sparsity(result, place).get_triplet()[1]}
         used += [names[k] for k in sorted(columns) if names[k] not in used]
     return tuple(used)
