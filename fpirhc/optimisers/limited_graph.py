@@ -26,6 +26,8 @@ _SCALARS = (
     *("use_exact", "stuck", "rolled", "accepted", "count", "ends", "descends", "price"),
 )
 
+_BLOCK = 20  # turns; most plans need fewer
+
 
 def limited_graph(ocp: OptimalControl, settings: LimitedSettings, name: str) -> ca.Function:
     """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
@@ -36,8 +38,8 @@ def limited_graph(ocp: OptimalControl, settings: LimitedSettings, name: str) -> 
     first["ends"] = ca.logic_not(posed)
     packed = ca.vertcat(*(ca.vec(v) for v in [*arguments, *first.values()]))
     shapes = {**_argument_shapes(ocp), **{k: ca.MX(v).shape for k, v in first.items()}}
-    turns = _guarded_turn(ocp, settings, shapes).fold(settings.iterations + 1)
-    state = dict(zip(shapes, _unpacked(turns(packed), shapes), strict=True))
+    last = _repeated(_guarded_turn(ocp, settings, shapes), packed, settings.iterations + 1, shapes)
+    state = dict(zip(shapes, _unpacked(last, shapes), strict=True))
     return ca.Function(name, [*arguments, memory], _results(call, state, memory, posed))
 
 
@@ -53,9 +55,24 @@ def _guarded_turn(ocp: OptimalControl, settings: LimitedSettings, shapes: dict[s
     call = Call(ocp, settings, *(state[k] for k in _argument_shapes(ocp)))
     after = Turn(call).turned(state)
     work = ca.Function("fpirhc_limited_turn", [column], [ca.vertcat(*(ca.vec(ca.MX(after[k])) for k in shapes))])
+    return _while_needed(work, shapes)
+
+
+def _while_needed(work: ca.Function, shapes: dict[str, tuple[int, int]]) -> ca.Function:
+    """Function column -> column after `work`, or the same once the iteration has ended."""
+    column = ca.MX.sym("column", work.size1_in(0))
+    ends = dict(zip(shapes, _unpacked(column, shapes), strict=True))["ends"]
     rest = ca.Function("fpirhc_limited_rest", [column], [column])
-    work_or_rest = ca.Function.if_else("fpirhc_limited_turn_if_needed", work, rest)
-    return ca.Function("fpirhc_limited_turn_guarded", [column], [work_or_rest(state["ends"] == 0, column)])
+    work_or_rest = ca.Function.if_else("fpirhc_limited_if_needed", work, rest)
+    return ca.Function("fpirhc_limited_guarded", [column], [work_or_rest(ends == 0, column)])
+
+
+def _repeated(turn: ca.Function, column: ca.MX, count: int, shapes: dict[str, tuple[int, int]]) -> ca.MX:
+    """Return the column after `count` turns. Blocks of turns are passed over as a whole once the iteration has ended."""
+    blocks, others = divmod(count, _BLOCK)
+    if blocks:
+        column = _while_needed(turn.fold(_BLOCK), shapes).fold(blocks)(column)
+    return turn.fold(others)(column) if others else column
 
 
 def _unpacked(column: ca.MX, shapes: dict[str, tuple[int, int]]) -> list[ca.MX]:
