@@ -249,6 +249,7 @@ def test_a_baseline_that_is_no_text_or_no_file(folder, capsys):
         (["check", "--junit", "line.py"], 3, "is not overwritten"),
         (["check", "--markdown", "baselines/line.json"], 3, "is not overwritten"),
         (["check", "--junit", "nowhere/a.xml"], 3, "no folder 'nowhere'"),
+        (["check", "--junit", "a" * 300], 3, "File name too long"),
         (["check", "--baselines", "nowhere", "noisy.py", "--no-compile"], 6, "there is no baseline 'noisy.json'"),
         (["check", "nosuch"], 2, "problem 'nosuch' is unknown"),
     ],

@@ -86,11 +86,11 @@ def check_replaceable(path: Path, mark: str) -> None:
     Raises:
         OutputError: the path holds something else, or its folder does not exist.
     """
-    if not path.parent.is_dir():
-        raise OutputError(f"cannot write to '{path}': there is no folder '{path.parent}'")
-    if not path.exists():
-        return
     try:
+        if not path.parent.is_dir():
+            raise OutputError(f"cannot write to '{path}': there is no folder '{path.parent}'")
+        if not path.exists():
+            return
         with path.open("rb") as file:
             head = file.read(400)
     except OSError as error:
