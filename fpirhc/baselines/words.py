@@ -86,9 +86,9 @@ def check_replaceable(path: Path, mark: str) -> None:
     Raises:
         OutputError: the path holds something else, or its folder does not exist.
     """
+    if not path.parent.is_dir():
+        raise OutputError(f"cannot write to '{path}': there is no folder '{path.parent}'")
     try:
-        if not path.parent.is_dir():
-            raise OutputError(f"cannot write to '{path}': there is no folder '{path.parent}'")
         if not path.exists():
             return
         with path.open("rb") as file:
