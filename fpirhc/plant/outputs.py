@@ -25,6 +25,7 @@ from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.expected import takes
 from fpirhc.fields.user_code import called, scalar_expression
+from fpirhc.plant.plant_functions import by_name
 from fpirhc.symbolic.layout import Expression, Named
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ def output_expression(plant: Plant, name: str, x: Expression, p: Expression) -> 
         InvalidProblem: the function fails, or does not return one scalar.
     """
     what, expression = f"outputs: '{name}'", plant.outputs[name].expression
-    value = called(what, expression, *plant._derivatives(x), plant._parameters(p))
+    value = called(what, expression, *by_name(plant, x, p))
     return scalar_expression(what, value, of=expression, symbols=(x, p))
 
 

@@ -19,6 +19,8 @@ from fpirhc.symbolic.layout import Expression
 if TYPE_CHECKING:
     from fpirhc.plant.plant import Plant
 
+HIGHEST_ORDER = 20  # every derivative is a state with a name of its own: a mistyped 10**9 would fill the memory
+
 
 def check_names(plant: Plant, mistakes: Mistakes) -> None:
     """Add every mistake in names, units, orders and the choice of controlled coordinates to `mistakes`."""
@@ -112,6 +114,11 @@ def _check_order_numbers(plant: Plant, mistakes: Mistakes) -> None:
     for order in orders:
         if not isinstance(order, int) or isinstance(order, bool) or order < 1:
             mistakes.add(f"order must be a whole number of at least 1, got {order!r}")
+        elif order > HIGHEST_ORDER:
+            mistakes.add(
+                f"order is {order}, and the highest possible is {HIGHEST_ORDER}: the response has one argument per lower "
+                "derivative; give the order of the derivative that the response returns"
+            )
 
 
 def _check_inverse(plant: Plant, inverse: Callable[..., Mapping[str, Expression]], mistakes: Mistakes) -> None:
