@@ -53,7 +53,7 @@ def test_a_controller_inside_that_does_not_cover_outputs_is_named() -> None:
 def test_a_wrong_model_that_asks_for_too_much_is_led_back_from_the_limit(
     offset: float, aim: float, command: float
 ) -> None:
-    """Y' = (u + 2 - y) / 5 with the model y' = (u - y) / 5: the model asks for a command beyond the limits, one inside them is right."""
+    """Y' = (u + o - y) / 5, modelled without o: the model asks for a command beyond the limits, and u = 1 is right."""
     plain = linear(1.0)
     rate = plain.plant.response
     plant = replace(
