@@ -27,7 +27,14 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called
 from fpirhc.plant.algebraic import Algebraic
 from fpirhc.plant.inverse import inverse_by_newton, inverse_by_user, inverse_of_affine
-from fpirhc.plant.outputs import Output, check_outputs, face_of, lie_derivatives, output_expression
+from fpirhc.plant.outputs import (
+    Output,
+    believed_disturbance,
+    check_outputs,
+    face_of,
+    lie_derivatives,
+    output_expression,
+)
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_ranges, check_response
 from fpirhc.plant.plant_view import plant_facts, plant_table
@@ -339,11 +346,12 @@ class Plant(Checked):
         if self.outputs:
             calm, face = ca.SX.zeros(len(self.names)), self.face
             orders = {name: face.orders[face.names.index(name)] for name in self.controlled_names}
-            chains = (
-                lie_derivatives(self, output_expression(self, name, x, p), order, (x, u, p, calm))
+            chains = {
+                name: lie_derivatives(self, output_expression(self, name, x, p), order, (x, u, p, calm))
                 for name, order in orders.items()
-            )
-            responses = ca.densify(ca.vertcat(*(chain[-1] for chain in chains)))
+            }
+            entries = (chain[-1] + believed_disturbance(self, name, p) for name, chain in chains.items())
+            responses = ca.densify(ca.vertcat(*entries))
         else:
             responses = self.response_function(x, u, p)[list(self.controlled_indices)]
         return ca.Function("fpirhc_controlled_response", [x, u, p], [responses], ["x", "u", "p"], ["r"])
