@@ -17,6 +17,7 @@ from fpirhc.controllers.own_reference import given_signals
 from fpirhc.controllers.plausible import plausible_range
 from fpirhc.controllers.seeing import compose_seeing, raw_signal
 from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidName, InvalidShape, InvalidValue, NotSupported
+from fpirhc.fields.checked import Checked
 from fpirhc.sensing.base import names_of_responses
 from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, Watch, machine_step
 from fpirhc.simulation.sample import numbers as numbers_of
@@ -40,7 +41,7 @@ class _View(Protocol):
     def __len__(self) -> int: ...
 
 
-class Stepper:
+class Stepper(Checked):
     """One controller, ready to be called once per control cycle.
 
         stepper = Stepper(problem, controller)

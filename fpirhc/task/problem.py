@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -67,6 +68,9 @@ class Problem(Checked):
     Raises:
         InvalidProblem: all mistakes together.
     """
+
+    LOADED: ClassVar[str] = "fp.load_problem({}).problem"
+    """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
 
     plant: Plant
     reference: Reference
