@@ -96,9 +96,9 @@ class ThroughModel(Checked):
     def memory(self, problem: Problem) -> tuple[Signal, ...]:
         """Return references and shifts on their way, newest first, and the shift in force: at first the distance of the start."""
         plant, names = problem.plant, problem.plant.controlled_names
-        places = [plant.state.elements.index(n) for n in names]
+        places = [plant.output.elements.index(n) for n in names]
         first = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()[places]
-        away, length = problem.start_state[places] - first, self.queue(problem).length
+        away, length = problem.start_output[places] - first, self.queue(problem).length
         queued = tuple(f"{n}@{k}" for k in range(1, length + 1) for n in names)
         return (
             Signal("references_sent", queued, start=tuple(map(float, first)) * length),
