@@ -23,7 +23,7 @@ from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.largest_response import largest_response
-from fpirhc.controllers.mirror import measured_state, mirror_blocks, with_measured_state
+from fpirhc.controllers.mirror import measured_reads, mirror_blocks, with_measured_state
 from fpirhc.controllers.outside_block import ACTED, NOW, Told
 from fpirhc.controllers.own_reference import given_signals, motion_of, own_signals, own_values, with_reference
 from fpirhc.deformation.base import Deformation
@@ -53,16 +53,18 @@ def compose_controller(problem: Problem, controller: Controller, *, ahead: bool 
     Args:
         problem: that the controller is composed for.
         controller: checked here against the problem.
-        ahead: whether time and state are those at which the command will act. The step then also reads the measured state, and the
-            signals of the last cycle, where a block needs them.
+        ahead: whether time and state are those at which the command will act. The step then also reads the measured state, its
+            time, and the signals of the last cycle, where a block needs them.
     """
     ready = checked(problem, controller)
     blocks, delays = ready.blocks(problem)
     blocks = with_reference(problem, blocks)
-    reads, named = controller_reads(problem, ready), with_measured_state(problem.plant, blocks)
-    if ahead and len(named) > len(blocks):
-        reads, named = reads + Layout((measured_state(problem.plant),)), blocks
-    return compose_informed(problem, ready, reads, named, delays, ahead=ahead)
+    reads = controller_reads(problem, ready)
+    if ahead:
+        reads = reads + Layout(measured_reads(problem.plant, blocks))
+    else:
+        blocks = with_measured_state(problem.plant, blocks)
+    return compose_informed(problem, ready, reads, blocks, delays, ahead=ahead)
 
 
 def compose_informed(

@@ -209,6 +209,14 @@ class Controller(Checked, ABC):
             return self.around(self.inner.with_deformation(deformation))
         raise NotSupported(f"{type(self).__name__} has no deformation that can be replaced")
 
+    def unadapted(self) -> Controller:
+        """Return the controller of the same settings that does not adapt, beside which a comparison judges this one.
+
+        Raises:
+            NotSupported: it has a deformation that cannot be left out.
+        """
+        return without_deformation(self)
+
     def stated(self, problem: Problem) -> Controller:
         """Return the controller with every number of its own stated that it would take from the problem; itself without any."""
         del problem

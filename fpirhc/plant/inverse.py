@@ -6,7 +6,6 @@ one is solved by Newton's method, and an input that Newton's method does not fin
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
@@ -15,6 +14,8 @@ import casadi as ca
 from fpirhc.errors import Mistakes, NotInvertible
 from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.plant.plant_functions import by_name
+from fpirhc.symbolic.expression import expression, graph
+from fpirhc.symbolic.functions import nan_where
 from fpirhc.symbolic.layout import Expression, Named
 
 if TYPE_CHECKING:
@@ -75,5 +76,8 @@ def inverse_by_newton(plant: Plant) -> ca.Function:
     xm, rm, pm = (ca.MX.sym(n, s) for n, s in (("x", x.numel()), ("r", r.numel()), ("p", p.numel())))
     root = finder(ca.DM.zeros(len(plant.inputs)), xm, rm, pm)
     residual = ca.norm_inf(error(root, xm, rm, pm))
-    solved = residual <= INVERSE_TOLERANCE * (1 + ca.norm_inf(rm))
-    return ca.Function("fpirhc_inverse", [xm, rm, pm], [ca.if_else(solved, root, math.nan)], ["x", "r", "p"], ["u"])
+    # NaN is on neither side of a comparison, so arriving is asked for and not missing.
+    lost = ca.logic_not(residual <= INVERSE_TOLERANCE * (1 + ca.norm_inf(rm)))
+    return ca.Function(
+        "fpirhc_inverse", [xm, rm, pm], [root + graph(nan_where(expression(lost)))], ["x", "r", "p"], ["u"]
+    )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import casadi as ca
 
 from fpirhc.plant.instant import response_orders
-from fpirhc.plant.outputs import lie_derivatives, output_expression
+from fpirhc.plant.outputs import believed_disturbance, lie_derivatives, output_expression
 
 if TYPE_CHECKING:
     from fpirhc.plant.plant import Plant
@@ -47,11 +47,12 @@ def controlled_response_function(plant: Plant) -> ca.Function:
     x, u, p = plant.symbols()
     if plant.outputs:
         calm = ca.SX.zeros(len(plant.names))
-        chains = (
-            lie_derivatives(plant, output_expression(plant, name, x, u, p), order, (x, u, p, calm))
+        chains = {
+            name: lie_derivatives(plant, output_expression(plant, name, x, u, p), order, (x, u, p, calm))
             for name, order in response_orders(plant).items()
-        )
-        responses = ca.densify(ca.vertcat(*(chain[-1] for chain in chains)))
+        }
+        entries = (chain[-1] + believed_disturbance(plant, name, p) for name, chain in chains.items())
+        responses = ca.densify(ca.vertcat(*entries))
     else:
         responses = plant.response_function(x, u, p)[list(plant.controlled_indices)]
     return ca.Function("fpirhc_controlled_response", [x, u, p], [responses], ["x", "u", "p"], ["r"])

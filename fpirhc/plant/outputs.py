@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -42,10 +42,14 @@ class Output(Checked):
     Args:
         unit: of the output.
         expression: function of the arguments of the response, with or without the inputs; it returns one scalar.
+        response_disturbance: name of a parameter that a model believes to add to the response y^(r) and to nothing else, as
+            estimators of disturbances do; empty: none. The inverse has it in every cycle. A plan is made without it, as if the
+            response were the model's, which is how a plan is made behind a deformation.
     """
 
     unit: str
     expression: Callable[..., Expression]
+    response_disturbance: str = field(default="", kw_only=True, metadata={"setting": False})
 
 
 def output_expression(plant: Plant, name: str, x: Expression, u: Expression, p: Expression) -> Expression:
@@ -74,6 +78,19 @@ def lie_derivatives(plant: Plant, value: Expression, count: int, symbols: Symbol
     for _ in range(count):
         chain.append(ca.jtimes(chain[-1], x, rate))
     return chain
+
+
+def believed_disturbance(plant: Plant, name: str, p: Expression) -> Expression:
+    """Return what a model believes to add to the response of an output: zero, or a parameter of an estimator."""
+    parameter = plant.outputs[name].response_disturbance
+    return p[plant.parameter.elements.index(parameter)] if parameter else ca.SX(0)
+
+
+def without_disturbances(plant: Plant) -> Plant:
+    """Return the plant without believed disturbances of its outputs' responses; itself where there are none."""
+    if not any(one.response_disturbance for one in plant.outputs.values()):
+        return plant
+    return replace(plant, outputs={n: replace(one, response_disturbance="") for n, one in plant.outputs.items()})
 
 
 def output_order(plant: Plant, name: str) -> int | None:
@@ -157,6 +174,9 @@ def _check_one(plant: Plant, name: str, mistakes: Mistakes) -> None:
     if name in plant.coordinates and not ca.is_equal(value, x[plant.state.elements.index(name)], 1):
         mistakes.add(f"outputs: '{name}' has the name of a coordinate, but is another expression; rename the output")
         return
+    parameter = plant.outputs[name].response_disturbance
+    if parameter and parameter not in plant.parameters:
+        mistakes.add(f"outputs: '{name}': response_disturbance={parameter!r} is no parameter of the plant; add it there")
     controlled = plant.controlled is None or name in plant.controlled
     if controlled and output_order(plant, name) is None:
         mistakes.add(f"outputs: no input reaches '{name}', however often it is differentiated; control another output")

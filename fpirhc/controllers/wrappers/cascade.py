@@ -79,6 +79,10 @@ class Cascade(Controller):
     def planner(self) -> None:
         """None: plans of the inner controller follow the target, and not the reference of the problem."""
 
+    def unadapted(self) -> Controller:
+        """Return the inner controller: without a shift its target is the reference."""
+        return self.controller.unadapted()
+
     def stated(self, problem: Problem) -> Cascade:
         """Return the cascade with lag and dead time of its pairing as numbers."""
         return self if self.paired is None else replace(self, paired=self.paired.stated(problem))

@@ -10,7 +10,7 @@ from typing import Any
 
 from fpirhc.contraction import ContractionReport, Spectrum, assess_gain
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import checked, resolved, without_deformation
+from fpirhc.controllers.contract import checked, resolved
 from fpirhc.deformation.base import innermost
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, NotSupported, nearest
@@ -354,7 +354,7 @@ def _predicted(problem: Problem, controller: Controller, compiled: bool) -> Pred
 def _pair(controllers: Mapping[str, Controller], name: str) -> str | None:
     """The controller with the same settings and no adaptation."""
     try:
-        wanted = describe(without_deformation(controllers[name]))
+        wanted = describe(controllers[name].unadapted())
     except NotSupported:
         return None
     plain = ((n, c) for n, c in controllers.items() if not c.deformation.adapts)
