@@ -250,6 +250,11 @@ class Controller(Checked, ABC):
         """
         return "it takes the plant's state for what follows the reference"
 
+    @property
+    def covers_order_zero(self) -> bool:
+        """Whether it controls outputs of order 0, which the command moves at once and no tracking law follows."""
+        return False if self.inner is None else self.inner.covers_order_zero
+
     def floquet(self, problem: Problem) -> Floquet | None:
         """Return the stability of one period of a controller that switches; None for a controller that does not switch."""
         return None if self.inner is None else self.inner.floquet(self.inner_problem(problem))

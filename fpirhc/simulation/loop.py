@@ -22,6 +22,7 @@ from fpirhc.controllers.own_reference import given_signals, own_signals
 from fpirhc.controllers.plausible import plausible_range
 from fpirhc.controllers.seeing import compose_seeing, first_estimates, seeing_blocks
 from fpirhc.plant.chain import derivatives_function
+from fpirhc.plant.instant import response_orders
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, measures_all, sending_block
 from fpirhc.simulation.outside_blocks import outside_blocks, real_name
@@ -231,8 +232,7 @@ def _own_response(problem: Problem, *, seen: bool) -> Response:
     if problem.symbolic_reality is not None:
         return Response(plant.response_signal("realised"), problem.symbolic_reality.response_function(plant, seen=seen))
     if plant.outputs:
-        orders = dict(zip(plant.face.names, plant.face.orders, strict=True))
-        function = derivatives_function(plant, [(name, orders[name]) for name in plant.controlled_names])
+        function = derivatives_function(plant, list(response_orders(plant).items()))
         return Response(plant.response_signal("realised"), function)
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))

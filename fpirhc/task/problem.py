@@ -21,6 +21,7 @@ from fpirhc.horizon.stage_check import check_stage
 from fpirhc.plant.algebraic import unsolved
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.plant import Plant
+from fpirhc.plant.signals_in_outputs import differentiated_signals
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line
 from fpirhc.symbolic.live import nominal
@@ -342,10 +343,11 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
             "reality: a foreign reality measures coordinates of the model, and a plant with outputs has more to measure; "
             "write the outputs as coordinates"
         )
-    if problem.signals:
+    late = differentiated_signals(plant)
+    if late:
         mistakes.add(
-            f"signals: {', '.join(problem.signals)} from outside have derivatives of their own in those of outputs, which is not "
-            "covered; leave them out, or write the outputs as coordinates"
+            f"signals: {', '.join(late)} from outside have derivatives of their own in those of outputs, which is not covered; "
+            "choose an output that depends on the state alone, or write it as a coordinate"
         )
     if problem.sensing.measured is not None or problem.sensing.belief is not None:
         mistakes.add("sensing: believed states are not covered for outputs; leave measured and belief out")
