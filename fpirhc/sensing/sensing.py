@@ -196,7 +196,7 @@ class Sensing(Checked):
 
     def _sensor_block(self, plant: Plant, true: tuple[Signal, Signal], measured: Signal, first: Array) -> Block:
         """Block (true state, true response, random series) -> measured quantities."""
-        every = plant.state.elements + response_names(plant)
+        every = [e for signal in true[:-1] for e in signal.elements] + list(response_names(plant.face))
         columns, drawn = self._columns(), self.drawn
         lossy = [n for n in measured.elements if f"{n} lost" in columns]
         starts = [float(first[measured.elements.index(n)]) for n in lossy]
