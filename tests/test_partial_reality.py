@@ -21,13 +21,17 @@ FPI = fp.Sigmoid(gain=-0.8, scale=20.0)
 
 def compartments(deep: str = "c2") -> fp.Plant:
     """A drug in blood and in a tissue, whose name is free."""
+
+    def response(q: Any, u: Any, p: Any) -> dict[str, Any]:
+        return {"c1": p.b * u.u - 0.5 * q.c1 + 0.2 * q[deep], deep: 0.3 * q.c1 - 0.2 * q[deep]}
+
     return fp.Plant(
         coordinates={"c1": "mg/l", deep: "mg/l"},
         inputs={"u": "mg/min"},
         order=1,
         controlled=("c1",),
         parameters=PARAMETERS,
-        response=lambda q, u, p: {"c1": p.b * u.u - 0.5 * q.c1 + 0.2 * q[deep], deep: 0.3 * q.c1 - 0.2 * q[deep]},
+        response=response,
         time_unit="min",
     )
 

@@ -20,7 +20,7 @@ from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.own_reference import given_signals, own_signals
 from fpirhc.controllers.plausible import plausible_range
-from fpirhc.controllers.seeing import compose_seeing, first_estimates, seeing_blocks
+from fpirhc.controllers.seeing import compose_seeing, first_estimates, first_shown, seeing_blocks
 from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, sending_block, shows_truth
@@ -189,11 +189,12 @@ def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
     starts = (problem.start_state, first) if plant.outputs else (first,)
     states = [*zip(shown[0], measured_signals(plant), starts, strict=True)]
     if not sensing.ideal:
-        *others, (seen, _, _) = states
-        sensors = [*_late_states(others, late), *sensing.blocks(plant.face, first, late, (seen, shown[1]), resting)]
+        others = states[:-1] if sensing.belief is None else []  # a believed state is the controller's own
+        all_shown = first_shown(problem)
+        sensors = [*_late_states(others, late), *sensing.blocks(plant, all_shown, late, (*shown[0], shown[1]))]
         if sensing.estimates:
             return sensors
-        raw = sensing.raw(plant.face, first, late, resting)
+        raw = sensing.raw(plant, all_shown, late)
         return [*sensors, on_face(plant, sensing.estimator.block(plant.face, problem.period, first, raw))]
     assert late is not None
     realised = replace(shown[1], name="realised", start=tuple(map(float, resting)))

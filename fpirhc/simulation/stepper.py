@@ -11,11 +11,12 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
+from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.gate import HELD, Gate
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.controllers.own_reference import given_signals
 from fpirhc.controllers.plausible import plausible_range
-from fpirhc.controllers.seeing import compose_seeing, raw_signal
+from fpirhc.controllers.seeing import compose_seeing, given_states, raw_signal
 from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidName, InvalidShape, InvalidValue, NotSupported
 from fpirhc.sensing.base import names_of_responses
 from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, Watch, machine_step
@@ -53,6 +54,8 @@ class Stepper:
     show, in the order of `measures`:
 
         command, memory = stepper.step_measured(time, measured, memory)
+
+    Of a plant with outputs raw measurements are those of the outputs; the state stands before them, unless it is believed.
 
     A bad sample skips the cycle: one that is not finite, outside its plausible range, or (with `max_age`) out of date. The command
     is the last one, every memory stays as it was, the status is BAD_SAMPLE, and the signal 'skipped' counts. Before the first good
@@ -96,14 +99,9 @@ class Stepper:
         Raises:
             InvalidProblem: an unknown name or a wrong interval in `plausible`.
             InvalidName: a live setting that does not exist.
-            NotSupported: outputs behind an estimator; an optimiser without a bound of its time; a setting that cannot be live.
+            NotSupported: an optimiser without a bound of its time; a setting that cannot be live.
             CompileError: the compiler fails on a controller with live settings.
         """
-        if problem.plant.outputs and problem.sensing.estimates:
-            raise NotSupported(
-                "a stepper behind an estimator is not covered for outputs: it would be given raw measurements and the state; leave "
-                "the estimator out, and give it `output`"
-            )
         self._live = live_settings(problem, controller, live)
         ready = checked(problem, self._live.controller)
         if bounded:
@@ -149,7 +147,8 @@ class Stepper:
             realised: the measured response of the controlled coordinates to the last command; any finite value in the first cycle,
                 and for a controller that does not adapt.
             memory: from `start` or from the step before.
-            output: the measured outputs and their derivatives of a plant that has outputs, as `Plant.output` lays them out.
+            output: the measured outputs and their derivatives of a plant that has outputs, as `Plant.output` lays them out. Where
+                they are estimated, use `step_measured`.
             taken: time stamp of the sample, s; None: it was taken at `time`. Read with `max_age` only.
             settings: numbers of live settings from this step on, by path. Checks and derived numbers are computed in Python before
                  the step, a tenth of a millisecond for gains and some tens for the weights of a horizon; see `change`.
@@ -180,7 +179,7 @@ class Stepper:
                 self._accept(time, state, realised, memory)
             if self._memory[0] != self._fingerprint:
                 self._inspect()
-            if self._ages or self.outputs:
+            if self._ages or self.beside:
                 self._take_more(time, taken, output)
             if self._may_fail:
                 self._command[0] = _NOT_WRITTEN
@@ -217,10 +216,15 @@ class Stepper:
         Raises:
             FpirhcError: as in `step`.
         """
-        if self.estimates:
+        if self.estimates and not self.beside:
             return self.step(time, measured, _NOTHING, memory, taken=taken, settings=settings, setpoints=setpoints)
         column = numbers_of("measured", measured, len(self.measures))
-        state, seen, realised = np.split(column, [len(self._state), len(self._state) + self.outputs])
+        if self.estimates:
+            seen, raw = np.split(column, [self.beside])
+            return self.step(
+                time, raw, _NOTHING, memory, output=seen, taken=taken, settings=settings, setpoints=setpoints
+            )
+        state, seen, realised = np.split(column, [len(self._state), len(self._state) + self.beside])
         return self.step(
             time, state, realised, memory, output=seen, taken=taken, settings=settings, setpoints=setpoints
         )
@@ -324,10 +328,11 @@ class Stepper:
         raw = raw_signal(self._live.problem)
         self.estimates = raw is not None  # whether the step begins with raw measurements
         sample = ("state", "realised") if raw is None else (raw.name,)
-        self.outputs = (
-            self._live.problem.plant.output.size if self._live.problem.plant.outputs else 0
-        )  # entries of `output`
-        self._output = _view(arguments["output"] if self.outputs else _NOTHING)
+        beside = given_states(self._live.problem) or measured_signals(self._live.problem.plant)[1:] * (raw is None)
+        self.beside = sum(
+            signal.size for signal in beside
+        )  # entries beside the sample: measured outputs, or their state
+        self._output = _view(arguments[beside[0].name] if beside else _NOTHING)
         self._memory, self._time, self._state, *rest = (_view(arguments[n]) for n in ("memory", "time", *sample))
         self._realised = rest[0] if rest else _view(_NOTHING)
         self._memory_array = arguments["memory"]
@@ -345,11 +350,11 @@ class Stepper:
             one_number("time", time)
 
     def _take_more(self, time: float, taken: float | None, output: np.ndarray | None) -> None:
-        """Take the time stamp of the sample, and measured outputs, where the step reads them."""
+        """Take the time stamp of the sample, and measured outputs or their state, where the step reads them."""
         if self._ages:
             self._taken[0] = one_number("taken", time if taken is None else taken)
-        if self.outputs:
-            self._output[:] = numbers_of("output", output, self.outputs)
+        if self.beside:
+            self._output[:] = numbers_of("output", output, self.beside)
 
     def _accept(self, time: object, state: object, realised: object, memory: object) -> None:
         """Take arguments that are no arrays of float64, or say what is wrong with them."""
@@ -411,7 +416,7 @@ def _measures(problem: Problem, controller: Controller) -> tuple[str, ...]:
     """Names of what a step is given: the state and the responses, or what the sensors show."""
     raw, plant, own = raw_signal(problem), problem.plant, controller.response(problem)
     if raw is not None:
-        return raw.elements
+        return (*(e for signal in given_states(problem) for e in signal.elements), *raw.elements)
     outputs = plant.output.elements if plant.outputs else ()
     responses = plant.response_signal("realised") if own is None else own.signal
     return (*plant.state.elements, *outputs, *names_of_responses(plant.face, responses))

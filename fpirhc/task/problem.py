@@ -15,7 +15,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Duration
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.horizon.regular_gain import singular_gain
+from fpirhc.horizon.regular_gain import Bounds, singular_gain
 from fpirhc.horizon.stage_check import check_stage
 from fpirhc.plant.algebraic import unsolved
 from fpirhc.plant.integrators import Integrator, RungeKutta4
@@ -107,7 +107,7 @@ class Problem(Checked):
             lambda: self.reference.function(plant),
             lambda: check_steps(plant.face, self.limits, self.reference.set_points),
             lambda: self.dead_time.check(plant, self.period),
-            lambda: self.sensing.check(plant.face),
+            lambda: self.sensing.check(plant),
             lambda: self.symbolic_reality.check(plant, self._needed) if self.symbolic_reality else None,
             lambda: self.foreign.check(plant, needed_measurements(plant, self.sensing)) if self.foreign else None,
         )
@@ -344,18 +344,17 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
             f"signals: {', '.join(problem.signals)} from outside have derivatives of their own in those of outputs, which is not "
             "covered; leave them out, or write the outputs as coordinates"
         )
-    if problem.sensing.measured is not None or problem.sensing.belief is not None:
-        mistakes.add("sensing: believed states are not covered for outputs; leave measured and belief out")
     if len(plant.inputs) == len(plant.controlled or plant.outputs):
-        bounds = nominal(problem.limits).input_bounds(plant)
-        start, ends = (
-            tuple(map(float, problem.start_state)),
-            (tuple(map(float, bounds[0])), tuple(map(float, bounds[1]))),
-        )
-        times = problem.period, problem.cycles
-        singular = singular_gain(plant, problem.reference, problem.integrator, start, ends, times)
+        singular = singular_gain(plant, problem.reference, *nominal_start(problem))
         if singular:
             mistakes.add(f"outputs: {singular}")
+
+
+def nominal_start(problem: Problem) -> tuple[Integrator, tuple[float, ...], Bounds, tuple[float, int]]:
+    """Return integrator, start, bounds of the inputs, and times of the model's nominal run, as `nominal_run` takes them."""
+    lower, upper = nominal(problem.limits).input_bounds(problem.plant)
+    bounds = tuple(map(float, lower)), tuple(map(float, upper))
+    return problem.integrator, tuple(map(float, problem.start_state)), bounds, (problem.period, problem.cycles)
 
 
 def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
