@@ -90,8 +90,11 @@ def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     calm = np.zeros(len(problem.real_plant.names))
     if plant.outputs:
         return problem.start_output, reality.response_function(plant, seen=True)(*at, calm).full().ravel()
-    state = reality.state_function(plant, seen=True)(*at, calm)
-    return state.full().ravel(), reality.response_function(plant, seen=True)(*at, calm).full().ravel()
+    shown = dict(
+        zip(reality.shown(plant), reality.state_function(plant, seen=True)(*at, calm).full().ravel(), strict=True)
+    )
+    state = [shown.get(e, first) for e, first in zip(plant.state.elements, problem.start_state, strict=True)]
+    return np.array(state), reality.response_function(plant, seen=True)(*at, calm).full().ravel()
 
 
 def first_shown(problem: Problem) -> dict[str, float]:

@@ -30,8 +30,8 @@ class Run:
         controller: its name.
         seed: of disturbances and noise.
         period: of the control cycle.
-        layout: the logged signals. Every run has 'plant_state' and 'plant_realised', state and response of the plant, and
-            'true_error', the reference minus the plant's state at the same time.
+        layout: the logged signals. Every run has 'plant_state' and 'plant_realised', response of the plant and those states of
+            the model that it has, and 'true_error', the reference minus the plant's state at the same time.
         log: values of all signals, shape (cycles, layout.size), read-only.
         stop: why the run ended early; None for a run that finished.
         compiled: whether the loop ran as compiled C.

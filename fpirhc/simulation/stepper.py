@@ -13,7 +13,7 @@ from fpirhc.controllers.contract import checked
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import Numbers, live_settings
 from fpirhc.controllers.plausible import plausible_range
-from fpirhc.errors import ConcurrentUse, NotSupported
+from fpirhc.errors import ConcurrentUse
 from fpirhc.fields.checked import Checked
 from fpirhc.simulation.machine import FINGERPRINT, Watch
 from fpirhc.simulation.numbers_now import NumbersNow

@@ -29,6 +29,7 @@ from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.foreign import Foreign
 from fpirhc.task.limits import Limits
+from fpirhc.task.needed import needed_measurements, needed_names
 from fpirhc.task.outside import External, check_signals, real_values, rows_of, signals_of
 from fpirhc.task.problem_view import problem_facts, problem_table
 from fpirhc.task.reality import Reality
@@ -112,8 +113,8 @@ class Problem(Checked):
             lambda: check_steps(plant.face, self.limits, self.reference.set_points),
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant),
-            lambda: self.symbolic_reality.check(plant) if self.symbolic_reality else None,
-            lambda: self.foreign.check(plant, self.sensing.measures(plant)) if self.foreign else None,
+            lambda: self.symbolic_reality.check(plant, self._needed) if self.symbolic_reality else None,
+            lambda: self.foreign.check(plant, needed_measurements(plant, self.sensing)) if self.foreign else None,
         )
         for check in checks:
             try:
@@ -211,6 +212,11 @@ class Problem(Checked):
         """Parameters of the plant that a run moves in its first cycle: the exact ones, with the real values of signals."""
         plant = self.real_plant
         return rows_of(real_values(plant, self.signals), np.array([self.period / 2]), plant.exact)[0]
+
+    @property
+    def _needed(self) -> frozenset[str]:
+        """Names of the model's coordinates and outputs that what moves must have."""
+        return needed_names(self.plant, self.sensing, self.judged)
 
     @property
     def _plants(self) -> tuple[Plant, ...]:
@@ -338,11 +344,6 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
     plant = problem.plant
     if not plant.outputs:
         return
-    if problem.foreign is not None:
-        mistakes.add(
-            "reality: a foreign reality measures coordinates of the model, and a plant with outputs has more to measure; "
-            "write the outputs as coordinates"
-        )
     late = differentiated_signals(plant)
     if late:
         mistakes.add(
