@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import casadi as ca
 import numpy as np
@@ -82,6 +82,9 @@ class Controller(Checked, ABC):
 
     Concrete controllers are frozen dataclasses. `fpirhc.conformance.check_controller` tests that a controller keeps this contract.
     """
+
+    LOADED: ClassVar[str] = "controllers[{}] of a loaded problem file"
+    """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
 
     if TYPE_CHECKING:
 
@@ -246,6 +249,11 @@ class Controller(Checked, ABC):
         By default it cannot: a controller that takes the state for what follows the reference would follow the wrong one.
         """
         return "it takes the plant's state for what follows the reference"
+
+    @property
+    def covers_order_zero(self) -> bool:
+        """Whether it controls outputs of order 0, which the command moves at once and no tracking law follows."""
+        return False if self.inner is None else self.inner.covers_order_zero
 
     def floquet(self, problem: Problem) -> Floquet | None:
         """Return the stability of one period of a controller that switches; None for a controller that does not switch."""

@@ -24,6 +24,7 @@ import numpy as np
 from fpirhc.deformation.queue import MOST, Queue, every
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
+from fpirhc.plant.instant import response_orders
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.task.problem import Problem
@@ -37,7 +38,8 @@ class ThroughModel(Checked):
 
     Args:
         lag: time constant with which the model follows a shift of its target, in the plant's unit of time; a tuple has one per
-            controlled coordinate, 0 settles within a cycle. None: the slowest one of the model at the start, with the command held.
+            controlled coordinate, 0 settles within a cycle. None: the slowest one of the model at the start, with the command held;
+            0 for outputs of order 0, which the model moves at once.
         dead_time: from a target to its measured output; None: that of the problem, for the slowest input.
 
     Raises:
@@ -58,7 +60,7 @@ class ThroughModel(Checked):
     def stated(self, problem: Problem) -> ThroughModel:
         """Return the pairing with lag and dead time as numbers; one that cannot be known stays open, for `decays` to refuse."""
         try:
-            lag = _slowest(problem) if self.lag is None else self.lag
+            lag = _own_lags(problem) if self.lag is None else self.lag
         except InvalidValue:
             return self
         return ThroughModel(lag, self._late(problem))
@@ -74,7 +76,7 @@ class ThroughModel(Checked):
             InvalidValue: a model that does not settle, a wrong number of lags.
         """
         count = len(problem.plant.controlled_names)
-        lags = every(_slowest(problem) if self.lag is None else self.lag)
+        lags = every(_own_lags(problem) if self.lag is None else self.lag)
         if len(lags) not in (1, count):
             raise InvalidValue(
                 f"{self!r}: there are {count} controlled coordinates; give one lag for each, or one for all"
@@ -120,6 +122,13 @@ class ThroughModel(Checked):
             "shifts_sent_next": shifts,
             "shift_in_force_next": rho * s.shift_in_force + (1 - rho) * queue.delayed(shifts, shift.numel()),
         }
+
+
+def _own_lags(problem: Problem) -> float | tuple[float, ...]:
+    """The model's own time constants, one per controlled quantity where some settle at once."""
+    orders = list(response_orders(problem.plant).values())
+    slowest = _slowest(problem) if any(orders) else 0.0
+    return slowest if all(orders) else tuple(slowest if order else 0.0 for order in orders)
 
 
 def _slowest(problem: Problem) -> float:

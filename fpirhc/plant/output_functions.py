@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 
+from fpirhc.plant.instant import response_orders
 from fpirhc.plant.outputs import believed_disturbance, lie_derivatives, output_expression
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ def output_function(plant: Plant) -> ca.Function:
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
     chains = {
-        name: lie_derivatives(plant, output_expression(plant, name, x, p), order, (x, u, p, w))
+        name: lie_derivatives(plant, output_expression(plant, name, x, u, p), order, (x, u, p, w))
         for name, order in zip(plant.face.names, plant.face.orders, strict=True)
         if plant.outputs
     }
@@ -39,14 +40,16 @@ def known_by_outputs(plant: Plant) -> tuple[int, ...]:
 
 
 def controlled_response_function(plant: Plant) -> ca.Function:
-    """Return the Function (state, input, parameters) -> highest derivative of the controlled coordinates or outputs."""
+    """Return the Function (state, input, parameters) -> highest derivative of the controlled coordinates or outputs.
+
+    The response of an output of order 0 is the output.
+    """
     x, u, p = plant.symbols()
     if plant.outputs:
-        calm, face = ca.SX.zeros(len(plant.names)), plant.face
-        orders = {name: face.orders[face.names.index(name)] for name in plant.controlled_names}
+        calm = ca.SX.zeros(len(plant.names))
         chains = {
-            name: lie_derivatives(plant, output_expression(plant, name, x, p), order, (x, u, p, calm))
-            for name, order in orders.items()
+            name: lie_derivatives(plant, output_expression(plant, name, x, u, p), order, (x, u, p, calm))
+            for name, order in response_orders(plant).items()
         }
         entries = (chain[-1] + believed_disturbance(plant, name, p) for name, chain in chains.items())
         responses = ca.densify(ca.vertcat(*entries))

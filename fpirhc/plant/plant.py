@@ -26,6 +26,7 @@ from fpirhc.errors import Mistakes, NotInvertible, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.plant import by_states, output_functions, plant_functions
 from fpirhc.plant.algebraic import Algebraic
+from fpirhc.plant.instant import instant_outputs, response_orders
 from fpirhc.plant.inverse import inverse_function
 from fpirhc.plant.outputs import Output, check_outputs, face_of
 from fpirhc.plant.parameter import Parameter, check_parameters, with_exact_values
@@ -120,7 +121,7 @@ class Plant(Checked):
     def state(self) -> Signal:
         """The state vector's signal: q, q', ... below the highest derivative."""
         names, units = [], []
-        for k in range(max(self.orders)):
+        for k in range(max(self.orders, default=0)):
             for c, r in zip(self.names, self.orders, strict=True):
                 if r > k:
                     names.append(c + "'" * k)
@@ -178,6 +179,11 @@ class Plant(Checked):
         return face_of(self) if self.outputs else self
 
     @cached_property
+    def instant_names(self) -> tuple[str, ...]:
+        """Outputs of order 0, which the command moves at once."""
+        return instant_outputs(self)
+
+    @cached_property
     def output(self) -> Signal:
         """The signal of what is measured of the face: the state without outputs, else y, y', ... below each relative order."""
         return replace(self.face.state, name="output") if self.outputs else self.state
@@ -207,8 +213,9 @@ class Plant(Checked):
         return tuple(self.derivative_unit(u, r) for u, r in zip(self.coordinates.values(), self.orders, strict=True))
 
     def response_signal(self, name: str) -> Signal:
-        """Return a signal that holds a highest derivative of every controlled quantity."""
-        units = [self.face.response_units[k] for k in self.face.controlled_indices]
+        """Return a signal that holds a highest derivative of every controlled quantity; of order 0 it is the quantity."""
+        face = self.face.coordinates
+        units = [self.derivative_unit(face[n], order) for n, order in response_orders(self).items()]
         return vector(name, self.controlled_names, units)
 
     @cached_property

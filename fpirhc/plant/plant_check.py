@@ -27,7 +27,7 @@ def check_names(plant: Plant, mistakes: Mistakes) -> None:
     outputs = {name: one.unit for name, one in plant.outputs.items()}
     quantities = "states" if plant.outputs and plant.order == 1 else "coordinates"
     for what, group in ((quantities, plant.coordinates), ("inputs", plant.inputs), ("outputs", outputs)):
-        if not group and what != "outputs":
+        if not group and what != "outputs" and not (what == quantities and plant.outputs):
             mistakes.add(f"{what} are empty; name at least one, with its unit")
         for name, unit in group.items():
             if not isinstance(unit, str) or not unit:
@@ -80,8 +80,8 @@ def check_response(plant: Plant, mistakes: Mistakes) -> None:
         arguments = len(inspect.signature(plant.response).parameters)
         lower = ["x"] if function == "rates" else ["q", "v", "a"] + [f"d{k}" for k in range(3, 12)]
         mistakes.add(
-            f"{function} takes {arguments} argument(s); with order {max(plant.orders)} it is called as "
-            f"{function}({', '.join([*lower[: max(plant.orders)], 'u', 'p', *(['z'] if algebraic else [])])})"
+            f"{function} takes {arguments} argument(s); with order {max(plant.orders, default=0)} it is called as "
+            f"{function}({', '.join([*lower[: max(plant.orders, default=0)], 'u', 'p', *(['z'] if algebraic else [])])})"
         )
         return
     try:
@@ -122,7 +122,7 @@ def _check_order_numbers(plant: Plant, mistakes: Mistakes) -> None:
 
 
 def _check_inverse(plant: Plant, inverse: Callable[..., Mapping[str, Expression]], mistakes: Mistakes) -> None:
-    arguments = max(plant.orders) + 2
+    arguments = max(plant.orders, default=0) + 2
     if not takes(inverse, arguments):
         mistakes.add(
             f"inverse is called with {arguments} arguments: the derivatives below the order, responses, parameters"

@@ -26,7 +26,7 @@ def by_name(plant: Plant, x: Expression, p: Expression) -> tuple[Named, ...]:
             x[list(plant.indices(k))],
             plant.words[0],
         )
-        for k in range(max(plant.orders))
+        for k in range(max(plant.orders, default=0))
     ]
     return (*derivatives, Named(tuple(plant.parameters), p, "parameter"))
 

@@ -27,9 +27,11 @@ Judgement = tuple[Signal, np.ndarray]
 
 
 def judgements(problem: Problem, controller: Controller, layout: Layout, log: np.ndarray) -> list[Judgement]:
-    """Return 'cost' by term where the problem has a cost, and 'contraction' where the controller adapts."""
+    """Return 'cost' by term where there is one of states that really are, and 'contraction' where the controller adapts."""
     judged = []
-    if problem.cost is not None and problem.horizon is not None:
+    # A cost of states that the reality does not have is nobody's.
+    whole = "plant_state" in layout and layout["plant_state"].elements == problem.plant.state.elements
+    if problem.cost is not None and problem.horizon is not None and whole:
         judged.append(_costs(problem, layout, log))
     gain = controller.deformation.effective_gain()
     of_responses = controller.response(problem) is None and not controller.deforms_target

@@ -15,6 +15,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.describe import describe
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.simulation.changes import Changes, in_force
 from fpirhc.simulation.common_columns import with_common_columns
 from fpirhc.simulation.foreign_run import Patch, run_foreign, stopped
@@ -125,6 +126,7 @@ class Simulator:
         return Run(problem.name, title, seed, problem.period, layout, log, stop, self.compiled, facts)
 
 
+@checked_call
 def simulator(
     problem: Problem,
     controller: Controller,
@@ -160,6 +162,7 @@ def simulator(
     return Simulator(problem, ready, loop, evaluator, bool(backend and backend.compiled), reason, settings)
 
 
+@checked_call
 def simulate(
     problem: Problem,
     controller: Controller,

@@ -11,9 +11,10 @@ from typing import Protocol, cast
 import casadi as ca
 import numpy as np
 
+from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.own_reference import given_signals
-from fpirhc.controllers.seeing import raw_signal
+from fpirhc.controllers.seeing import given_states, raw_signal
 from fpirhc.errors import InvalidShape, InvalidValue
 from fpirhc.simulation.machine import SKIPPED
 from fpirhc.simulation.sample import numbers as numbers_of
@@ -46,7 +47,8 @@ class StepArguments:
         time, memory, state, realised, output, taken, command: views; `state` is that of the raw measurements where they are read.
         memory_before, memory_next, trace, command_next: arrays of the memory that is read, and of what is written.
         estimates: whether the step begins with raw measurements.
-        outputs: number of entries of `output`; 0 for a plant without outputs.
+        beside: number of entries of `output`, which are read beside the sample: measured outputs, or the state where the sample is
+            that of estimated outputs; 0 without any.
         ages: whether the time stamp of the sample is read.
     """
 
@@ -67,8 +69,9 @@ class StepArguments:
         self.memory_next, self.trace, self.command_next = self.evaluator.results
         raw = raw_signal(problem)
         self.estimates = raw is not None
-        self.outputs = problem.plant.output.size if problem.plant.outputs else 0
-        self.output = _view(arguments["output"] if self.outputs else NOTHING)
+        beside = given_states(problem) if self.estimates else measured_signals(problem.plant)[1:]
+        self.beside = sum(signal.size for signal in beside)
+        self.output = _view(arguments[beside[0].name] if beside else NOTHING)
         sample = ("state", "realised") if raw is None else (raw.name,)
         self.memory, self.time, self.state, *rest = (_view(arguments[n]) for n in ("memory", "time", *sample))
         self.realised = rest[0] if rest else _view(NOTHING)
@@ -97,11 +100,11 @@ class StepArguments:
             view[:] = checked_values[name]
 
     def take_more(self, time: float, taken: float | None, output: np.ndarray | None) -> None:
-        """Take the time stamp of the sample, and measured outputs, where the step reads them."""
+        """Take the time stamp of the sample, and measured outputs or the state beside them, where the step reads them."""
         if self.ages:
             self.taken[0] = one_number("taken", time if taken is None else taken)
-        if self.outputs:
-            self.output[:] = numbers_of("output", output, self.outputs)
+        if self.beside:
+            self.output[:] = numbers_of("output", output, self.beside)
 
     def hold(self, layout: Layout, signals: Layout) -> np.ndarray:
         """Return the memory of a skipped cycle, and write status, command and count of it into the trace.

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.gate import Gate
 from fpirhc.controllers.live_settings import LiveSettings
-from fpirhc.controllers.seeing import compose_seeing, raw_signal
+from fpirhc.controllers.seeing import compose_seeing, given_states, raw_signal
 from fpirhc.errors import NotSupported
 from fpirhc.sensing.base import names_of_responses
 from fpirhc.simulation.machine import Watch, machine_step
@@ -39,7 +39,7 @@ def measures(problem: Problem, controller: Controller) -> tuple[str, ...]:
     """Return the names of what a step is given: the state and the responses, or what the sensors show."""
     raw, plant, own = raw_signal(problem), problem.plant, controller.response(problem)
     if raw is not None:
-        return raw.elements
+        return (*(e for signal in given_states(problem) for e in signal.elements), *raw.elements)
     outputs = plant.output.elements if plant.outputs else ()
     responses = plant.response_signal("realised") if own is None else own.signal
     return (*plant.state.elements, *outputs, *names_of_responses(plant.face, responses))

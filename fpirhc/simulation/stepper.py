@@ -13,7 +13,8 @@ from fpirhc.controllers.contract import checked
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import Numbers, live_settings
 from fpirhc.controllers.plausible import plausible_range
-from fpirhc.errors import ConcurrentUse, NotSupported
+from fpirhc.errors import ConcurrentUse
+from fpirhc.fields.checked import Checked
 from fpirhc.simulation.machine import FINGERPRINT, Watch
 from fpirhc.simulation.numbers_now import NumbersNow
 from fpirhc.simulation.sample import numbers as numbers_of
@@ -27,7 +28,7 @@ from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
 
-class Stepper:
+class Stepper(Checked):
     """One controller, ready to be called once per control cycle.
 
         stepper = Stepper(problem, controller)
@@ -40,6 +41,8 @@ class Stepper:
     response, the estimator is part of the step, which is given what the sensors show, in the order of `measures`:
 
         command, memory = stepper.step_measured(time, measured, memory)
+
+    Where the outputs of a plant are estimated, its state stands before them, unless it is believed.
 
     A bad sample skips the cycle: one that is not finite, outside its plausible range, or (with `max_age`) out of date. The command
     is the last one, every memory stays as it was, the status is BAD_SAMPLE, and the signal 'skipped' counts. Before the first good
@@ -84,14 +87,9 @@ class Stepper:
         Raises:
             InvalidProblem: an unknown name or a wrong interval in `plausible`.
             InvalidName: a live setting that does not exist.
-            NotSupported: outputs behind an estimator; an optimiser without a bound of its time; a setting that cannot be live.
+            NotSupported: an optimiser without a bound of its time; a setting that cannot be live.
             CompileError: the compiler fails on a controller with live settings.
         """
-        if problem.plant.outputs and problem.sensing.estimates:
-            raise NotSupported(
-                "a stepper behind an estimator is not covered for outputs: it would be given raw measurements and the state; leave "
-                "the estimator out, and give it `output`"
-            )
         settings = live_settings(problem, controller, live)
         ready = checked(problem, settings.controller)
         if bounded:
@@ -108,7 +106,7 @@ class Stepper:
         parameters = ready.parameters(ready.model_plant(problem))
         arguments = StepArguments(function, self._composite, problem, parameters, ages=max_age is not None)
         self._now = NumbersNow(settings, self._composite, arguments.settings, arguments.setpoints)
-        self.estimates, self.outputs = arguments.estimates, arguments.outputs
+        self.estimates, self.beside = arguments.estimates, arguments.beside
         self._tokens = [True]
         self._fingerprint = float(self.memory[FINGERPRINT].start[0])
         # Attributes of the stepper itself are found faster in every step.
@@ -116,7 +114,7 @@ class Stepper:
         self._time, self._state, self._realised = arguments.time, arguments.state, arguments.realised
         self._memory, self._command = arguments.memory, arguments.command
         self._new_command, self._new_memory = arguments.command_next.copy, arguments.memory_next.copy
-        self._more = arguments.ages or bool(arguments.outputs)
+        self._more = arguments.ages or bool(arguments.beside)
 
     def start(self) -> np.ndarray:
         """Return the memory of the controller before its first cycle, with the settings in force."""
@@ -142,7 +140,8 @@ class Stepper:
             realised: the measured response of the controlled coordinates to the last command; any finite value in the first cycle,
                 and for a controller that does not adapt.
             memory: from `start` or from the step before.
-            output: the measured outputs and their derivatives of a plant that has outputs, as `Plant.output` lays them out.
+            output: the measured outputs and their derivatives of a plant that has outputs, as `Plant.output` lays them out. Where
+                they are estimated, use `step_measured`.
             taken: time stamp of the sample, s; None: it was taken at `time`. Read with `max_age` only.
             settings: numbers of live settings from this step on, by path. Checks and derived numbers are computed in Python before
                 the step, a tenth of a millisecond for gains and some tens for the weights of a horizon; see `change`.
@@ -207,10 +206,15 @@ class Stepper:
         Raises:
             FpirhcError: as in `step`.
         """
-        if self.estimates:
+        if self.estimates and not self.beside:
             return self.step(time, measured, NOTHING, memory, taken=taken, settings=settings, setpoints=setpoints)
         column = numbers_of("measured", measured, len(self.measures))
-        state, seen, realised = np.split(column, [len(self._state), len(self._state) + self.outputs])
+        if self.estimates:
+            seen, raw = np.split(column, [self.beside])
+            return self.step(
+                time, raw, NOTHING, memory, output=seen, taken=taken, settings=settings, setpoints=setpoints
+            )
+        state, seen, realised = np.split(column, [len(self._state), len(self._state) + self.beside])
         return self.step(
             time, state, realised, memory, output=seen, taken=taken, settings=settings, setpoints=setpoints
         )

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -15,11 +16,12 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Duration
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.horizon.regular_gain import singular_gain
+from fpirhc.horizon.regular_gain import Bounds, singular_gain
 from fpirhc.horizon.stage_check import check_stage
 from fpirhc.plant.algebraic import unsolved
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.plant import Plant
+from fpirhc.plant.signals_in_outputs import differentiated_signals
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line
 from fpirhc.symbolic.live import nominal
@@ -27,6 +29,7 @@ from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.foreign import Foreign
 from fpirhc.task.limits import Limits
+from fpirhc.task.needed import needed_measurements, needed_names
 from fpirhc.task.outside import External, check_signals, real_values, rows_of, signals_of
 from fpirhc.task.problem_view import problem_facts, problem_table
 from fpirhc.task.reality import Reality
@@ -68,6 +71,9 @@ class Problem(Checked):
         InvalidProblem: all mistakes together.
     """
 
+    LOADED: ClassVar[str] = "fp.load_problem({}).problem"
+    """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
+
     plant: Plant
     reference: Reference
     start: Mapping[str, float]
@@ -106,9 +112,9 @@ class Problem(Checked):
             lambda: self.reference.function(plant),
             lambda: check_steps(plant.face, self.limits, self.reference.set_points),
             lambda: self.dead_time.check(plant, self.period),
-            lambda: self.sensing.check(plant.face),
-            lambda: self.symbolic_reality.check(plant) if self.symbolic_reality else None,
-            lambda: self.foreign.check(plant, self.sensing.measures(plant)) if self.foreign else None,
+            lambda: self.sensing.check(plant),
+            lambda: self.symbolic_reality.check(plant, self._needed) if self.symbolic_reality else None,
+            lambda: self.foreign.check(plant, needed_measurements(plant, self.sensing)) if self.foreign else None,
         )
         for check in checks:
             try:
@@ -206,6 +212,11 @@ class Problem(Checked):
         """Parameters of the plant that a run moves in its first cycle: the exact ones, with the real values of signals."""
         plant = self.real_plant
         return rows_of(real_values(plant, self.signals), np.array([self.period / 2]), plant.exact)[0]
+
+    @property
+    def _needed(self) -> frozenset[str]:
+        """Names of the model's coordinates and outputs that what moves must have."""
+        return needed_names(self.plant, self.sensing, self.judged)
 
     @property
     def _plants(self) -> tuple[Plant, ...]:
@@ -333,28 +344,23 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
     plant = problem.plant
     if not plant.outputs:
         return
-    if problem.foreign is not None:
+    late = differentiated_signals(plant)
+    if late:
         mistakes.add(
-            "reality: a foreign reality measures coordinates of the model, and a plant with outputs has more to measure; "
-            "write the outputs as coordinates"
+            f"signals: {', '.join(late)} from outside have derivatives of their own in those of outputs, which is not covered; "
+            "choose an output that depends on the state alone, or write it as a coordinate"
         )
-    if problem.signals:
-        mistakes.add(
-            f"signals: {', '.join(problem.signals)} from outside have derivatives of their own in those of outputs, which is not "
-            "covered; leave them out, or write the outputs as coordinates"
-        )
-    if problem.sensing.measured is not None or problem.sensing.belief is not None:
-        mistakes.add("sensing: believed states are not covered for outputs; leave measured and belief out")
     if len(plant.inputs) == len(plant.controlled or plant.outputs):
-        bounds = nominal(problem.limits).input_bounds(plant)
-        start, ends = (
-            tuple(map(float, problem.start_state)),
-            (tuple(map(float, bounds[0])), tuple(map(float, bounds[1]))),
-        )
-        times = problem.period, problem.cycles
-        singular = singular_gain(plant, problem.reference, problem.integrator, start, ends, times)
+        singular = singular_gain(plant, problem.reference, *nominal_start(problem))
         if singular:
             mistakes.add(f"outputs: {singular}")
+
+
+def nominal_start(problem: Problem) -> tuple[Integrator, tuple[float, ...], Bounds, tuple[float, int]]:
+    """Return integrator, start, bounds of the inputs, and times of the model's nominal run, as `nominal_run` takes them."""
+    lower, upper = nominal(problem.limits).input_bounds(problem.plant)
+    bounds = tuple(map(float, lower)), tuple(map(float, upper))
+    return problem.integrator, tuple(map(float, problem.start_state)), bounds, (problem.period, problem.cycles)
 
 
 def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:

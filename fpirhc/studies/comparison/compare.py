@@ -14,6 +14,7 @@ from fpirhc.controllers.contract import checked, resolved
 from fpirhc.deformation.base import innermost
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, NotSupported, nearest
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.response_prediction import Prediction, predict_response
 from fpirhc.simulation.changes import Changes
@@ -194,6 +195,7 @@ def select(task: Task, names: Sequence[str] | None) -> dict[str, Controller]:
     return {name: task.controllers[name] for name in names}
 
 
+@checked_call
 def compare(
     task: Task,
     *,
