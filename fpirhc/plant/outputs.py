@@ -176,7 +176,9 @@ def _check_one(plant: Plant, name: str, mistakes: Mistakes) -> None:
         return
     parameter = plant.outputs[name].response_disturbance
     if parameter and parameter not in plant.parameters:
-        mistakes.add(f"outputs: '{name}': response_disturbance={parameter!r} is no parameter of the plant; add it there")
+        mistakes.add(
+            f"outputs: '{name}': response_disturbance={parameter!r} is no parameter of the plant; add it there"
+        )
     controlled = plant.controlled is None or name in plant.controlled
     if controlled and output_order(plant, name) is None:
         mistakes.add(f"outputs: no input reaches '{name}', however often it is differentiated; control another output")
