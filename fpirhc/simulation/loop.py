@@ -189,9 +189,10 @@ def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
     plant, late, sensing = problem.plant, problem.dead_time.measurement_wait(problem.period), problem.sensing
     first, resting = first_estimates(problem)
     starts = (problem.start_state, first) if plant.outputs else (first,)
-    states = [*zip(shown[0], measured_signals(plant), starts, strict=True)]
+    given = sensing.belief is None  # a believed state is the controller's own
+    states = [*zip(shown[0], measured_signals(plant), starts, strict=True)] if given else []
     if not sensing.ideal:
-        others = states[:-1] if sensing.belief is None else []  # a believed state is the controller's own
+        others = states[:-1]
         all_shown = first_shown(problem)
         sensors = [*_late_states(others, late), *sensing.blocks(plant, all_shown, late, (*shown[0], shown[1]))]
         if sensing.estimates:
