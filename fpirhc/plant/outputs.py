@@ -113,7 +113,10 @@ def face_of(plant: Plant) -> Plant:
     An output that no input reaches has the order one, and so has one of order 0 (see `fpirhc.plant.instant`).
     """
     orders = {name: output_order(plant, name) or 1 for name in plant.outputs}
-    return light_plant(plant, {name: one.unit for name, one in plant.outputs.items()}, orders, plant.controlled_names)
+    units = {name: one.unit for name, one in plant.outputs.items()}
+    light = light_plant(plant, units, orders, plant.controlled_names)
+    vars(light)["instant_names"] = plant.instant_names  # the property of a light plant, which has no expressions to find them from
+    return light
 
 
 def light_plant(

@@ -62,6 +62,7 @@ def _given(problem: Problem) -> str:
     names = sensing.measures(plant) if sensing.estimates else (*plant.face.state.elements, *response_names(plant.face))
     if plant.outputs and sensing.belief is None:  # the state too
         names = (*plant.state.elements, *(n for n in names if n not in plant.state.elements))
+    names = tuple(dict.fromkeys(names))  # an output of order 0 is its own response
     text = f"all controllers are given {', '.join(names)} in every cycle of {problem.period:g} {problem.time_unit}"
     late = problem.dead_time.measurement
     text += f", {late:g} {problem.time_unit} late" if late else ""
