@@ -88,6 +88,7 @@ from .sensing import (
     Sensing,
     Sensor,
     StateVariableFilter,
+    StepDifference,
     VelocityDifference,
 )
 from .sensing.beliefs.kalman_filter import KalmanFilter
@@ -249,6 +250,7 @@ __all__ = [
     "StateVariableFilter",
     "Status",
     "Step",
+    "StepDifference",
     "Stepper",
     "StopRun",
     "Suggestion",

@@ -25,6 +25,7 @@ from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.expected import takes
 from fpirhc.fields.user_code import called, scalar_expression
+from fpirhc.plant.maps import shifted
 from fpirhc.symbolic.layout import Expression, Named
 
 if TYPE_CHECKING:
@@ -66,20 +67,27 @@ def lie_derivatives(plant: Plant, value: Expression, count: int, symbols: Symbol
         count: number of derivatives.
         symbols: x, u, p, and the forcing w.
     """
-    x, u, p, w = symbols
-    rate, chain = plant.forced_derivative_function(x, u, p, w), [value]
+    chain = [value]
     for _ in range(count):
-        chain.append(ca.jtimes(chain[-1], x, rate))
+        chain.append(_along(plant, chain[-1], symbols))
     return chain
+
+
+def _along(plant: Plant, value: Expression, symbols: Symbols) -> Expression:
+    """The derivative of an expression along the motion, or of a map its divided difference, with the input held."""
+    if plant.step is not None:
+        return shifted(plant, value, symbols)
+    x, u, p, w = symbols
+    return ca.jtimes(value, x, plant.forced_derivative_function(x, u, p, w))
 
 
 def output_order(plant: Plant, name: str) -> int | None:
     """Return the relative order of an output: the first derivative that depends on an input; None where none does."""
     x, u, p = plant.symbols()
-    w = ca.SX.zeros(len(plant.names))
-    rate, value = plant.forced_derivative_function(x, u, p, w), output_expression(plant, name, x, p)
+    symbols = x, u, p, ca.SX.zeros(len(plant.names))
+    value = output_expression(plant, name, x, p)
     for order in range(1, plant.state.size + 1):
-        value = ca.jtimes(value, x, rate)
+        value = _along(plant, value, symbols)
         if ca.jacobian_sparsity(value, u).nnz():
             return order
     return None
@@ -125,6 +133,7 @@ def light_plant(
         ranges={},
         outputs={},
         algebraic=None,
+        next=None,
     )
 
 

@@ -14,6 +14,7 @@ themselves are not converted anywhere.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -24,9 +25,11 @@ import numpy as np
 
 from fpirhc.errors import Mistakes, NotInvertible, NotSupported
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import Few
 from fpirhc.fields.user_code import called
 from fpirhc.plant.algebraic import Algebraic
 from fpirhc.plant.inverse import inverse_by_newton, inverse_by_user, inverse_of_affine
+from fpirhc.plant.maps import Differences, check_map, next_function, over
 from fpirhc.plant.outputs import Output, check_outputs, face_of, lie_derivatives, output_expression
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_ranges, check_response
@@ -60,6 +63,9 @@ class Plant(Checked):
         outputs: name -> Output(unit, function of (q, q', ..., p)): the quantities that follow a reference, where these are not the
             coordinates themselves. Their relative orders are found from the symbols.
         time_unit: unit of time of the equations ('s', 'ms', 'day'), and so of every time and rate of the problem.
+        step: of a map, the time from one state to the next; None: differential equations. See `Plant.of_map`.
+        next: of a map, the function of (x, u, p) that returns {state: its value one step later}.
+        steps: of a map, how many a control cycle has, with the command held; `Problem` counts them.
 
     Raises:
         InvalidProblem: all mistakes together.
@@ -78,10 +84,16 @@ class Plant(Checked):
     algebraic: Algebraic | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
     outputs: Mapping[str, Output] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
     time_unit: str = field(default="s", kw_only=True, metadata={"setting": False})
+    step: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    next: Callable[..., Mapping[str, Expression]] | None = field(
+        default=None, kw_only=True, metadata={"setting": "where given"}
+    )
+    steps: Few = field(default=1, kw_only=True, metadata={"setting": "where given"})
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("plant")
         check_names(self, mistakes)
+        check_map(self, mistakes)
         check_parameters(self.parameters, mistakes)
         mistakes.raise_if_any()
         check_ranges(self, mistakes)
@@ -137,6 +149,58 @@ class Plant(Checked):
             time_unit=time_unit,
         )
 
+    @classmethod
+    def of_map(
+        cls,
+        *,
+        states: Mapping[str, str],
+        inputs: Mapping[str, str],
+        parameters: Mapping[str, Parameter],
+        next: Callable[..., Mapping[str, Expression]],
+        step: float,
+        outputs: Mapping[str, Output] | None = None,
+        controlled: Sequence[str] | None = None,
+        ranges: Mapping[str, tuple[float, float]] | None = None,
+        algebraic: Algebraic | None = None,
+        time_unit: str = "s",
+    ) -> Plant:
+        """Return the map x+ = f(x, u, p), y = h(x, p), which steps and has no differential equation.
+
+            plant = Plant.of_map(states={"stock": "t"}, inputs={"catch": "t/year"}, parameters={...}, next=grown, step=1.0, ...)
+
+        A response is a divided difference, (y_{k+1} - y_k) / T for an output that an input reaches in one control cycle of T; see
+        `fpirhc.plant.maps`. `Problem` takes no integrator for a map, and its period is a whole number of steps.
+
+        Args:
+            states: name -> unit of every state.
+            inputs: name -> unit of every input.
+            parameters: name -> Parameter(approximate, exact, unit), or outside(nominal, unit).
+            next: function of (x, u, p) that returns {state: its value one step later}.
+            step: time from one state to the next.
+            outputs: name -> Output(unit, function of (x, p)); None: the states follow a reference.
+            controlled: outputs, or states, on which a tracking law and a deformation act, as many as there are inputs; None: all.
+            ranges: physical range (lowest, highest) of states by name.
+            algebraic: quantities that equations tie to the state in every step; see `Plant`.
+            time_unit: unit of time of the step.
+
+        Raises:
+            InvalidProblem: all mistakes together.
+        """
+        return cls(
+            coordinates=states,
+            inputs=inputs,
+            parameters=parameters,
+            response=Differences(next, tuple(states), step),  # type: ignore[arg-type]  # what is no mapping is refused by name
+            order=1,
+            controlled=controlled,
+            ranges=ranges or {},
+            outputs=outputs or {},
+            algebraic=algebraic,
+            time_unit=time_unit,
+            step=step,
+            next=next,
+        )
+
     def __repr__(self) -> str:
         return line(self, *plant_facts(self))
 
@@ -157,7 +221,9 @@ class Plant(Checked):
 
     @property
     def words(self) -> tuple[str, str]:
-        """What a coordinate and the response are called: "state" and "rates" where the plant is given by its states."""
+        """What a coordinate and the response are called: "state" and "rates", or "next", where the plant is given by its states."""
+        if self.next is not None:
+            return "state", "next"
         by_states = bool(self.outputs) and set(self.orders) == {1}
         return ("state", "rates") if by_states else ("coordinate", "response")
 
@@ -299,6 +365,24 @@ class Plant(Checked):
         object.__setattr__(other, "parameters", parameters)
         return other
 
+    @property
+    def sampling(self) -> float:
+        """Time from one state of a map to the next that a controller sees: the control cycle; NaN for differential equations."""
+        return math.nan if self.step is None else self.step * self.steps
+
+    def over(self, cycle: float) -> Plant:
+        """Return the plant as a controller with this cycle sees it: a map's steps with the command held, or the plant itself.
+
+        Raises:
+            InvalidValue: the cycle is no whole number of the map's steps; the next ones are named.
+        """
+        return self if self.step is None else over(self, cycle)
+
+    @cached_property
+    def next_function(self) -> ca.Function:
+        """Function (state, input, parameters, forcing) -> state of a map one control cycle later."""
+        return next_function(self)
+
     def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Return new symbols of the state, the input and the parameters, with the sizes of this plant."""
         return (ca.SX.sym("x", self.state.size), ca.SX.sym("u", len(self.inputs)), ca.SX.sym("p", len(self.parameters)))
@@ -312,6 +396,9 @@ class Plant(Checked):
     def response_function(self) -> ca.Function:
         """Function (state, input, parameters) -> highest derivative of every coordinate (n)."""
         x, u, p = self.symbols()
+        if self.next is not None:
+            differences = (self.next_function(x, u, p, ca.SX.zeros(len(self.names))) - x) / self.sampling
+            return ca.Function("fpirhc_response", [x, u, p], [differences], ["x", "u", "p"], ["r"])
         views = self.views(x, u, p)
         if self.algebraic is not None:
             views = (*views, self.algebraic.view(self.algebraic_function(x, u, p)))
@@ -353,6 +440,9 @@ class Plant(Checked):
         """Function (state, input, parameters, forcing) -> dx/dt; `forcing` (n) adds to the responses."""
         x, u, p = self.symbols()
         w = ca.SX.sym("w", len(self.names))
+        if self.next is not None:
+            differences = (self.next_function(x, u, p, w) - x) / self.sampling
+            return ca.Function("fpirhc_derivative", [x, u, p, w], [differences], ["x", "u", "p", "w"], ["xdot"])
         responses = self.response_function(x, u, p) + w
         rates = []
         for element in self.state.elements:

@@ -24,6 +24,7 @@ from fpirhc.controllers.seeing import compose_seeing, first_estimates, seeing_bl
 from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, measures_all, sending_block
+from fpirhc.simulation.map_blocks import with_true_response
 from fpirhc.simulation.outside_blocks import outside_blocks, real_name
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals, expression
@@ -169,6 +170,8 @@ def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], Sho
         return [_sense_block(problem, hidden[0], Response(hidden[1], response.function))], hidden
     true = tuple(like(s, f"plant_{s.name}") for s in motion), like(response.signal, "plant_realised")
     sense = _sense_block(problem, true[0], Response(true[1], response.function))
+    if problem.plant.step is not None:
+        sense = with_true_response(problem, sense, true[0][-1], true[1])
     blocks = [sense, _truth_block(problem, true[0][-1])]
     if problem.symbolic_reality is None or not problem.symbolic_reality.seen:
         return blocks, true
