@@ -121,6 +121,7 @@ from .task.samples import Samples
 from .task.set_point import Setpoint
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
+from .tracking.shift_polynomial import ShiftPolynomial
 
 __all__ = [
     "PID",
@@ -239,6 +240,7 @@ __all__ = [
     "Sensor",
     "SequentialQuadratic",
     "Setpoint",
+    "ShiftPolynomial",
     "Sigmoid",
     "Sine",
     "SlidingMode",

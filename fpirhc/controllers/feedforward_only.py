@@ -32,6 +32,11 @@ class FeedforwardOnly(Controller):
         """Identity(): no request is iterated."""
         return Identity()
 
+    def maps_unusable(self, problem: Problem) -> str:
+        """Return nothing: it has no law."""
+        del problem
+        return ""
+
     def check(self, problem: Problem) -> None:
         """Raise if the model has no inverse.
 

@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import NotSupported
+from fpirhc.plant.maps import growth_of
 from fpirhc.sensing.beliefs.kalman_filter import shown_by
 from fpirhc.sensing.observability import members, slowest
 from fpirhc.task.problem import Problem
@@ -49,7 +50,7 @@ def free_errors(problem: Problem) -> FreeErrors:
     known = [plant.state.elements.index(e) for e in problem.sensing.known(plant)]
     scaled = [a * size / size[:, None] for a in slopes]
     basis = belief.free(scaled, [c * size for c in shown], known)
-    pole = slowest(scaled, basis)
+    pole = slowest(scaled, basis, growth_of(plant))
     fastest = max(float(np.abs(np.linalg.eigvals(a)).max()) for a in slopes)
     return FreeErrors(tuple(plant.state.elements[k] for k in members(basis)), pole, decays=pole < -_STAYS * fastest)
 

@@ -18,6 +18,7 @@ from fpirhc.controllers.contract import checked
 from fpirhc.controllers.face import on_face
 from fpirhc.controllers.mirror import with_measured_state
 from fpirhc.controllers.own_reference import with_reference
+from fpirhc.controllers.steps_ahead import with_steps_ahead
 from fpirhc.symbolic.block import Block, Composite
 from fpirhc.symbolic.layout import Layout, Signal
 from fpirhc.task.dead_time import Wait
@@ -70,7 +71,9 @@ def seeing_blocks(problem: Problem) -> list[Block]:
     if problem.sensing.measured is not None:
         return _estimating_part(problem, raw, start)
     plant = problem.plant
-    return [on_face(plant, problem.sensing.estimator.block(plant.face, problem.period, start, raw))]
+    return with_steps_ahead(
+        plant, on_face(plant, problem.sensing.estimator.block(plant.face, problem.period, start, raw))
+    )
 
 
 def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:

@@ -23,9 +23,11 @@ import inspect
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import casadi as ca
+import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.user_code import called, scalar_expression
@@ -77,8 +79,12 @@ def check_map(plant: Plant, mistakes: Mistakes) -> None:
     step = plant.step
     if isinstance(step, bool) or not isinstance(step, int | float) or not (math.isfinite(step) and step > 0):
         mistakes.add(f"step must be a positive number, in {plant.time_unit}, got {step!r}")
-    elif set(plant.orders) != {1} and plant.next is not None:
+    elif plant.next is not None and set(plant.orders) != {1}:
         mistakes.add("order: every state of a map has the order 1; later steps are found from outputs")
+    elif plant.next is not None and getattr(plant.response, "next", None) is not plant.next:
+        mistakes.add(
+            "response: that of a map is the difference of its steps; give the map alone, Plant.of_map(next=...)"
+        )
 
 
 def over(plant: Plant, cycle: float) -> Plant:
@@ -131,6 +137,22 @@ def shifted(plant: Plant, value: Expression, symbols: tuple[ca.SX, ca.SX, ca.SX,
     """
     x, u, p, w = symbols
     return (ca.substitute(ca.SX(value), x, plant.next_function(x, u, p, w)) - value) / plant.sampling
+
+
+def decay_rates(modes: np.ndarray, cycle: float) -> np.ndarray:
+    """Return log|1 + T s| / T of eigenvalues s of a map's divided differences: negative where the mode decays, -inf where it ends.
+
+    Args:
+        modes: eigenvalues.
+        cycle: T.
+    """
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(np.abs(1 + cycle * modes)) / cycle)
+
+
+def growth_of(plant: Plant) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the function from eigenvalues of the rates to the rates with which modes grow: the real part, or that of a map."""
+    return np.real if plant.step is None else partial(decay_rates, cycle=plant.sampling)
 
 
 def _one_step(plant: Plant, step: Callable[..., Mapping[str, Expression]], x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
