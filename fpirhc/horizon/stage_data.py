@@ -12,7 +12,7 @@ from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import kind
-from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.reference import Reference
 
 
@@ -101,6 +101,8 @@ def shifted_reference(plant: Plant, layout: Layout, nodes: int) -> ca.Function:
 
         d^(k)(t + tau) = sum_{j >= k} d^(j)(t) tau^(j-k) / (j-k)!,    j < r.
 
+    In the cycles T of a map these are divided differences, and tau^n is tau (tau - T) ... (tau - (n - 1) T), as Newton has it.
+
     The errors of the model's outputs plus d are those of the model's outputs where d is subtracted from the reference.
 
     Args:
@@ -116,10 +118,16 @@ def shifted_reference(plant: Plant, layout: Layout, nodes: int) -> ca.Function:
     for k, element in enumerate(elements):
         higher = [i for i, e in enumerate(elements) if e.startswith(element) and not e[len(element) :].strip("'")]
         powers = [elements[i].count("'") - element.count("'") for i in higher]
-        terms = (error[i] * later**n / math.factorial(n) for i, n in zip(higher, powers, strict=True))
+        terms = (error[i] * _power(later, n, plant) / math.factorial(n) for i, n in zip(higher, powers, strict=True))
         difference[place.start + k] = sum(terms, start=ca.SX(0))
     one = ca.Function("fpirhc_shifted_column", [column, now, x, y, p], [ca.densify(column - difference)])
     sizes = {"x": x.numel(), "y": y.numel(), "p": p.numel()}
     data, arguments = ca.MX.sym("data", layout.size, nodes), [ca.MX.sym(name, size) for name, size in sizes.items()]
     repeated = [ca.repmat(v, 1, nodes) for v in (data[layout.slice("time"), 0], *arguments)]
     return ca.Function("fpirhc_shifted_reference", [data, *arguments], [one.map(nodes)(data, *repeated)])
+
+
+def _power(time: Expression, exponent: int, plant: Plant) -> Expression:
+    if plant.step is None:
+        return time**exponent
+    return math.prod((time - k * plant.sampling for k in range(exponent)), start=ca.SX(1))

@@ -25,6 +25,7 @@ from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.instant import response_orders
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, sending_block, shows_truth
+from fpirhc.simulation.map_blocks import with_true_response
 from fpirhc.simulation.outside_blocks import outside_blocks, real_name
 from fpirhc.simulation.true_motion import true_motion
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
@@ -172,6 +173,8 @@ def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], Sho
         return [_sense_block(problem, hidden[0], Response(hidden[1], response.function))], hidden
     true = tuple(like(s, f"plant_{s.name}") for s in motion), like(response.signal, "plant_realised")
     sense = _sense_block(problem, true[0], Response(true[1], response.function))
+    if problem.plant.step is not None:
+        sense = with_true_response(problem, sense, true[0][-1], true[1])
     blocks = [sense, _truth_block(problem, true[0][-1])]
     if problem.symbolic_reality is None or not problem.symbolic_reality.seen:
         return blocks, true

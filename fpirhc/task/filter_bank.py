@@ -14,7 +14,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.symbolic.live import is_live
-from fpirhc.task.equal_poles import Entry, highest, moved, transition
+from fpirhc.task.equal_poles import Entry, differences, highest, moved, transition
 
 GIVEN = "setpoints"  # signal from outside: the set-points in force, then those of the next nodes
 OWN = "_reference_own"  # the filters' state, what is given, and a live rate
@@ -108,8 +108,11 @@ class FilterBank:
         return self._split(own[:size]), points, own[size + count] if is_live(self.rate) else self.rate
 
     def _chains(self, z: Sequence[Expression], held: Expression, rate: Entry) -> list[Expression]:
-        """(y, y', ..., y^(m)) of every coordinate."""
+        """(y, y', ..., y^(m)) of every coordinate; of a map the divided differences."""
         orders = enumerate(self.orders.values())
+        if self.plant.step is not None:
+            step = self.plant.sampling
+            return [ca.vertcat(*differences(rate, step, z[k], held[k], order)) for k, order in orders]
         return [ca.vertcat(z[k], highest(rate, z[k], held[k], order)) for k, order in orders]
 
 

@@ -19,7 +19,8 @@ from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.regular_gain import Bounds, singular_gain
 from fpirhc.horizon.stage_check import check_stage
 from fpirhc.plant.algebraic import unsolved
-from fpirhc.plant.integrators import Integrator, RungeKutta4
+from fpirhc.plant.integrators import USUAL, Integrator
+from fpirhc.plant.map_steps import motion_of
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.signals_in_outputs import differentiated_signals
 from fpirhc.sensing.sensing import Sensing
@@ -29,6 +30,7 @@ from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.foreign import Foreign
 from fpirhc.task.limits import Limits
+from fpirhc.task.map_task import check_map_task, settle_maps
 from fpirhc.task.needed import needed_measurements, needed_names
 from fpirhc.task.outside import External, check_signals, real_values, rows_of, signals_of
 from fpirhc.task.problem_view import problem_facts, problem_table
@@ -57,7 +59,7 @@ class Problem(Checked):
         sensing: sensors and estimator between the plant and the controller; ideal by default.
         horizon: stages over which a receding-horizon controller plans.
         cost: of such a plan.
-        integrator: of the simulated plant.
+        integrator: of the simulated plant; a map has none.
         input_before: inputs before the first cycle, by name. The first rate and the first weight of a rate are counted from them,
             and they act until the first command arrives. An input that is not named has the value of `DeadTime(before=...)`, or
             else zero, moved into its limits.
@@ -86,7 +88,7 @@ class Problem(Checked):
     sensing: Sensing = field(default_factory=Sensing)
     horizon: Horizon | None = None
     cost: Cost | None = None
-    integrator: Integrator = field(default_factory=RungeKutta4)
+    integrator: Integrator = USUAL
     measure_from: float = 0.0
     judged: Sequence[str] | None = None
     input_before: Mapping[str, float] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
@@ -96,6 +98,8 @@ class Problem(Checked):
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("problem")
+        settle_maps(self, mistakes)
+        mistakes.raise_if_any()
         _check_times(self, mistakes)
         _check_start(self, mistakes)
         plant = self.plant
@@ -124,6 +128,8 @@ class Problem(Checked):
                 check()
             except FpirhcError as error:
                 mistakes.add(str(error))
+        mistakes.raise_if_any()
+        check_map_task(self, mistakes)
         mistakes.raise_if_any()
         check_stage(plant, self.cost, self.limits, mistakes)
         _check_inverse(self, mistakes)
@@ -197,7 +203,8 @@ class Problem(Checked):
     @property
     def real_integrator(self) -> Integrator:
         """Integrator of the plant that a run moves."""
-        return (self.symbolic_reality.integrator if self.symbolic_reality else None) or self.integrator
+        chosen = (self.symbolic_reality.integrator if self.symbolic_reality else None) or self.integrator
+        return motion_of(self.real_plant, chosen, USUAL)
 
     @cached_property
     def real_start(self) -> np.ndarray:
