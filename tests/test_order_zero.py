@@ -131,6 +131,8 @@ def test_set_points_noise_and_dead_time() -> None:
     )
     run = simulated(problem, fp.Cascade(STATIC, affine(0.3)))
     assert np.std(run["output.power"] - run["plant_output.power"]) == pytest.approx(0.5, rel=0.2)
+    assert np.array_equal(run["realised"], run["output"])
+    assert not np.array_equal(run["plant_realised"], run["realised"])
     settled = (run.time > 15) | ((run.time > 5) & (run.time < 10))
     assert np.abs(run["true_error.power"][settled]).max() < 3.0  # W; the element is still warming up
 
@@ -144,6 +146,22 @@ def test_a_stepper_does_what_the_loop_does() -> None:
         sample = run["state"][k], run["realised"][k]
         command, memory = stepper.step(run.time[k], *sample, memory, output=run["output"][k])
         assert np.array_equal(command, run["command"][k])
+
+
+def test_a_review_says_what_it_covers() -> None:
+    """Order, inverse and commands are answered; the linear loop is named as not covered."""
+    answers = fp.review(heated(element()), {"static": STATIC}, mismatch=0.0, seed=0)
+    by_question = {a.question: a for a in answers.problem}
+    assert by_question["Are the relative orders those of the plant?"].evidence.startswith("power 0")
+    assert str(by_question["Does the inverse exist along the reference?"].verdict) == "yes"
+    assert "not covered for outputs of order 0" in answers.problem[-1].evidence
+
+
+def test_a_comparison_says_that_the_output_is_measured() -> None:
+    problem = heated(element(), duration=10.0)
+    outcome = fp.compare(problem, {"static": STATIC, "iterated": fp.Cascade(STATIC, affine(0.5))}, seed=0, timing=False)
+    assert "static: uses theta" in outcome.information
+    assert "iterated: uses theta, power" in outcome.information
 
 
 def test_an_output_of_order_zero_may_be_judged_beside_a_controlled_one() -> None:

@@ -113,7 +113,10 @@ def face_of(plant: Plant) -> Plant:
     An output that no input reaches has the order one, and so has one of order 0 (see `fpirhc.plant.instant`).
     """
     orders = {name: output_order(plant, name) or 1 for name in plant.outputs}
-    return light_plant(plant, {name: one.unit for name, one in plant.outputs.items()}, orders, plant.controlled_names)
+    units = {name: one.unit for name, one in plant.outputs.items()}
+    light = light_plant(plant, units, orders, plant.controlled_names)
+    vars(light)["instant_names"] = plant.instant_names  # the property of a light plant, which has no expressions to find them from
+    return light
 
 
 def light_plant(
@@ -176,7 +179,9 @@ def _check_one(plant: Plant, name: str, mistakes: Mistakes) -> None:
         return
     parameter = plant.outputs[name].response_disturbance
     if parameter and parameter not in plant.parameters:
-        mistakes.add(f"outputs: '{name}': response_disturbance={parameter!r} is no parameter of the plant; add it there")
+        mistakes.add(
+            f"outputs: '{name}': response_disturbance={parameter!r} is no parameter of the plant; add it there"
+        )
     controlled = plant.controlled is None or name in plant.controlled
     if controlled and output_order(plant, name) is None:
         mistakes.add(f"outputs: no input reaches '{name}', however often it is differentiated; control another output")

@@ -32,6 +32,7 @@ from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX, nominal
 from fpirhc.task.dead_time import MEASUREMENT, Wait, delay_block
+from fpirhc.task.output_disturbance import LOGGED, added, disturbance_signal, disturbed_outputs, logged_signal
 from fpirhc.task.problem import Problem
 
 Shown: TypeAlias = tuple[tuple[Signal, ...], Signal]  # signals of the motion, and of the response
@@ -113,7 +114,7 @@ def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:
     """Return the signal of all disturbances in the order of the problem, or nothing when there are none."""
     if not problem.disturbances:
         return ()
-    return (Signal("disturbance", tuple(problem.disturbances)),)
+    return (disturbance_signal(problem),)
 
 
 def _plant_delays(problem: Problem, controller: Controller) -> list[Delay]:
@@ -188,9 +189,10 @@ def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
     plant, late, sensing = problem.plant, problem.dead_time.measurement_wait(problem.period), problem.sensing
     first, resting = first_estimates(problem)
     starts = (problem.start_state, first) if plant.outputs else (first,)
-    states = [*zip(shown[0], measured_signals(plant), starts, strict=True)]
+    given = sensing.belief is None  # a believed state is the controller's own
+    states = [*zip(shown[0], measured_signals(plant), starts, strict=True)] if given else []
     if not sensing.ideal:
-        others = states[:-1] if sensing.belief is None else []  # a believed state is the controller's own
+        others = states[:-1]
         all_shown = first_shown(problem)
         sensors = [*_late_states(others, late), *sensing.blocks(plant, all_shown, late, (*shown[0], shown[1]))]
         if sensing.estimates:
@@ -268,11 +270,18 @@ def _sense_block(problem: Problem, motion: Sequence[Signal], response: Response)
     outputs = motion[-1:] if problem.plant.outputs else ()
     states = motion[: len(motion) - len(outputs)]
     outputs_of = problem.plant.output_function if reality is None else reality.output_function(problem.plant)
+    shifts = bool(disturbed_outputs(problem))
+    if shifts:
+        reads, own = (*reads, disturbance_signal(problem)), (*own, logged_signal(problem))
 
     def step(s: Signals) -> dict[str, Expression]:
         now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
         values = {response.signal.name: response.function(*now)}
         values |= {signal.name: outputs_of(*now) for signal in outputs}
+        if shifts:
+            below, answered = added(problem, s.disturbance)
+            sums = {response.signal.name: answered, motion[-1].name: below}
+            values |= {name: values[name] + more for name, more in sums.items()} | {LOGGED: below}
         if state_of is None:
             return {motion[0].name: s._state_before, **values}
         values |= {signal.name: state_of(*now) for signal in states}
@@ -321,9 +330,9 @@ def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Si
     def step(s: Signals) -> dict[str, Expression]:
         u, w = getattr(s, arriving.name), expression(ca.DM.zeros(len(plant.names)))
         if disturbed:
-            added = dict(zip(problem.disturbances, ca.vertsplit(s.disturbance), strict=True))
-            u = u + ca.vertcat(*(added.get(name, 0) for name in plant.inputs))
-            w = ca.vertcat(*(added.get(name, 0) for name in plant.names))
+            adds = dict(zip(disturbed[0].elements, ca.vertsplit(s.disturbance), strict=True))
+            u = u + ca.vertcat(*(adds.get(name, 0) for name in plant.inputs))
+            w = ca.vertcat(*(adds.get(name, 0) for name in plant.names))
         return {
             "_state_after": advance(getattr(s, state.name), u, getattr(s, exact.name), w),
             "_acting": u,

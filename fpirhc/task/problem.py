@@ -51,7 +51,8 @@ class Problem(Checked):
         period: control cycle, in the plant's unit of time, as are all times.
         duration: length of a run.
         limits: of inputs, states, rates and paths.
-        disturbances: by name of the input or coordinate to which they add.
+        disturbances: by name of the input, coordinate or output to which they add; a name of both a coordinate of the moving plant
+            and an output is the coordinate's, and adds to its response.
         dead_time: of inputs and measurement. A controller may assume another one.
         sensing: sensors and estimator between the plant and the controller; ideal by default.
         horizon: stages over which a receding-horizon controller plans.
@@ -102,12 +103,14 @@ class Problem(Checked):
         mistakes.unknown(
             "judged: output" if plant.outputs else "judged: coordinate", self.judged or (), plant.face.coordinates
         )
-        disturbed = [*plant.inputs, *(() if self.foreign else self.real_plant.coordinates)]
-        mistakes.unknown("disturbances: input or coordinate", self.disturbances, disturbed)
+        disturbed = [*plant.inputs, *(() if self.foreign else (*self.real_plant.coordinates, *plant.outputs))]
+        what = "input, coordinate or output" if plant.outputs else "input or coordinate"
+        mistakes.unknown(f"disturbances: {what}", self.disturbances, disturbed)
         instants, random = np.array([0.0, self.period]), np.random.default_rng(0)
         check_signals(self._plants, self.signals, np.linspace(0.0, self.duration, _INSTANTS), mistakes)
         checks = (
             *((lambda one=one: one.values(instants, random)) for one in self.disturbances.values()),
+            lambda: self._check_derivatives(instants),
             lambda: self.limits.check(plant),
             lambda: self.reference.function(plant),
             lambda: check_steps(plant.face, self.limits, self.reference.set_points),
@@ -186,7 +189,7 @@ class Problem(Checked):
         """The problem without its reality: the model's own plant moves, and disturbances of what it does not have are left out."""
         if self.reality is None:
             return self
-        known = {*self.plant.inputs, *self.plant.coordinates}
+        known = {*self.plant.inputs, *self.plant.coordinates, *self.plant.outputs}
         disturbances = {name: one for name, one in self.disturbances.items() if name in known}
         signals = signals_of(self.plant, self.signals)
         return replace(self, reality=None, disturbances=disturbances, signals=signals)
@@ -212,6 +215,12 @@ class Problem(Checked):
         """Parameters of the plant that a run moves in its first cycle: the exact ones, with the real values of signals."""
         plant = self.real_plant
         return rows_of(real_values(plant, self.signals), np.array([self.period / 2]), plant.exact)[0]
+
+    def _check_derivatives(self, instants: np.ndarray) -> None:
+        """Raise if the disturbance of an output has no derivatives, which its own derivatives need."""
+        for name in self.plant.outputs:
+            if name in self.disturbances:
+                self.disturbances[name].derivative(instants, 1)
 
     @property
     def _needed(self) -> frozenset[str]:
