@@ -1,7 +1,7 @@
-"""Learners on plants with outputs: offset-free control, disturbances of outputs and of their responses, learned parameters.
+"""Learners on plants with outputs: offset-free control, disturbances of outputs and responses, learned parameters.
 
-Laws: outputs that are coordinates change no estimate; the filter is a recursion that is written here; a disturbance of a response is
-what a deformation corrects, and a plan does not see it; parameters are found from the response of an output.
+Laws: outputs that are coordinates change no estimate; the filter is a recursion that is written here; a disturbance of a
+response is what a deformation corrects, and a plan does not see it; parameters are found from the response of an output.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ def test_the_filter_on_the_hand_of_an_arm_is_the_recursion_by_hand() -> None:
         y = plant.output_function(x, u, [mass], forcing).full().ravel()
         step = 1e-4  # of a central difference of the hand's speed along the motion
         xdot = rate(x, u, [mass], forcing).full().ravel()
-        ends = (plant.output_function(x + s * step * xdot, u, [mass], forcing).full().ravel()[2] for s in (1, -1))
-        back = (lambda one, other: (one - other) / (2 * step))(*ends)
+        ends = tuple(plant.output_function(x + s * step * xdot, u, [mass], forcing).full().ravel()[2] for s in (1, -1))
+        back = (ends[0] - ends[1]) / (2 * step)
         return np.array([x[0], x[1], y[0], y[3], back + w[1]])
 
     def slopes(of: Callable[[np.ndarray], np.ndarray], at: np.ndarray) -> np.ndarray:
@@ -83,7 +83,9 @@ def test_the_filter_on_the_hand_of_an_arm_is_the_recursion_by_hand() -> None:
     a_x = slopes(lambda x: moved(x, u0, np.zeros(2)), first)
     b_w = slopes(lambda w: moved(first, u0, w), np.zeros(2))
     a = np.block([[a_x, b_w[:, :1], np.zeros((4, 1))], [np.zeros((2, 4)), np.eye(2)]])
-    c = np.hstack([slopes(lambda x: shown(x, u0, np.zeros(2)), first), slopes(lambda w: shown(first, u0, w), np.zeros(2))])
+    c = np.hstack(
+        [slopes(lambda x: shown(x, u0, np.zeros(2)), first), slopes(lambda w: shown(first, u0, w), np.zeros(2))]
+    )
     q = scipy.linalg.block_diag(np.outer(b_w[:, 1], b_w[:, 1]) * 0.1**2, np.diag([period * 4.0, period * 9.0]))
     r = np.diag(np.array(list(measured.values())) ** 2)
     p = scipy.linalg.solve_discrete_are(a.T, c.T, q, r)
@@ -174,7 +176,9 @@ def test_a_disturbance_reaches_a_model_with_algebraic_states() -> None:
         ),
     )
     p = np.array([5.5, 0.7])  # the half, and the disturbance of C
-    one, other = (disturbed(plant, ("C",)).derivative_function([2.0, 1.0], 3.0, p).full() for plant in (hill(5.5), through))
+    one, other = (
+        disturbed(plant, ("C",)).derivative_function([2.0, 1.0], 3.0, p).full() for plant in (hill(5.5), through)
+    )
     assert np.allclose(one.ravel(), [3.0 - 2.0 + 0.7, 0.5])
     assert np.allclose(one, other)
 
@@ -195,6 +199,7 @@ class Foreigner(fp.RecursiveLeastSquares):
 
     @property
     def covers_outputs(self) -> bool:
+        """Nothing is said."""
         return False
 
 

@@ -57,7 +57,7 @@ def task(**changes: Any) -> fp.Problem:
     """Blood along a sine; the tissue is nobody's to measure."""
     settings: dict[str, Any] = {
         "plant": compartments(),
-        "reference": fp.Trajectory(lambda t: {"c1": 2 + 0.3 * ca.sin(t / 2), "c2": 3.0}),
+        "reference": fp.Trajectory(lambda t: {"c1": 2 + 0.3 * ca.sin(t / 2), "c2": 3 + 0 * t}),
         "start": {"c1": 2.0, "c2": 3.0},
         "period": PERIOD,
         "duration": 20.0,

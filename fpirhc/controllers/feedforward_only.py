@@ -50,6 +50,11 @@ class FeedforwardOnly(Controller):
         """Yes."""
         return True
 
+    def maps_unusable(self, problem: Problem) -> str:
+        """Return nothing: it has no law."""
+        del problem
+        return ""
+
     def check(self, problem: Problem) -> None:
         """Raise if the model has no inverse.
 

@@ -27,6 +27,8 @@ class _Controller(Protocol):
     @property
     def planner(self) -> object: ...
 
+    def maps_unusable(self, problem: Problem) -> str: ...
+
 
 def check_outputs(problem: Problem, controller: _Controller) -> None:
     """Raise if the problem's plant has outputs and the controller, or its deformation, does not cover them.
@@ -39,12 +41,26 @@ def check_outputs(problem: Problem, controller: _Controller) -> None:
     _check_order_zero(problem, controller)
     name, mirror = type(controller).__name__, controller.deformation.mirror
     reason = controller.outputs_unusable(problem)
-    if not reason and mirror is not None and (not problem.sensing.estimator.shows_response or mirror.measurement):
+    estimated = not (problem.sensing.estimator.shows_response or problem.plant.step)
+    if not reason and mirror is not None and (estimated or mirror.measurement):
         name = type(controller.deformation).__name__
         reason = "it compares with a twin of the plant behind the estimator or the late measurement, which has coordinates only"
     if reason:
         what = ", ".join(problem.plant.outputs)
         raise NotSupported(f"{name} does not cover outputs that are expressions of the state ({what}): {reason}")
+
+
+def check_maps(problem: Problem, controller: _Controller) -> None:
+    """Raise if the problem's plant is a map and the controller does not cover maps.
+
+    Raises:
+        NotSupported: with the reason.
+    """
+    reason = controller.maps_unusable(problem) if problem.plant.step is not None else ""
+    if reason:
+        raise NotSupported(
+            f"{type(controller).__name__} does not cover maps: {reason}; use ComputedTorque, RecedingHorizon or FeedforwardOnly"
+        )
 
 
 def check_form(problem: Problem, controller: _Controller) -> None:
@@ -76,6 +92,13 @@ def check_form(problem: Problem, controller: _Controller) -> None:
                 f"ModelReferenced({name}={values!r}): the plant has {len(plant.inputs)} inputs ({', '.join(plant.inputs)}); give "
                 "one number for each, or one for all"
             )
+    if plant.step is not None and (
+        any(every(mirror.lag)) or any(c % 1 for c in every(mirror.cycles)) or mirror.measurement % 1
+    ):
+        raise NotSupported(
+            f"{type(deformation).__name__}: a map has no lag, and no dead time of parts of a cycle; write an actuator as a state "
+            "of the map, and dead times in whole cycles"
+        )
     reason = controller.unusable(problem, mirror)
     if reason:
         raise NotSupported(f"{type(controller).__name__} cannot use a model-referenced deformation here: {reason}")

@@ -25,6 +25,7 @@ from fpirhc.deformation.queue import MOST, Queue, every
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.instant import response_orders
+from fpirhc.plant.maps import growth_of
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.task.problem import Problem
@@ -137,7 +138,8 @@ def _slowest(problem: Problem) -> float:
     x, u, p = plant.symbols()
     slope = ca.Function("fpirhc_modes", [x, u, p], [ca.densify(ca.jacobian(plant.derivative_function(x, u, p), x))])
     matrix = np.asarray(slope(problem.start_state, problem.inputs_before, plant.approximate).full())
-    rates = -np.linalg.eigvals(matrix).real if np.isfinite(matrix).all() else np.zeros(1)
+    modes = np.linalg.eigvals(matrix) if np.isfinite(matrix).all() else np.zeros(1)
+    rates = -growth_of(plant)(modes)
     if rates.min() <= _STILL * np.abs(rates).max():
         raise InvalidValue(
             f"ThroughModel(): the model does not settle at the start with its command held (slowest rate {rates.min():.3g} "

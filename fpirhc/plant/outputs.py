@@ -26,6 +26,7 @@ from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.expected import takes
 from fpirhc.fields.user_code import called, scalar_expression
+from fpirhc.plant.maps import shifted
 from fpirhc.plant.plant_functions import by_name
 from fpirhc.symbolic.layout import Expression, Named
 
@@ -73,10 +74,9 @@ def lie_derivatives(plant: Plant, value: Expression, count: int, symbols: Symbol
         count: number of derivatives.
         symbols: x, u, p, and the forcing w.
     """
-    x, u, p, w = symbols
-    rate, chain = plant.forced_derivative_function(x, u, p, w), [value]
+    chain = [value]
     for _ in range(count):
-        chain.append(ca.jtimes(chain[-1], x, rate))
+        chain.append(_along(plant, chain[-1], symbols))
     return chain
 
 
@@ -93,15 +93,23 @@ def without_disturbances(plant: Plant) -> Plant:
     return replace(plant, outputs={n: replace(one, response_disturbance="") for n, one in plant.outputs.items()})
 
 
+def _along(plant: Plant, value: Expression, symbols: Symbols) -> Expression:
+    """The derivative of an expression along the motion, or of a map its divided difference, with the input held."""
+    if plant.step is not None:
+        return shifted(plant, value, symbols)
+    x, u, p, w = symbols
+    return ca.jtimes(value, x, plant.forced_derivative_function(x, u, p, w))
+
+
 def output_order(plant: Plant, name: str) -> int | None:
     """Return the relative order of an output: the first derivative that depends on an input, or 0; None where none does."""
     x, u, p = plant.symbols()
-    w = ca.SX.zeros(len(plant.names))
-    rate, value = plant.forced_derivative_function(x, u, p, w), output_expression(plant, name, x, u, p)
+    symbols = x, u, p, ca.SX.zeros(len(plant.names))
+    value = output_expression(plant, name, x, u, p)
     if ca.jacobian_sparsity(value, u).nnz():
         return 0
     for order in range(1, plant.state.size + 1):
-        value = ca.jtimes(value, x, rate)
+        value = _along(plant, value, symbols)
         if ca.jacobian_sparsity(value, u).nnz():
             return order
     return None
@@ -115,7 +123,9 @@ def face_of(plant: Plant) -> Plant:
     orders = {name: output_order(plant, name) or 1 for name in plant.outputs}
     units = {name: one.unit for name, one in plant.outputs.items()}
     light = light_plant(plant, units, orders, plant.controlled_names)
-    vars(light)["instant_names"] = plant.instant_names  # the property of a light plant, which has no expressions to find them from
+    vars(light)["instant_names"] = (
+        plant.instant_names
+    )  # the property of a light plant, which has no expressions to find them from
     return light
 
 
@@ -150,6 +160,7 @@ def light_plant(
         ranges={},
         outputs={},
         algebraic=None,
+        next=None,
     )
 
 
@@ -179,7 +190,9 @@ def _check_one(plant: Plant, name: str, mistakes: Mistakes) -> None:
         return
     parameter = plant.outputs[name].response_disturbance
     if parameter and parameter not in plant.parameters:
-        mistakes.add(f"outputs: '{name}': response_disturbance={parameter!r} is no parameter of the plant; add it there")
+        mistakes.add(
+            f"outputs: '{name}': response_disturbance={parameter!r} is no parameter of the plant; add it there"
+        )
     controlled = plant.controlled is None or name in plant.controlled
     if controlled and output_order(plant, name) is None:
         mistakes.add(f"outputs: no input reaches '{name}', however often it is differentiated; control another output")

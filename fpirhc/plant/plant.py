@@ -14,6 +14,7 @@ themselves are not converted anywhere.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -24,10 +25,12 @@ import numpy as np
 
 from fpirhc.errors import Mistakes, NotInvertible, NotSupported
 from fpirhc.fields.checked import Checked
-from fpirhc.plant import by_states, output_functions, plant_functions
+from fpirhc.fields.kinds import Few
+from fpirhc.plant import by_states, by_steps, output_functions, plant_functions
 from fpirhc.plant.algebraic import Algebraic
 from fpirhc.plant.instant import instant_outputs, response_orders
 from fpirhc.plant.inverse import inverse_function
+from fpirhc.plant.maps import check_map, next_function, over
 from fpirhc.plant.outputs import Output, check_outputs, face_of
 from fpirhc.plant.parameter import Parameter, check_parameters, with_exact_values
 from fpirhc.plant.plant_check import check_names, check_ranges, check_response
@@ -62,6 +65,9 @@ class Plant(Checked):
         outputs: name -> Output(unit, function of (q, q', ..., p)): the quantities that follow a reference, where these are not the
             coordinates themselves. Their relative orders are found from the symbols.
         time_unit: unit of time of the equations ('s', 'ms', 'day'), and so of every time and rate of the problem.
+        step: of a map, the time from one state to the next; None: differential equations. See `Plant.of_map`.
+        next: of a map, the function of (x, u, p) that returns {state: its value one step later}.
+        steps: of a map, how many a control cycle has, with the command held; `Problem` counts them.
 
     Raises:
         InvalidProblem: all mistakes together.
@@ -80,10 +86,16 @@ class Plant(Checked):
     algebraic: Algebraic | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
     outputs: Mapping[str, Output] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
     time_unit: str = field(default="s", kw_only=True, metadata={"setting": False})
+    step: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    next: Callable[..., Mapping[str, Expression]] | None = field(
+        default=None, kw_only=True, metadata={"setting": "where given"}
+    )
+    steps: Few = field(default=1, kw_only=True, metadata={"setting": "where given"})
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("plant")
         check_names(self, mistakes)
+        check_map(self, mistakes)
         check_parameters(self.parameters, mistakes)
         mistakes.raise_if_any()
         check_ranges(self, mistakes)
@@ -93,6 +105,7 @@ class Plant(Checked):
         mistakes.raise_if_any()
 
     of_states = classmethod(by_states.of_states)
+    of_map = classmethod(by_steps.of_map)
 
     def __repr__(self) -> str:
         return line(self, *plant_facts(self))
@@ -114,7 +127,9 @@ class Plant(Checked):
 
     @property
     def words(self) -> tuple[str, str]:
-        """What a coordinate and the response are called: "state" and "rates" where the plant is given by its states."""
+        """What a coordinate and the response are called: "state" and "rates", or "next", where the plant is given by its states."""
+        if self.next is not None:
+            return "state", "next"
         return ("state", "rates") if self.outputs and set(self.orders) == {1} else ("coordinate", "response")
 
     @cached_property
@@ -240,6 +255,24 @@ class Plant(Checked):
         other.__dict__.pop("exact", None)
         object.__setattr__(other, "parameters", parameters)
         return other
+
+    @property
+    def sampling(self) -> float:
+        """Time from one state of a map to the next that a controller sees: the control cycle; NaN for differential equations."""
+        return math.nan if self.step is None else self.step * self.steps
+
+    def over(self, cycle: float) -> Plant:
+        """Return the plant as a controller with this cycle sees it: a map's steps with the command held, or the plant itself.
+
+        Raises:
+            InvalidValue: the cycle is no whole number of the map's steps; the next ones are named.
+        """
+        return self if self.step is None else over(self, cycle)
+
+    @cached_property
+    def next_function(self) -> ca.Function:
+        """Function (state, input, parameters, forcing) -> state of a map one control cycle later."""
+        return next_function(self)
 
     def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Return new symbols of the state, the input and the parameters, with the sizes of this plant."""

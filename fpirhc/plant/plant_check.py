@@ -25,7 +25,7 @@ HIGHEST_ORDER = 20  # every derivative is a state with a name of its own: a mist
 def check_names(plant: Plant, mistakes: Mistakes) -> None:
     """Add every mistake in names, units, orders and the choice of controlled coordinates to `mistakes`."""
     outputs = {name: one.unit for name, one in plant.outputs.items()}
-    quantities = "states" if plant.outputs and plant.order == 1 else "coordinates"
+    quantities = "states" if plant.next is not None or (plant.outputs and plant.order == 1) else "coordinates"
     for what, group in ((quantities, plant.coordinates), ("inputs", plant.inputs), ("outputs", outputs)):
         if not group and what != "outputs" and not (what == quantities and plant.outputs):
             mistakes.add(f"{what} are empty; name at least one, with its unit")
@@ -78,7 +78,7 @@ def check_response(plant: Plant, mistakes: Mistakes) -> None:
     expected = len(arguments_of_step)
     if not takes(plant.response, expected):
         arguments = len(inspect.signature(plant.response).parameters)
-        lower = ["x"] if function == "rates" else ["q", "v", "a"] + [f"d{k}" for k in range(3, 12)]
+        lower = ["x"] if quantity == "state" else ["q", "v", "a"] + [f"d{k}" for k in range(3, 12)]
         mistakes.add(
             f"{function} takes {arguments} argument(s); with order {max(plant.orders, default=0)} it is called as "
             f"{function}({', '.join([*lower[: max(plant.orders, default=0)], 'u', 'p', *(['z'] if algebraic else [])])})"
@@ -91,6 +91,9 @@ def check_response(plant: Plant, mistakes: Mistakes) -> None:
         return
     mistakes.unknown(f"{function}: {quantity}", response, plant.coordinates)
     for c, r in zip(plant.names, plant.orders, strict=True):
+        if c not in response and plant.next is not None:
+            mistakes.add(f"next does not give the value of state '{c}' one step later; return it too")
+            continue
         if c not in response:
             mistakes.add(f"{function} does not give the derivative {c}{chr(39) * r} of {quantity} '{c}'; return it too")
             continue
@@ -142,6 +145,11 @@ def _check_orders(plant: Plant, mistakes: Mistakes) -> None:
         order = structural_order(plant, name)
         if order is None:
             mistakes.add(f"no input reaches coordinate '{name}', however often it is differentiated")
+        elif order != stated and plant.next is not None:
+            mistakes.add(
+                f"an input reaches state '{name}' only after {order} steps; write it as an output, whose order is found: "
+                f"outputs={{'{name}': Output(unit, lambda x, p: x.{name})}}"
+            )
         elif order != stated:
             mistakes.add(
                 f"order of '{name}' is given as {stated}, but its response has no input: the first derivative that an "

@@ -3,6 +3,8 @@
 With the state x = (q, q', ...), derivative-major, and a forcing w that adds to the highest derivatives,
 
     response    r = f(x, u, p),        algebraic states    z(x, u, p),        x' = (q', q'', ..., f(x, u, p) + w).
+
+Those of a map are its divided differences over one control cycle; see `fpirhc.plant.maps`.
 """
 
 from __future__ import annotations
@@ -34,6 +36,9 @@ def by_name(plant: Plant, x: Expression, p: Expression) -> tuple[Named, ...]:
 def response_function(plant: Plant) -> ca.Function:
     """Return the Function (state, input, parameters) -> highest derivative of every coordinate (n)."""
     x, u, p = plant.symbols()
+    if plant.next is not None:
+        differences = (plant.next_function(x, u, p, ca.SX.zeros(len(plant.names))) - x) / plant.sampling
+        return ca.Function("fpirhc_response", [x, u, p], [differences], ["x", "u", "p"], ["r"])
     views = plant.views(x, u, p)
     if plant.algebraic is not None:
         views = (*views, plant.algebraic.view(plant.algebraic_function(x, u, p)))
@@ -55,6 +60,9 @@ def forced_derivative_function(plant: Plant) -> ca.Function:
     """Return the Function (state, input, parameters, forcing) -> dx/dt; `forcing` (n) adds to the responses."""
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
+    if plant.next is not None:
+        differences = (plant.next_function(x, u, p, w) - x) / plant.sampling
+        return ca.Function("fpirhc_derivative", [x, u, p, w], [differences], ["x", "u", "p", "w"], ["xdot"])
     responses = plant.response_function(x, u, p) + w
     rates = []
     for element in plant.state.elements:

@@ -41,6 +41,11 @@ class DerivativeEstimator(Checked, ABC):
         """Whether state and response are both measured, so that nothing is estimated."""
         return False
 
+    @property
+    def of_steps(self) -> bool:
+        """Whether it takes differences of a map's steps; False for derivatives with respect to time."""
+        return False
+
     @abstractmethod
     def measures(self, plant: Plant) -> tuple[str, ...]:
         """Names of the measured quantities: state elements, and highest derivatives of controlled coordinates."""

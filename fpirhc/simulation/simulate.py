@@ -28,6 +28,7 @@ from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator, unwrapped
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native
+from fpirhc.task.output_disturbance import disturbance_values
 from fpirhc.task.problem import Problem
 
 CHUNK = 500  # cycles per call: long enough to hide Python, short enough for progress and Ctrl-C
@@ -98,8 +99,8 @@ class Simulator:
         problem, controller = force.problem, force.controller
         start = start_memory(self.loop, problem, controller, force.numbers)
         common = (problem, start, self.loop.trace, self.evaluator, seed, disturbed, progress)
-        chosen = _run_chunks if problem.foreign is None else _run_foreign
-        logged, stop = chosen(*common, force.patches, setpoints)
+        run_cycles = _run_chunks if problem.foreign is None else _run_foreign
+        logged, stop = run_cycles(*common, force.patches, setpoints)
         layout, log = with_common_columns(self.loop.trace, logged)
         log.setflags(write=False)
         step_limit = controller.deformation.largest_step()
@@ -233,14 +234,8 @@ def judged_run(
 
 
 def disturbance_table(problem: Problem, seed: int, cycles: int) -> np.ndarray:
-    """Return the disturbances of every cycle, shape (cycles, number of disturbances); each has its own stream."""
-    times = np.arange(cycles) * problem.period
-    streams = np.random.SeedSequence(seed).spawn(len(problem.disturbances))
-    columns = [
-        d.values(times, np.random.default_rng(stream))
-        for d, stream in zip(problem.disturbances.values(), streams, strict=True)
-    ]
-    return np.column_stack(columns) if columns else np.zeros((cycles, 0))
+    """Return the disturbances of every cycle, shape (cycles, columns); see `disturbance_values`."""
+    return disturbance_values(problem, np.arange(cycles) * problem.period, seed)
 
 
 def sensing_table(problem: Problem, seed: int, cycles: int) -> np.ndarray:

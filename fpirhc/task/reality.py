@@ -220,6 +220,8 @@ class Reality(Checked):
             differences = ["its coordinates in another order"]
         if tuple(plant.outputs) != tuple(model.outputs):
             differences.append("other outputs")
+        if (plant.step is None) != (model.step is None):
+            differences.append("differential equations, and the model is a map")
         if not differences and (plant.controlled or tuple(plant.outputs) or plant.names) != model.controlled_names:
             differences = [
                 f"other controlled coordinates (write controlled={model.controlled_names!r} in its plant too)"

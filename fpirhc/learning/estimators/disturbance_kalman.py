@@ -213,7 +213,10 @@ class DisturbanceKalman(Estimator):
         states = dict(zip(model.state.elements, ca.vertsplit(x), strict=True))
         if self.reads_outputs(model):
             calm = ca.DM.zeros(len(model.names))
-            states = dict(zip(model.output.elements, ca.vertsplit(model.output_function(x, u, p, calm)), strict=True)) | states
+            states = (
+                dict(zip(model.output.elements, ca.vertsplit(model.output_function(x, u, p, calm)), strict=True))
+                | states
+            )
         if self._responses(model):
             responses = ca.vertsplit(model.controlled_response_function(x, u, p))
             states |= dict(zip(response_names(model.face), responses, strict=True))

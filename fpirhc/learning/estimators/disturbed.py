@@ -46,7 +46,9 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
             f"disturbed: Plant(inverse=...) does not know the disturbance of {coordinates[0]}, of which outputs are expressions; "
             f"leave the inverse out, or disturb an output ({', '.join(plant.outputs)})"
         )
-    units = {n: one.unit for n, one in plant.outputs.items()} | dict(zip(plant.names, plant.response_units, strict=True))
+    units = {n: one.unit for n, one in plant.outputs.items()} | dict(
+        zip(plant.names, plant.response_units, strict=True)
+    )
     if responses:
         units |= dict(zip(responses, plant.response_signal("_").units, strict=True))
     added = {disturbance_name(n): Parameter(0.0, 0.0, units[n]) for n in names}
@@ -88,8 +90,12 @@ def _output(plant: Plant, name: str, one: Output, names: Sequence[str]) -> Outpu
 
     vars(expression)["__signature__"] = inspect.signature(one.expression)
     if own and one.response_disturbance:
-        raise NotSupported(f"disturbed: the response of '{name}' has the disturbance {one.response_disturbance} already")
-    return replace(one, expression=expression, response_disturbance=disturbance_name(own[0]) if own else one.response_disturbance)
+        raise NotSupported(
+            f"disturbed: the response of '{name}' has the disturbance {one.response_disturbance} already"
+        )
+    return replace(
+        one, expression=expression, response_disturbance=disturbance_name(own[0]) if own else one.response_disturbance
+    )
 
 
 def _inverse(
