@@ -36,7 +36,7 @@ def settle_maps(problem: Problem, mistakes: Mistakes) -> None:
         if problem.horizon is not None:
             discretisation = _steps("horizon: discretisation", problem.horizon.discretisation, mistakes)
             settled["horizon"] = replace(problem.horizon, discretisation=discretisation)
-        if problem.sensing.estimator.measures_all:
+        if problem.sensing.estimator.measures_all and _has_differences(problem):
             settled["sensing"] = replace(problem.sensing, estimator=StepDifference())
     elif problem.integrator.steps_maps:
         settled["integrator"] = USUAL
@@ -47,14 +47,14 @@ def settle_maps(problem: Problem, mistakes: Mistakes) -> None:
 def check_map_task(problem: Problem, mistakes: Mistakes) -> None:
     """Add what is not covered beside a map to `mistakes`."""
     model, reality = problem.plant, problem.symbolic_reality
-    if reality is not None and reality.plant.step is not None and model.step is None:
+    if reality is not None and reality.plant.step is not None and model.step is None and _has_differences(problem):
         mistakes.add(
             "reality: it is a map, and the model has differential equations, whose derivatives a map does not have; write the "
             "model as a map with the same step"
         )
     if model.step is None:
         return
-    if not problem.sensing.estimator.of_steps:
+    if not problem.sensing.estimator.of_steps and _has_differences(problem):
         mistakes.add(
             f"sensing: {type(problem.sensing.estimator).__name__} estimates derivatives with respect to time, which a map does not "
             "have; leave the estimator out, and differences of its steps are taken"
@@ -65,6 +65,12 @@ def check_map_task(problem: Problem, mistakes: Mistakes) -> None:
             f"reality: '{later[0]}' has the order {max(model.face.orders)} in the model's steps, and the reality has differential "
             "equations, in which every input shows within one cycle; write a model in which it does too"
         )
+
+
+def _has_differences(problem: Problem) -> bool:
+    """Whether a controlled response is a derivative or a difference; that of an output of order 0 is the output."""
+    plant = problem.plant
+    return any(name not in plant.instant_names for name in plant.controlled or plant.outputs or plant.coordinates)
 
 
 def _steps(what: str, integrator: Integrator, mistakes: Mistakes) -> Integrator:
