@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_review import about, answers, mass, torque
+from reviewed import about, answers, mass, torque
 
 import fpirhc
 import fpirhc as fp

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import casadi as ca
 import numpy as np
@@ -82,6 +82,9 @@ class Controller(Checked, ABC):
 
     Concrete controllers are frozen dataclasses. `fpirhc.conformance.check_controller` tests that a controller keeps this contract.
     """
+
+    LOADED: ClassVar[str] = "controllers[{}] of a loaded problem file"
+    """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
 
     if TYPE_CHECKING:
 
@@ -209,6 +212,14 @@ class Controller(Checked, ABC):
             return self.around(self.inner.with_deformation(deformation))
         raise NotSupported(f"{type(self).__name__} has no deformation that can be replaced")
 
+    def unadapted(self) -> Controller:
+        """Return the controller of the same settings that does not adapt, beside which a comparison judges this one.
+
+        Raises:
+            NotSupported: it has a deformation that cannot be left out.
+        """
+        return without_deformation(self)
+
     def stated(self, problem: Problem) -> Controller:
         """Return the controller with every number of its own stated that it would take from the problem; itself without any."""
         del problem
@@ -247,6 +258,11 @@ class Controller(Checked, ABC):
         if self.inner is not None:
             return self.inner.maps_unusable(self.inner_problem(problem))
         return "its law is written for derivatives with respect to time"
+
+    @property
+    def covers_order_zero(self) -> bool:
+        """Whether it controls outputs of order 0, which the command moves at once and no tracking law follows."""
+        return False if self.inner is None else self.inner.covers_order_zero
 
     def floquet(self, problem: Problem) -> Floquet | None:
         """Return the stability of one period of a controller that switches; None for a controller that does not switch."""

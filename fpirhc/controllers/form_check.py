@@ -22,6 +22,11 @@ class _Controller(Protocol):
     def outputs_unusable(self, problem: Problem) -> str: ...
 
     def maps_unusable(self, problem: Problem) -> str: ...
+    @property
+    def covers_order_zero(self) -> bool: ...
+
+    @property
+    def planner(self) -> object: ...
 
 
 def check_outputs(problem: Problem, controller: _Controller) -> None:
@@ -32,6 +37,7 @@ def check_outputs(problem: Problem, controller: _Controller) -> None:
     """
     if not problem.plant.outputs:
         return
+    _check_order_zero(problem, controller)
     name, mirror = type(controller).__name__, controller.deformation.mirror
     reason = controller.outputs_unusable(problem)
     estimated = not (problem.sensing.estimator.shows_response or problem.plant.step)
@@ -95,3 +101,24 @@ def check_form(problem: Problem, controller: _Controller) -> None:
     reason = controller.unusable(problem, mirror)
     if reason:
         raise NotSupported(f"{type(controller).__name__} cannot use a model-referenced deformation here: {reason}")
+
+
+def _check_order_zero(problem: Problem, controller: _Controller) -> None:
+    """Raise for outputs of order 0 that the controller does not cover."""
+    plant, name = problem.plant, type(controller).__name__
+    controlled = [n for n in plant.controlled_names if n in plant.instant_names]
+    if controlled and not controller.covers_order_zero:
+        raise NotSupported(
+            f"{name} does not cover outputs of order 0 ({', '.join(controlled)}): the command moves them at once, so there "
+            "is no derivative to prescribe; use FeedforwardOnly(), and Cascade(FeedforwardOnly(), map) to iterate on its target"
+        )
+    if plant.instant_names and controller.planner is not None:
+        raise NotSupported(
+            f"{name} plans with outputs that are functions of the state, and {', '.join(plant.instant_names)} depends on the "
+            "command too (order 0); leave it out of the outputs of the plant"
+        )
+    if controlled and not problem.sensing.estimator.measures_all:
+        raise NotSupported(
+            f"{type(problem.sensing.estimator).__name__} estimates derivatives, and outputs of order 0 ({', '.join(controlled)}) "
+            "need none; leave the estimator out: Sensing(sensors=...)"
+        )

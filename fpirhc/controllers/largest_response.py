@@ -8,6 +8,8 @@ remember with multiples of it, so that one absurd but finite sample does not sta
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from fpirhc.controllers.reference_states import reference_states
@@ -17,6 +19,7 @@ from fpirhc.task.problem import Problem
 _SAMPLES = 100  # instants at which the reference is looked at
 
 
+@lru_cache(maxsize=8)  # several blocks of one loop ask for it, and every controller of a comparison
 def largest_response(problem: Problem) -> tuple[float, ...]:
     """Return L of every controlled coordinate, by the limits of the build; infinite where an input has no finite limits.
 

@@ -23,6 +23,7 @@ from fpirhc.controllers.base import like
 from fpirhc.controllers.largest_response import largest_response
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.integrators import runge_kutta_4
+from fpirhc.plant.outputs import without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
@@ -69,7 +70,7 @@ class FromMeasurement(Replanning):
         """Return the blocks plan_state before the plan and nominal after it."""
         plant = problem.plant
         start = _choose("plan_state", plant, lambda s: {"_plan_state": s.state}, ["_plan_state"])
-        response = plant.controlled_response_function
+        response = without_disturbances(plant).controlled_response_function
         reads = Layout((plant.state, like(plant.input, "planned"), plant.parameter))
         writes = Layout((plant.response_signal("nominal"), plant.response_signal("desired")))
 

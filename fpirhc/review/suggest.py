@@ -21,6 +21,7 @@ from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import InvalidName, InvalidValue, NotContractive, NotSupported, nearest
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.review.grid import review_grid
 from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import loops_along
@@ -66,6 +67,7 @@ class Suggestion:
         return [*own, *steps, *((f"rms error of {c} from noise", number(v)) for c, v in self.floor.items())]
 
 
+@checked_call
 def suggest(
     problem: Problem,
     controller: Controller,

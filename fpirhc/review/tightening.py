@@ -31,6 +31,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.review.grid import each, review_grid
 from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import ideal_loops
@@ -45,6 +46,7 @@ _KEPT = 1e-8  # of the range: what a limit may be passed by
 Margins = Mapping[str, tuple[float, ...]]
 
 
+@checked_call
 def tightened(
     problem: Problem,
     controller: Controller,
@@ -77,6 +79,7 @@ def tightened(
     return planned
 
 
+@checked_call
 def state_margins(
     problem: Problem,
     controller: Controller,

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -15,12 +16,13 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Duration
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.horizon.regular_gain import singular_gain
+from fpirhc.horizon.regular_gain import Bounds, singular_gain
 from fpirhc.horizon.stage_check import check_stage
 from fpirhc.plant.algebraic import unsolved
 from fpirhc.plant.integrators import USUAL, Integrator
 from fpirhc.plant.map_steps import motion_of
 from fpirhc.plant.plant import Plant
+from fpirhc.plant.signals_in_outputs import differentiated_signals
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line
 from fpirhc.symbolic.live import nominal
@@ -29,6 +31,7 @@ from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.foreign import Foreign
 from fpirhc.task.limits import Limits
 from fpirhc.task.map_task import check_map_task, settle_maps
+from fpirhc.task.needed import needed_measurements, needed_names
 from fpirhc.task.outside import External, check_signals, real_values, rows_of, signals_of
 from fpirhc.task.problem_view import problem_facts, problem_table
 from fpirhc.task.reality import Reality
@@ -50,7 +53,8 @@ class Problem(Checked):
         period: control cycle, in the plant's unit of time, as are all times.
         duration: length of a run.
         limits: of inputs, states, rates and paths.
-        disturbances: by name of the input or coordinate to which they add.
+        disturbances: by name of the input, coordinate or output to which they add; a name of both a coordinate of the moving plant
+            and an output is the coordinate's, and adds to its response.
         dead_time: of inputs and measurement. A controller may assume another one.
         sensing: sensors and estimator between the plant and the controller; ideal by default.
         horizon: stages over which a receding-horizon controller plans.
@@ -69,6 +73,9 @@ class Problem(Checked):
     Raises:
         InvalidProblem: all mistakes together.
     """
+
+    LOADED: ClassVar[str] = "fp.load_problem({}).problem"
+    """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
 
     plant: Plant
     reference: Reference
@@ -100,19 +107,21 @@ class Problem(Checked):
         mistakes.unknown(
             "judged: output" if plant.outputs else "judged: coordinate", self.judged or (), plant.face.coordinates
         )
-        disturbed = [*plant.inputs, *(() if self.foreign else self.real_plant.coordinates)]
-        mistakes.unknown("disturbances: input or coordinate", self.disturbances, disturbed)
+        disturbed = [*plant.inputs, *(() if self.foreign else (*self.real_plant.coordinates, *plant.outputs))]
+        what = "input, coordinate or output" if plant.outputs else "input or coordinate"
+        mistakes.unknown(f"disturbances: {what}", self.disturbances, disturbed)
         instants, random = np.array([0.0, self.period]), np.random.default_rng(0)
         check_signals(self._plants, self.signals, np.linspace(0.0, self.duration, _INSTANTS), mistakes)
         checks = (
             *((lambda one=one: one.values(instants, random)) for one in self.disturbances.values()),
+            lambda: self._check_derivatives(instants),
             lambda: self.limits.check(plant),
             lambda: self.reference.function(plant),
             lambda: check_steps(plant.face, self.limits, self.reference.set_points),
             lambda: self.dead_time.check(plant, self.period),
-            lambda: self.sensing.check(plant.face),
-            lambda: self.symbolic_reality.check(plant) if self.symbolic_reality else None,
-            lambda: self.foreign.check(plant, self.sensing.measures(plant)) if self.foreign else None,
+            lambda: self.sensing.check(plant),
+            lambda: self.symbolic_reality.check(plant, self._needed) if self.symbolic_reality else None,
+            lambda: self.foreign.check(plant, needed_measurements(plant, self.sensing)) if self.foreign else None,
         )
         for check in checks:
             try:
@@ -186,7 +195,7 @@ class Problem(Checked):
         """The problem without its reality: the model's own plant moves, and disturbances of what it does not have are left out."""
         if self.reality is None:
             return self
-        known = {*self.plant.inputs, *self.plant.coordinates}
+        known = {*self.plant.inputs, *self.plant.coordinates, *self.plant.outputs}
         disturbances = {name: one for name, one in self.disturbances.items() if name in known}
         signals = signals_of(self.plant, self.signals)
         return replace(self, reality=None, disturbances=disturbances, signals=signals)
@@ -213,6 +222,17 @@ class Problem(Checked):
         """Parameters of the plant that a run moves in its first cycle: the exact ones, with the real values of signals."""
         plant = self.real_plant
         return rows_of(real_values(plant, self.signals), np.array([self.period / 2]), plant.exact)[0]
+
+    def _check_derivatives(self, instants: np.ndarray) -> None:
+        """Raise if the disturbance of an output has no derivatives, which its own derivatives need."""
+        for name in self.plant.outputs:
+            if name in self.disturbances:
+                self.disturbances[name].derivative(instants, 1)
+
+    @property
+    def _needed(self) -> frozenset[str]:
+        """Names of the model's coordinates and outputs that what moves must have."""
+        return needed_names(self.plant, self.sensing, self.judged)
 
     @property
     def _plants(self) -> tuple[Plant, ...]:
@@ -340,28 +360,23 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
     plant = problem.plant
     if not plant.outputs:
         return
-    if problem.foreign is not None:
+    late = differentiated_signals(plant)
+    if late:
         mistakes.add(
-            "reality: a foreign reality measures coordinates of the model, and a plant with outputs has more to measure; "
-            "write the outputs as coordinates"
+            f"signals: {', '.join(late)} from outside have derivatives of their own in those of outputs, which is not covered; "
+            "choose an output that depends on the state alone, or write it as a coordinate"
         )
-    if problem.signals:
-        mistakes.add(
-            f"signals: {', '.join(problem.signals)} from outside have derivatives of their own in those of outputs, which is not "
-            "covered; leave them out, or write the outputs as coordinates"
-        )
-    if problem.sensing.measured is not None or problem.sensing.belief is not None:
-        mistakes.add("sensing: believed states are not covered for outputs; leave measured and belief out")
     if len(plant.inputs) == len(plant.controlled or plant.outputs):
-        bounds = nominal(problem.limits).input_bounds(plant)
-        start, ends = (
-            tuple(map(float, problem.start_state)),
-            (tuple(map(float, bounds[0])), tuple(map(float, bounds[1]))),
-        )
-        times = problem.period, problem.cycles
-        singular = singular_gain(plant, problem.reference, problem.integrator, start, ends, times)
+        singular = singular_gain(plant, problem.reference, *nominal_start(problem))
         if singular:
             mistakes.add(f"outputs: {singular}")
+
+
+def nominal_start(problem: Problem) -> tuple[Integrator, tuple[float, ...], Bounds, tuple[float, int]]:
+    """Return integrator, start, bounds of the inputs, and times of the model's nominal run, as `nominal_run` takes them."""
+    lower, upper = nominal(problem.limits).input_bounds(problem.plant)
+    bounds = tuple(map(float, lower)), tuple(map(float, upper))
+    return problem.integrator, tuple(map(float, problem.start_state)), bounds, (problem.period, problem.cycles)
 
 
 def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:

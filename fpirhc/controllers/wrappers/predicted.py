@@ -28,7 +28,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, embedded, like
-from fpirhc.controllers.mirror import MEASURED
+from fpirhc.controllers.mirror import MEASURED, MEASURED_TIME
 from fpirhc.controllers.own_reference import own_signals
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
@@ -238,7 +238,7 @@ class Predicted(Controller):
             return self.controller.blocks(problem)
         inner = compose_controller(problem, self.controller, ahead=True)
         ahead = {"time": like(plant.time, "time_ahead"), "state": like(plant.state, "state_ahead")}
-        feeds = {**ahead, MEASURED: plant.state}
+        feeds = {**ahead, MEASURED: plant.state, MEASURED_TIME: plant.time}
         sent = self.by.sent(plant)
         before = Signal("_sent_before", sent.elements, sent.units, self.by.sent_at_start(problem))
         ahead_by = _Lead(self._cycles(problem), self._length(problem), self.inputs)

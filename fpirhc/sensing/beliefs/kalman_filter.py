@@ -25,7 +25,7 @@ import numpy as np
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.kinds import Positive
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import response_names
+from fpirhc.sensing.base import quantities, values_of
 from fpirhc.sensing.belief import Belief, Correct, Evidence, Model, Predict, Remembered
 from fpirhc.sensing.observability import unobservable
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -64,7 +64,7 @@ class KalmanFilter(Belief):
             InvalidProblem: all mistakes together.
         """
         mistakes = Mistakes("KalmanFilter")
-        every = plant.state.elements + response_names(plant)
+        every = quantities(plant)
         mistakes.unknown("measured: quantity", self.measured, every)
         for name in self.measured:
             if name in every and name not in measured:
@@ -102,9 +102,7 @@ class KalmanFilter(Belief):
         calm = np.zeros(len(model.plant.names))
 
         def predicted(evidence: Evidence, memory: Remembered) -> Expression:
-            before = memory[_STATE]
-            after = model.advance(before, evidence.command, evidence.parameters, calm)
-            return ca.if_else(evidence.moves, after, before)
+            return model.move(memory[_STATE], evidence.command, evidence.parameters, calm, evidence.moves)
 
         return predicted
 
@@ -116,7 +114,7 @@ class KalmanFilter(Belief):
             evidence: Evidence, memory: Remembered, predicted: Expression
         ) -> tuple[Expression, dict[str, Expression]]:
             u, p, before = evidence.command, evidence.parameters, memory[_COVARIANCE]
-            moved = ca.if_else(evidence.moves, spread(memory[_STATE], before, u, p), before)
+            moved = spread(memory[_STATE], before, u, p, evidence.moves)
             shown = ca.vertcat(*(evidence.measured[n] for n in self.measured))
             state, covariance = gain(predicted, moved, u, p, shown)
             state = ca.if_else(evidence.counts, state, predicted)
@@ -135,16 +133,17 @@ class KalmanFilter(Belief):
         return True
 
     def _spread_function(self, model: Model) -> ca.Function:
-        """Function (state, covariance, input, parameters) -> covariance of the prediction one cycle later."""
+        """Function (state, covariance, input, parameters, share) -> covariance of the prediction after that share of a cycle."""
         plant, size = model.plant, model.plant.state.size
         x, u, p = plant.symbols()
         w, before = ca.SX.sym("w", len(plant.names)), ca.SX.sym("P", size * size)
-        after = model.advance(x, u, p, w)
-        jacobians = ca.Function("fpirhc_slopes", [x, u, p, w], [ca.jacobian(after, x), ca.jacobian(after, w)])
-        slope, effect = (ca.densify(m) for m in jacobians(x, u, p, ca.SX.zeros(w.numel())))
+        share = ca.SX.sym("share")
+        after, at = model.move(x, u, p, w, share), [x, u, p, w, share]
+        jacobians = ca.Function("fpirhc_slopes", at, [ca.jacobian(after, x), ca.jacobian(after, w)])
+        slope, effect = (ca.densify(m) for m in jacobians(x, u, p, ca.SX.zeros(w.numel()), share))
         white = ca.diag(ca.DM([self.noise.get(n, 0.0) ** 2 for n in plant.names]))
         spread = slope @ ca.reshape(before, size, size) @ slope.T + effect @ white @ effect.T
-        return ca.Function("fpirhc_spread", [x, before, u, p], [ca.densify(ca.vec(spread))])
+        return ca.Function("fpirhc_spread", [x, before, u, p, share], [ca.densify(ca.vec(spread))])
 
     def _gain_function(self, model: Model) -> ca.Function:
         """Function (prediction, its covariance, input, parameters, measured) -> (state, covariance)."""
@@ -152,7 +151,8 @@ class KalmanFilter(Belief):
         x, u, p = plant.symbols()
         y, column = ca.SX.sym("y", len(self.measured)), ca.SX.sym("P", size * size)
         covariance = ca.reshape(column, size, size)
-        expected = ca.vertcat(*shown_by(plant, tuple(self.measured), x, u, p))
+        values = values_of(plant, x, u, p)
+        expected = ca.vertcat(*(values[n] for n in self.measured))
         slope = ca.densify(ca.jacobian(expected, x))
         noise = ca.diag(ca.DM([d**2 for d in self.measured.values()]))
         innovation = slope @ covariance @ slope.T + noise
@@ -161,13 +161,6 @@ class KalmanFilter(Belief):
         joseph = rest @ covariance @ rest.T + gain @ noise @ gain.T
         results = [x + gain @ (y - expected), ca.vec(joseph)]
         return ca.Function("fpirhc_kalman", [x, column, u, p, y], [ca.densify(r) for r in results])
-
-
-def shown_by(plant: Plant, names: tuple[str, ...], x: ca.SX, u: ca.SX, p: ca.SX) -> list[ca.SX]:
-    """Return measured quantities as expressions of the state and the input that acted."""
-    responses = dict(zip(response_names(plant), ca.vertsplit(plant.controlled_response_function(x, u, p)), strict=True))
-    states = dict(zip(plant.state.elements, ca.vertsplit(x), strict=True))
-    return [{**states, **responses}[name] for name in names]
 
 
 EXAMPLES = (KalmanFilter(measured={"a": 1e-3, "b": 1e-3}, noise={"a": 1.0, "b": 1.0}),)
