@@ -80,14 +80,14 @@ def compose_informed(
         delays: what the step remembers of its signals.
         ahead: whether the time is the one at which the command will act.
     """
-    told = Told(ready.model_plant(problem), ready.told(problem), problem.period)
+    known = Told(ready.model_plant(problem), ready.told(problem), problem.period)
     compares = any(ACTED in block.reads for block in blocks)
-    first = told.block(remembers=compares and not ahead)
+    first = known.block(remembers=compares and not ahead)
     if first is None:
         return compose("controller", reads, blocks, delays, outputs=("command",))
-    needed = reads + Layout(told.reads if compares else ())
+    needed = reads + Layout(known.reads if compares else ())
     inner = compose("informed", needed, blocks, delays, outputs=("command",))
-    block = embedded("informed", inner, {"parameters": like(told.plant.parameter, NOW)})
+    block = embedded("informed", inner, {"parameters": like(known.plant.parameter, NOW)})
     return compose("controller", needed if ahead else reads, [first, block], outputs=("command",))
 
 

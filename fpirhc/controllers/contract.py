@@ -250,6 +250,11 @@ class Controller(Checked, ABC):
         """
         return "it takes the plant's state for what follows the reference"
 
+    @property
+    def covers_order_zero(self) -> bool:
+        """Whether it controls outputs of order 0, which the command moves at once and no tracking law follows."""
+        return False if self.inner is None else self.inner.covers_order_zero
+
     def maps_unusable(self, problem: Problem) -> str:
         """Return why the controller cannot control a map, x+ = f(x, u); empty where it can.
 
@@ -258,11 +263,6 @@ class Controller(Checked, ABC):
         if self.inner is not None:
             return self.inner.maps_unusable(self.inner_problem(problem))
         return "its law is written for derivatives with respect to time"
-
-    @property
-    def covers_order_zero(self) -> bool:
-        """Whether it controls outputs of order 0, which the command moves at once and no tracking law follows."""
-        return False if self.inner is None else self.inner.covers_order_zero
 
     def floquet(self, problem: Problem) -> Floquet | None:
         """Return the stability of one period of a controller that switches; None for a controller that does not switch."""

@@ -36,11 +36,6 @@ class FeedforwardOnly(Controller):
         """Identity(): no request is iterated."""
         return Identity()
 
-    def maps_unusable(self, problem: Problem) -> str:
-        """Return nothing: it has no law."""
-        del problem
-        return ""
-
     def outputs_unusable(self, problem: Problem) -> str:
         """Return why not: a derivative of an output without feedback would drift where states have no reference."""
         plant = problem.plant
@@ -54,6 +49,11 @@ class FeedforwardOnly(Controller):
     def covers_order_zero(self) -> bool:
         """Yes."""
         return True
+
+    def maps_unusable(self, problem: Problem) -> str:
+        """Return nothing: it has no law."""
+        del problem
+        return ""
 
     def check(self, problem: Problem) -> None:
         """Raise if the model has no inverse.

@@ -56,8 +56,8 @@ def stage_data(
     """
     looked_up = signals is not None and not signals.is_a("SXFunction")
     matrix = kind(reference.opaque or plant.inverse_opaque or looked_up)
-    t, given = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
-    p = given if signals is None else signals(t + horizon.step / 2, given)
+    t, of_cycle = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
+    p = of_cycle if signals is None else signals(t + horizon.step / 2, of_cycle)
     motion = [matrix.sym("x", plant.output.size), matrix.sym("r", len(plant.face.names))] if previewed else []
     state, response = motion or reference.function(plant)(t)
     zero = matrix.zeros(plant.input.size)
@@ -66,7 +66,7 @@ def stage_data(
     joined = bool(live) and not (horizon.blocks or horizon.terminal or horizon.margins)
     rows = [matrix.sym("live", live)] if joined else []
     stage = ca.densify(ca.vertcat(t, state, needed, p, *rows))
-    one = ca.Function("fpirhc_stage_data", [t, *motion, given, *rows], [stage])
+    one = ca.Function("fpirhc_stage_data", [t, *motion, of_cycle, *rows], [stage])
     start, parameters = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
     columns = dict(zip(("states", "responses"), motion, strict=False))
     tables = [ca.MX.sym(name, m.numel(), horizon.stages + 1) for name, m in columns.items()]

@@ -80,14 +80,6 @@ def lie_derivatives(plant: Plant, value: Expression, count: int, symbols: Symbol
     return chain
 
 
-def _along(plant: Plant, value: Expression, symbols: Symbols) -> Expression:
-    """The derivative of an expression along the motion, or of a map its divided difference, with the input held."""
-    if plant.step is not None:
-        return shifted(plant, value, symbols)
-    x, u, p, w = symbols
-    return ca.jtimes(value, x, plant.forced_derivative_function(x, u, p, w))
-
-
 def believed_disturbance(plant: Plant, name: str, p: Expression) -> Expression:
     """Return what a model believes to add to the response of an output: zero, or a parameter of an estimator."""
     parameter = plant.outputs[name].response_disturbance
@@ -99,6 +91,14 @@ def without_disturbances(plant: Plant) -> Plant:
     if not any(one.response_disturbance for one in plant.outputs.values()):
         return plant
     return replace(plant, outputs={n: replace(one, response_disturbance="") for n, one in plant.outputs.items()})
+
+
+def _along(plant: Plant, value: Expression, symbols: Symbols) -> Expression:
+    """The derivative of an expression along the motion, or of a map its divided difference, with the input held."""
+    if plant.step is not None:
+        return shifted(plant, value, symbols)
+    x, u, p, w = symbols
+    return ca.jtimes(value, x, plant.forced_derivative_function(x, u, p, w))
 
 
 def output_order(plant: Plant, name: str) -> int | None:

@@ -26,7 +26,7 @@ import numpy as np
 from fpirhc.errors import Mistakes, NotInvertible, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Few
-from fpirhc.plant import by_map, by_states, output_functions, plant_functions
+from fpirhc.plant import by_states, by_steps, output_functions, plant_functions
 from fpirhc.plant.algebraic import Algebraic
 from fpirhc.plant.instant import instant_outputs, response_orders
 from fpirhc.plant.inverse import inverse_function
@@ -105,7 +105,7 @@ class Plant(Checked):
         mistakes.raise_if_any()
 
     of_states = classmethod(by_states.of_states)
-    of_map = classmethod(by_map.of_map)
+    of_map = classmethod(by_steps.of_map)
 
     def __repr__(self) -> str:
         return line(self, *plant_facts(self))

@@ -4,7 +4,7 @@ With the state x = (q, q', ...), derivative-major, and a forcing w that adds to 
 
     response    r = f(x, u, p),        algebraic states    z(x, u, p),        x' = (q', q'', ..., f(x, u, p) + w).
 
-Of a map x' is the divided difference over a control cycle (`fpirhc.plant.maps`).
+Those of a map are its divided differences over one control cycle; see `fpirhc.plant.maps`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def response_function(plant: Plant) -> ca.Function:
     """Return the Function (state, input, parameters) -> highest derivative of every coordinate (n)."""
     x, u, p = plant.symbols()
     if plant.next is not None:
-        differences = plant.forced_derivative_function(x, u, p, ca.SX.zeros(len(plant.names)))
+        differences = (plant.next_function(x, u, p, ca.SX.zeros(len(plant.names))) - x) / plant.sampling
         return ca.Function("fpirhc_response", [x, u, p], [differences], ["x", "u", "p"], ["r"])
     views = plant.views(x, u, p)
     if plant.algebraic is not None:

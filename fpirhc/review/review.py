@@ -112,8 +112,8 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: N
 
 def _more(case: Case) -> list[Answer]:
     """Answers to the questions that are found by discovery."""
-    asked = (q for q in known_questions(ControllerQuestion) if _concerns(q, case.controller))
-    answers = (question.ask(case) for question in asked if not question.doubts)
+    questions = (q for q in known_questions(ControllerQuestion) if _concerns(q, case.controller))
+    answers = (question.ask(case) for question in questions if not question.doubts)
     return [answer for answer in answers if answer is not None]
 
 

@@ -90,11 +90,11 @@ def suggest(
         or coordinate. NotSupported: a controller without adaptation; a response that is estimated, whose noise must
         be given. NotInvertible: see `review`. NotContractive: eigenvalues that no gain suits.
     """
-    chosen = resolved(problem, controller)
-    _check(chosen, ringing)
+    ready = resolved(problem, controller)
+    _check(ready, ringing)
     budget = _budget(problem, chatter)
     grid = review_grid(problem, 0.0, 0)
-    noisy = noisy_points(grid, chosen, noise)
+    noisy = noisy_points(grid, ready, noise)
     sign, largest = _largest_eigenvalue(noisy.jacobians)
 
     def fits(size: float) -> bool:
@@ -102,11 +102,11 @@ def suggest(
 
     size = _largest_within(fits, 1 / largest)
     pole = filter_pole(size * largest, ringing)
-    deformation = _with(chosen.deformation, sign * size, pole)
+    deformation = _with(ready.deformation, sign * size, pole)
     own = getattr(deformation, deformation.gain_name, None)
     name, value = ("effective gain", sign * size) if own is None else (deformation.gain_name, float(own))
     predicted = dict(zip(problem.plant.inputs, map(float, noisy.steps(sign * size, pole)), strict=True))
-    floor = _floor(loops_along(grid, chosen).ideal, noisy, problem)
+    floor = _floor(loops_along(grid, ready).ideal, noisy, problem)
     return Suggestion(deformation, sign * size, pole, name, value, predicted, floor)
 
 

@@ -158,8 +158,8 @@ def _deviations(nominal: NominalRun, exact: np.ndarray) -> np.ndarray:
     believed, rows = (np.tile(p, (nominal.cycles, 1)) for p in (nominal.believed, exact))
     still = np.zeros((nominal.cycles, len(plant.names)))
     own = each(plant.inverse_function, nominal.states[:-1], nominal.desired, believed)
-    moved = each(advance, nominal.states[:-1], errors.command, rows, still)
-    deviations = moved - each(advance, nominal.states[:-1], own, believed, still)
+    states_next = each(advance, nominal.states[:-1], errors.command, rows, still)
+    deviations = states_next - each(advance, nominal.states[:-1], own, believed, still)
     if not np.isfinite(deviations).all():
         raise NotSupported("no margins: the predicted deviations do not stay finite")
     return np.asarray(deviations[min(round(problem.measure_from / problem.period), nominal.cycles - 1) :])

@@ -71,14 +71,14 @@ def _contraction_outside(problem: Problem, controller: Controller, layout: Layou
     plant, own = problem.real_plant, controller.model_plant(problem)
     times = log[:, layout.slice("time")].ravel() + problem.period / 2
     real = rows_of(real_values(plant, problem.signals), times, plant.exact)
-    told = rows_of(model_values(own, controller.told(problem)), times, controller.parameters(own))
+    believed = rows_of(model_values(own, controller.told(problem)), times, controller.parameters(own))
     modelled = problem if own is problem.plant else replace(problem, plant=own)
 
     def jacobians(rows: np.ndarray) -> np.ndarray:
         if problem.symbolic_reality is None:
-            return response_jacobians(own, states[rows], deformed[rows], real[rows], told[rows])
-        moved = log[rows][:, layout.slice(REALITY_STATE)]
-        return sampled_jacobians(modelled, moved, states[rows], deformed[rows], told[rows], real[rows])
+            return response_jacobians(own, states[rows], deformed[rows], real[rows], believed[rows])
+        real_states = log[rows][:, layout.slice(REALITY_STATE)]
+        return sampled_jacobians(modelled, real_states, states[rows], deformed[rows], believed[rows], real[rows])
 
     return factors_along(len(log), jacobians, controller.deformation.effective_gain())
 

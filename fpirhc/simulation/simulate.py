@@ -99,8 +99,8 @@ class Simulator:
         problem, controller = force.problem, force.controller
         start = start_memory(self.loop, problem, controller, force.numbers)
         common = (problem, start, self.loop.trace, self.evaluator, seed, disturbed, progress)
-        chosen = _run_chunks if problem.foreign is None else _run_foreign
-        logged, stop = chosen(*common, force.patches, setpoints)
+        run_cycles = _run_chunks if problem.foreign is None else _run_foreign
+        logged, stop = run_cycles(*common, force.patches, setpoints)
         layout, log = with_common_columns(self.loop.trace, logged)
         log.setflags(write=False)
         step_limit = controller.deformation.largest_step()

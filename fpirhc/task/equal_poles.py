@@ -38,7 +38,7 @@ def transition(rate: Entry, time: Entry, order: int) -> list[list[Entry]]:
     return [[decay * entry for entry in row] for row in terms]
 
 
-def moved(phi: Sequence[Sequence[Entry]], z: Expression, held: Expression) -> Expression:
+def after_motion(phi: Sequence[Sequence[Entry]], z: Expression, held: Expression) -> Expression:
     """Return z after the motion with the transition Phi while w = `held`."""
     apart = [z[0] - held, *(z[k] for k in range(1, len(phi)))]
     # At rest every difference is exactly zero, and so z stays exactly where it is.

@@ -154,8 +154,8 @@ class Cascade(Controller):
             wanted, output, before = s.reference[places], getattr(s, seen.name)[places], s.shift_last
             in_force = pairing.in_force(problem, s, wanted) if pairing else s.target_last
             undeformed = in_force - before if pairing else wanted
-            kept = {m: getattr(s, m) for m in own.names}
-            request, after = self.deformation.step(in_force, output, undeformed, kept)
+            remembered = {m: getattr(s, m) for m in own.names}
+            request, after = self.deformation.step(in_force, output, undeformed, remembered)
             change = request - undeformed
             running = ca.logic_and(s.shift_cycles > problem.warm_up_cycles - 0.5, is_finite(change))
             beyond, sent = (response(s.state, getattr(s, u), s.parameters) for u in _COMMANDS)
@@ -165,7 +165,7 @@ class Cascade(Controller):
             target = wanted + shift
             paired = pairing.remembered(problem, s, wanted, shift) if pairing else {}
             counted = {"shift_cycles_next": ca.fmin(s.shift_cycles + 1, problem.warm_up_cycles)}
-            own_next = {f"{m}_next": ca.if_else(running, after[m], kept[m]) for m in own.names}
+            own_next = {f"{m}_next": ca.if_else(running, after[m], remembered[m]) for m in own.names}
             held = {"shift_last_next": shift, "target_last_next": target, **counted}
             return {SHIFT: shift, "shift": shift, **held, **paired, **own_next}
 

@@ -31,7 +31,7 @@ def of_map(
 ) -> Plant:
     """Return the map x+ = f(x, u, p), y = h(x, p), which steps and has no differential equation.
 
-        plant = Plant.of_map(states={"stock": "t"}, inputs={"catch": "t/year"}, parameters={...}, next=grown, step=1.0)
+        plant = Plant.of_map(states={"stock": "t"}, inputs={"catch": "t/year"}, parameters={...}, next=grown, step=1.0, ...)
 
     A response is a divided difference, (y_{k+1} - y_k) / T for an output that an input reaches in one control cycle of T; see
     `fpirhc.plant.maps`. `Problem` takes no integrator for a map, and its period is a whole number of steps.
