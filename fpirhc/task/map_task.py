@@ -2,7 +2,7 @@
 
 A map has its own steps in place of an integrator, in the run and along a horizon. The plant of the problem is the map over one
 control cycle (`fpirhc.plant.maps`). A response of a map is a difference of outputs, which no sensor shows, so it is taken from the
-outputs of the last cycles (`StepDifference`).
+outputs of the last cycles (`StepDifference`); that of an output of order 0 is the output itself, and measured.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.plant.integrators import USUAL, Integrator
 from fpirhc.plant.map_steps import MapSteps
+from fpirhc.plant.plant import Plant
 from fpirhc.sensing.positions import StepDifference
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def settle_maps(problem: Problem, mistakes: Mistakes) -> None:
         if problem.horizon is not None:
             discretisation = _steps("horizon: discretisation", problem.horizon.discretisation, mistakes)
             settled["horizon"] = replace(problem.horizon, discretisation=discretisation)
-        if problem.sensing.estimator.measures_all:
+        if problem.sensing.estimator.measures_all and not _instant(problem.plant):
             settled["sensing"] = replace(problem.sensing, estimator=StepDifference())
     elif problem.integrator.steps_maps:
         settled["integrator"] = USUAL
@@ -54,10 +55,21 @@ def check_map_task(problem: Problem, mistakes: Mistakes) -> None:
         )
     if model.step is None:
         return
-    if not problem.sensing.estimator.of_steps:
+    instant = _instant(model)
+    if instant and set(instant) < set(model.controlled or model.outputs):
+        mistakes.add(
+            f"outputs: {', '.join(instant)} of order 0 beside outputs that steps move: their responses belong to other "
+            "cycles, which is not covered; control them by two problems"
+        )
+    if not instant and not problem.sensing.estimator.of_steps:
         mistakes.add(
             f"sensing: {type(problem.sensing.estimator).__name__} estimates derivatives with respect to time, which a map does not "
             "have; leave the estimator out, and differences of its steps are taken"
+        )
+    if max(model.face.orders) > 1 and (problem.sensing.belief is not None or problem.sensing.measured is not None):
+        mistakes.add(
+            "sensing: believed states are not covered where an output of a map has an order above 1, because its next values are "
+            "predicted from measured states; leave measured and belief out"
         )
     later = [name for name, order in zip(model.face.names, model.face.orders, strict=True) if order > 1]
     if later and reality is not None and reality.plant.step is None:
@@ -65,6 +77,11 @@ def check_map_task(problem: Problem, mistakes: Mistakes) -> None:
             f"reality: '{later[0]}' has the order {max(model.face.orders)} in the model's steps, and the reality has differential "
             "equations, in which every input shows within one cycle; write a model in which it does too"
         )
+
+
+def _instant(plant: Plant) -> tuple[str, ...]:
+    """Controlled outputs that the command moves at once; their response is the output itself."""
+    return tuple(name for name in plant.controlled or plant.outputs if name in plant.instant_names)
 
 
 def _steps(what: str, integrator: Integrator, mistakes: Mistakes) -> Integrator:
