@@ -88,6 +88,7 @@ from .sensing import (
     Sensing,
     Sensor,
     StateVariableFilter,
+    StepDifference,
     VelocityDifference,
 )
 from .sensing.beliefs.kalman_filter import KalmanFilter
@@ -121,6 +122,7 @@ from .task.samples import Samples
 from .task.set_point import Setpoint
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
+from .tracking.shift_polynomial import ShiftPolynomial
 
 __all__ = [
     "PID",
@@ -240,6 +242,7 @@ __all__ = [
     "Sensor",
     "SequentialQuadratic",
     "Setpoint",
+    "ShiftPolynomial",
     "Sigmoid",
     "Sine",
     "SlidingMode",
@@ -251,6 +254,7 @@ __all__ = [
     "StateVariableFilter",
     "Status",
     "Step",
+    "StepDifference",
     "Stepper",
     "StopRun",
     "Suggestion",

@@ -17,6 +17,7 @@ from fpirhc.symbolic.layout import Expression, Signal, scalar
 from fpirhc.task.problem import Problem
 
 MEASURED = "_measured_state"  # the state that the response belongs to, where a controller may act on a predicted one
+MEASURED_TIME = "_measured_time"  # the time at which it is given, where a controller may act on a predicted one
 NONE = 1e-9  # a fraction of a cycle below this counts as zero
 
 

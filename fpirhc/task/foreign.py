@@ -53,7 +53,7 @@ class Foreign(Checked):
     Args:
         body: object with `reset(seed)` and `step(time, command)`, see `Body`.
         measures: name -> unit of every measured quantity, in the order of its answers: elements of the model's state ("q1", "q1'"),
-            and, where the response is measured, highest derivatives of controlled coordinates ("q1''").
+            outputs and their derivatives, and, where the response is measured, highest derivatives of what is controlled ("q1''").
         holds: consecutive bad answers that are bridged with the last good one; the next one ends the run. 0: the first ends it.
         deadline: longest wall time of an answer, s; a later one is bad. None: the body may take its time, as a simulator does.
         clock: function that returns the wall time, s.
@@ -142,7 +142,8 @@ class Foreign(Checked):
 
 
 def quantities(model: Plant) -> dict[str, str]:
-    """Return the unit of every quantity of a model that can be measured: state elements and controlled responses."""
-    states = dict(zip(model.state.elements, model.state.entry_units, strict=True))
-    responses = {model.names[k] + "'" * model.orders[k]: model.response_units[k] for k in model.controlled_indices}
-    return {**states, **responses}
+    """Return the unit of every quantity of a model that can be measured: state elements, outputs, and controlled responses."""
+    face, signals = model.face, (model.state, model.output)
+    shown = {name: unit for s in signals for name, unit in zip(s.elements, s.entry_units, strict=True)}
+    responses = {face.names[k] + "'" * face.orders[k]: face.response_units[k] for k in face.controlled_indices}
+    return {**shown, **responses}

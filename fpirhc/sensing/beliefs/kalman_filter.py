@@ -100,11 +100,11 @@ class KalmanFilter(Belief):
             evidence: Evidence, memory: Remembered, predicted: Expression
         ) -> tuple[Expression, dict[str, Expression]]:
             u, p, before = evidence.command, evidence.parameters, memory[_COVARIANCE]
-            moved = spread(memory[_STATE], before, u, p, evidence.moves)
+            covariance_predicted = spread(memory[_STATE], before, u, p, evidence.moves)
             shown = ca.vertcat(*(evidence.measured[n] for n in self.measured))
-            state, covariance = gain(predicted, moved, u, p, shown)
+            state, covariance = gain(predicted, covariance_predicted, u, p, shown)
             state = ca.if_else(evidence.counts, state, predicted)
-            return state, {_STATE: state, _COVARIANCE: ca.if_else(evidence.counts, covariance, moved)}
+            return state, {_STATE: state, _COVARIANCE: ca.if_else(evidence.counts, covariance, covariance_predicted)}
 
         return corrected
 
