@@ -357,7 +357,7 @@ def test_a_stepper_believes_as_the_loop_does(name):
         assert np.array_equal(command, result["command"][k])
 
 
-@pytest.mark.skipif(find_compiler() is None, reason="no compiler")
+@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
 @pytest.mark.parametrize("name", ["Kalman", "late servo"])
 def test_compiled_loops_believe_alike(name):
     """C and the virtual machine agree to 1e-9 of the states' size."""

@@ -93,8 +93,8 @@ class Believing:
         state, next_memory = correct(replace(evidence, known=known), memory, predicted)
         names = sensing.believed(plant)
         believed = dict(zip(elements, ca.vertsplit(state), strict=True))
-        chosen = [believed[e] if e in names or e not in shown else shown[e] for e in elements]
-        results |= {plant.output.name: motion, "state": ca.vertcat(*chosen), "realised": realised}
+        states = [believed[e] if e in names or e not in shown else shown[e] for e in elements]
+        results |= {plant.output.name: motion, "state": ca.vertcat(*states), "realised": realised}
         results |= {f"{m}_next": v for m, v in next_memory.items()}
         return results | {f"{m.name}_next": v for m, v in zip(self._estimator.memory.signals, remembered, strict=True)}
 
@@ -131,8 +131,8 @@ def moving(plant: Plant, integrator: Integrator, period: float, *, fraction: boo
     """
     (x, u, p), w, share = plant.symbols(), ca.SX.sym("w", len(plant.names)), ca.SX.sym("share")
     after = integrator.step(plant, period)(x, u, p, w)
-    moved = x + share * (after - x) if fraction else after
-    return ca.Function("fpirhc_move", [x, u, p, w, share], [ca.if_else(share, moved, x)])
+    state_next = x + share * (after - x) if fraction else after
+    return ca.Function("fpirhc_move", [x, u, p, w, share], [ca.if_else(share, state_next, x)])
 
 
 def believed_integrator(problem: Problem) -> Integrator:

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import casadi as ca
 
+from fpirhc.controllers.map_mirror import map_mirror
 from fpirhc.controllers.mirror_path import MEASURED, MEASURED_TIME, NONE, Path, measured_state
 from fpirhc.controllers.twin import BEFORE, twin_block
 from fpirhc.deformation.base import Deformation
@@ -38,6 +39,8 @@ def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Bloc
         return [], []
     estimated = not problem.sensing.estimator.shows_response or mirror.measurement % 1 > NONE
     path = Path(problem, mirror, estimated or max(every(mirror.cycles)) + mirror.measurement > 0)
+    if problem.plant.step is not None:
+        return [map_mirror(path)], []
     if not estimated:
         return [_instant_block(path)], []
     return [twin_block(path)], [Delay(problem.plant.response_signal(BEFORE), "_deformation")]

@@ -17,6 +17,7 @@ from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.sample_time import SampleTime
 from fpirhc.errors import NotSupported
 from fpirhc.horizon.regular_gain import nominal_run
+from fpirhc.plant.maps import growth_of
 from fpirhc.sensing.base import values_of
 from fpirhc.sensing.observability import members, slowest
 from fpirhc.task.outside import told_places
@@ -54,7 +55,7 @@ def free_errors(problem: Problem) -> FreeErrors:
     known = [plant.state.elements.index(e) for e in problem.sensing.known(plant)]
     scaled = [a * size / size[:, None] for a in slopes]
     basis = belief.free(scaled, [c * size for c in shown], known)
-    pole = slowest(scaled, basis)
+    pole = slowest(scaled, basis, growth_of(plant))
     fastest = max(float(np.abs(np.linalg.eigvals(a)).max()) for a in slopes)
     return FreeErrors(tuple(plant.state.elements[k] for k in members(basis)), pole, decays=pole < -_STAYS * fastest)
 

@@ -14,8 +14,8 @@ def reference_states(problem: Problem, count: int) -> np.ndarray:
     """Return states at evenly spaced instants of a run, shape (nx, count); NaN after a nominal run that does not stay finite."""
     plant, times = problem.plant, np.linspace(0.0, problem.duration, count)
     if known_on_reference(plant):
-        given = np.asarray(problem.reference.function(plant).map(count)(times[None, :])[0].full())
-        return given[list(plant.known_by_outputs)]
+        referenced = np.asarray(problem.reference.function(plant).map(count)(times[None, :])[0].full())
+        return referenced[list(plant.known_by_outputs)]
     lower, upper = nominal(problem.limits).input_bounds(plant)
     bounds = tuple(map(float, lower)), tuple(map(float, upper))
     start = tuple(map(float, problem.start_state))

@@ -23,6 +23,7 @@ from fpirhc.controllers.base import like
 from fpirhc.controllers.largest_response import largest_response
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.integrators import runge_kutta_4
+from fpirhc.plant.outputs import without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
@@ -69,7 +70,7 @@ class FromMeasurement(Replanning):
         """Return the blocks plan_state before the plan and nominal after it."""
         plant = problem.plant
         start = _choose("plan_state", plant, lambda s: {"_plan_state": s.state}, ["_plan_state"])
-        response = plant.controlled_response_function
+        response = without_disturbances(plant).controlled_response_function
         reads = Layout((plant.state, like(plant.input, "planned"), plant.parameter))
         writes = Layout((plant.response_signal("nominal"), plant.response_signal("desired")))
 
@@ -161,9 +162,13 @@ def _propagate(plant: Plant, period: float) -> Block:
     reads = Layout((like(plant.state, "_target"), like(plant.input, "planned"), plant.parameter))
     writes = Layout((plant.response_signal("nominal"), like(plant.state, "target")))
     response, rate = plant.controlled_response_function, plant.derivative_function
+    calm = ca.DM.zeros(len(plant.names))
 
     def step(s: Signals) -> dict[str, Expression]:
-        target_next = runge_kutta_4(lambda x: rate(x, s.planned, s.parameters), s._target, period)
+        if plant.step is not None:
+            target_next = plant.next_function(s._target, s.planned, s.parameters, calm)
+        else:
+            target_next = runge_kutta_4(lambda x: rate(x, s.planned, s.parameters), s._target, period)
         return {"nominal": response(s._target, s.planned, s.parameters), "target": target_next}
 
     return Block("propagate", reads, writes, step)

@@ -22,7 +22,7 @@ from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.problem import Problem
 
-_STATES, _COMMANDS = "pair_states", "pair_commands"
+_STATES, _COMMANDS, _OUTPUTS = "pair_states", "pair_commands", "pair_outputs"
 _NONE = 1e-9  # a fraction of a cycle below this counts as zero
 
 
@@ -33,10 +33,12 @@ class ResponsePairs:
     Args:
         problem: with the plant that is measured.
         dead_time: that is believed.
+        outputs: whether the measured outputs of that instant belong to a pair.
     """
 
     problem: Problem
     dead_time: DeadTime
+    outputs: bool = False
 
     @property
     def waiting(self) -> bool:
@@ -52,7 +54,7 @@ class ResponsePairs:
     def cycles(self) -> int:
         """Number of the first cycle whose pair belongs to this run: before it, samples show the start."""
         late = self.dead_time.measurement / self.problem.period
-        first = self.problem.sensing.warm_up_cycles(self.problem.plant, late)
+        first = self.problem.sensing.warm_up_cycles(self.problem.plant.face, late)
         return max(int(first), math.ceil(late - _NONE) + 1)
 
     @property
@@ -66,7 +68,10 @@ class ResponsePairs:
         problem = self.problem
         states = _past(_STATES, problem.plant.state.elements, problem.start_state.tolist(), self._states.length)
         commands = _past(_COMMANDS, problem.plant.input.elements, problem.inputs_before.tolist(), self._commands.length)
-        return (*states, *commands)
+        if not self.outputs:
+            return (*states, *commands)
+        first = problem.start_output.tolist()
+        return (*states, *commands, *_past(_OUTPUTS, problem.plant.output.elements, first, self._states.length))
 
     def pair(self, s: Signals, newest: Expression) -> tuple[Expression, Expression, dict[str, Expression]]:
         """Return state and command of the response, and what is remembered.
@@ -75,20 +80,18 @@ class ResponsePairs:
             s: signals of the cycle.
             newest: command of the last cycle.
         """
-        remembered: dict[str, Expression] = {}
-        results = []
         state = getattr(s, MEASURED if self.waiting else self.problem.plant.state.name)
-        for name, queue, now in ((_STATES, self._states, state), (_COMMANDS, self._commands, newest)):
-            column, size = now, now.numel()
-            if queue.length > 1:
-                column = ca.vertcat(now, getattr(s, name))
-                remembered[f"{name}_next"] = column[: size * (queue.length - 1)]
-            results.append(queue.delayed(column, size) if queue.length > 1 else now)
-        return results[0], results[1], remembered
+        state, states = _queued(s, _STATES, self._states, state)
+        command, commands = _queued(s, _COMMANDS, self._commands, newest)
+        return state, command, {**states, **commands}
+
+    def output(self, s: Signals) -> tuple[Expression | None, dict[str, Expression]]:
+        """Return the measured outputs of that instant, and what is remembered; None where they do not belong to a pair."""
+        return _queued(s, _OUTPUTS, self._states, s.output) if self.outputs else (None, {})
 
     @cached_property
     def _delay(self) -> float:
-        delay = self.problem.sensing.delay(self.problem.plant, self.problem.period)
+        delay = self.problem.sensing.delay(self.problem.plant.face, self.problem.period)
         return delay if delay > _NONE else 0.0
 
     @property
@@ -100,6 +103,14 @@ class ResponsePairs:
         period, late = self.problem.period, self.dead_time
         waits = (late.inputs.get(name, 0.0) + late.measurement for name in self.problem.plant.inputs)
         return Queue(tuple(_rounded(wait / period) + self._delay for wait in waits))
+
+
+def _queued(s: Signals, name: str, queue: Queue, now: Expression) -> tuple[Expression, dict[str, Expression]]:
+    """The value that left the queue, and what the queue remembers."""
+    if queue.length <= 1:
+        return now, {}
+    column, size = ca.vertcat(now, getattr(s, name)), now.numel()
+    return queue.delayed(column, size), {f"{name}_next": column[: size * (queue.length - 1)]}
 
 
 def _rounded(cycles: float) -> float:

@@ -19,6 +19,7 @@ from fpirhc.controllers.face import measured_signals, on_face
 from fpirhc.controllers.mirror import with_measured_state
 from fpirhc.controllers.observed import check_believed
 from fpirhc.controllers.own_reference import with_reference
+from fpirhc.controllers.steps_ahead import with_steps_ahead
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.block import Block, Composite
 from fpirhc.symbolic.layout import Layout, Signal
@@ -78,7 +79,9 @@ def seeing_blocks(problem: Problem) -> list[Block]:
     if problem.sensing.measured is not None:
         return _estimating_part(problem, raw, start)
     plant = problem.plant
-    return [on_face(plant, problem.sensing.estimator.block(plant.face, problem.period, start, raw))]
+    return with_steps_ahead(
+        plant, on_face(plant, problem.sensing.estimator.block(plant.face, problem.period, start, raw))
+    )
 
 
 def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:

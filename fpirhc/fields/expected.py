@@ -215,8 +215,8 @@ class Choice(Expected):
     def parts(self, value: object) -> Iterator[tuple[str, Expected, object]]:
         """The parts by the option that accepts all of them, or by the first one that fits."""
         fitting = [option for option in self.options if option.fits(value)]
-        chosen = next((option for option in fitting if accepts(option, value)), fitting[0])
-        yield from chosen.parts(value)
+        accepting = next((option for option in fitting if accepts(option, value)), fitting[0])
+        yield from accepting.parts(value)
 
     def contract(self) -> type | None:
         """The first contract among the options."""

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 
-from fpirhc.errors import Mistakes
+from fpirhc.errors import Mistakes, NotInvertible
 from fpirhc.fields.user_code import called, named_results, scalar_expression
+from fpirhc.plant.plant_functions import by_name
 from fpirhc.symbolic.expression import expression, graph
 from fpirhc.symbolic.functions import nan_where
 from fpirhc.symbolic.layout import Expression, Named
@@ -23,14 +24,26 @@ if TYPE_CHECKING:
 INVERSE_TOLERANCE = 1e-8  # relative response error beyond which an input of Newton's method is NaN
 
 
+def inverse_function(plant: Plant) -> ca.Function:
+    """Return the Function (state, response of the controlled coordinates, parameters) -> input.
+
+    Raises:
+        NotInvertible: the inputs and the controlled coordinates differ in number.
+    """
+    if len(plant.controlled_names) != len(plant.inputs):
+        raise NotInvertible(f"{len(plant.controlled_names)} controlled coordinates need as many inputs")
+    if plant.inverse is not None:
+        return inverse_by_user(plant, plant.inverse)
+    return inverse_of_affine(plant) if plant.affine else inverse_by_newton(plant)
+
+
 def inverse_by_user(plant: Plant, inverse: Callable[..., Mapping[str, Expression]]) -> ca.Function:
     """Function (state, response, parameters) -> input, made of the user's `inverse`."""
     x, _, p = plant.symbols()
     r = ca.SX.sym("r", len(plant.controlled_names))
     wanted = Named(plant.controlled_names, r, "coordinate")
-    commands = named_results(
-        "inverse", called("inverse", inverse, *plant._derivatives(x), wanted, plant._parameters(p))
-    )
+    *derivatives, parameters = by_name(plant, x, p)
+    commands = named_results("inverse", called("inverse", inverse, *derivatives, wanted, parameters))
     mistakes = Mistakes("inverse")
     for name in plant.inputs:
         if name not in commands:

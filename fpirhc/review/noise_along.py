@@ -39,8 +39,8 @@ class Noisy:
             NotContractive: gain and pole with which noise grows.
         """
         spreads = [noise_spread(j, self.covariance, gain, pole).step for j in self.jacobians]
-        moved = [b @ s @ b.T for b, s in zip(self.inverses, spreads, strict=True)]
-        return np.asarray(np.sqrt(np.max([np.diag(m) for m in moved], axis=0)))
+        covariances = [b @ s @ b.T for b, s in zip(self.inverses, spreads, strict=True)]
+        return np.asarray(np.sqrt(np.max([np.diag(m) for m in covariances], axis=0)))
 
 
 def noisy_points(grid: ReviewGrid, controller: Controller, noise: Mapping[str, float] | None) -> Noisy:
@@ -111,8 +111,8 @@ def _along_the_reference(grid: ReviewGrid, believed: np.ndarray) -> tuple[np.nda
     places = np.unique(np.linspace(0, len(grid.times) - 1, _POINTS).astype(int))
     exact = np.tile(grid.draws[0], (len(places), 1))
     jacobians = response_jacobians(plant, grid.states[places], grid.requests(believed)[places], exact, believed)
-    slopes, chosen = response_slopes(plant), list(plant.controlled_indices)
-    gains = [np.asarray(slopes(grid.states[k], grid.commands[0, k], believed)[1].full())[chosen] for k in places]
+    slopes, controlled = response_slopes(plant), list(plant.controlled_indices)
+    gains = [np.asarray(slopes(grid.states[k], grid.commands[0, k], believed)[1].full())[controlled] for k in places]
     usable = [k for k in range(len(places)) if np.isfinite(jacobians[k]).all() and np.isfinite(gains[k]).all()]
     if not usable:
         raise NotContractive(

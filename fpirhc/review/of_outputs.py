@@ -22,6 +22,7 @@ from fpirhc.review.inverse import inverse_exists
 from fpirhc.review.loops import Loops, loops_along
 from fpirhc.review.maps import largest_product
 from fpirhc.review.neighbourhood import spectrum_near
+from fpirhc.review.of_order_zero import controls_order_zero, review_of_order_zero
 from fpirhc.review.orders import relative_orders
 from fpirhc.review.questions.believed_states import right_after_a_while
 from fpirhc.review.signs import one_sign
@@ -42,6 +43,8 @@ def review_of_outputs(grid: ReviewGrid, controllers: Mapping[str, Controller]) -
         grid: points and draws of the problem.
         controllers: by name.
     """
+    if controls_order_zero(grid):
+        return review_of_order_zero(grid, controllers)
     general = [well_posed(grid), relative_orders(grid), inverse_exists(grid), commands_inside(grid)]
     believed = right_after_a_while(grid)
     rest = Answer("What do the other questions say?", Verdict.UNKNOWN, _NOT_COVERED, "Run it and compare.")

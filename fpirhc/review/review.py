@@ -8,6 +8,7 @@ from dataclasses import replace
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked, resolved
 from fpirhc.errors import FpirhcError, InvalidValue
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.review.answer import Answer, Review, Verdict
 from fpirhc.review.chatter import chatter_small
 from fpirhc.review.commands import commands_inside
@@ -40,6 +41,7 @@ from fpirhc.review.zero_dynamics import zero_dynamics, zero_dynamics_rate
 from fpirhc.task.problem import Problem
 
 
+@checked_call
 def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch: float, seed: int) -> Review:
     """Return the answers to all questions that can be answered before a run.
 
@@ -110,8 +112,8 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: N
 
 def _more(case: Case) -> list[Answer]:
     """Answers to the questions that are found by discovery."""
-    asked = (q for q in known_questions(ControllerQuestion) if _concerns(q, case.controller))
-    answers = (question.ask(case) for question in asked if not question.doubts)
+    questions = (q for q in known_questions(ControllerQuestion) if _concerns(q, case.controller))
+    answers = (question.ask(case) for question in questions if not question.doubts)
     return [answer for answer in answers if answer is not None]
 
 

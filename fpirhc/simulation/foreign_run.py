@@ -42,8 +42,8 @@ def run_foreign(
     """
     foreign, cycles = problem.foreign, problem.cycles
     assert foreign is not None
-    memory, *given = evaluator.arguments
-    *random, answer, held = given
+    memory, *inputs = evaluator.arguments
+    *random, answer, held = inputs
     log, ranges, bridged = np.empty((cycles, trace.size)), ranges_of(problem, trace), 0
     memory[:], held[0] = start, 0.0
     answer[:] = foreign.first(seed)

@@ -22,8 +22,10 @@ from fpirhc.controllers.own_reference import given_signals, own_signals
 from fpirhc.controllers.plausible import plausible_range
 from fpirhc.controllers.seeing import compose_seeing, first_estimates, first_shown, seeing_blocks
 from fpirhc.plant.chain import derivatives_function
+from fpirhc.plant.instant import response_orders
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, sending_block, shows_truth
+from fpirhc.simulation.map_blocks import with_true_response
 from fpirhc.simulation.outside_blocks import outside_blocks, real_name
 from fpirhc.simulation.true_motion import true_motion
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
@@ -31,6 +33,7 @@ from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX, nominal
 from fpirhc.task.dead_time import MEASUREMENT, Wait, delay_block
+from fpirhc.task.output_disturbance import LOGGED, added, disturbance_signal, disturbed_outputs, logged_signal
 from fpirhc.task.problem import Problem
 
 Shown: TypeAlias = tuple[tuple[Signal, ...], Signal]  # signals of the motion, and of the response
@@ -112,7 +115,7 @@ def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:
     """Return the signal of all disturbances in the order of the problem, or nothing when there are none."""
     if not problem.disturbances:
         return ()
-    return (Signal("disturbance", tuple(problem.disturbances)),)
+    return (disturbance_signal(problem),)
 
 
 def _plant_delays(problem: Problem, controller: Controller) -> list[Delay]:
@@ -170,6 +173,8 @@ def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], Sho
         return [_sense_block(problem, hidden[0], Response(hidden[1], response.function))], hidden
     true = tuple(like(s, f"plant_{s.name}") for s in motion), like(response.signal, "plant_realised")
     sense = _sense_block(problem, true[0], Response(true[1], response.function))
+    if problem.sensing.estimator.of_steps:
+        sense = with_true_response(problem, sense, true[0][-1], true[1])
     blocks = [sense, _truth_block(problem, true[0][-1])]
     if problem.symbolic_reality is None or not problem.symbolic_reality.seen:
         return blocks, true
@@ -237,8 +242,7 @@ def _own_response(problem: Problem, *, seen: bool) -> Response:
     if problem.symbolic_reality is not None:
         return Response(plant.response_signal("realised"), problem.symbolic_reality.response_function(plant, seen=seen))
     if plant.outputs:
-        orders = dict(zip(plant.face.names, plant.face.orders, strict=True))
-        function = derivatives_function(plant, [(name, orders[name]) for name in plant.controlled_names])
+        function = derivatives_function(plant, list(response_orders(plant).items()))
         return Response(plant.response_signal("realised"), function)
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
@@ -269,11 +273,18 @@ def _sense_block(problem: Problem, motion: Sequence[Signal], response: Response)
     outputs = motion[-1:] if problem.plant.outputs else ()
     states = motion[: len(motion) - len(outputs)]
     outputs_of = problem.plant.output_function if reality is None else reality.output_function(problem.plant)
+    shifts = bool(disturbed_outputs(problem))
+    if shifts:
+        reads, own = (*reads, disturbance_signal(problem)), (*own, logged_signal(problem))
 
     def step(s: Signals) -> dict[str, Expression]:
         now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
         values = {response.signal.name: response.function(*now)}
         values |= {signal.name: outputs_of(*now) for signal in outputs}
+        if shifts:
+            below, answered = added(problem, s.disturbance)
+            sums = {response.signal.name: answered, motion[-1].name: below}
+            values |= {name: values[name] + more for name, more in sums.items()} | {LOGGED: below}
         if state_of is None:
             return {motion[0].name: s._state_before, **values}
         values |= {signal.name: state_of(*now) for signal in states}
@@ -322,9 +333,9 @@ def _advance_block(problem: Problem, disturbed: tuple[Signal, ...], arriving: Si
     def step(s: Signals) -> dict[str, Expression]:
         u, w = getattr(s, arriving.name), expression(ca.DM.zeros(len(plant.names)))
         if disturbed:
-            added = dict(zip(problem.disturbances, ca.vertsplit(s.disturbance), strict=True))
-            u = u + ca.vertcat(*(added.get(name, 0) for name in plant.inputs))
-            w = ca.vertcat(*(added.get(name, 0) for name in plant.names))
+            adds = dict(zip(disturbed[0].elements, ca.vertsplit(s.disturbance), strict=True))
+            u = u + ca.vertcat(*(adds.get(name, 0) for name in plant.inputs))
+            w = ca.vertcat(*(adds.get(name, 0) for name in plant.names))
         return {
             "_state_after": advance(getattr(s, state.name), u, getattr(s, exact.name), w),
             "_acting": u,

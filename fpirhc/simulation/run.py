@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, ClassVar, cast
 
 import numpy as np
 
@@ -37,6 +37,9 @@ class Run:
         compiled: whether the loop ran as compiled C.
         settings: of problem and controller, as plain data.
     """
+
+    LOADED: ClassVar[str] = "fp.load_run({})"
+    """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
 
     problem: str
     controller: str

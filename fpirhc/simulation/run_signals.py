@@ -19,6 +19,7 @@ from fpirhc.horizon.transcription import transcribe
 from fpirhc.simulation.loop import REALITY_STATE
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.task.output_disturbance import LOGGED
 from fpirhc.task.outside import model_values, real_values, rows_of
 from fpirhc.task.problem import Problem
 
@@ -70,14 +71,14 @@ def _contraction_outside(problem: Problem, controller: Controller, layout: Layou
     plant, own = problem.real_plant, controller.model_plant(problem)
     times = log[:, layout.slice("time")].ravel() + problem.period / 2
     real = rows_of(real_values(plant, problem.signals), times, plant.exact)
-    told = rows_of(model_values(own, controller.told(problem)), times, controller.parameters(own))
+    believed = rows_of(model_values(own, controller.told(problem)), times, controller.parameters(own))
     modelled = problem if own is problem.plant else replace(problem, plant=own)
 
     def jacobians(rows: np.ndarray) -> np.ndarray:
         if problem.symbolic_reality is None:
-            return response_jacobians(own, states[rows], deformed[rows], real[rows], told[rows])
-        moved = log[rows][:, layout.slice(REALITY_STATE)]
-        return sampled_jacobians(modelled, moved, states[rows], deformed[rows], told[rows], real[rows])
+            return response_jacobians(own, states[rows], deformed[rows], real[rows], believed[rows])
+        real_states = log[rows][:, layout.slice(REALITY_STATE)]
+        return sampled_jacobians(modelled, real_states, states[rows], deformed[rows], believed[rows], real[rows])
 
     return factors_along(len(log), jacobians, controller.deformation.effective_gain())
 
@@ -102,25 +103,35 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
     times = log[:, layout.slice("time")]
     # Along the reference that the run had, where it is no function of the time alone.
     motion = [log[:, layout.slice(name)] for name in ("reference", "reference_response")] if own else []
-    function = _cost_function(ocp, data_of, _CHUNK)
+    # A disturbed output is h + d; its error is that of h to the reference less d.
+    shift = [log[:, layout.slice(LOGGED)]] if LOGGED in layout.names else []
+    function = _cost_function(ocp, data_of, _CHUNK, shifted=bool(shift))
     evaluator = Evaluator(function)
     costs = np.empty((log.shape[0], len(ocp.terms)))
     evaluator.arguments[-1][:] = plant.exact
     for at in range(0, log.shape[0], _CHUNK):
         size = min(_CHUNK, log.shape[0] - at)
-        for argument, source in zip(evaluator.arguments, (times, *motion, states, commands), strict=False):
+        for argument, source in zip(evaluator.arguments, (times, *motion, *shift, states, commands), strict=False):
             argument.reshape(_CHUNK, -1)[:size] = source[at : at + size]
         evaluator.evaluate()
         costs[at : at + size] = evaluator.results[0].reshape(_CHUNK, -1)[:size]
     return Signal("cost", tuple(ocp.terms)), costs
 
 
-def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int) -> ca.Function:
-    """Function (times, [states and responses of the reference], states, inputs, parameters) -> cost terms of `count` cycles."""
+def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int, *, shifted: bool) -> ca.Function:
+    """Function (times, [states and responses of the reference], [shift], states, inputs, parameters) -> cost terms of many cycles.
+
+    There are `count` cycles. The shift is subtracted from the reference.
+    """
     t, s = ca.MX.sym("t"), ca.MX.sym("s", ocp.state.size)
     u, p = ca.MX.sym("u", ocp.input.size), ca.MX.sym("p", data_of.size1_in(data_of.n_in() - 1))
     motion = [ca.MX.sym(data_of.name_in(k), data_of.size1_in(k)) for k in range(1, data_of.n_in() - 1)]
     data = data_of(t, *(ca.repmat(m, 1, 2) for m in motion), p)[:, 0]
+    if shifted:
+        place = ocp.data.slice("reference")
+        shift = ca.MX.sym("shift", place.stop - place.start)
+        data = ca.vertcat(data[: place.start], data[place] - shift, data[place.stop :])
+        motion = [*motion, shift]
     one = ca.Function("fpirhc_cost", [t, *motion, s, u, p], [ocp.stage_cost(s, u, data)[1]])
     times, states = ca.MX.sym("t", 1, count), ca.MX.sym("s", ocp.state.size, count)
     inputs = ca.MX.sym("u", ocp.input.size, count)

@@ -19,8 +19,8 @@ def raw_measurements(run: Run) -> np.ndarray:
     for name in ("arrived", "measured"):
         if name in run.layout:
             # A state that is logged before the measurements is not made from them.
-            given = "output" in run.layout and run.layout.names.index("state") < run.layout.names.index(name)
-            return np.ascontiguousarray(np.hstack([run["state"], run[name]]) if given else run[name])
+            state_measured = "output" in run.layout and run.layout.names.index("state") < run.layout.names.index(name)
+            return np.ascontiguousarray(np.hstack([run["state"], run[name]]) if state_measured else run[name])
     return np.hstack([run[name] for name in ("state", "output", "realised") if name in run.layout])
 
 

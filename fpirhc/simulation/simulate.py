@@ -15,6 +15,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.describe import describe
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.simulation.changes import Changes, in_force
 from fpirhc.simulation.common_columns import with_common_columns
 from fpirhc.simulation.foreign_run import Patch, run_foreign, stopped
@@ -27,6 +28,7 @@ from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator, unwrapped
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native
+from fpirhc.task.output_disturbance import disturbance_values
 from fpirhc.task.problem import Problem
 
 CHUNK = 500  # cycles per call: long enough to hide Python, short enough for progress and Ctrl-C
@@ -97,8 +99,8 @@ class Simulator:
         problem, controller = force.problem, force.controller
         start = start_memory(self.loop, problem, controller, force.numbers)
         common = (problem, start, self.loop.trace, self.evaluator, seed, disturbed, progress)
-        chosen = _run_chunks if problem.foreign is None else _run_foreign
-        logged, stop = chosen(*common, force.patches, setpoints)
+        run_cycles = _run_chunks if problem.foreign is None else _run_foreign
+        logged, stop = run_cycles(*common, force.patches, setpoints)
         layout, log = with_common_columns(self.loop.trace, logged)
         log.setflags(write=False)
         step_limit = controller.deformation.largest_step()
@@ -125,6 +127,7 @@ class Simulator:
         return Run(problem.name, title, seed, problem.period, layout, log, stop, self.compiled, facts)
 
 
+@checked_call
 def simulator(
     problem: Problem,
     controller: Controller,
@@ -160,6 +163,7 @@ def simulator(
     return Simulator(problem, ready, loop, evaluator, bool(backend and backend.compiled), reason, settings)
 
 
+@checked_call
 def simulate(
     problem: Problem,
     controller: Controller,
@@ -230,14 +234,8 @@ def judged_run(
 
 
 def disturbance_table(problem: Problem, seed: int, cycles: int) -> np.ndarray:
-    """Return the disturbances of every cycle, shape (cycles, number of disturbances); each has its own stream."""
-    times = np.arange(cycles) * problem.period
-    streams = np.random.SeedSequence(seed).spawn(len(problem.disturbances))
-    columns = [
-        d.values(times, np.random.default_rng(stream))
-        for d, stream in zip(problem.disturbances.values(), streams, strict=True)
-    ]
-    return np.column_stack(columns) if columns else np.zeros((cycles, 0))
+    """Return the disturbances of every cycle, shape (cycles, columns); see `disturbance_values`."""
+    return disturbance_values(problem, np.arange(cycles) * problem.period, seed)
 
 
 def sensing_table(problem: Problem, seed: int, cycles: int) -> np.ndarray:

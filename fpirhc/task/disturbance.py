@@ -1,7 +1,8 @@
 """Disturbances: signals that act on the plant and that no controller receives.
 
-A disturbance is attached by name, to an input (it adds to the clipped command) or to a coordinate (it adds to the
-response). It is sampled once per control cycle and held over the cycle.
+A disturbance is attached by name, to an input (it adds to the clipped command), to a coordinate (it adds to the
+response), or to an output that is an expression (it adds to the output, see `output_disturbance`). It is sampled once per control
+cycle and held over the cycle.
 """
 
 from __future__ import annotations
@@ -37,6 +38,13 @@ class Disturbance(Checked, ABC):
     @abstractmethod
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:
         """Return one value per time, shape (m,), in the unit of the disturbed signal."""
+
+    def derivative(self, times: np.ndarray, order: int) -> np.ndarray:  # noqa: ARG002
+        """Return the derivative of that order, 1 or more, between jumps, shape (m,); zero by default: constant between jumps.
+
+        A disturbed output has it in its own derivatives. A subclass whose values change smoothly should override it.
+        """
+        return np.zeros_like(times)
 
 
 @dataclass(frozen=True)
@@ -103,6 +111,11 @@ class Sine(Disturbance):
     def slew(self) -> float:
         """2 pi frequency amplitude."""
         return abs(2 * math.pi * self.frequency * self.amplitude)
+
+    def derivative(self, times: np.ndarray, order: int) -> np.ndarray:
+        """Return amplitude omega^k sin(omega t + phase + k pi / 2)."""
+        omega = 2 * np.pi * self.frequency
+        return self.amplitude * omega**order * np.sin(omega * times + self.phase + order * np.pi / 2)
 
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:  # noqa: ARG002
         """Return the sine's values."""
@@ -183,15 +196,29 @@ class Formula(Disturbance):
         Raises:
             InvalidValue: a value is not finite.
         """
+        return self._evaluated(times, 0)
+
+    def derivative(self, times: np.ndarray, order: int) -> np.ndarray:
+        """Return the expression's derivative.
+
+        Raises:
+            InvalidValue: a value is not finite.
+        """
+        return self._evaluated(times, order)
+
+    def _evaluated(self, times: np.ndarray, order: int) -> np.ndarray:
         t = ca.SX.sym("t")
         expression = scalar_expression(
             "disturbance", called("disturbance", self.expression, t), of=self.expression, symbols=(t,)
         )
+        for _ in range(order):
+            expression = ca.jacobian(expression, t)
         function = ca.Function("fpirhc_disturbance", [t], [expression])
         samples = np.asarray(function.map(times.size)(times[None, :]).full()).ravel()
         if not np.all(np.isfinite(samples)):
             where = times[np.argmin(np.isfinite(samples))]
-            raise InvalidValue(f"a disturbance expression is not finite at t = {where:g}")
+            what = "a disturbance expression" + (f" is differentiated {order} times and" if order else "")
+            raise InvalidValue(f"{what} is not finite at t = {where:g}")
         return samples
 
 

@@ -13,8 +13,8 @@ from fpirhc.sensing.sensing import Sensing
 
 def needed_measurements(plant: Plant, sensing: Sensing) -> tuple[str, ...]:
     """Return the names of what is measured: by sensors, and the state that is given beside outputs where nothing is believed."""
-    given = plant.state.elements if plant.outputs and sensing.belief is None else ()
-    return tuple(dict.fromkeys((*given, *sensing.measures(plant))))
+    states = plant.state.elements if plant.outputs and sensing.belief is None else ()
+    return tuple(dict.fromkeys((*states, *sensing.measures(plant))))
 
 
 def needed_names(plant: Plant, sensing: Sensing, judged: Sequence[str] | None) -> frozenset[str]:

@@ -131,8 +131,8 @@ def real_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function | 
 
 def model_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function | None:
     """Function (time, parameters) -> parameters with what the model is told at this time; None where it is told nothing."""
-    told = {n: signals[n].told for n in plant.signal_names if n in signals}
-    return _filled(plant, {n: course for n, course in told.items() if course is not None})
+    courses = {n: signals[n].told for n in plant.signal_names if n in signals}
+    return _filled(plant, {n: course for n, course in courses.items() if course is not None})
 
 
 def previewed_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function | None:
@@ -162,8 +162,8 @@ def as_told(plant: Plant, signals: Mapping[str, External]) -> dict[str, External
     nominal = {name: plant.parameters[name].approximate for name in plant.signal_names}
     made: dict[str, External] = {}
     for name, one in signals_of(plant, signals).items():
-        told = one.told
-        made[name] = Known(nominal[name] if told is None else told, preview=one.previewed or told is None)
+        course = one.told
+        made[name] = Known(nominal[name] if course is None else course, preview=one.previewed or course is None)
     return made
 
 

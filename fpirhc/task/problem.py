@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -18,8 +19,10 @@ from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.regular_gain import Bounds, singular_gain
 from fpirhc.horizon.stage_check import check_stage
 from fpirhc.plant.algebraic import unsolved
-from fpirhc.plant.integrators import Integrator, RungeKutta4
+from fpirhc.plant.integrators import USUAL, Integrator
+from fpirhc.plant.map_steps import motion_of
 from fpirhc.plant.plant import Plant
+from fpirhc.plant.signals_in_outputs import differentiated_signals
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line
 from fpirhc.symbolic.live import nominal
@@ -27,6 +30,7 @@ from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.foreign import Foreign
 from fpirhc.task.limits import Limits
+from fpirhc.task.map_task import check_map_task, settle_maps
 from fpirhc.task.needed import needed_measurements, needed_names
 from fpirhc.task.outside import External, check_signals, real_values, rows_of, signals_of
 from fpirhc.task.problem_view import problem_facts, problem_table
@@ -49,12 +53,13 @@ class Problem(Checked):
         period: control cycle, in the plant's unit of time, as are all times.
         duration: length of a run.
         limits: of inputs, states, rates and paths.
-        disturbances: by name of the input or coordinate to which they add.
+        disturbances: by name of the input, coordinate or output to which they add; a name of both a coordinate of the moving plant
+            and an output is the coordinate's, and adds to its response.
         dead_time: of inputs and measurement. A controller may assume another one.
         sensing: sensors and estimator between the plant and the controller; ideal by default.
         horizon: stages over which a receding-horizon controller plans.
         cost: of such a plan.
-        integrator: of the simulated plant.
+        integrator: of the simulated plant; a map has none.
         input_before: inputs before the first cycle, by name. The first rate and the first weight of a rate are counted from them,
             and they act until the first command arrives. An input that is not named has the value of `DeadTime(before=...)`, or
             else zero, moved into its limits.
@@ -69,6 +74,9 @@ class Problem(Checked):
         InvalidProblem: all mistakes together.
     """
 
+    LOADED: ClassVar[str] = "fp.load_problem({}).problem"
+    """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
+
     plant: Plant
     reference: Reference
     start: Mapping[str, float]
@@ -80,7 +88,7 @@ class Problem(Checked):
     sensing: Sensing = field(default_factory=Sensing)
     horizon: Horizon | None = None
     cost: Cost | None = None
-    integrator: Integrator = field(default_factory=RungeKutta4)
+    integrator: Integrator = USUAL
     measure_from: float = 0.0
     judged: Sequence[str] | None = None
     input_before: Mapping[str, float] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
@@ -90,6 +98,8 @@ class Problem(Checked):
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("problem")
+        settle_maps(self, mistakes)
+        mistakes.raise_if_any()
         _check_times(self, mistakes)
         _check_start(self, mistakes)
         plant = self.plant
@@ -97,12 +107,14 @@ class Problem(Checked):
         mistakes.unknown(
             "judged: output" if plant.outputs else "judged: coordinate", self.judged or (), plant.face.coordinates
         )
-        disturbed = [*plant.inputs, *(() if self.foreign else self.real_plant.coordinates)]
-        mistakes.unknown("disturbances: input or coordinate", self.disturbances, disturbed)
+        disturbed = [*plant.inputs, *(() if self.foreign else (*self.real_plant.coordinates, *plant.outputs))]
+        what = "input, coordinate or output" if plant.outputs else "input or coordinate"
+        mistakes.unknown(f"disturbances: {what}", self.disturbances, disturbed)
         instants, random = np.array([0.0, self.period]), np.random.default_rng(0)
         check_signals(self._plants, self.signals, np.linspace(0.0, self.duration, _INSTANTS), mistakes)
         checks = (
             *((lambda one=one: one.values(instants, random)) for one in self.disturbances.values()),
+            lambda: self._check_derivatives(instants),
             lambda: self.limits.check(plant),
             lambda: self.reference.function(plant),
             lambda: check_steps(plant.face, self.limits, self.reference.set_points),
@@ -116,6 +128,8 @@ class Problem(Checked):
                 check()
             except FpirhcError as error:
                 mistakes.add(str(error))
+        mistakes.raise_if_any()
+        check_map_task(self, mistakes)
         mistakes.raise_if_any()
         check_stage(plant, self.cost, self.limits, mistakes)
         _check_inverse(self, mistakes)
@@ -181,7 +195,7 @@ class Problem(Checked):
         """The problem without its reality: the model's own plant moves, and disturbances of what it does not have are left out."""
         if self.reality is None:
             return self
-        known = {*self.plant.inputs, *self.plant.coordinates}
+        known = {*self.plant.inputs, *self.plant.coordinates, *self.plant.outputs}
         disturbances = {name: one for name, one in self.disturbances.items() if name in known}
         signals = signals_of(self.plant, self.signals)
         return replace(self, reality=None, disturbances=disturbances, signals=signals)
@@ -189,7 +203,8 @@ class Problem(Checked):
     @property
     def real_integrator(self) -> Integrator:
         """Integrator of the plant that a run moves."""
-        return (self.symbolic_reality.integrator if self.symbolic_reality else None) or self.integrator
+        chosen = (self.symbolic_reality.integrator if self.symbolic_reality else None) or self.integrator
+        return motion_of(self.real_plant, chosen, USUAL)
 
     @cached_property
     def real_start(self) -> np.ndarray:
@@ -207,6 +222,12 @@ class Problem(Checked):
         """Parameters of the plant that a run moves in its first cycle: the exact ones, with the real values of signals."""
         plant = self.real_plant
         return rows_of(real_values(plant, self.signals), np.array([self.period / 2]), plant.exact)[0]
+
+    def _check_derivatives(self, instants: np.ndarray) -> None:
+        """Raise if the disturbance of an output has no derivatives, which its own derivatives need."""
+        for name in self.plant.outputs:
+            if name in self.disturbances:
+                self.disturbances[name].derivative(instants, 1)
 
     @property
     def _needed(self) -> frozenset[str]:
@@ -339,10 +360,11 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
     plant = problem.plant
     if not plant.outputs:
         return
-    if problem.signals:
+    late = differentiated_signals(plant)
+    if late:
         mistakes.add(
-            f"signals: {', '.join(problem.signals)} from outside have derivatives of their own in those of outputs, which is not "
-            "covered; leave them out, or write the outputs as coordinates"
+            f"signals: {', '.join(late)} from outside have derivatives of their own in those of outputs, which is not covered; "
+            "choose an output that depends on the state alone, or write it as a coordinate"
         )
     if len(plant.inputs) == len(plant.controlled or plant.outputs):
         singular = singular_gain(plant, problem.reference, *nominal_start(problem))

@@ -22,6 +22,7 @@ from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.algebraic import unsolved
 from fpirhc.plant.chain import derivatives_function, input_reaches_at
+from fpirhc.plant.instant import response_orders
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.settling import settled
@@ -124,8 +125,7 @@ class Reality(Checked):
     def response_function(self, model: Plant, *, seen: bool) -> ca.Function:
         """Function (state, input, parameters, forcing) of the reality -> the model's controlled responses."""
         if model.outputs:
-            orders = dict(zip(model.face.names, model.face.orders, strict=True))
-            return derivatives_function(self.plant, [(name, orders[name]) for name in model.controlled_names])
+            return derivatives_function(self.plant, list(response_orders(model).items()))
         names = self._names(model, seen=seen)
         return derivatives_function(self.plant, [(names[k], model.orders[k]) for k in model.controlled_indices])
 
@@ -221,6 +221,8 @@ class Reality(Checked):
             differences = ["its coordinates in another order"]
         if tuple(plant.outputs) != tuple(model.outputs):
             differences.append("other outputs")
+        if (plant.step is None) != (model.step is None):
+            differences.append("differential equations, and the model is a map")
         if not differences and (plant.controlled or tuple(plant.outputs) or plant.names) != model.controlled_names:
             differences = [
                 f"other controlled coordinates (write controlled={model.controlled_names!r} in its plant too)"
@@ -291,6 +293,8 @@ def _check_expression(reality: Reality, model: Plant, name: str, mistakes: Mista
         return
     if units[name] != unit:
         mistakes.add(f"its '{name}' is in {units[name]}, the model's in {unit}; write both in one unit")
+    if name in model.instant_names:
+        return
     order = model.face.orders[model.face.names.index(name)]
     at_once = input_reaches_at(plant, name, order - 1)
     if at_once is not None:

@@ -77,11 +77,22 @@ class Estimating(Controller):
     @property
     def model_acts_at_once(self) -> bool:
         """Whether a new estimate changes the command in every cycle."""
-        return self.at_once or self.controller.model_acts_at_once
+        return self.at_once or self.estimator.acts_at_once or self.controller.model_acts_at_once
+
+    def maps_unusable(self, problem: Problem) -> str:
+        """Return why not: the estimators' models add to derivatives."""
+        del problem
+        return "its estimators add what they learn to derivatives with respect to time"
 
     def linear_around(self, inner: Controller) -> Controller:
         """Return the inner controller: near the reference the parameters are those of the start."""
         return inner
+
+    def outputs_unusable(self, problem: Problem) -> str:
+        """Return why the estimator or the wrapped controller does not cover outputs; empty where both do."""
+        if not self.estimator.covers_outputs:
+            return f"{type(self.estimator).__name__} is written for responses of coordinates"
+        return self.controller.outputs_unusable(self.inner_problem(problem))
 
     def check(self, problem: Problem) -> None:
         """Raise if the estimator or the wrapped controller does not fit the problem.
@@ -95,7 +106,7 @@ class Estimating(Controller):
         self.controller.check(modelled)
         if self.dead_time is not None:
             self.dead_time.check(problem.plant, problem.period)
-        lost = problem.sensing.believed_response(problem.plant)
+        lost = problem.sensing.believed_response(problem.plant.face)
         if lost and self.estimator.reads_response(modelled.plant):
             raise NotSupported(
                 f"{type(self.estimator).__name__} learns from the response, which needs {', '.join(lost)}, and no sensor shows it; "
@@ -111,7 +122,8 @@ class Estimating(Controller):
         modelled = self.inner_problem(problem)
         controller = self.controller.following_its_model() if self.at_once else self.controller
         inner = compose_controller(modelled, controller)
-        pairs = ResponsePairs(problem, self.dead_time or problem.dead_time)
+        outputs = self.estimator.reads_outputs(modelled.plant)
+        pairs = ResponsePairs(problem, self.dead_time or problem.dead_time, outputs)
         believed = Signal(_BELIEVED, modelled.plant.parameter.elements, modelled.plant.parameter.units)
         acted = replace(command_before(problem), name="_acted")
         blocks = [
@@ -138,9 +150,10 @@ def _estimate_block(
         parameters = ca.vertcat(s.parameters[:count], ca.DM(model.approximate[count:]))
         before = {m: getattr(s, m) for m in memory.names}
         state, command, waiting = pairs.pair(s, s._acted)
+        output, others = pairs.output(s)
         numbers = None if followed is None else getattr(s, followed.signal.name)
         begun = s.estimate_begun > pairs.cycles - 0.5
-        evidence = Seen(state, command, s.realised, parameters, begun, numbers)
+        evidence = Seen(state, command, s.realised, parameters, begun, numbers, output)
         parameter_change, next_memory = correct(evidence, before)
         # A change that is not finite is not learned: one bad measurement must not spoil the model for ever.
         finite = is_finite(ca.vertcat(parameter_change, *next_memory.values()))
@@ -155,9 +168,11 @@ def _estimate_block(
             "estimate_begun_next": ca.fmin(s.estimate_begun + 1, pairs.cycles),
             **remembered,
             **waiting,
+            **others,
         }
 
-    reads = Layout((pairs.state, plant.response_signal("realised"), plant.parameter, acted))
+    outputs = (plant.output,) if pairs.outputs else ()
+    reads = Layout((pairs.state, *outputs, plant.response_signal("realised"), plant.parameter, acted))
     block = Block("estimate", reads, Layout((believed, estimate)), step, own, opaque=True)
     return block if followed is None else replace(block, reads=reads + followed.reads, derived=followed.derived)
 

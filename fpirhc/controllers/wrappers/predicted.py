@@ -35,6 +35,7 @@ from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.members import Example
 from fpirhc.plant.integrators import RungeKutta4
+from fpirhc.plant.map_steps import motion_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
@@ -106,8 +107,8 @@ class ByModel(Predictor):
         return tuple(map(float, problem.inputs_before))
 
     def advance(self, plant: Plant, period: float) -> ca.Function:
-        """Return one Runge-Kutta step of the model as a Function."""
-        step = RungeKutta4().step(plant, period)
+        """Return one Runge-Kutta step of the model, or one cycle of a map, as a Function."""
+        step = motion_of(plant, RungeKutta4(), RungeKutta4()).step(plant, period)
         x, u, p = plant.symbols()
         w = ca.SX.sym("w", len(plant.names))
         return ca.Function("fpirhc_predict", [x, u, p, w], [step(x, u, p, w)])
@@ -217,6 +218,11 @@ class Predicted(Controller):
         """
         self.controller.check(problem)
         self.by.check(problem.plant)
+        if problem.plant.step is not None and self.by.residual_time is not None:
+            raise NotSupported(
+                f"Predicted(by={self.by!r}): a residual compares the response with the model's at this state, and the response "
+                "of a map belongs to the state of the last cycle; use by=ByModel()"
+            )
         if self.controller.response(problem) is not None and self.by != ByModel():
             raise NotSupported(
                 f"Predicted: {self.by} compares the responses of the plant's controlled coordinates, but "

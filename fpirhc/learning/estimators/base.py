@@ -29,6 +29,7 @@ class Seen:
         parameters: those of the model without the estimator's change.
         valid: 0 before the first pair of this run (in the first cycle, and until the first sample of the run arrives), then 1.
         followed: what the estimator computes from its live settings; None without any.
+        output: the measured outputs y, y', ... at that instant; None without outputs, or where the estimator does not read them.
     """
 
     state: Expression
@@ -37,6 +38,7 @@ class Seen:
     parameters: Expression
     valid: Expression
     followed: Expression | None = None
+    output: Expression | None = None
 
 
 Correct = Callable[[Seen, Mapping[str, Expression]], tuple[Expression, dict[str, Expression]]]
@@ -52,6 +54,20 @@ class Estimator(Checked, ABC):
     def reads_response(self, plant: Plant) -> bool:  # noqa: ARG002
         """Whether it learns from the measured response of this plant; True by default."""
         return True
+
+    @property
+    def acts_at_once(self) -> bool:
+        """Whether what it learns changes the command in every cycle, also between plans; False by default."""
+        return False
+
+    @property
+    def covers_outputs(self) -> bool:
+        """Whether it serves a plant whose response is that of outputs; False by default, so that nothing is wrong in silence."""
+        return False
+
+    def reads_outputs(self, plant: Plant) -> bool:  # noqa: ARG002
+        """Whether it learns from the measured outputs of this plant below their responses; False by default."""
+        return False
 
     @abstractmethod
     def learned(self) -> tuple[str, ...]:

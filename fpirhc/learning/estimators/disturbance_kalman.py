@@ -9,7 +9,8 @@ Kalman filter, for the model linearised on the reference at t = 0, corrects,
 
     x- = F(x^, u, w^),      x^ = x- + K_x (y - h(x-, u, w^)),      w^ <- w^ + K_w (y - h(x-, u, w^)).
 
-A measured response shows its disturbance in the same cycle, states show it through their motion. A constant disturbance is
+A measured response shows its disturbance in the same cycle, states show it through their motion. Where the plant has outputs, these
+may be disturbed and measured too, y_j = h_j(q, q', ...) + w_j, and the responses are theirs. A constant disturbance is
 estimated without error, whatever the tuning, if [A - I, B; C, D] has full column rank (B, D: effect of the disturbances on the
 state and on what is measured), which needs at least as many measured quantities as disturbances. Otherwise `check` refuses the
 filter.
@@ -21,7 +22,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import casadi as ca
@@ -52,9 +53,12 @@ class DisturbanceKalman(Estimator):
     larger the drift, the faster and the noisier the estimate.
 
     Args:
-        drift: coordinate -> deviation of the change of its disturbance in one second, response unit / s^0.5.
-        measured: state (q1, q1', ...) or response (q1'' for order 2) -> deviation of its measurement noise, in its unit. A response
-            shows its disturbance at once, and a deformation has it; an estimator that is late cannot serve the filter.
+        drift: coordinate -> deviation of the change of its disturbance in one second, response unit / s^0.5. Of a plant with
+            outputs also output (y), for a disturbance that adds to it, or response of an output (y'' for order 2), for one that
+            adds to the response alone, which is what a deformation sees.
+        measured: state (q1, q1', ...), output (y, y', ...) or response (q1'' for order 2) -> deviation of its measurement noise, in
+            its unit. A response shows its disturbance at once, and a deformation has it; an estimator that is late cannot serve the
+            filter.
         noise: coordinate -> deviation of the white noise of its response in every cycle; zero where not named.
 
     Raises:
@@ -80,6 +84,20 @@ class DisturbanceKalman(Estimator):
         """The disturbances."""
         return tuple(disturbance_name(c) for c in self.drift)
 
+    @property
+    def acts_at_once(self) -> bool:
+        """Whether all disturbances are those of outputs' responses, which plans do not have and the inverse has."""
+        return all("'" in name for name in self.drift)
+
+    @property
+    def covers_outputs(self) -> bool:
+        """True: outputs are disturbed and measured by name."""
+        return True
+
+    def reads_outputs(self, plant: Plant) -> bool:
+        """Whether some output, or a derivative below its response, is measured."""
+        return bool(plant.outputs) and any(n in plant.output.elements for n in self.measured)
+
     def reads_response(self, plant: Plant) -> bool:
         """Whether some response is measured."""
         return bool(self._responses(plant))
@@ -93,10 +111,11 @@ class DisturbanceKalman(Estimator):
         """
         mistakes = Mistakes("DisturbanceKalman")
         plant = problem.plant
-        mistakes.unknown("measured: state or response", self.measured, plant.state.elements + response_names(plant))
+        what = "state, output or response" if plant.outputs else "state or response"
+        mistakes.unknown(f"measured: {what}", self.measured, _measurable(plant))
         mistakes.unknown("noise: coordinate", self.noise, problem.plant.coordinates)
         mistakes.raise_if_any()
-        late = problem.sensing.delay(plant, problem.period)
+        late = problem.sensing.delay(plant.face, problem.period)
         if self._responses(plant) and late > 0:
             raise NotSupported(
                 f"DisturbanceKalman: {', '.join(self._responses(plant))} is estimated {late:.4g} cycles late, and the filter needs "
@@ -179,21 +198,28 @@ class DisturbanceKalman(Estimator):
 
     def _responses(self, plant: Plant) -> tuple[str, ...]:
         """Names of the measured responses."""
-        return tuple(n for n in self.measured if n in response_names(plant))
+        return tuple(n for n in self.measured if n in response_names(plant.face))
 
     def _measured(self, model: Plant, seen: Seen) -> Expression:
         """The measured quantities as a column."""
         states = {e: seen.state[k] for k, e in enumerate(model.state.elements)}
-        responses = {e: seen.response[k] for k, e in enumerate(response_names(model))}
-        return ca.vertcat(*({**states, **responses}[name] for name in self.measured))
+        responses = {e: seen.response[k] for k, e in enumerate(response_names(model.face))}
+        outputs = {} if seen.output is None else {e: seen.output[k] for k, e in enumerate(model.output.elements)}
+        return ca.vertcat(*({**outputs, **states, **responses}[name] for name in self.measured))
 
     def _shown_function(self, model: Plant) -> ca.Function:
         """Function (state, command that acted, parameters) -> the measured quantities."""
         x, u, p = model.symbols()
         states = dict(zip(model.state.elements, ca.vertsplit(x), strict=True))
+        if self.reads_outputs(model):
+            calm = ca.DM.zeros(len(model.names))
+            states = (
+                dict(zip(model.output.elements, ca.vertsplit(model.output_function(x, u, p, calm)), strict=True))
+                | states
+            )
         if self._responses(model):
             responses = ca.vertsplit(model.controlled_response_function(x, u, p))
-            states |= dict(zip(response_names(model), responses, strict=True))
+            states |= dict(zip(response_names(model.face), responses, strict=True))
         return ca.Function("fpirhc_shown", [x, u, p], [ca.densify(ca.vertcat(*(states[n] for n in self.measured)))])
 
     def _matrices(self, problem: Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -204,7 +230,8 @@ class DisturbanceKalman(Estimator):
         x_next = RungeKutta4().step(model, problem.period)(x, u, p, w)
         function = ca.Function("fpirhc_linear", [x, u, p, w], [ca.jacobian(x_next, x), ca.jacobian(x_next, w)])
         a, b = (np.asarray(m.full()) for m in function(*_operating_point(problem), np.zeros(len(model.names))))
-        disturbance_input = b[:, [model.names.index(c) for c in self.drift]]
+        effects = dict(zip(model.names, b.T, strict=True))  # that of an output is on what is measured alone
+        disturbance_input = np.column_stack([effects.get(n, np.zeros(len(a))) for n in self.drift])
         size = len(self.drift)
         augmented = np.block([[a, disturbance_input], [np.zeros((size, a.shape[1])), np.eye(size)]])
         shown = self._shown_function(model)(x, u, p)
@@ -243,8 +270,7 @@ class DisturbanceKalman(Estimator):
         used, pattern = (c != 0).any(axis=0), a != 0
         while (grown := used | pattern[used].any(axis=0)).sum() > used.sum():
             used = grown
-        judged = [problem.plant.state.elements.index(n) for n in problem.judged_names]
-        judged += range(problem.plant.state.size, len(a))
+        judged = [*_shown_by(problem.plant, problem.judged_names), *range(problem.plant.state.size, len(a))]
         rest = a[np.ix_(~used, ~used)]
         harmless = used[judged].all() and np.abs(np.linalg.eigvals(rest)).max(initial=0.0) < 1 + _SLOWEST
         return used if harmless else everything
@@ -265,13 +291,31 @@ def _rank(a: np.ndarray, c: np.ndarray) -> int:
     return int(np.linalg.matrix_rank(stacked[rows] / np.abs(stacked[rows]).max(axis=1, keepdims=True), tol=1e-9))
 
 
+def _measurable(plant: Plant) -> tuple[str, ...]:
+    """Names of states, of outputs with their derivatives, and of responses."""
+    outputs = plant.output.elements if plant.outputs else ()
+    return (*plant.state.elements, *outputs, *response_names(plant.face))
+
+
+def _shown_by(plant: Plant, names: Sequence[str]) -> list[int]:
+    """Places of the states on which these coordinates or outputs depend."""
+    if not plant.outputs:
+        return [plant.state.elements.index(n) for n in names]
+    x, u, p = plant.symbols()
+    values = plant.output_function(x, u, p, ca.DM.zeros(len(plant.names)))
+    shown = values[[plant.output.elements.index(n) for n in names]]
+    return sorted(set(ca.jacobian_sparsity(shown, x).get_triplet()[1]))
+
+
 def _operating_point(problem: Problem) -> tuple[ca.DM, ca.DM, np.ndarray]:
-    """State, input and parameters of the model on the reference at t = 0."""
+    """State, input and parameters of the model on the reference at t = 0; states without a reference are those of the start."""
     plant = problem.plant
-    state, response = problem.reference.function(plant)(0.0)
-    if plant.controlled is None and len(plant.inputs) != len(plant.names):
+    seen, response = problem.reference.function(plant)(0.0)
+    known = zip(problem.start_state, plant.known_by_outputs, strict=True)
+    state = ca.DM([value if place < 0 else float(seen[place]) for value, place in known])
+    if plant.controlled is None and len(plant.inputs) != len(plant.face.names):
         return state, ca.DM.zeros(len(plant.inputs)), plant.approximate
-    needed = plant.inverse_function(state, response[list(plant.controlled_indices)], plant.approximate)
+    needed = plant.inverse_function(state, response[list(plant.face.controlled_indices)], plant.approximate)
     return state, needed, plant.approximate
 
 

@@ -1,6 +1,6 @@
-"""A model with unknown disturbances of its responses as further parameters.
+"""A model with unknown disturbances of its responses, or of its outputs, as further parameters.
 
-    q_i^(r_i) = f_i(q, q', ..., u, p) + w_i
+    q_i^(r_i) = f_i(q, q', ..., u, p) + w_i,      y_j = h_j(q, q', ..., p) + w_j
 
 A horizon or an inverse, which takes the model's parameters as data, then takes the disturbances as well.
 """
@@ -13,56 +13,102 @@ from dataclasses import replace
 
 import casadi as ca
 
-from fpirhc.errors import Mistakes
+from fpirhc.errors import Mistakes, NotSupported
+from fpirhc.plant.outputs import Output
 from fpirhc.plant.plant import Parameter, Plant
+from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.layout import Expression, Named
 
 
-def disturbed(plant: Plant, coordinates: Sequence[str]) -> Plant:
-    """Return the plant with a disturbance w_i of the response of each named coordinate, a parameter 'w_<name>' of value 0.
+def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
+    """Return the plant with disturbances as parameters of value 0, see `disturbance_name`.
+
+    The disturbance of a coordinate adds to its response, that of an output to the output. That of an output's response (y'' for
+    order 2) adds to the response alone, and no state sees it. A name of both a coordinate and an output is the coordinate's.
 
     Raises:
-        InvalidProblem: an unknown coordinate, no coordinate, or a parameter that already has the name.
+        InvalidProblem: an unknown name, no name, or a parameter that already has the name.
+        NotSupported: the disturbance of a state, which an inverse of the user's does not know.
     """
     mistakes = Mistakes("disturbed")
-    mistakes.unknown("coordinate", coordinates, plant.coordinates)
-    if not coordinates:
+    responses = dict(zip(response_names(plant.face), plant.controlled_names, strict=True)) if plant.outputs else {}
+    what = "coordinate, output or response of an output" if plant.outputs else "coordinate"
+    mistakes.unknown(what, names, [*plant.names, *plant.outputs, *responses])
+    if not names:
         mistakes.add("name at least one coordinate whose response is disturbed")
-    for name in (disturbance_name(c) for c in coordinates):
+    for name in (disturbance_name(c) for c in names):
         if name in plant.parameters:
             mistakes.add(f"the plant has a parameter '{name}' already; rename it")
     mistakes.raise_if_any()
-    units = dict(zip(plant.names, plant.response_units, strict=True))
-    added = {disturbance_name(c): Parameter(0.0, 0.0, units[c]) for c in coordinates}
+    coordinates = [n for n in names if n in plant.coordinates]
+    if plant.outputs and plant.inverse is not None and coordinates:
+        raise NotSupported(
+            f"disturbed: Plant(inverse=...) does not know the disturbance of {coordinates[0]}, of which outputs are expressions; "
+            f"leave the inverse out, or disturb an output ({', '.join(plant.outputs)})"
+        )
+    units = {n: one.unit for n, one in plant.outputs.items()} | dict(
+        zip(plant.names, plant.response_units, strict=True)
+    )
+    if responses:
+        units |= dict(zip(responses, plant.response_signal("_").units, strict=True))
+    added = {disturbance_name(n): Parameter(0.0, 0.0, units[n]) for n in names}
     return replace(
         plant,
         parameters={**plant.parameters, **added},
         response=_response(plant, coordinates),
-        inverse=None if plant.inverse is None else _inverse(plant, plant.inverse, coordinates),
+        inverse=None if plant.inverse is None else _inverse(plant, plant.inverse, names),
+        outputs={n: _output(plant, n, one, names) for n, one in plant.outputs.items()},
     )
 
 
-def disturbance_name(coordinate: str) -> str:
-    """Name of the parameter that disturbs the response of a coordinate."""
-    return f"w_{coordinate}"
+def disturbance_name(name: str) -> str:
+    """Name of the parameter that disturbs a coordinate's response, an output (w_y), or an output's response (w_y_2 of y'')."""
+    order = name.count("'")
+    return f"w_{name.rstrip(chr(39))}_{order}" if order else f"w_{name}"
 
 
 def _response(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping[str, Expression]]:
     def response(*arguments: Named) -> Mapping[str, Expression]:
-        *others, p = arguments
-        responses = plant.response(*others, _own(plant, p))
+        count = 1 if plant.algebraic is None else 2  # algebraic states come after the parameters
+        others, (p, *algebraic) = arguments[:-count], arguments[-count:]
+        responses = plant.response(*others, _own(plant, p), *algebraic)
         return {c: v + p[disturbance_name(c)] if c in coordinates else v for c, v in responses.items()}
 
     vars(response)["__signature__"] = inspect.signature(plant.response)
     return response
 
 
+def _output(plant: Plant, name: str, one: Output, names: Sequence[str]) -> Output:
+    """The output as an expression of the plant's own parameters, and of those of `names` that disturb it or its response."""
+    shifted = name in names and name not in plant.coordinates
+    own = [n for n in names if "'" in n and n.rstrip("'") == name]
+
+    def expression(*arguments: Named) -> Expression:
+        *others, p = arguments
+        value = one.expression(*others, _own(plant, p))
+        return value + p[disturbance_name(name)] if shifted else value
+
+    vars(expression)["__signature__"] = inspect.signature(one.expression)
+    if own and one.response_disturbance:
+        raise NotSupported(
+            f"disturbed: the response of '{name}' has the disturbance {one.response_disturbance} already"
+        )
+    return replace(
+        one, expression=expression, response_disturbance=disturbance_name(own[0]) if own else one.response_disturbance
+    )
+
+
 def _inverse(
-    plant: Plant, inverse: Callable[..., Mapping[str, Expression]], coordinates: Sequence[str]
+    plant: Plant, inverse: Callable[..., Mapping[str, Expression]], names: Sequence[str]
 ) -> Callable[..., Mapping[str, Expression]]:
+    """The user's inverse for the response without its disturbance; that of an output itself changes no response."""
+    responses = zip(response_names(plant.face), plant.controlled_names, strict=True)
+    disturbs = dict(responses) if plant.outputs else dict.fromkeys(plant.names)
+    by = {disturbs[n] or n: disturbance_name(n) for n in names if n in disturbs}
+
     def undisturbed(*arguments: Named) -> Mapping[str, Expression]:
         *others, r, p = arguments
-        entries = [r[c] - p[disturbance_name(c)] if c in coordinates else r[c] for c in plant.controlled_names]
+        entries = [r[c] - p[by[c]] if c in by else r[c] for c in plant.controlled_names]
         return inverse(*others, Named(plant.controlled_names, ca.vertcat(*entries), "coordinate"), _own(plant, p))
 
     return undisturbed

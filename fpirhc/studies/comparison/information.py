@@ -24,10 +24,12 @@ class Information:
     Args:
         uses: names of the measured quantities on which its command depends.
         rate: in words: in every cycle, or with every plan.
+        waits: whether what it learns waits for the next plan.
     """
 
     uses: tuple[str, ...]
     rate: str
+    waits: bool = False
 
 
 def information(problem: Problem, controller: Controller, loop: Composite, cycles: int) -> Information:
@@ -39,7 +41,8 @@ def information(problem: Problem, controller: Controller, loop: Composite, cycle
         loop: closed with it.
         cycles: from plan to plan; 1 for a controller that does not plan.
     """
-    return Information(_used(problem, loop), _rate(controller, cycles))
+    waits = cycles > 1 and controller.learns and not controller.model_acts_at_once
+    return Information(_used(problem, loop), _rate(controller, cycles), waits)
 
 
 def sentences(problem: Problem, known: Mapping[str, Information]) -> tuple[str, ...]:
@@ -59,6 +62,7 @@ def _given(problem: Problem) -> str:
     names = sensing.measures(plant) if sensing.estimates else (*plant.face.state.elements, *response_names(plant.face))
     if plant.outputs and sensing.belief is None:  # the state too
         names = (*plant.state.elements, *(n for n in names if n not in plant.state.elements))
+    names = tuple(dict.fromkeys(names))  # an output of order 0 is its own response
     text = f"all controllers are given {', '.join(names)} in every cycle of {problem.period:g} {problem.time_unit}"
     late = problem.dead_time.measurement
     text += f", {late:g} {problem.time_unit} late" if late else ""

@@ -84,7 +84,9 @@ def _rates(entries: Sequence[Entry]) -> list[str]:
     """Adaptation acts in every cycle; what is learned for a plan acts when a plan is made."""
     planners = [e for e in entries if e.plan_every > 1]
     every_cycle = [e.name for e in planners if e.adaptive and not e.learns]
-    every_plan = [e.name for e in planners if e.learns and not e.adaptive]
+    every_plan = [
+        e.name for e in planners if e.learns and not e.adaptive and (e.information is None or e.information.waits)
+    ]
     if not every_cycle or not every_plan:
         return []
     stride = planners[0].plan_every

@@ -1,0 +1,158 @@
+"""Disturbances of outputs: y = h(x, p) + d(t) is what is measured, judged and followed.
+
+Laws: a plant whose output has the disturbance as an expression of a clock is the same task; d moves no state by itself; derivatives
+of y have those of d; a controller holds y, so that h moves the other way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from own_disturbance import Sawtooth
+from test_outputs import OPTIMISER, SAME, SHORT, TWO_MASS, curve, hill, on_outputs, planned, sedated, simulated
+
+import fpirhc as fp
+from fpirhc.errors import InvalidProblem
+from fpirhc.simulation.simulate import disturbance_table
+
+LAW = fp.Exponential(rate=1.0)
+WAVE = fp.Sine(2.0, 0.1, 0.3)
+FORMULA = fp.Formula(lambda t: 2.0 * ca.sin(0.2 * ca.pi * t + 0.3))
+
+
+def with_clock(believed: float) -> fp.Plant:
+    """The wave as a part of the output, by the plant's own clock."""
+    plain = hill(believed)
+    return fp.Plant.of_states(
+        states={**plain.coordinates, "clock": "min"},
+        inputs=plain.inputs,
+        parameters=plain.parameters,
+        rates=lambda x, u, p: {"C": u.u - x.C, "E": 0.5 * (x.C - x.E), "clock": 1.0 + 0 * x.C},
+        outputs={"depth": fp.Output("1", lambda x, p: curve(x.E, p.half) + FORMULA.expression(x.clock))},
+        time_unit="min",
+    )
+
+
+@pytest.mark.parametrize("wave", [WAVE, FORMULA])
+@pytest.mark.parametrize("adaptive", [False, True])
+def test_a_disturbed_output_is_the_output_with_the_disturbance_in_it(wave: Any, adaptive: bool) -> None:
+    """A controller that knows the clock has the wave in its model; the other one sees it in what is measured."""
+    plain = sedated(hill(4.0), disturbances={"depth": wave})
+    clock = replace(plain, plant=with_clock(4.0), start={**plain.start, "clock": 0.0}, disturbances={})
+    law = fp.ComputedTorque(LAW, fp.Affine(-1.0) if adaptive else fp.Identity())
+    run, other = (simulated(p, law) for p in (plain, clock))
+    assert np.allclose(run["output_disturbance.depth"], FORMULA.values(run.time, np.random.default_rng(0)), atol=1e-12)
+    # At the same states both measure the same y, y' and, under the same command, the same y''.
+    x = np.column_stack([run["plant_state"], run.time])
+    u, p, calm = run["command"], [4.0], np.zeros(3)
+    of = clock.plant.output_function.map(run.cycles)
+    y = np.asarray(of(x.T, u.T, np.tile(p, (run.cycles, 1)).T, np.tile(calm, (run.cycles, 1)).T).full()).T
+    assert np.allclose(run["output"], y, atol=1e-9)
+    second = clock.plant.controlled_response_function.map(run.cycles - 1)
+    r = np.asarray(second(x[1:].T, u[:-1].T, np.full((1, run.cycles - 1), 4.0)).full()).ravel()
+    assert np.allclose(run["realised.depth"][1:], r, atol=1e-9)
+    # The controller that does not know the wave follows nearly as well once it adapts.
+    errors = [np.sqrt(np.mean(one["true_error.depth"][900:] ** 2)) for one in (run, other)]
+    if adaptive:
+        assert errors[0] < 0.01
+    else:
+        assert errors[0] > 0.1
+        assert errors[1] < 0.005
+
+
+def test_a_step_of_an_output_is_measured_judged_and_followed() -> None:
+    """The output jumps with its error, no state does; at rest y is back at its reference and h is lower by d."""
+    step = fp.Step(at=6.0, size=4.0)
+    problem = sedated(hill(5.5), disturbances={"depth": step})
+    run = simulated(problem, fp.ComputedTorque(LAW, fp.Affine(-1.5)))
+    at = round(6.0 / problem.period)
+    jumps = np.diff(run["output.depth"])
+    assert jumps[at - 1] == pytest.approx(4.0, abs=0.1)
+    assert np.diff(run["true_error.depth"])[at - 1] == pytest.approx(-4.0, abs=0.1)
+    assert np.abs(np.diff(run["output.depth'"])[at - 1]) < 0.2
+    assert np.allclose(
+        run["output.depth"] - run["output_disturbance.depth"], curve(run["plant_state.E"], 4.0), rtol=1e-12
+    )
+    assert abs(run["true_error.depth"][-1]) < 0.01
+
+
+def test_without_feedback_no_state_feels_it() -> None:
+    """Open loop: the same commands, the same states, another output."""
+    problem = sedated(hill(4.0))
+    held = fp.ComputedTorque(fp.Exponential(rate=1e-9, integral=False))
+    runs = [simulated(replace(problem, disturbances=d), held) for d in ({}, {"depth": fp.Step(at=5.0, size=3.0)})]
+    assert np.allclose(runs[0]["plant_state"], runs[1]["plant_state"], atol=1e-6)
+    assert np.allclose(runs[1]["output.depth"][-1] - runs[0]["output.depth"][-1], 3.0, atol=1e-5)
+
+
+def test_plans_follow_a_disturbed_output_and_adaptation_helps() -> None:
+    problem = planned(disturbances={"depth": WAVE})
+    plain, adaptive = fp.RecedingHorizon(OPTIMISER), fp.RecedingHorizon(OPTIMISER, fp.Affine(-1.5))
+    errors = [fp.measure(problem, simulated(problem, c)).rms_error["depth"] for c in (plain, adaptive)]
+    assert errors[1] < 0.6 * errors[0]
+    assert errors[0] < 0.5  # a quarter of the wave
+
+
+def test_the_cost_of_a_run_is_that_of_the_disturbed_output() -> None:
+    problem = replace(planned(disturbances={"depth": WAVE}), duration=3.0, measure_from=0.0)
+    run = simulated(problem, fp.RecedingHorizon(OPTIMISER))
+    error = run["true_error"][:, 0]
+    slope = run["reference.depth'"] - run["output.depth'"]
+    assert np.allclose(run["cost.outputs"], problem.period * (error**2 + 0.1 * slope**2), rtol=1e-6)
+
+
+def test_an_estimator_sees_a_jump_in_its_samples() -> None:
+    """The measured derivative does not have the jump; a difference of samples does, for one cycle."""
+    problem = sedated(hill(4.0), disturbances={"depth": fp.Step(at=5.0, size=0.5)})
+    problem = replace(problem, sensing=fp.Sensing(estimator=fp.PositionDifference()), duration=6.0)
+    run = simulated(problem, fp.ComputedTorque(LAW))
+    at = round(5.0 / problem.period)
+    wrong = np.abs(run["output.depth'"] - run["plant_output.depth'"])
+    assert wrong[at] > 0.2 / problem.period
+    assert wrong[:at].max() < 0.1 * wrong[at]
+
+
+def test_a_reality_has_it_on_its_own_output() -> None:
+    model = hill(5.5)
+    problem = sedated(model, disturbances={"depth": WAVE})
+    real = replace(problem, reality=fp.Reality(model))
+    one, other = (simulated(p, fp.ComputedTorque(LAW, fp.Affine(-1.0))) for p in (problem, real))
+    assert np.array_equal(one["output"], other["output"])
+    assert np.array_equal(one["realised"], other["realised"])
+
+
+def test_a_name_of_a_coordinate_is_the_coordinates() -> None:
+    """An output q1 that is the coordinate q1 is disturbed as the coordinate is: its response."""
+    disturbances = {"q1": fp.Sine(0.5, 3.0)}
+    short = replace(SHORT, duration=0.05, measure_from=0.0, disturbances=disturbances)
+    plain, run = (simulated(p, TWO_MASS.controllers["CTC"]) for p in (short, on_outputs(short)))
+    assert np.array_equal(plain["state"], run["state"])
+    assert "output_disturbance" not in run.layout.names
+    other = {"one": fp.Output("m", lambda q, v, p: q.q1), "q2": SAME["q2"]}
+    named = replace(SHORT, plant=replace(SHORT.plant, outputs=other), disturbances={"one": fp.Sine(0.5, 3.0)},
+        reference=fp.Trajectory(lambda t: {"one": 2.2 + 0 * t, "q2": 5.4 + 0 * t}), cost=None, horizon=None,
+        duration=0.05, measure_from=0.0)  # fmt: skip
+    one = simulated(named, fp.ComputedTorque(fp.Exponential(6.0)))
+    assert np.allclose(one["output.one"] - one["state.q1"], 0.5 * np.sin(6 * np.pi * one.time), atol=1e-12)
+
+
+def test_columns_are_the_disturbances_then_the_derivatives() -> None:
+    problem = sedated(hill(4.0), disturbances={"u": fp.Noise(1.0), "depth": WAVE, "E": Sawtooth()})
+    table, t = disturbance_table(problem, 3, 50), np.arange(50) * problem.period
+    omega = 0.2 * np.pi
+    assert table.shape == (50, 5)
+    assert np.allclose(table[:, 3], 2 * omega * np.cos(omega * t + 0.3))
+    assert np.allclose(table[:, 4], -2 * omega**2 * np.sin(omega * t + 0.3))
+    assert np.allclose(FORMULA.derivative(t, 2), table[:, 4])
+    assert not Sawtooth().derivative(t, 1).any()
+
+
+def test_a_name_that_is_neither_is_named() -> None:
+    with pytest.raises(InvalidProblem, match="disturbances: input, coordinate or output 'deep' is unknown"):
+        sedated(hill(4.0), disturbances={"deep": WAVE})
+    with pytest.raises(InvalidProblem, match="not finite"):
+        sedated(hill(4.0), disturbances={"depth": fp.Formula(ca.sqrt)})

@@ -1,0 +1,236 @@
+"""Learners on plants with outputs: offset-free control, disturbances of outputs and responses, learned parameters.
+
+Laws: outputs that are coordinates change no estimate; the filter is a recursion that is written here; a disturbance of a
+response is what a deformation corrects, and a plan does not see it; parameters are found from the response of an output.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+import scipy.linalg
+from test_outputs import SHORT, TWO_MASS, arm, circle, hill, on_outputs, planned, sedated, simulated
+
+import fpirhc as fp
+from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
+from fpirhc.learning.estimators.disturbed import disturbed
+from fpirhc.studies.comparison.information import information
+
+LAW = fp.ComputedTorque(fp.Exponential(rate=1.0))
+STATES = {"C": 0.01, "E": 0.01}
+SLOW = {"C": 1e-3, "E": 1e-3}
+ANSWER = fp.DisturbanceKalman({"depth''": 100.0}, {"depth''": 0.1, **STATES}, noise=SLOW)
+SHIFT = fp.DisturbanceKalman({"depth": 1.0}, {"depth": 0.01, **STATES}, noise=SLOW)
+PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-2))
+
+
+@pytest.mark.parametrize("name", ["CTC", "RHC"])
+def test_outputs_that_are_coordinates_change_no_estimate(name: str) -> None:
+    """The filter that measures the response too: positions and velocities are states and outputs at once."""
+    short = replace(SHORT, duration=0.1, measure_from=0.0)
+    weights = {"q1": 1e-3, "q2": 1e-3, "q1'": 1e-2, "q2'": 1e-2, "q1''": 0.1, "q2''": 0.1}
+    offset_free = fp.Estimating(
+        TWO_MASS.controllers[name], fp.DisturbanceKalman({"q1": 5.0, "q2": 5.0}, weights), at_once=True
+    )
+    plain, run = (simulated(p, offset_free) for p in (short, on_outputs(short)))
+    assert np.ptp(plain["estimate"]) > 0.1
+    for signal in ("state", "command", "estimate"):
+        assert np.array_equal(plain[signal], run[signal])
+
+
+def test_the_filter_on_the_hand_of_an_arm_is_the_recursion_by_hand() -> None:
+    """Angles, hand and the hand's acceleration are measured; a joint and the hand's acceleration are disturbed."""
+    drift, noise = {"a": 2.0, "x''": 3.0}, {"b": 0.1}
+    measured = {"a": 0.01, "b": 0.01, "x": 0.02, "y'": 0.05, "x''": 0.5}
+    problem = replace(circle(arm()), duration=0.3, measure_from=0.0)
+    run = simulated(
+        problem, fp.Estimating(fp.ComputedTorque(fp.Exponential(6.0)), fp.DisturbanceKalman(drift, measured, noise))
+    )
+
+    plant, mass, period = problem.plant, 1.4, problem.period
+    rate = plant.forced_derivative_function
+
+    def moved(x: np.ndarray, u: np.ndarray, w: np.ndarray) -> np.ndarray:
+        def f(s: np.ndarray) -> np.ndarray:
+            return rate(s, u, [mass], w).full().ravel()
+
+        k1 = f(x)
+        k2 = f(x + period / 2 * k1)
+        k3 = f(x + period / 2 * k2)
+        return x + period / 6 * (k1 + 2 * k2 + 2 * k3 + f(x + period * k3))
+
+    def shown(x: np.ndarray, u: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """The second w adds to the hand's acceleration alone."""
+        forcing = np.array([w[0], 0.0])
+        y = plant.output_function(x, u, [mass], forcing).full().ravel()
+        step = 1e-4  # of a central difference of the hand's speed along the motion
+        xdot = rate(x, u, [mass], forcing).full().ravel()
+        ends = tuple(plant.output_function(x + s * step * xdot, u, [mass], forcing).full().ravel()[2] for s in (1, -1))
+        back = (ends[0] - ends[1]) / (2 * step)
+        return np.array([x[0], x[1], y[0], y[3], back + w[1]])
+
+    def slopes(of: Callable[[np.ndarray], np.ndarray], at: np.ndarray) -> np.ndarray:
+        return np.column_stack([(of(at + e) - of(at - e)) / 2e-5 for e in 1e-5 * np.eye(at.size)])
+
+    # The operating point: the reference at t = 0 and the input that the model needs for its response there.
+    first = problem.start_state
+    response = np.asarray(problem.reference.function(plant)(0.0)[1].full()).ravel()
+    u0 = plant.inverse_function(first, response, [mass]).full().ravel()
+    a_x = slopes(lambda x: moved(x, u0, np.zeros(2)), first)
+    b_w = slopes(lambda w: moved(first, u0, w), np.zeros(2))
+    a = np.block([[a_x, b_w[:, :1], np.zeros((4, 1))], [np.zeros((2, 4)), np.eye(2)]])
+    c = np.hstack(
+        [slopes(lambda x: shown(x, u0, np.zeros(2)), first), slopes(lambda w: shown(first, u0, w), np.zeros(2))]
+    )
+    q = scipy.linalg.block_diag(np.outer(b_w[:, 1], b_w[:, 1]) * 0.1**2, np.diag([period * 4.0, period * 9.0]))
+    r = np.diag(np.array(list(measured.values())) ** 2)
+    p = scipy.linalg.solve_discrete_are(a.T, c.T, q, r)
+    gain = p @ c.T @ np.linalg.inv(c @ p @ c.T + r)
+
+    x, w = run["state"][0], np.zeros(2)
+    for k in range(1, run.cycles):
+        u = run["command"][k - 1]
+        ahead = moved(x, u, np.array([w[0], 0.0]))
+        seen = np.array([*run["state"][k][:2], run["output.x"][k], run["output.y'"][k], run["realised.x"][k]])
+        z = np.concatenate([ahead, w]) + gain @ (seen - shown(ahead, u, w))
+        x, w = z[:4], z[4:]
+        assert np.allclose(run["estimate"][k], w, rtol=1e-3, atol=1e-4)
+    assert np.ptp(run["estimate"], axis=0).min() > 0.05
+
+
+def rms(problem: fp.Problem, controller: fp.ComputedTorque | fp.RecedingHorizon | fp.Estimating) -> float:
+    return fp.measure(problem, simulated(problem, controller)).rms_error["depth"]
+
+
+def test_offset_free_control_of_a_wrong_curve() -> None:
+    """An estimate in every cycle lowers the error of both controllers, and a plan is not changed by it."""
+    problem = sedated(hill(5.5))
+    assert rms(problem, fp.Estimating(LAW, ANSWER)) < 0.5 * rms(problem, LAW)
+    run = simulated(planned(), fp.Estimating(PLAN, ANSWER))
+    assert fp.measure(planned(), run).rms_error["depth"] < 0.6 * rms(planned(), PLAN)
+    assert abs(run["true_error.depth"][-1]) < 0.02
+
+
+def test_a_disturbance_of_an_output_is_the_distance_of_the_curves() -> None:
+    """At rest the estimate is the measured depth less that of the model."""
+    problem = sedated(hill(5.5))
+    run = simulated(problem, fp.Estimating(LAW, SHIFT))
+    model = problem.plant.output_function(run["state"][-1], run["command"][-1], [5.5], np.zeros(2)).full().ravel()
+    assert run["estimate.w_depth"][-1] == pytest.approx(run["output.depth"][-1] - model[0], rel=0.01)
+    assert abs(run["estimate.w_depth"][-1]) > 5
+
+
+def test_a_plan_does_not_see_a_disturbance_of_the_response_and_the_inverse_does() -> None:
+    problem = replace(planned(), duration=1.0, measure_from=0.0)
+    run = simulated(problem, fp.Estimating(PLAN, ANSWER))
+    plant, k = problem.plant, 30
+    without = plant.controlled_response_function(run["state"][k], run["planned"][k], [5.5]).full().ravel()
+    assert np.allclose(run["desired"][k], without)
+    aimed = run["desired"][k] - run["estimate"][k]
+    assert np.allclose(run["command"][k], plant.inverse_function(run["state"][k], aimed, [5.5]).full().ravel())
+    assert abs(run["estimate"][k][0]) > 0.01
+
+
+def test_a_comparison_says_that_the_newest_estimate_acts() -> None:
+    from fpirhc.simulation.loop import close_loop
+
+    problem = planned()
+    for estimator, words in ((ANSWER, "its newest estimate acts"), (SHIFT, "in which a new estimate takes effect")):
+        controller = fp.Estimating(PLAN, estimator)
+        told = information(problem, controller, close_loop(problem, controller), 15)
+        assert words in told.rate
+        assert "depth" in told.uses
+
+
+def test_the_mass_of_an_arm_is_found_from_the_acceleration_of_its_hand() -> None:
+    """Recursive least squares by name; the response is that of the outputs, linear in 1 / m."""
+    problem = replace(circle(arm()), duration=1.5, measure_from=0.5)
+    learner = fp.RecursiveLeastSquares({"m": fp.Uncertain(0.3, 3.0, 0.5)}, {"x": 0.1, "y": 0.1}, 5.0)
+    run = simulated(problem, fp.Estimating(fp.ComputedTorque(fp.Exponential(6.0)), learner))
+    assert run["estimate.m"][-1] == pytest.approx(1.0, abs=3e-3)
+
+
+def test_late_samples_give_the_pairs_that_belong_together() -> None:
+    """Behind a dead time the mass is found as well; with pairs that ignore it, it is not."""
+    late = fp.DeadTime(inputs={"A": 6e-3, "B": 6e-3}, measurement=4e-3)
+    problem = replace(circle(arm(), dead_time=late), duration=1.5, measure_from=0.5)
+    learner = fp.MovingHorizon({"m": fp.Uncertain(0.3, 3.0, 0.5)}, {"x": 0.1, "y": 0.1}, 20, 5.0)
+    masses = [
+        simulated(problem, fp.Estimating(fp.ComputedTorque(fp.Exponential(6.0)), learner, dead_time=believed))["estimate.m"][-1]
+        for believed in (None, fp.DeadTime())
+    ]  # fmt: skip
+    assert masses[0] == pytest.approx(1.0, abs=2e-3)
+    assert abs(masses[1] - 1.0) > 5 * abs(masses[0] - 1.0)
+
+
+def test_a_disturbance_reaches_a_model_with_algebraic_states() -> None:
+    through = replace(
+        hill(5.5),
+        response=lambda x, u, p, z: {"C": u.u - z.lost, "E": 0.5 * (x.C - x.E)},
+        algebraic=fp.Algebraic(
+            {"lost": "mg/l/min"}, lambda x, u, p, z: {"lost": z.lost - x.C}, lambda x, u, p: {"lost": 0 * x.C}
+        ),
+    )
+    p = np.array([5.5, 0.7])  # the half, and the disturbance of C
+    one, other = (
+        disturbed(plant, ("C",)).derivative_function([2.0, 1.0], 3.0, p).full() for plant in (hill(5.5), through)
+    )
+    assert np.allclose(one.ravel(), [3.0 - 2.0 + 0.7, 0.5])
+    assert np.allclose(one, other)
+
+
+def test_an_inverse_of_the_user_has_the_disturbance_of_the_response() -> None:
+    plant = hill(5.5)
+    by_user = replace(plant, inverse=lambda x, r, p: {"u": plant.inverse_function(x.vector, r.depth, p.half)[0]})
+    x, r, p = ca.DM([2.0, 1.5]), 3.0, ca.DM([5.5, 0.4])
+    one, other = (disturbed(one, ("depth''",)).inverse_function(x, r, p) for one in (plant, by_user))
+    assert float(one) == pytest.approx(float(other), rel=1e-9)
+    assert float(one) == pytest.approx(float(plant.inverse_function(x, r - 0.4, 5.5)), rel=1e-9)
+    with pytest.raises(NotSupported, match=r"Plant\(inverse=...\) does not know the disturbance of C"):
+        disturbed(by_user, ("C",))
+
+
+class Foreigner(fp.RecursiveLeastSquares):
+    """An estimator that does not say that it covers outputs."""
+
+    @property
+    def covers_outputs(self) -> bool:
+        """Nothing is said."""
+        return False
+
+
+WRONG: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
+    "a stranger": (
+        lambda: simulated(sedated(hill(5.5)), fp.Estimating(LAW, Foreigner({"half": fp.Uncertain(1, 9, 1)}, {"depth": 1.0}, 5.0))),
+        NotSupported,
+        "Foreigner is written for responses of coordinates",
+    ),
+    "a name": (lambda: disturbed(hill(5.5), ("deep",)), InvalidProblem, "mean 'depth'"),
+    "a measured name": (
+        lambda: simulated(sedated(hill(5.5)), fp.Estimating(LAW, fp.DisturbanceKalman({"C": 1.0}, {"depth'''": 1.0}))),
+        InvalidProblem,
+        "measured: state, output or response",
+    ),
+    "too little": (
+        lambda: simulated(sedated(hill(5.5)), fp.Estimating(LAW, fp.DisturbanceKalman({"C": 1.0, "E": 1.0, "depth": 1.0}, STATES))),
+        NotSupported,
+        "measure as many",
+    ),
+    "twice": (lambda: disturbed(disturbed(hill(5.5), ("depth''",)), ("depth''",)), InvalidProblem, "rename it"),
+    "no parameter": (
+        lambda: replace(hill(5.5), outputs={"depth": fp.Output("1", lambda x, p: x.E, response_disturbance="w")}),
+        InvalidProblem,
+        "is no parameter of the plant",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mistake", WRONG)
+def test_a_mistake_is_named(mistake: str) -> None:
+    make, kind, words = WRONG[mistake]
+    with pytest.raises(kind, match=words):
+        make()
