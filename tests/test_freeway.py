@@ -187,7 +187,7 @@ def test_even_the_exact_map_is_worse_than_the_iteration() -> None:
     """Traffic takes its time, and nobody knows the mainstream: figures of the description."""
     problem = task("freeway").problem
     exact = {n: replace(one, approximate=one.exact) for n, one in problem.plant.parameters.items()}
-    known = {n: fp.Known(one.real) for n, one in problem.signals.items()}
+    known = {n: fp.Known(one.values) for n, one in problem.signals.items()}
     informed = replace(problem, plant=replace(problem.plant, parameters=exact))
     for one, expected in ((informed, 33.5), (replace(informed, signals=known), 7.3)):
         run = fp.simulate(one, fp.FeedforwardOnly(), seed=0, compiled=False)

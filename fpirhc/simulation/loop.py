@@ -173,7 +173,7 @@ def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], Sho
         return [_sense_block(problem, hidden[0], Response(hidden[1], response.function))], hidden
     true = tuple(like(s, f"plant_{s.name}") for s in motion), like(response.signal, "plant_realised")
     sense = _sense_block(problem, true[0], Response(true[1], response.function))
-    if problem.plant.step is not None:
+    if problem.sensing.estimator.of_steps:
         sense = with_true_response(problem, sense, true[0][-1], true[1])
     blocks = [sense, _truth_block(problem, true[0][-1])]
     if problem.symbolic_reality is None or not problem.symbolic_reality.seen:

@@ -2,7 +2,7 @@
 
 A map has its own steps in place of an integrator, in the run and along a horizon. The plant of the problem is the map over one
 control cycle (`fpirhc.plant.maps`). A response of a map is a difference of outputs, which no sensor shows, so it is taken from the
-outputs of the last cycles (`StepDifference`).
+outputs of the last cycles (`StepDifference`); that of an output of order 0 is the output itself, and measured.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.plant.integrators import USUAL, Integrator
 from fpirhc.plant.map_steps import MapSteps
+from fpirhc.plant.plant import Plant
 from fpirhc.sensing.positions import StepDifference
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def settle_maps(problem: Problem, mistakes: Mistakes) -> None:
         if problem.horizon is not None:
             discretisation = _steps("horizon: discretisation", problem.horizon.discretisation, mistakes)
             settled["horizon"] = replace(problem.horizon, discretisation=discretisation)
-        if problem.sensing.estimator.measures_all and _has_differences(problem):
+        if problem.sensing.estimator.measures_all and not _instant(problem.plant):
             settled["sensing"] = replace(problem.sensing, estimator=StepDifference())
     elif problem.integrator.steps_maps:
         settled["integrator"] = USUAL
@@ -47,17 +48,29 @@ def settle_maps(problem: Problem, mistakes: Mistakes) -> None:
 def check_map_task(problem: Problem, mistakes: Mistakes) -> None:
     """Add what is not covered beside a map to `mistakes`."""
     model, reality = problem.plant, problem.symbolic_reality
-    if reality is not None and reality.plant.step is not None and model.step is None and _has_differences(problem):
+    instant = _instant(model)
+    at_once = bool(instant) and set(instant) == set(model.controlled or model.outputs)  # no derivative is looked for
+    if reality is not None and reality.plant.step is not None and model.step is None and not at_once:
         mistakes.add(
             "reality: it is a map, and the model has differential equations, whose derivatives a map does not have; write the "
             "model as a map with the same step"
         )
     if model.step is None:
         return
-    if not problem.sensing.estimator.of_steps and _has_differences(problem):
+    if instant and not at_once:
+        mistakes.add(
+            f"outputs: {', '.join(instant)} of order 0 beside outputs that steps move: their responses belong to other "
+            "cycles, which is not covered; control them by two problems"
+        )
+    if not instant and not problem.sensing.estimator.of_steps:
         mistakes.add(
             f"sensing: {type(problem.sensing.estimator).__name__} estimates derivatives with respect to time, which a map does not "
             "have; leave the estimator out, and differences of its steps are taken"
+        )
+    if max(model.face.orders) > 1 and (problem.sensing.belief is not None or problem.sensing.measured is not None):
+        mistakes.add(
+            "sensing: believed states are not covered where an output of a map has an order above 1, because its next values are "
+            "predicted from measured states; leave measured and belief out"
         )
     later = [name for name, order in zip(model.face.names, model.face.orders, strict=True) if order > 1]
     if later and reality is not None and reality.plant.step is None:
@@ -67,10 +80,9 @@ def check_map_task(problem: Problem, mistakes: Mistakes) -> None:
         )
 
 
-def _has_differences(problem: Problem) -> bool:
-    """Whether a controlled response is a derivative or a difference; that of an output of order 0 is the output."""
-    plant = problem.plant
-    return any(name not in plant.instant_names for name in plant.controlled or plant.outputs or plant.coordinates)
+def _instant(plant: Plant) -> tuple[str, ...]:
+    """Controlled outputs that the command moves at once; their response is the output itself."""
+    return tuple(name for name in plant.controlled or plant.outputs if name in plant.instant_names)
 
 
 def _steps(what: str, integrator: Integrator, mistakes: Mistakes) -> Integrator:

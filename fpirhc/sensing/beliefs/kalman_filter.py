@@ -22,11 +22,11 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.kinds import Positive
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import quantities, values_of
+from fpirhc.sensing.base import values_of
 from fpirhc.sensing.belief import Belief, Correct, Evidence, Model, Predict, Remembered
+from fpirhc.sensing.noises import covariance_entries, first_covariance, name_mistakes, require_named
 from fpirhc.sensing.observability import unobservable
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
@@ -53,9 +53,7 @@ class KalmanFilter(Belief):
     start: Mapping[str, Positive] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("measured", "noise"):
-            if not getattr(self, name):
-                raise InvalidValue(f"KalmanFilter({name}={{}}): name at least one")
+        require_named("KalmanFilter", measured=self.measured, noise=self.noise)
 
     def check(self, plant: Plant, measured: tuple[str, ...]) -> None:
         """Raise if a name is unknown or not measured.
@@ -63,17 +61,7 @@ class KalmanFilter(Belief):
         Raises:
             InvalidProblem: all mistakes together.
         """
-        mistakes = Mistakes("KalmanFilter")
-        every = quantities(plant)
-        mistakes.unknown("measured: quantity", self.measured, every)
-        for name in self.measured:
-            if name in every and name not in measured:
-                mistakes.add(
-                    f"measured: no sensor shows '{name}'; those of Sensing(measured=...) are {', '.join(measured)}"
-                )
-        mistakes.unknown("noise: coordinate", self.noise, plant.coordinates)
-        mistakes.unknown("start: state", self.start, plant.state.elements)
-        mistakes.raise_if_any()
+        name_mistakes("KalmanFilter", plant, measured, self.measured, self.noise, self.start).raise_if_any()
 
     def believes(self, plant: Plant, known: tuple[str, ...]) -> tuple[str, ...]:
         """The whole state: measured states come filtered."""
@@ -87,13 +75,11 @@ class KalmanFilter(Belief):
 
     def memory(self, model: Model) -> Layout:
         """The believed state, and its covariance column by column."""
-        state = model.plant.state
-        first = np.diag([self.start.get(e, 0.0) ** 2 for e in state.elements])
-        entries = tuple(f"{i},{j}" for j in state.elements for i in state.elements)
+        state, first = model.plant.state, first_covariance(model.plant, self.start)
         return Layout(
             (
                 Signal(_STATE, state.elements, state.units, tuple(map(float, model.start))),
-                Signal(_COVARIANCE, entries, start=tuple(map(float, first.ravel()))),
+                Signal(_COVARIANCE, covariance_entries(model.plant), start=tuple(map(float, first.ravel()))),
             )
         )
 
