@@ -220,6 +220,15 @@ def test_a_comparison_says_what_is_measured_and_what_is_believed() -> None:
     assert said.endswith("C, R, E are believed (KalmanFilter)")
 
 
+FIGURES = {"known": (0.117, 0.0217), "model": (0.078, 0.0210), "filter": (0.070, 0.0207)}
+
+
+@pytest.mark.parametrize("known", FIGURES)
+def test_figures_are_those_of_the_page(bis_errors: dict[tuple[str, str], float], known: str) -> None:
+    errors = [bis_errors[known, name] for name in ("CTC", "CTC+FPI")]
+    assert errors == pytest.approx(FIGURES[known], rel=0.01)
+
+
 # Steppers are given raw measurements
 
 
