@@ -13,7 +13,10 @@ import matplotlib.pyplot as plt
 import fpirhc as fp
 
 metering = fp.load_problem("freeway_metering")
-print("one step:", metering.problem.plant.step, metering.problem.plant.time_unit)
+plant = metering.problem.plant
+print(
+    f"one step: {3600 * plant.step:g} s, one cycle: {3600 * metering.problem.period:g} s"
+)
 
 # %%
 # The density at the merge follows a reference below the critical one. The law for the
@@ -28,14 +31,26 @@ figure, (density, rate) = plt.subplots(
     2, 1, sharex=True, figsize=(8, 5), layout="constrained"
 )
 for name, run in runs.items():
-    error = fp.measure(metering.problem, run).rms_error["rho5"]
+    error = fp.measure(metering.problem, run).rms_error["density"]
     print(f"{name:16s} {error:.2g} veh/km per lane")
-    density.plot(run.time, run["error.rho5"], label=name)
+    density.plot(run.time, run["error.density"], label=name)
     rate.plot(run.time, run["command.r"])
-density.set_ylabel("error of rho5 [veh/km]")
+density.set_ylabel("error of density [veh/km]")
 density.legend()
 rate.set_ylabel("metering rate")
 rate.set_xlabel("time [h]")
+
+# %%
+# What the iteration holds back: the densities of the six segments. The ramp joins the
+# fifth one.
+
+figure, axes = plt.subplots(figsize=(8, 2.5), layout="constrained")
+densities = [runs["CTC+FPI"][f"plant_state.rho{i}"] for i in range(1, 7)]
+time = runs["CTC+FPI"].time
+image = axes.pcolormesh(time, range(1, 7), densities, shading="nearest", cmap="magma")
+figure.colorbar(image, label="veh/km per lane")
+axes.set_xlabel("time [h]")
+axes.set_ylabel("segment")
 
 # %%
 # Emission is another task. It settles when traffic has settled, and the model of the
@@ -58,8 +73,18 @@ axes.set_ylabel("emission [kg/h]")
 axes.legend()
 
 # %%
-# The wrong map asks for more than the light can let in all the time. What the iteration
-# does with the target is a log of what the map has wrong.
+# The wrong map asks for more than the light can let in all the time, so its command
+# stands at the limit. The iteration moves the target until the measured emission is the
+# reference.
 
-run = runs["static map+FPI"]
-print([name for name in run.layout.names if "shift" in name or "target" in name])
+figure, (target, rate) = plt.subplots(
+    2, 1, sharex=True, figsize=(8, 4.5), layout="constrained"
+)
+for name, run in runs.items():
+    shown = "target.emission" if "target" in run.layout.names else "reference.emission"
+    target.plot(run.time, run[shown], label=name)
+    rate.plot(run.time, run["command.r"])
+target.set_ylabel("target [kg/h]")
+target.legend()
+rate.set_ylabel("metering rate")
+rate.set_xlabel("time [h]")
