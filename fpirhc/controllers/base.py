@@ -23,7 +23,7 @@ from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.largest_response import largest_response
-from fpirhc.controllers.mirror import measured_state, mirror_blocks, with_measured_state
+from fpirhc.controllers.mirror import mirror_blocks, with_measured_state
 from fpirhc.controllers.outside_block import ACTED, NOW, Told
 from fpirhc.controllers.own_reference import given_signals, motion_of, own_signals, own_values, with_reference
 from fpirhc.deformation.base import Deformation
@@ -60,7 +60,8 @@ def compose_controller(problem: Problem, controller: Controller, *, ahead: bool 
     blocks = with_reference(problem, blocks)
     reads, named = controller_reads(problem, ready), with_measured_state(problem.plant, blocks)
     if ahead and len(named) > len(blocks):
-        reads, named = reads + Layout((measured_state(problem.plant),)), blocks
+        added = named[: len(named) - len(blocks)]
+        reads, named = reads + Layout(tuple(s for block in added for s in block.writes.signals)), blocks
     return compose_informed(problem, ready, reads, named, delays, ahead=ahead)
 
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import casadi as ca
 
-from fpirhc.controllers.mirror_path import MEASURED, NONE, Path, measured_state
+from fpirhc.controllers.mirror_path import MEASURED, MEASURED_OUTPUT, NONE, Path, measured_output, measured_state
 from fpirhc.controllers.twin import BEFORE, twin_block
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.queue import every
@@ -22,7 +22,7 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout
 from fpirhc.task.problem import Problem
 
-__all__ = ["MEASURED", "measured_state", "mirror_blocks", "with_measured_state"]
+__all__ = ["MEASURED", "MEASURED_OUTPUT", "measured_output", "measured_state", "mirror_blocks", "with_measured_state"]
 
 
 def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
@@ -43,17 +43,20 @@ def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Bloc
 
 
 def with_measured_state(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
-    """Return the blocks, and before them one that writes the measured state where a block reads it.
+    """Return the blocks, and before them one that writes the measured state, or the outputs, where a block reads it.
 
     Args:
         plant: the plant.
         blocks: of the controller.
     """
-    if not any(MEASURED in block.reads for block in blocks):
-        return list(blocks)
-    target = measured_state(plant)
-    first = Block("measured", Layout((plant.state,)), Layout((target,)), lambda s: {MEASURED: s.state})
-    return [first, *blocks]
+    first: list[Block] = []
+    if any(MEASURED in block.reads for block in blocks):
+        target = measured_state(plant)
+        first = [Block("measured", Layout((plant.state,)), Layout((target,)), lambda s: {MEASURED: s.state})]
+    if any(MEASURED_OUTPUT in block.reads for block in blocks):
+        seen = Layout((plant.output,)), Layout((measured_output(plant),))
+        first.append(Block("measured_output", *seen, lambda s: {MEASURED_OUTPUT: s.output}))
+    return [*first, *blocks]
 
 
 def _instant_block(path: Path) -> Block:
