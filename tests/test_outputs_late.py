@@ -1,4 +1,4 @@
-"""Plants with outputs behind dead time: the outputs are predicted with the state, and the distance of a wrong model stays on them."""
+"""Plants with outputs behind dead time: outputs are predicted with the state, and keep their distance from the model's."""
 
 from __future__ import annotations
 
@@ -50,10 +50,11 @@ def test_outputs_ahead_of_a_right_model_are_those_that_come() -> None:
 def test_the_distance_of_a_wrong_model_moves_as_a_polynomial() -> None:
     """Y + d' tau of a plant whose outputs differ from the model's by d and d'; d'' of the model is zero."""
     plant = hill(5.5)
+    shift = np.array([2.0, -0.3])
     x, later, tau = np.array([3.0, 2.0]), np.array([3.1, 2.1]), 0.25
     own, ahead = (plant.output_function(s, 0.0, 5.5, np.zeros(2)).full().ravel() for s in (x, later))
-    y = output_ahead(plant)(own + [2.0, -0.3], x, later, 5.5, tau).full().ravel()
-    assert np.allclose(y, ahead + [2.0 - 0.3 * tau, -0.3])
+    y = output_ahead(plant)(own + shift, x, later, 5.5, tau).full().ravel()
+    assert np.allclose(y, ahead + np.array([2.0 - 0.3 * tau, -0.3]))
 
 
 def test_a_prediction_helps_behind_dead_time_and_leaves_no_error_at_rest() -> None:
@@ -111,8 +112,8 @@ def test_the_linear_loop_of_a_prediction_says_why_there_is_none() -> None:
 
 
 def test_live_dead_times_of_outputs_are_those_that_are_built() -> None:
-    times = {"inputs": {"A": 4e-3, "B": 4e-3}}
-    problem = replace(circle(arm(), dead_time=fp.DeadTime(**times)), duration=0.2, measure_from=0.0)
+    times = fp.DeadTime(inputs={"A": 4e-3, "B": 4e-3})
+    problem = replace(circle(arm(), dead_time=times), duration=0.2, measure_from=0.0)
     law = fp.ComputedTorque(fp.Exponential(6.0))
     built = simulated(problem, fp.Predicted(law, inputs=4e-3))
     ready = simulator(problem, fp.Predicted(law, inputs=2e-3, longest=8e-3), compiled=False, live=["inputs"])

@@ -1,4 +1,4 @@
-"""The outputs at the time when a command will act: those of the predicted state, and the distance of the measured ones from the model's.
+"""The outputs at the time when a command will act: the model's at the predicted state, and the distance of the measured ones.
 
     y^(k)(t + tau) = h_k(x(t + tau), p) + sum_{j >= k} d^(j)(t) tau^(j-k) / (j-k)!,      d^(j) = y^(j) - h_j(x, p),   j < r,
 
