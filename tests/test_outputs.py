@@ -417,7 +417,6 @@ def test_a_gain_that_vanishes_on_the_way_is_named_for_several_inputs_too() -> No
 
 
 NOT_COVERED: dict[str, tuple[Callable[[], Controller], str]] = {
-    "predicting": (lambda: fp.Predicted(fp.ComputedTorque(TRACK), inputs=1), "Predicted does not cover outputs"),
     "from plan": (lambda: fp.RecedingHorizon(OPTIMISER, replanning=fp.FromPlan(TRACK)), "FromPlan tracks"),
     "tracked": (
         lambda: fp.RecedingHorizon(OPTIMISER, replanning=fp.FromMeasurementTracked(TRACK)),
