@@ -170,6 +170,50 @@ def test_an_output_of_order_zero_shows_what_is_believed() -> None:
     assert errors["model"] > 10
 
 
+# Signals from outside
+
+
+def room(belief: Belief) -> fp.Problem:
+    """A heated room in known weather: its air is an output that is measured, late by two cycles; its walls are believed."""
+    plant = fp.Plant.of_states(
+        states={"air": "K", "walls": "K"},
+        inputs={"heat": "kW"},
+        parameters={"loss": fp.Parameter(0.3, 0.3, "kW/K"), "ambient": fp.outside(nominal=280.0, unit="K")},
+        rates=lambda x, u, p: {
+            "air": p.loss * (p.ambient - x.air) + 0.5 * (x.walls - x.air) + u.heat,
+            "walls": 0.1 * (x.air - x.walls) + 0.05 * (p.ambient - x.walls),
+        },
+        outputs={"felt": fp.Output("K", lambda x, p: 0.7 * x.air + 0.3 * x.walls)},
+        time_unit="h",
+    )
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"felt": 291.0 + ca.sin(0.3 * t)}),
+        start={"air": 292.0, "walls": 289.0},
+        period=0.25,
+        duration=10.0,
+        signals={"ambient": fp.Known(lambda t: 280.0 + 5.0 * ca.sin(0.4 * t))},
+        dead_time=fp.DeadTime(measurement=0.5),
+        sensing=fp.Sensing({}, fp.PositionDifference(), measured=["felt"], belief=belief),
+    )
+
+
+ROOM: dict[str, Any] = {"measured": {"felt": 0.1}, "noise": {"air": 0.1, "walls": 0.1}}
+
+
+@pytest.mark.parametrize(
+    "belief",
+    [fp.ModelStates(), fp.KalmanFilter(**ROOM), fp.MovingHorizonStates(**ROOM, window=5)],
+    ids=lambda b: type(b).__name__,
+)
+def test_states_behind_an_output_are_believed_in_known_weather(belief: Belief) -> None:
+    """The model moves in the weather of the time of the samples, in every cycle of a window too."""
+    result = run(room(belief), fp.ComputedTorque(fp.Exponential(rate=0.5)))
+    true = result["plant_state"]
+    assert np.ptp(true[:, 1]) > 0.5
+    np.testing.assert_allclose(result["state"][2:], true[:-2], atol=1e-9)
+
+
 # Live settings
 
 
