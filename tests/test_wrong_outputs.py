@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.controllers import receding_horizon
+from fpirhc.horizon.stage_data import shifted_reference
 
 TASK = fp.load_problem("anaesthesia")
 PROBLEM, PLANT = TASK.problem, TASK.problem.plant
@@ -16,14 +16,13 @@ PROBLEM, PLANT = TASK.problem, TASK.problem.plant
 @pytest.mark.parametrize(("name", "described"), [("RHC", 2.29), ("RHC+FPI", 2.30)])
 def test_a_plan_along_the_models_own_outputs_stays_at_the_wrong_one(name, described, monkeypatch):
     """Without d, the measured outputs minus the model's, a plan ends where the wrong curve says that it is."""
-    ordinary = receding_horizon.shifted_reference
 
     def unshifted(*arguments):
-        function = ordinary(*arguments)
+        function = shifted_reference(*arguments)
         symbols = [ca.MX.sym(function.name_in(k), *function.size_in(k)) for k in range(function.n_in())]
         return ca.Function("unshifted", symbols, symbols[:1])
 
-    monkeypatch.setattr(receding_horizon, "shifted_reference", unshifted)
+    monkeypatch.setattr("fpirhc.controllers.receding_horizon.shifted_reference", unshifted)
     run = fp.simulate(PROBLEM, TASK.controllers[name], seed=0, compiled=False)
     assert fp.measure(PROBLEM, run).rms_error["bis"] == pytest.approx(described, abs=0.01)
 
