@@ -60,9 +60,10 @@ controller = fp.ComputedTorque(fp.Exponential(rate=1.0))
 runs = {name: fp.simulate(batch(b), controller, seed=0) for name, b in beliefs.items()}
 
 # %%
-# Two pressures of A explain the falling sum: the true one and one below zero, for the
-# rate goes with the square of A. A filter that was once behind zero stays there, and so
-# does a window. Bounds keep the window where the true one can be found.
+# Two pressures of A explain why the sum falls: the true one and one below zero, for the
+# rate goes with the square of A. A filter that was once behind zero stays there, with a
+# sum that is 0.2 bar too low, and so does a window. Bounds keep the window where the
+# true pressure can be found.
 
 figure, (top, bottom) = plt.subplots(
     2, 1, figsize=(8, 6), layout="constrained", sharex=True
