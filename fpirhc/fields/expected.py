@@ -282,4 +282,11 @@ def _container(origin: type, arguments: tuple[typing.Any, ...]) -> Expected:
 
 
 _OFTEN = (float, int)
-_WORDS = {str: "a text", bool: "True or False", type(None): "None", dict: "a dict", ca.SX: "an expression", np.ndarray: "an array"}
+_WORDS = {
+    str: "a text",
+    bool: "True or False",
+    type(None): "None",
+    dict: "a dict",
+    ca.SX: "an expression",
+    np.ndarray: "an array",
+}
