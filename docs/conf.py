@@ -49,5 +49,6 @@ sphinx_gallery_conf = {
     "abort_on_example_error": True,
     "only_warn_on_example_error": False,
     "plot_gallery": True,
+    "parallel": 2,
     "remove_config_comments": True,
 }

@@ -88,10 +88,12 @@ from .sensing import (
     Sensing,
     Sensor,
     StateVariableFilter,
+    StepDifference,
     VelocityDifference,
 )
 from .sensing.beliefs.kalman_filter import KalmanFilter
 from .sensing.beliefs.model_states import ModelStates
+from .sensing.beliefs.moving_horizon_states import MovingHorizonStates
 from .simulation.lyapunov_view import LyapunovView, lyapunov_view
 from .simulation.machine import Watch
 from .simulation.metrics import Metric, Metrics, measure
@@ -120,6 +122,7 @@ from .task.samples import Samples
 from .task.set_point import Setpoint
 from .tracking.exponential import Exponential
 from .tracking.fractional import Fractional
+from .tracking.shift_polynomial import ShiftPolynomial
 
 __all__ = [
     "PID",
@@ -195,6 +198,7 @@ __all__ = [
     "ModelReferenced",
     "ModelStates",
     "MovingHorizon",
+    "MovingHorizonStates",
     "Noise",
     "Normal",
     "Osqp",
@@ -238,6 +242,7 @@ __all__ = [
     "Sensor",
     "SequentialQuadratic",
     "Setpoint",
+    "ShiftPolynomial",
     "Sigmoid",
     "Sine",
     "SlidingMode",
@@ -249,6 +254,7 @@ __all__ = [
     "StateVariableFilter",
     "Status",
     "Step",
+    "StepDifference",
     "Stepper",
     "StopRun",
     "Suggestion",

@@ -442,12 +442,6 @@ REFUSED = {
         InvalidValue,
         "damping must name",
     ),
-    "dead time where pairs are needed": (
-        replace(task(), dead_time=fp.DeadTime(inputs={"u": 0.01})),
-        NLMS,
-        NotSupported,
-        "only without dead time",
-    ),
     "order other than 2": (
         fp.Problem(chain(1), fp.Trajectory(lambda t: {"y": t}), {"y": 0}, period=1e-3, duration=1.0),
         fp.SlotineLi(1.0, {"y": 1.0}, fp.Projection(0.1), {"m": (0.1, 2.0)}),

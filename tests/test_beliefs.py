@@ -100,8 +100,8 @@ def test_a_right_model_believes_what_is(make, controller, corrected):
     np.testing.assert_allclose(believed[late:], true[: len(true) - late], atol=1e-11 * (1 + np.abs(true).max()))
 
 
-def test_a_right_model_in_known_weather_believes_what_is():
-    """A heated room: the walls are believed, the weather of each cycle is a signal from outside that the model is told."""
+def room(**changes: Any) -> fp.Problem:
+    """A heated room: the walls are believed, the weather is a signal from outside that the model is told."""
     weather = fp.Known(lambda t: 280.0 + 5.0 * ca.sin(0.4 * t))
     plant = fp.Plant(
         coordinates={"air": "K", "walls": "K"},
@@ -124,9 +124,40 @@ def test_a_right_model_in_known_weather_believes_what_is():
         signals={"ambient": weather},
         sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["air"], belief=fp.ModelStates()),
     )
-    result = run(problem, CTC)
-    assert np.ptp(result["plant_state.walls"]) > 1
-    np.testing.assert_allclose(result["state"], result["plant_state"], atol=1e-10)
+    return replace(problem, **changes)
+
+
+@pytest.mark.parametrize("late", [0, 3])
+def test_a_right_model_in_known_weather_believes_what_is(late):
+    """Behind a dead time too: the model then moves in the weather of the time of the samples."""
+    result = run(room(dead_time=fp.DeadTime(measurement=0.25 * late)), CTC)
+    true = result["plant_state"]
+    assert np.ptp(true[:, 1]) > 1
+    np.testing.assert_allclose(result["state"][late:], true[: len(true) - late], atol=1e-10)
+
+
+@pytest.mark.parametrize("belief", [fp.ModelStates(), fp.ModelStates(corrected=False), KALMAN], ids=str)
+def test_samples_that_are_late_by_a_fraction_are_those_of_a_linear_model(belief):
+    """Commands 1.25 and samples 2.4 cycles late: every believed state is interpolated as the measured one is, to rounding."""
+    dead_time = fp.DeadTime(inputs={"u": 1.25 / 6}, measurement=2.4 / 6, before={"u": 9.0})
+    result = run(infusion(belief, dead_time=dead_time, duration=15.0), fp.ExactModel(CTC))
+    true = result["plant_state"]
+    expected = 0.6 * true[1:-2] + 0.4 * true[:-3]
+    np.testing.assert_allclose(result["state"][3:], expected, atol=1e-11)
+    assert np.array_equal(result["state"][:3], np.tile(true[0], (3, 1)))
+    assert np.ptp(expected, axis=0).min() > 0.1
+
+
+def test_on_a_curved_motion_a_fraction_costs_an_error_of_second_order():
+    """The pendulum by itself, 1.5 cycles late: half the period, a quarter of the difference to the interpolated angle."""
+    belief, errors = fp.ModelStates(corrected=False), []
+    sensing = fp.Sensing({}, fp.VelocityDifference(), measured=["angle'"], belief=belief)
+    for period in (0.02, 0.01):
+        late = fp.DeadTime(measurement=1.5 * period)
+        result = run(swing(belief, period=period, dead_time=late, sensing=sensing, duration=1.0), fp.ExactModel(TRACK))
+        true = result["plant_state.angle"]
+        errors.append(np.abs(result["state.angle"][2:] - (true[1:-1] + true[:-2]) / 2).max())
+    assert errors[1] == pytest.approx(errors[0] / 4, rel=0.2)
 
 
 def test_a_wrong_model_drifts_no_further_than_its_bound():
@@ -326,7 +357,7 @@ def test_a_stepper_believes_as_the_loop_does(name):
         assert np.array_equal(command, result["command"][k])
 
 
-@pytest.mark.skipif(find_compiler() is None, reason="no compiler")
+@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
 @pytest.mark.parametrize("name", ["Kalman", "late servo"])
 def test_compiled_loops_believe_alike(name):
     """C and the virtual machine agree to 1e-9 of the states' size."""
@@ -452,10 +483,10 @@ BAD: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
         NotSupported,
         "the response that Affine compares needs C1, which no sensor shows.*nothing can be learned",
     ),
-    "late by a fraction": (
-        lambda: run(infusion(KALMAN, dead_time=fp.DeadTime(measurement=0.25)), CTC),
+    "late by a fraction beside weather": (
+        lambda: run(room(dead_time=fp.DeadTime(measurement=0.375)), CTC),
         NotSupported,
-        "late by whole cycles, and 0.25 min are 1.5 cycles",
+        "signals from outside need a measurement that is late by whole cycles, and 0.375 h are 1.5 cycles; use 0.25 h",
     ),
 }
 

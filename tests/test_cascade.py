@@ -11,6 +11,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.errors import InvalidValue, NotContractive, NotSupported
+from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.task.set_point import Setpoint
 
 TASK = fp.load_problem("problems/heat_exchanger.py")
@@ -235,3 +236,13 @@ def test_a_review_has_the_linear_loop_of_a_cascade():
     assert verdict.numbers["radius"] == pytest.approx(np.abs(np.linalg.eigvals(loop)).max(), rel=1e-4)
     assert "not covered" in answers["Is the map's gain admissible?"].evidence
     assert "Do the eigenvalues of the response Jacobian have one sign?" not in answers
+
+
+def test_a_comparison_judges_a_cascade_beside_its_inner_controller():
+    """The inner controller alone is the cascade without adaptation; a null test belongs to the pair."""
+    comparison = fp.compare(TASK, seed=0, controllers=["static inverse", "Cascade"], compiled=False)
+    assert comparison.findings[0].pair == ("static inverse", "Cascade")
+    assert comparison.findings[0].outcome is Outcome.BETTER
+    assert "Cascade lowers the rms error of outlet from 0.688 to 0.0573 K" in comparison.findings[0].text
+    assert comparison.null is not None
+    assert comparison.null.pair == ("static inverse", "Cascade")

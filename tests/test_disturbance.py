@@ -5,10 +5,10 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
+from own_disturbance import Sawtooth
 
 import fpirhc as fp
 from fpirhc.errors import InvalidValue
-from fpirhc.task.disturbance import Disturbance
 
 TIMES = np.linspace(0, 2, 21)
 
@@ -22,16 +22,6 @@ def test_step_pulse_and_sine():
     assert _values(fp.Step(at=1.0, size=3.0)).tolist() == [0.0] * 10 + [3.0] * 11
     assert _values(fp.Pulse(at=0.5, duration=0.5, size=2.0)).sum() == pytest.approx(10.0)
     np.testing.assert_allclose(_values(fp.Sine(2.0, 0.25)), 2 * np.sin(np.pi / 2 * TIMES), equal_nan=False)
-
-
-class Sawtooth(Disturbance):
-    """A user's own: rises by 3 per second and falls back by 1.5 every half second."""
-
-    jump, slew = 1.5, 3.0
-
-    def values(self, times, random):  # noqa: ARG002
-        """Return the values."""
-        return 3.0 * np.mod(times + 1e-12, 0.5)
 
 
 @pytest.mark.parametrize(

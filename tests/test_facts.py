@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_review import about, answers, mass, torque
+from reviewed import about, answers, mass, torque
 
 import fpirhc
 import fpirhc as fp
@@ -390,7 +390,7 @@ BUILDS = {
     "review/prediction.py": {"Identity"},  # no adaptation
     "review/suggest.py": {"Filtered"},  # the suggested deformation
     "studies/comparison/optimality.py": {"FixedPoint"},  # the converged optimum
-    "task/problem.py": {"RungeKutta4"},  # the default
+    "task/map_task.py": {"MapSteps", "StepDifference"},  # what a map has in place of an integrator and of its response
 }
 
 

@@ -18,16 +18,16 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from mutated_problems import SOURCE, mutated
+from mutated_problems import SOURCE
+from raw_errors import raw_error
 
 import fpirhc as fp
 from fpirhc.cli.exit_codes import ExitCode
 from fpirhc.cli.main import main
 from fpirhc.controllers.contract import checked
 from fpirhc.deformation.base import Deformation
-from fpirhc.errors import FpirhcError, InvalidField, ProblemFileError
+from fpirhc.errors import InvalidField
 from fpirhc.fields.checked import Checked, expects_whole_number
-from fpirhc.problem_files import importing
 from fpirhc.symbolic.number import SymbolicNumber
 
 
@@ -344,46 +344,6 @@ def test_an_error_in_a_files_own_code_during_a_run_is_bad_input(code, cause, tmp
 
 
 # --- Random mistakes --------------------------------------------------------------------------------------------------
-
-
-_CAUSE = importing._cause
-
-
-def raw_error(path: Path, seed: int, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The Python error that a random mistake raises inside the library; empty where it is refused by name, or accepted."""
-    inside: list[BaseException] = []
-    cause = _CAUSE
-
-    def seen(error: Exception) -> str:
-        inside.append(error)
-        return cause(error)
-
-    monkeypatch.setattr(importing, "_cause", seen)
-    path.write_text(mutated(seed), encoding="utf-8")
-    try:
-        task = fp.load_problem(str(path))
-        for controller in task.controllers.values():
-            try:
-                checked(task.problem, controller)
-            except FpirhcError:
-                continue
-    except ProblemFileError:
-        # An error of the file itself, such as a misspelt name, is shown as Python has it; one from our own lines is not.
-        wrapped = [e for e in inside if not isinstance(e, FpirhcError) and not _from_file(e, path)]
-        return f"seed {seed}: {wrapped[0]!r}" if wrapped else ""
-    except Exception as error:  # noqa: BLE001 -- what is looked for
-        return f"seed {seed}: {error!r}"
-    return ""
-
-
-def _from_file(error: BaseException, path: Path) -> bool:
-    """Whether the innermost line of the file or of the package is the file's."""
-    place, own = error.__traceback__, False
-    while place is not None:
-        name = place.tb_frame.f_code.co_filename
-        own = name == str(path) if name == str(path) or "/fpirhc/" in name else own
-        place = place.tb_next
-    return own or isinstance(error, SyntaxError)
 
 
 def test_the_file_without_mistakes_is_accepted(tmp_path):

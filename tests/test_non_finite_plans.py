@@ -7,7 +7,7 @@ import pytest
 from hand_made_runs import CYCLES, SOLVE, problem, run
 
 import fpirhc as fp
-from fpirhc.report.terminal import show_plans
+from fpirhc.report.terminal import show_plans, status_shares
 from fpirhc.simulation.metrics import measure
 from fpirhc.status import Status
 from fpirhc.studies.open_loop import Solved
@@ -69,3 +69,16 @@ def test_metrics_of_a_run_leave_such_plans_out():
     assert metrics["solve.median_stationarity"][""] == 1e-3
     rows[:] = rows[0]
     assert "" not in measure(problem(), run(0.1, solve=(signal, rows)))["solve.median_stationarity"]
+
+
+@pytest.mark.parametrize(
+    ("statuses", "words"),
+    [
+        ({"OK": 720, "HELD": 0}, "ok"),
+        ({"OK": 708, "NOT_CONVERGED": 12}, "not converged 1.67 %"),
+        ({"OK": 10, "NON_FINITE": 20, "HELD": 10}, "non finite 50 %, held 25 %"),
+    ],
+)
+def test_the_table_of_controllers_names_what_went_wrong(statuses, words):
+    """A share of cycles that are ok does not say what the others were."""
+    assert status_shares(statuses) == words

@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from test_disturbance import Sawtooth
+from own_disturbance import Sawtooth
 from test_outputs import OPTIMISER, SAME, SHORT, TWO_MASS, curve, hill, on_outputs, planned, sedated, simulated
 
 import fpirhc as fp

@@ -383,10 +383,6 @@ WRONG: dict[str, tuple[Callable[[], object], str]] = {
     "judged": (lambda: squared(lambda t: 1 + 0 * t, judged=("z",)), "judged: output 'z' is unknown"),
     "states in the cost": (lambda: squared(lambda t: 1 + 0 * t, cost=fp.Quadratic(states={"a": 1.0})), "have no reference"),
     "outputs in the cost": (lambda: replace(SHORT, cost=fp.Quadratic(outputs={"q1": 1.0})), "the plant has no outputs"),
-    "believed": (
-        lambda: squared(lambda t: 1 + 0 * t, sensing=fp.Sensing(measured=["y"], belief=fp.ModelStates())),
-        "believed states are not covered",
-    ),
     "reality": (lambda: replace(squared(lambda t: 1 + 0 * t), reality=fp.Reality(double({}))), "it has no output 'y'"),
 }  # fmt: skip
 

@@ -103,6 +103,7 @@ BAD: dict[str, dict[str, Any]] = {
     "coordinate 'z' is unknown": {"response": lambda q, v, u, p: {"y": u.u, "z": u.u}},
     "takes 3 argument": {"response": lambda q, u, p: {"y": u.u}},
     "order must be a whole number": {"order": 0},
+    "order is 1000000000, and the highest possible is 20": {"order": 10**9},
     "must be one scalar": {"response": lambda q, v, u, p: {"y": ca.vertcat(u.u, u.u)}},
     "no input reaches coordinate": {"response": lambda q, v, u, p: {"y": -q.y}},
     "names both a coordinate and an input": {"inputs": {"y": "N"}},

@@ -110,7 +110,7 @@ def test_raw_measurements_of_plants_of_others(make):
     assert np.array_equal(replayed(stepper, run), run["command"])
 
 
-@pytest.mark.skipif(find_compiler() is None, reason="no compiler")
+@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
 def test_compiled_step_estimates_alike():
     """C and the virtual machine run the same operations: estimates to the last bits of a second derivative, 1e-9 of its size."""
     task = problem(fp.SavitzkyGolay(window=7, degree=4))

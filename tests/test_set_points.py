@@ -387,6 +387,25 @@ def test_set_points_of_outputs(controller):
             np.testing.assert_array_equal(runs[0][signal], runs[1][signal])
 
 
+def test_a_stepper_names_set_points_of_outputs():
+    """They are those of the outputs, which are other quantities than the states and of another number."""
+    plant = fp.Plant.of_states(
+        states={"place": "m", "speed": "m/s"},
+        inputs={"force": "N"},
+        parameters={"mass": fp.Parameter(1.0, 1.0, "kg")},
+        rates=lambda x, u, p: {"place": x.speed, "speed": u.force / p.mass},
+        outputs={"height": fp.Output("m", lambda x, p: 2.0 * x.place)},
+    )
+    reference = fp.Setpoint({"height": 1.0}, rate=2.0)
+    problem = fp.Problem(plant, reference, start={"place": 0.5, "speed": 0.0}, period=0.01, duration=0.1)
+    stepper = fp.Stepper(problem, fp.ComputedTorque(fp.Exponential(rate=3.0)), compiled=False)
+    assert stepper.setpoints == {"height": 1.0}
+    sample = 0.0, problem.start_state, np.zeros(1), stepper.start()
+    stepper.step(*sample, output=np.array([1.0, 0.0]), setpoints={"height": 1.5})
+    assert stepper.setpoints == {"height": 1.5}
+    assert stepper.trace()["setpoint"].tolist() == [1.5]
+
+
 def test_plans_towards_set_points_have_no_gap():
     """The nominal motion knows steps that the plans did not know: their cost is not compared with an optimum along it."""
     problem, controller = two_mass(0.03), TWO_MASS.controllers["RHC"]

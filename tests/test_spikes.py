@@ -5,6 +5,7 @@ The samples reach the controller, because the stepper's plausible range is infin
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -16,7 +17,7 @@ from fpirhc.conformance.controller import two_masses
 from fpirhc.controllers.largest_response import largest_response
 from fpirhc.deformation.base import Deformation
 from fpirhc.sensing.base import response_names
-from fpirhc.simulation.loop import _own_response
+from fpirhc.simulation.loop import _own_response, close_loop
 from fpirhc.tracking.base import Tracking
 
 PROBLEM = replace(two_masses(), duration=6.0)
@@ -135,3 +136,18 @@ def test_the_largest_response_is_that_of_the_limits():
     assert (np.abs(sizes).max(axis=(0, 1)).ravel() <= np.array(largest) * (1 + 1e-9)).all()
     free = replace(PROBLEM, limits=fp.Limits(inputs={"Fa": (-30.0, 30.0)}))
     assert largest_response(free) == (np.inf, np.inf)
+
+
+def test_the_largest_response_is_computed_once_for_a_loop(monkeypatch):
+    """Law, update and map have the same bound, and one evaluation along the reference."""
+    evaluations: list[fp.Problem] = []
+    module = sys.modules[largest_response.__module__]
+    states = module._states
+
+    def counted(task: fp.Problem) -> np.ndarray:
+        evaluations.append(task)
+        return states(task)
+
+    monkeypatch.setattr(module, "_states", counted)
+    close_loop(replace(PROBLEM, duration=1.0), fp.ComputedTorque(fp.Exponential(rate=6.0), SHAPE))
+    assert len(evaluations) == 1

@@ -18,10 +18,12 @@ from fpirhc.baselines.reading import read_baseline
 from fpirhc.baselines.settings import settings_of
 from fpirhc.baselines.variants import names_by_source, nominal, variants
 from fpirhc.errors import BaselineError, FpirhcError, InvalidValue
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.studies.comparison.compare import select, versions
 
 
+@checked_call
 def check_baseline(
     task: Task,
     *,
@@ -164,6 +166,7 @@ def write_baseline(task: Task, baseline: Baseline, baselines: Path | None, worki
     return path
 
 
+@checked_call
 def accept(
     task: Task,
     reason: str,
@@ -206,6 +209,7 @@ def accept(
     return baseline, write_baseline(task, baseline, baselines, project)
 
 
+@checked_call
 def bless(task: Task, reason: str, **settings: Any) -> tuple[Baseline, Path]:
     """Call `accept`: the earlier name, which the next version removes."""
     warnings.warn("fpirhc.bless is now fpirhc.accept", DeprecationWarning, stacklevel=2)

@@ -53,8 +53,8 @@ class Variant:
         """Return the problem as it runs in this variant."""
         if self.nudge:
             start = {name: value * (1 + self.nudge) for name, value in problem.start.items()}
-            moved = replace(problem, start=start)
-            return moved if problem.foreign else with_exact(moved, problem.real_plant.exact * (1 + self.nudge))
+            elsewhere = replace(problem, start=start)
+            return elsewhere if problem.foreign else with_exact(elsewhere, problem.real_plant.exact * (1 + self.nudge))
         if self.finer > 1:
             finer = problem.real_integrator.finer(self.finer) or problem.real_integrator
             if problem.symbolic_reality is not None:

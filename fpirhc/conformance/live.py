@@ -58,8 +58,8 @@ def check_live(
     """
     short = replace(problem, duration=cycles * problem.period, measure_from=0.0)
     plain = simulator(short, controller, compiled=compiled).run(seed=0)
-    asked = list(number_paths(problem, controller)) if paths is None else paths
-    return tuple(_tried(short, controller, path, plain.log, compiled) for path in asked)
+    tested = list(number_paths(problem, controller)) if paths is None else paths
+    return tuple(_tried(short, controller, path, plain.log, compiled) for path in tested)
 
 
 def number_paths(problem: Problem, controller: Controller) -> Iterator[str]:

@@ -15,7 +15,7 @@ from typing import TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.symbolic.expression import kind
+from fpirhc.symbolic.expression import Matrix, kind
 from fpirhc.task.problem import Problem
 
 Array: TypeAlias = np.ndarray
@@ -33,15 +33,43 @@ def sampled_jacobian(problem: Problem) -> ca.Function:
     r, u = matrix.sym("r", len(model.controlled_names)), matrix.sym("u", model.input.size)
     exact, assumed = matrix.sym("exact", len(plant.parameters)), matrix.sym("assumed", len(model.parameters))
     calm = ca.DM.zeros(len(plant.names))
-    after = problem.real_integrator.step(plant, problem.period)(x, u, exact, calm)
+    advance = problem.real_integrator.step(plant, problem.period)
+    after = advance(x, u, exact, calm)
     respond = reality.response_function(model, seen=True) if reality is not None else None
-    response = respond(after, u, exact, calm) if respond else model.controlled_response_function(after, u, exact)
-    gain = ca.Function("fpirhc_sampled_gain", [x, u, exact], [ca.densify(ca.jacobian(response, u))])
+    later = matrix.sym("later", model.input.size)
+    if model.step is not None:
+        response = _differences(problem, advance, after, (later, exact, calm))
+    else:
+        response = respond(after, u, exact, calm) if respond else model.controlled_response_function(after, u, exact)
+    gain = ca.Function("fpirhc_sampled_gain", [x, u, later, exact], [ca.densify(ca.jacobian(response, u))])
     command = model.inverse_function(state, r, assumed)
-    jacobian = gain(x, command, exact) @ ca.jacobian(command, r)
+    jacobian = gain(x, command, command, exact) @ ca.jacobian(command, r)
     names = ["reality", "state", "deformed", "exact", "approximate"]
     arguments = [x, state, r, exact, assumed]
     return ca.Function("fpirhc_sampled_jacobian", arguments, [ca.densify(jacobian)], names, ["jacobian"])
+
+
+def _differences(problem: Problem, advance: ca.Function, after: Matrix, held: tuple[Matrix, Matrix, ca.DM]) -> Matrix:
+    """The divided differences y_{k+r} / T^r of a map's controlled quantities, as far as the command of cycle k changes them.
+
+    Args:
+        problem: its model is a map.
+        advance: of the reality over a cycle.
+        after: its state one cycle after the command.
+        held: commands of the cycles after it, parameters, no forcing.
+    """
+    model, reality, face = problem.plant, problem.symbolic_reality, problem.plant.face
+    if reality is None:
+        outputs_of = model.output_function
+    else:
+        outputs_of = reality.output_function(model) if model.outputs else reality.state_function(model, seen=True)
+    states, entries = [after], []
+    for _ in range(1, max(face.orders)):
+        states.append(advance(states[-1], *held))
+    for name, k in zip(model.controlled_names, face.controlled_indices, strict=True):
+        outputs = outputs_of(states[face.orders[k] - 1], *held)
+        entries.append(outputs[face.state.elements.index(name)] / model.sampling ** face.orders[k])
+    return ca.vertcat(*entries)
 
 
 def sampled_jacobians(

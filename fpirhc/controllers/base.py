@@ -23,10 +23,11 @@ from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.largest_response import largest_response
-from fpirhc.controllers.mirror import mirror_blocks, with_measured_state
+from fpirhc.controllers.mirror import measured_reads, mirror_blocks, with_measured_state
 from fpirhc.controllers.outside_block import ACTED, NOW, Told
 from fpirhc.controllers.own_reference import given_signals, motion_of, own_signals, own_values, with_reference
 from fpirhc.deformation.base import Deformation
+from fpirhc.plant.instant import nominal_responses
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
@@ -52,17 +53,18 @@ def compose_controller(problem: Problem, controller: Controller, *, ahead: bool 
     Args:
         problem: that the controller is composed for.
         controller: checked here against the problem.
-        ahead: whether time and state are those at which the command will act. The step then also reads the measured state, and the
-            signals of the last cycle, where a block needs them.
+        ahead: whether time and state are those at which the command will act. The step then also reads the measured state, its
+            time, and the signals of the last cycle, where a block needs them.
     """
     ready = checked(problem, controller)
     blocks, delays = ready.blocks(problem)
     blocks = with_reference(problem, blocks)
-    reads, named = controller_reads(problem, ready), with_measured_state(problem.plant, blocks)
-    if ahead and len(named) > len(blocks):
-        added = named[: len(named) - len(blocks)]
-        reads, named = reads + Layout(tuple(s for block in added for s in block.writes.signals)), blocks
-    return compose_informed(problem, ready, reads, named, delays, ahead=ahead)
+    reads = controller_reads(problem, ready)
+    if ahead:
+        reads = reads + Layout(measured_reads(problem.plant, blocks))
+    else:
+        blocks = with_measured_state(problem.plant, blocks)
+    return compose_informed(problem, ready, reads, blocks, delays, ahead=ahead)
 
 
 def compose_informed(
@@ -78,14 +80,14 @@ def compose_informed(
         delays: what the step remembers of its signals.
         ahead: whether the time is the one at which the command will act.
     """
-    told = Told(ready.model_plant(problem), ready.told(problem), problem.period)
+    known = Told(ready.model_plant(problem), ready.told(problem), problem.period)
     compares = any(ACTED in block.reads for block in blocks)
-    first = told.block(remembers=compares and not ahead)
+    first = known.block(remembers=compares and not ahead)
     if first is None:
         return compose("controller", reads, blocks, delays, outputs=("command",))
-    needed = reads + Layout(told.reads if compares else ())
+    needed = reads + Layout(known.reads if compares else ())
     inner = compose("informed", needed, blocks, delays, outputs=("command",))
-    block = embedded("informed", inner, {"parameters": like(told.plant.parameter, NOW)})
+    block = embedded("informed", inner, {"parameters": like(known.plant.parameter, NOW)})
     return compose("controller", needed if ahead else reads, [first, block], outputs=("command",))
 
 
@@ -132,14 +134,16 @@ def reference_block(problem: Problem) -> Block:
     """Block (time, state or outputs) -> (their reference, response of the controlled ones, error of the judged ones)."""
     plant, seen = problem.plant, problem.plant.output
     function = motion_of(problem)
-    controlled = list(plant.face.controlled_indices)
+    at_end = motion_of(problem, ahead=problem.period) if plant.instant_names else None
     places = [seen.elements.index(c) for c in problem.judged_names]
 
     def step(s: Signals) -> dict[str, Expression]:
-        state, response = function(s.time, *own_values(problem, s))
+        own = own_values(problem, s)
+        state, response = function(s.time, *own)
+        later = at_end(s.time, *own)[0] if at_end is not None else None
         return {
             "reference": state,
-            "_reference_response": response[controlled],
+            "_reference_response": nominal_responses(plant, state, response, later),
             "error": state[places] - getattr(s, seen.name)[places],
         }
 

@@ -35,6 +35,11 @@ class ComputedTorque(Controller):
         del problem
         return ""
 
+    def maps_unusable(self, problem: Problem) -> str:
+        """Return nothing: in a map's cycles its law has differences in place of derivatives."""
+        del problem
+        return ""
+
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, tracking, deform, invert, limit, judge, running, tracking update."""
         return tracked_blocks(problem, self.tracking, self.deformation)

@@ -10,13 +10,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.demands import plan_demand, reference_demand
-from fpirhc.controllers.form_check import check_form, check_outputs
+from fpirhc.controllers.form_check import check_form, check_maps, check_outputs
 from fpirhc.controllers.gain_check import check_gain_sign, check_response_delay
 from fpirhc.deformation.base import Deformation, Demand, Mirror, with_inner
 from fpirhc.deformation.identity import Identity
@@ -82,6 +82,9 @@ class Controller(Checked, ABC):
 
     Concrete controllers are frozen dataclasses. `fpirhc.conformance.check_controller` tests that a controller keeps this contract.
     """
+
+    LOADED: ClassVar[str] = "controllers[{}] of a loaded problem file"
+    """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
 
     if TYPE_CHECKING:
 
@@ -209,6 +212,14 @@ class Controller(Checked, ABC):
             return self.around(self.inner.with_deformation(deformation))
         raise NotSupported(f"{type(self).__name__} has no deformation that can be replaced")
 
+    def unadapted(self) -> Controller:
+        """Return the controller of the same settings that does not adapt, beside which a comparison judges this one.
+
+        Raises:
+            NotSupported: it has a deformation that cannot be left out.
+        """
+        return without_deformation(self)
+
     def stated(self, problem: Problem) -> Controller:
         """Return the controller with every number of its own stated that it would take from the problem; itself without any."""
         del problem
@@ -238,6 +249,20 @@ class Controller(Checked, ABC):
         By default it cannot: a controller that takes the state for what follows the reference would follow the wrong one.
         """
         return "it takes the plant's state for what follows the reference"
+
+    @property
+    def covers_order_zero(self) -> bool:
+        """Whether it controls outputs of order 0, which the command moves at once and no tracking law follows."""
+        return False if self.inner is None else self.inner.covers_order_zero
+
+    def maps_unusable(self, problem: Problem) -> str:
+        """Return why the controller cannot control a map, x+ = f(x, u); empty where it can.
+
+        By default it cannot: a law for derivatives with respect to time is another one for differences of steps.
+        """
+        if self.inner is not None:
+            return self.inner.maps_unusable(self.inner_problem(problem))
+        return "its law is written for derivatives with respect to time"
 
     def floquet(self, problem: Problem) -> Floquet | None:
         """Return the stability of one period of a controller that switches; None for a controller that does not switch."""
@@ -285,13 +310,14 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
     Raises:
         FpirhcError: the controller's own check fails.
         NotContractive: the gain of the deformation has the wrong sign, or is too large behind estimator and filter.
-        NotSupported: a form of the deformation that cannot be used here; outputs that the controller does not cover; a response
-            of the controller's own behind sensors or dead time.
+        NotSupported: a form of the deformation that cannot be used here; outputs, or a map, that the controller does not cover; a
+            response of the controller's own behind sensors or dead time.
     """
     if not numbers_only and is_live(problem, controller):
         checked(nominal(problem), nominal(controller))
         return controller
     check_outputs(problem, controller)
+    check_maps(problem, controller)
     ready = resolved(problem, controller)
     if numbers_only:
         ready.check_numbers(problem)

@@ -1,6 +1,8 @@
 """The model's command for the reference, without any feedback: u = model^-1(x^N, r^N).
 
 For a plant that settles by itself it is the inverse of the model's static map, which is the usual inner controller of a `Cascade`.
+The response of an output of order 0 is the output itself, u = h^-1(x, y^N) with y^N at the end of the cycle. Where h depends on
+states that have no reference, the measured ones are used.
 """
 
 from __future__ import annotations
@@ -13,7 +15,9 @@ from fpirhc.controllers.base import Controller, commanding_blocks, like, referen
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import NotInvertible
+from fpirhc.horizon.nominal import known_on_reference, reference_state
 from fpirhc.members import Example
+from fpirhc.plant.instant import response_orders
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
@@ -25,12 +29,31 @@ _SEEN = "_seen_status"
 
 @dataclass(frozen=True)
 class FeedforwardOnly(Controller):
-    """The model's inverse at the reference's state and response; nothing that is measured is used."""
+    """The model's inverse at the reference's state and response; no error is fed back."""
 
     @property
     def deformation(self) -> Deformation:
         """Identity(): no request is iterated."""
         return Identity()
+
+    def outputs_unusable(self, problem: Problem) -> str:
+        """Return why not: a derivative of an output without feedback would drift where states have no reference."""
+        plant = problem.plant
+        orders = response_orders(plant)
+        if known_on_reference(plant) or not any(orders.values()):
+            return ""
+        slow = ", ".join(name for name, order in orders.items() if order)
+        return f"without feedback the error of {slow} would add up; use a controller with a tracking law"
+
+    @property
+    def covers_order_zero(self) -> bool:
+        """Yes."""
+        return True
+
+    def maps_unusable(self, problem: Problem) -> str:
+        """Return nothing: it has no law."""
+        del problem
+        return ""
 
     def check(self, problem: Problem) -> None:
         """Raise if the model has no inverse.
@@ -50,9 +73,11 @@ class FeedforwardOnly(Controller):
         """Block (reference, state, parameters) -> command, and the response that the model expects of it."""
         plant, wanted = problem.plant, problem.plant.response_signal("_reference_response")
         inverse, response = plant.inverse_function, plant.controlled_response_function
+        known = known_on_reference(plant)
 
         def step(s: Signals) -> dict[str, Expression]:
-            command = inverse(s.reference, s._reference_response, s.parameters)
+            nominal = reference_state(plant, s.reference) if known else s.state
+            command = inverse(nominal, s._reference_response, s.parameters)
             finite = is_finite(
                 s.state
             )  # a bad measurement changes no command here, and is a bad measurement all the same
@@ -67,7 +92,7 @@ class FeedforwardOnly(Controller):
             }
 
         responses = [plant.response_signal(name) for name in ("nominal", "desired", "_deformed_unclipped")]
-        reads = (like(plant.state, "reference"), wanted, plant.state, plant.parameter)
+        reads = (like(plant.output, "reference"), wanted, plant.state, plant.parameter)
         writes = Layout((*responses, like(plant.input, "command_unclipped"), scalar(_SEEN)))
         return Block("feedforward", Layout(reads), writes, step, opaque=plant.inverse_opaque)
 

@@ -21,6 +21,14 @@ class _Controller(Protocol):
 
     def outputs_unusable(self, problem: Problem) -> str: ...
 
+    @property
+    def covers_order_zero(self) -> bool: ...
+
+    @property
+    def planner(self) -> object: ...
+
+    def maps_unusable(self, problem: Problem) -> str: ...
+
 
 def check_outputs(problem: Problem, controller: _Controller) -> None:
     """Raise if the problem's plant has outputs and the controller, or its deformation, does not cover them.
@@ -30,14 +38,29 @@ def check_outputs(problem: Problem, controller: _Controller) -> None:
     """
     if not problem.plant.outputs:
         return
+    _check_order_zero(problem, controller)
     name, mirror = type(controller).__name__, controller.deformation.mirror
     reason = controller.outputs_unusable(problem)
-    if not reason and mirror is not None and (not problem.sensing.estimator.shows_response or mirror.measurement):
+    estimated = not (problem.sensing.estimator.shows_response or problem.plant.step)
+    if not reason and mirror is not None and (estimated or mirror.measurement):
         name = type(controller.deformation).__name__
         reason = "it compares with a twin of the plant behind the estimator or the late measurement, which has coordinates only"
     if reason:
         what = ", ".join(problem.plant.outputs)
         raise NotSupported(f"{name} does not cover outputs that are expressions of the state ({what}): {reason}")
+
+
+def check_maps(problem: Problem, controller: _Controller) -> None:
+    """Raise if the problem's plant is a map and the controller does not cover maps.
+
+    Raises:
+        NotSupported: with the reason.
+    """
+    reason = controller.maps_unusable(problem) if problem.plant.step is not None else ""
+    if reason:
+        raise NotSupported(
+            f"{type(controller).__name__} does not cover maps: {reason}; use ComputedTorque, RecedingHorizon or FeedforwardOnly"
+        )
 
 
 def check_form(problem: Problem, controller: _Controller) -> None:
@@ -69,6 +92,34 @@ def check_form(problem: Problem, controller: _Controller) -> None:
                 f"ModelReferenced({name}={values!r}): the plant has {len(plant.inputs)} inputs ({', '.join(plant.inputs)}); give "
                 "one number for each, or one for all"
             )
+    if plant.step is not None and (
+        any(every(mirror.lag)) or any(c % 1 for c in every(mirror.cycles)) or mirror.measurement % 1
+    ):
+        raise NotSupported(
+            f"{type(deformation).__name__}: a map has no lag, and no dead time of parts of a cycle; write an actuator as a state "
+            "of the map, and dead times in whole cycles"
+        )
     reason = controller.unusable(problem, mirror)
     if reason:
         raise NotSupported(f"{type(controller).__name__} cannot use a model-referenced deformation here: {reason}")
+
+
+def _check_order_zero(problem: Problem, controller: _Controller) -> None:
+    """Raise for outputs of order 0 that the controller does not cover."""
+    plant, name = problem.plant, type(controller).__name__
+    controlled = [n for n in plant.controlled_names if n in plant.instant_names]
+    if controlled and not controller.covers_order_zero:
+        raise NotSupported(
+            f"{name} does not cover outputs of order 0 ({', '.join(controlled)}): the command moves them at once, so there "
+            "is no derivative to prescribe; use FeedforwardOnly(), and Cascade(FeedforwardOnly(), map) to iterate on its target"
+        )
+    if plant.instant_names and controller.planner is not None:
+        raise NotSupported(
+            f"{name} plans with outputs that are functions of the state, and {', '.join(plant.instant_names)} depends on the "
+            "command too (order 0); leave it out of the outputs of the plant"
+        )
+    if controlled and not problem.sensing.estimator.measures_all:
+        raise NotSupported(
+            f"{type(problem.sensing.estimator).__name__} estimates derivatives, and outputs of order 0 ({', '.join(controlled)}) "
+            "need none; leave the estimator out: Sensing(sensors=...)"
+        )

@@ -116,8 +116,8 @@ class Gate:
             good = [getattr(s, f"good_{n}") for n in self.stored.names]
             before = getattr(s, DOUBTED) if self.plausible else expression(0.0)
             fits, held, good_next, doubted = entry(ca.vertcat(*now), getattr(s, HELD), ca.vertcat(*good), before)
-            kept = self.stored.split(good_next)
-            seen = kept if self.inner.opaque else {}
+            last_good = self.stored.split(good_next)
+            seen = last_good if self.inner.opaque else {}
             sample = [seen.get(r, getattr(s, r)) for r in self.inner.reads.names]
             memory = self.controller_memory.join({m: getattr(s, m) for m in self.controller_memory.names})
             usable = expression(1.0) if "memory" in self.trusted else finite(memory, opaque=self.inner.opaque)
@@ -127,7 +127,7 @@ class Gate:
                 status = ca.if_else(usable, values["status"], int(Status.RESTARTED))
                 values["status"] = ca.if_else(fits, status, int(Status.BAD_SAMPLE))
             remembered = {**self.controller_memory.split(memory_next), HELD: command}
-            remembered |= {f"good_{n}": v for n, v in kept.items()}
+            remembered |= {f"good_{n}": v for n, v in last_good.items()}
             remembered |= {DOUBTED: doubted} if self.plausible else {}
             return {**values, "command": command, **{f"{m}_next": v for m, v in remembered.items()}}
 

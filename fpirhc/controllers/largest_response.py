@@ -8,6 +8,8 @@ remember with multiples of it, so that one absurd but finite sample does not sta
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from fpirhc.controllers.reference_states import reference_states
@@ -17,6 +19,7 @@ from fpirhc.task.problem import Problem
 _SAMPLES = 100  # instants at which the reference is looked at
 
 
+@lru_cache(maxsize=8)  # several blocks of one loop ask for it, and every controller of a comparison
 def largest_response(problem: Problem) -> tuple[float, ...]:
     """Return L of every controlled coordinate, by the limits of the build; infinite where an input has no finite limits.
 
@@ -30,12 +33,13 @@ def largest_response(problem: Problem) -> tuple[float, ...]:
         return free
     states, middle = _states(task), (lower + upper) / 2
     corners = [middle] + [_with(middle, k, v) for k in range(middle.size) for v in (lower[k], upper[k])]
-    still, *moved = (_responses(task, states, corner) for corner in corners)
+    at_middle, *at_limits = (_responses(task, states, corner) for corner in corners)
     with np.errstate(all="ignore"):
         reach = [
-            np.fmax(abs(low - still), abs(high - still)) for low, high in zip(moved[::2], moved[1::2], strict=True)
+            np.fmax(abs(low - at_middle), abs(high - at_middle))
+            for low, high in zip(at_limits[::2], at_limits[1::2], strict=True)
         ]
-        sizes = abs(still) + sum(reach)
+        sizes = abs(at_middle) + sum(reach)
     finite = np.where(np.isfinite(sizes), sizes, 0.0).max(axis=1)
     return tuple(float(v) if v > 0 else float("inf") for v in finite)
 

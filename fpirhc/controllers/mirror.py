@@ -9,20 +9,30 @@ acted according to the beliefs. Where the response is estimated from samples, a 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import casadi as ca
 
-from fpirhc.controllers.mirror_path import MEASURED, MEASURED_OUTPUT, NONE, Path, measured_output, measured_state
+from fpirhc.controllers.map_mirror import map_mirror
+from fpirhc.controllers.mirror_path import (
+    MEASURED,
+    MEASURED_OUTPUT,
+    MEASURED_TIME,
+    NONE,
+    Path,
+    measured_output,
+    measured_state,
+)
 from fpirhc.controllers.twin import BEFORE, twin_block
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.queue import every
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Layout
+from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
 
-__all__ = ["MEASURED", "MEASURED_OUTPUT", "measured_output", "measured_state", "mirror_blocks", "with_measured_state"]
+__all__ = ["MEASURED", "MEASURED_OUTPUT", "MEASURED_TIME", "measured_reads", "mirror_blocks", "with_measured_state"]
 
 
 def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
@@ -37,26 +47,35 @@ def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Bloc
         return [], []
     estimated = not problem.sensing.estimator.shows_response or mirror.measurement % 1 > NONE
     path = Path(problem, mirror, estimated or max(every(mirror.cycles)) + mirror.measurement > 0)
+    if problem.plant.step is not None:
+        return [map_mirror(path)], []
     if not estimated:
         return [_instant_block(path)], []
     return [twin_block(path)], [Delay(problem.plant.response_signal(BEFORE), "_deformation")]
 
 
 def with_measured_state(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
-    """Return the blocks, and before them one that writes the measured state, or the outputs, where a block reads it.
+    """Return the blocks, and before them one that writes the measured state or outputs, and their time, where a block reads them.
 
     Args:
         plant: the plant.
         blocks: of the controller.
     """
-    first: list[Block] = []
-    if any(MEASURED in block.reads for block in blocks):
-        target = measured_state(plant)
-        first = [Block("measured", Layout((plant.state,)), Layout((target,)), lambda s: {MEASURED: s.state})]
-    if any(MEASURED_OUTPUT in block.reads for block in blocks):
-        seen = Layout((plant.output,)), Layout((measured_output(plant),))
-        first.append(Block("measured_output", *seen, lambda s: {MEASURED_OUTPUT: s.output}))
-    return [*first, *blocks]
+    writes = measured_reads(plant, blocks)
+    if not writes:
+        return list(blocks)
+    sources = {MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: plant.time}
+    reads = tuple(sources[w.name] for w in writes)
+    first = Block(
+        "measured", Layout(reads), Layout(writes), lambda s: {w.name: getattr(s, sources[w.name].name) for w in writes}
+    )
+    return [first, *blocks]
+
+
+def measured_reads(plant: Plant, blocks: Sequence[Block]) -> tuple[Signal, ...]:
+    """Return the signals of the measured state and outputs and of their time, as far as some blocks read them."""
+    every = measured_state(plant), measured_output(plant), replace(plant.time, name=MEASURED_TIME)
+    return tuple(signal for signal in every if any(signal.name in block.reads for block in blocks))
 
 
 def _instant_block(path: Path) -> Block:

@@ -18,6 +18,7 @@ from fpirhc.task.problem import Problem
 
 MEASURED_OUTPUT = "_measured_output"  # the outputs of the same instant
 MEASURED = "_measured_state"  # the state that the response belongs to, where a controller may act on a predicted one
+MEASURED_TIME = "_measured_time"  # the time at which it is given, where a controller may act on a predicted one
 NONE = 1e-9  # a fraction of a cycle below this counts as zero
 
 

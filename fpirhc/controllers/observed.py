@@ -6,16 +6,22 @@ the reference, so that a unit does not decide what can be seen.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
 import casadi as ca
 import numpy as np
 
+from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.sample_time import SampleTime
 from fpirhc.errors import NotSupported
-from fpirhc.sensing.beliefs.kalman_filter import shown_by
+from fpirhc.horizon.regular_gain import nominal_run
+from fpirhc.plant.maps import growth_of
+from fpirhc.sensing.base import values_of
 from fpirhc.sensing.observability import members, slowest
-from fpirhc.task.problem import Problem
+from fpirhc.task.outside import told_places
+from fpirhc.task.problem import Problem, nominal_start
 
 _INSTANTS = 25
 _STAYS = 1e-9  # share of the fastest pole below which an error counts as staying
@@ -49,7 +55,7 @@ def free_errors(problem: Problem) -> FreeErrors:
     known = [plant.state.elements.index(e) for e in problem.sensing.known(plant)]
     scaled = [a * size / size[:, None] for a in slopes]
     basis = belief.free(scaled, [c * size for c in shown], known)
-    pole = slowest(scaled, basis)
+    pole = slowest(scaled, basis, growth_of(plant))
     fastest = max(float(np.abs(np.linalg.eigvals(a)).max()) for a in slopes)
     return FreeErrors(tuple(plant.state.elements[k] for k in members(basis)), pole, decays=pole < -_STAYS * fastest)
 
@@ -73,24 +79,80 @@ def check_observed(problem: Problem) -> None:
         )
 
 
+def check_believed(problem: Problem, controller: Controller) -> None:
+    """Raise if a controller cannot be given believed states, or the belief cannot be right.
+
+    Raises:
+        NotSupported: an adaptive controller whose response nobody measures; a measurement that is late by a fraction of a cycle
+            beside signals from outside; a model with other parameters than the problem's; errors that are neither observed nor
+            decay.
+    """
+    sensing, plant = problem.sensing, problem.plant
+    if sensing.belief is None:
+        return
+    lost = sensing.believed_response(plant)
+    if lost and controller.deformation.adapts:
+        raise NotSupported(
+            f"the response that {type(controller.deformation).__name__} compares needs {', '.join(lost)}, which no sensor shows: "
+            "the model's own response is the request, from which nothing can be learned. Measure it, or choose an estimator of "
+            f"what is measured ({', '.join(sensing.measures(plant))})"
+        )
+    _check_late(problem)
+    model = controller.model_plant(problem)
+    if model.parameter.elements != plant.parameter.elements:
+        raise NotSupported(
+            f"{type(controller).__name__} has a model with other parameters than the problem's, and states are believed by the "
+            "problem's; leave the belief out, or give both the same parameters"
+        )
+    check_observed(problem)
+
+
+def _check_late(problem: Problem) -> None:
+    """Raise where the signals of the time of the samples are not known."""
+    if SampleTime(problem).fraction and told_places(problem.plant, problem.signals):
+        late, unit = problem.dead_time.measurement, problem.time_unit
+        raise NotSupported(
+            f"believed states beside signals from outside need a measurement that is late by whole cycles, and {late:g} {unit} are "
+            f"{late / problem.period:.4g} cycles; use {SampleTime(problem).late * problem.period:g} {unit}"
+        )
+
+
 def _linearised(problem: Problem, names: tuple[str, ...]) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
     """States of the reference, shape (instants, nx), and there dx'/dx and the Jacobian of the measured quantities."""
     plant = problem.plant
     x, u, p = plant.symbols()
-    shown = ca.vertcat(*shown_by(plant, names, x, u, p))
+    values = values_of(plant, x, u, p)
+    shown = ca.vertcat(*(values[n] for n in names))
     rate = plant.derivative_function(x, u, p)
     jacobians = ca.Function("fpirhc_observed", [x, u, p], [ca.jacobian(rate, x), ca.jacobian(shown, x)])
-    reference, states, slopes, seen = problem.reference.function(plant), [], [], []
-    for t in np.linspace(0.0, problem.duration, _INSTANTS):
-        state, response = reference(t)
-        needed: ca.DM = ca.DM(problem.inputs_before)
-        if len(plant.controlled_names) == len(plant.inputs):
-            needed = plant.inverse_function(state, response[list(plant.controlled_indices)], plant.approximate)
+    states, slopes, seen = [], [], []
+    for state, needed in _points(problem):
         slope, part = (np.asarray(m.full()) for m in jacobians(state, needed, plant.approximate))
         if np.isfinite(slope).all() and np.isfinite(part).all():
-            states.append(np.asarray(state.full()).ravel())
+            states.append(state)
             slopes.append(slope)
             seen.append(part)
     if not slopes:
         raise NotSupported("believed states: the model has no finite Jacobian along the reference")
     return np.array(states), slopes, seen
+
+
+def _points(problem: Problem) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """States and inputs of the model along the reference; with outputs those of a simulation in which they follow it."""
+    plant = problem.plant
+    if plant.outputs:
+        yield from _points_of_outputs(problem)
+        return
+    reference, needed = problem.reference.function(plant), problem.inputs_before
+    for t in np.linspace(0.0, problem.duration, _INSTANTS):
+        state, response = reference(t)
+        if len(plant.controlled_names) == len(plant.inputs):
+            function = plant.inverse_function
+            needed = np.asarray(function(state, response[list(plant.controlled_indices)], plant.approximate).full())
+        yield np.asarray(state.full()).ravel(), needed.ravel()
+
+
+def _points_of_outputs(problem: Problem) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    states, inputs = nominal_run(problem.plant, problem.reference, *nominal_start(problem))
+    for k in np.unique(np.linspace(0, states.shape[1] - 1, _INSTANTS).astype(int)):
+        yield states[:, k], inputs[:, k]

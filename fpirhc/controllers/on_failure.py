@@ -5,7 +5,6 @@ The plan of a solve that only ran out of iterations is used, because it is feasi
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -13,6 +12,7 @@ import casadi as ca
 
 from fpirhc.fields.checked import Checked
 from fpirhc.status import Status
+from fpirhc.symbolic.functions import nan_where
 from fpirhc.symbolic.layout import Expression
 
 
@@ -75,4 +75,4 @@ class StopRun(OnFailure):
     ) -> tuple[Expression, Expression]:
         """Return NaN in place of the plan."""
         del feedforward
-        return ca.if_else(failed, math.nan, planned), status
+        return ca.if_else(failed, nan_where(failed), planned), status

@@ -55,15 +55,15 @@ class Told:
         names, units = (tuple(v[k] for k in places) for v in (plant.parameter.elements, plant.parameter.units))
         return (Signal(ACTED, names, units, tuple(float(first[k]) for k in places)),)
 
-    def memory(self, late: int) -> tuple[Signal, ...]:
-        """Return the signals of `late` more cycles before the last one."""
+    def memory(self, late: int, name: str = _QUEUE) -> tuple[Signal, ...]:
+        """Return the signals of `late` more cycles before the last one, remembered under a name."""
         if not (self.reads and late):
             return ()
         [one] = self.reads
         names = tuple(f"{e}@{k}" for k in range(1, late + 1) for e in one.elements)
-        return (Signal(_QUEUE, names, start=one.start * late),)
+        return (Signal(name, names, start=one.start * late),)
 
-    def acted(self, s: Signals, late: int) -> tuple[Expression, dict[str, Expression]]:
+    def acted(self, s: Signals, late: int, name: str = _QUEUE) -> tuple[Expression, dict[str, Expression]]:
         """Return the parameters of the last cycle, or of `late` cycles before it, and what is remembered.
 
         They are the parameters of this cycle, with the signals of that one.
@@ -73,8 +73,8 @@ class Told:
         column, size = getattr(s, ACTED), len(self.places)
         remembered = {}
         if late:
-            column = ca.vertcat(column, getattr(s, _QUEUE))
-            remembered[f"{_QUEUE}_next"] = column[: size * late]
+            column = ca.vertcat(column, getattr(s, name))
+            remembered[f"{name}_next"] = column[: size * late]
         acted = dict(zip(self.places, ca.vertsplit(column[size * late :]), strict=True))
         parameters = ca.vertcat(*(acted.get(k, s.parameters[k]) for k in range(self.plant.parameter.size)))
         return parameters, remembered

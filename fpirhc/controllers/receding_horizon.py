@@ -100,6 +100,11 @@ class RecedingHorizon(Controller):
             return f"{type(self.on_failure).__name__} needs references of states that no output gives; use HoldPlan"
         return ""
 
+    def maps_unusable(self, problem: Problem) -> str:
+        """Return nothing: a stage of a map is a whole number of its steps."""
+        del problem
+        return ""
+
     def check(self, problem: Problem) -> None:
         """Raise if the problem has no horizon or cost, or the optimiser does not support it.
 

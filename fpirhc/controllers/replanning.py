@@ -162,9 +162,13 @@ def _propagate(plant: Plant, period: float) -> Block:
     reads = Layout((like(plant.state, "_target"), like(plant.input, "planned"), plant.parameter))
     writes = Layout((plant.response_signal("nominal"), like(plant.state, "target")))
     response, rate = plant.controlled_response_function, plant.derivative_function
+    calm = ca.DM.zeros(len(plant.names))
 
     def step(s: Signals) -> dict[str, Expression]:
-        target_next = runge_kutta_4(lambda x: rate(x, s.planned, s.parameters), s._target, period)
+        if plant.step is not None:
+            target_next = plant.next_function(s._target, s.planned, s.parameters, calm)
+        else:
+            target_next = runge_kutta_4(lambda x: rate(x, s.planned, s.parameters), s._target, period)
         return {"nominal": response(s._target, s.planned, s.parameters), "target": target_next}
 
     return Block("propagate", reads, writes, step)

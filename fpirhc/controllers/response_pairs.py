@@ -63,6 +63,11 @@ class ResponsePairs:
         return max(int(first), math.ceil(late - _NONE) + 1)
 
     @property
+    def late(self) -> float:
+        """How long before the cycle the response was realised, in units of time."""
+        return self.dead_time.measurement + self._delay * self.problem.period
+
+    @property
     def memory(self) -> tuple[Signal, ...]:
         """Past states and commands."""
         problem = self.problem

@@ -13,14 +13,16 @@ from __future__ import annotations
 import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, compose_informed, controller_reads
-from fpirhc.controllers.believing import Believing, check_believed
+from fpirhc.controllers.believing import Believing
 from fpirhc.controllers.contract import checked
-from fpirhc.controllers.face import on_face
+from fpirhc.controllers.face import measured_signals, on_face
 from fpirhc.controllers.mirror import with_measured_state
+from fpirhc.controllers.observed import check_believed
 from fpirhc.controllers.own_reference import with_reference
+from fpirhc.controllers.steps_ahead import with_steps_ahead
+from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.block import Block, Composite
 from fpirhc.symbolic.layout import Layout, Signal
-from fpirhc.task.dead_time import Wait
 from fpirhc.task.problem import Problem
 
 
@@ -39,27 +41,34 @@ def compose_seeing(problem: Problem, controller: Controller) -> Composite:
     ready = checked(problem, controller)
     blocks, delays = ready.blocks(problem)
     blocks = with_reference(problem, blocks)
-    reads = controller_reads(problem, ready)
-    own_state = (problem.plant.state,) if problem.plant.outputs else ()  # an estimator gives outputs, and not the state
-    first, others = reads.signals[: 2 + len(own_state)], reads.signals[3 + len(own_state) :]
     check_believed(problem, ready)
-    believing = _believing(problem)
+    believing, reads = _believing(problem), controller_reads(problem, ready).signals
+    others = reads[2 + len(measured_signals(problem.plant)) :]
     own = [believing.delay] if believing is not None else []
     every = [*seeing_blocks(problem), *with_measured_state(problem.plant, blocks)]
-    return compose_informed(problem, ready, Layout((first[0], *own_state, raw, *others)), every, [*delays, *own])
+    return compose_informed(
+        problem, ready, Layout((reads[0], *given_states(problem), raw, *others)), every, [*delays, *own]
+    )
+
+
+def given_states(problem: Problem) -> tuple[Signal, ...]:
+    """Return the signal of the state where it is given beside raw measurements: these are of outputs, and nothing is believed."""
+    estimated = problem.sensing.estimates and problem.sensing.belief is None
+    return (problem.plant.state,) if problem.plant.outputs and estimated else ()
 
 
 def raw_signal(problem: Problem) -> Signal | None:
     """Return the signal of the raw measurements that a step begins with; None where state and response are both measured."""
     if not problem.sensing.estimates:
         return None
-    return problem.sensing.raw(problem.plant.face, *_first(problem))
+    late = problem.dead_time.measurement_wait(problem.period)
+    return problem.sensing.raw(problem.plant, first_shown(problem), late)
 
 
 def seeing_blocks(problem: Problem) -> list[Block]:
     """Return the blocks from the raw measurements to 'state' and 'realised'; none where both are measured.
 
-    Of a plant with outputs these are estimated, 'output' and 'realised'.
+    Of a plant with outputs these are estimated, 'output' and 'realised', and 'state' where it is believed.
     """
     raw = raw_signal(problem)
     if raw is None:
@@ -70,7 +79,9 @@ def seeing_blocks(problem: Problem) -> list[Block]:
     if problem.sensing.measured is not None:
         return _estimating_part(problem, raw, start)
     plant = problem.plant
-    return [on_face(plant, problem.sensing.estimator.block(plant.face, problem.period, start, raw))]
+    return with_steps_ahead(
+        plant, on_face(plant, problem.sensing.estimator.block(plant.face, problem.period, start, raw))
+    )
 
 
 def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
@@ -82,8 +93,19 @@ def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     calm = np.zeros(len(problem.real_plant.names))
     if plant.outputs:
         return problem.start_output, reality.response_function(plant, seen=True)(*at, calm).full().ravel()
-    state = reality.state_function(plant, seen=True)(*at, calm)
-    return state.full().ravel(), reality.response_function(plant, seen=True)(*at, calm).full().ravel()
+    shown = dict(
+        zip(reality.shown(plant), reality.state_function(plant, seen=True)(*at, calm).full().ravel(), strict=True)
+    )
+    state = [shown.get(e, first) for e, first in zip(plant.state.elements, problem.start_state, strict=True)]
+    return np.array(state), reality.response_function(plant, seen=True)(*at, calm).full().ravel()
+
+
+def first_shown(problem: Problem) -> dict[str, float]:
+    """Return what sensors without noise show at the start, by name of everything that a sensor may show."""
+    plant, (motion, response) = problem.plant, first_estimates(problem)
+    names = (*plant.output.elements, *response_names(plant.face))
+    shown = dict(zip(names, map(float, np.concatenate([motion, response])), strict=True))
+    return dict(zip(plant.state.elements, map(float, problem.start_state), strict=True)) | shown
 
 
 def _believing(problem: Problem) -> Believing | None:
@@ -95,14 +117,9 @@ def _believing(problem: Problem) -> Believing | None:
 
 def _estimating_part(problem: Problem, raw: Signal, start: np.ndarray) -> list[Block]:
     """The estimator behind a block that leaves out what it does not need."""
-    names = problem.sensing.estimator.measures(problem.plant)
+    plant, estimator = problem.plant, problem.sensing.estimator
+    names = estimator.measures(plant.face)
     places = [raw.elements.index(n) for n in names]
     needed = Signal("_needed", names)
     select = Block("select", Layout((raw,)), Layout((needed,)), lambda s: {needed.name: getattr(s, raw.name)[places]})
-    return [select, problem.sensing.estimator.block(problem.plant, problem.period, start, needed)]
-
-
-def _first(problem: Problem) -> tuple[np.ndarray, Wait | None, np.ndarray]:
-    """First state, dead time of the measurement, and first response."""
-    start, resting = first_estimates(problem)
-    return start, problem.dead_time.measurement_wait(problem.period), resting
+    return [select, on_face(plant, estimator.block(plant.face, problem.period, start, needed))]

@@ -24,6 +24,8 @@ import numpy as np
 from fpirhc.deformation.queue import MOST, Queue, every
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
+from fpirhc.plant.instant import response_orders
+from fpirhc.plant.maps import growth_of
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.task.problem import Problem
@@ -37,7 +39,8 @@ class ThroughModel(Checked):
 
     Args:
         lag: time constant with which the model follows a shift of its target, in the plant's unit of time; a tuple has one per
-            controlled coordinate, 0 settles within a cycle. None: the slowest one of the model at the start, with the command held.
+            controlled coordinate, 0 settles within a cycle. None: the slowest one of the model at the start, with the command held;
+            0 for outputs of order 0, which the model moves at once.
         dead_time: from a target to its measured output; None: that of the problem, for the slowest input.
 
     Raises:
@@ -58,7 +61,7 @@ class ThroughModel(Checked):
     def stated(self, problem: Problem) -> ThroughModel:
         """Return the pairing with lag and dead time as numbers; one that cannot be known stays open, for `decays` to refuse."""
         try:
-            lag = _slowest(problem) if self.lag is None else self.lag
+            lag = _own_lags(problem) if self.lag is None else self.lag
         except InvalidValue:
             return self
         return ThroughModel(lag, self._late(problem))
@@ -74,7 +77,7 @@ class ThroughModel(Checked):
             InvalidValue: a model that does not settle, a wrong number of lags.
         """
         count = len(problem.plant.controlled_names)
-        lags = every(_slowest(problem) if self.lag is None else self.lag)
+        lags = every(_own_lags(problem) if self.lag is None else self.lag)
         if len(lags) not in (1, count):
             raise InvalidValue(
                 f"{self!r}: there are {count} controlled coordinates; give one lag for each, or one for all"
@@ -96,9 +99,9 @@ class ThroughModel(Checked):
     def memory(self, problem: Problem) -> tuple[Signal, ...]:
         """Return references and shifts on their way, newest first, and the shift in force: at first the distance of the start."""
         plant, names = problem.plant, problem.plant.controlled_names
-        places = [plant.state.elements.index(n) for n in names]
+        places = [plant.output.elements.index(n) for n in names]
         first = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()[places]
-        away, length = problem.start_state[places] - first, self.queue(problem).length
+        away, length = problem.start_output[places] - first, self.queue(problem).length
         queued = tuple(f"{n}@{k}" for k in range(1, length + 1) for n in names)
         return (
             Signal("references_sent", queued, start=tuple(map(float, first)) * length),
@@ -122,13 +125,21 @@ class ThroughModel(Checked):
         }
 
 
+def _own_lags(problem: Problem) -> float | tuple[float, ...]:
+    """The model's own time constants, one per controlled quantity where some settle at once."""
+    orders = list(response_orders(problem.plant).values())
+    slowest = _slowest(problem) if any(orders) else 0.0
+    return slowest if all(orders) else tuple(slowest if order else 0.0 for order in orders)
+
+
 def _slowest(problem: Problem) -> float:
     """Slowest time constant of the model at the start, with the command held."""
     plant = problem.plant
     x, u, p = plant.symbols()
     slope = ca.Function("fpirhc_modes", [x, u, p], [ca.densify(ca.jacobian(plant.derivative_function(x, u, p), x))])
     matrix = np.asarray(slope(problem.start_state, problem.inputs_before, plant.approximate).full())
-    rates = -np.linalg.eigvals(matrix).real if np.isfinite(matrix).all() else np.zeros(1)
+    modes = np.linalg.eigvals(matrix) if np.isfinite(matrix).all() else np.zeros(1)
+    rates = -growth_of(plant)(modes)
     if rates.min() <= _STILL * np.abs(rates).max():
         raise InvalidValue(
             f"ThroughModel(): the model does not settle at the start with its command held (slowest rate {rates.min():.3g} "

@@ -121,6 +121,8 @@ class Instance(Expected):
             ca.DM,
         ):  # every kind of expression passes for every other: see symbolic.expression
             return isinstance(value, ca.SX | ca.MX | ca.DM | int | float)
+        if self.one is np.ndarray:  # whatever numpy makes an array of numbers of
+            return isinstance(value, np.ndarray | ca.DM | list | tuple)
         return isinstance(value, np.bool_ if isinstance(value, np.bool_) and self.one is bool else self.one)
 
     def contract(self) -> type | None:
@@ -215,8 +217,8 @@ class Choice(Expected):
     def parts(self, value: object) -> Iterator[tuple[str, Expected, object]]:
         """The parts by the option that accepts all of them, or by the first one that fits."""
         fitting = [option for option in self.options if option.fits(value)]
-        chosen = next((option for option in fitting if accepts(option, value)), fitting[0])
-        yield from chosen.parts(value)
+        accepting = next((option for option in fitting if accepts(option, value)), fitting[0])
+        yield from accepting.parts(value)
 
     def contract(self) -> type | None:
         """The first contract among the options."""
@@ -280,4 +282,11 @@ def _container(origin: type, arguments: tuple[typing.Any, ...]) -> Expected:
 
 
 _OFTEN = (float, int)
-_WORDS = {str: "a text", bool: "True or False", type(None): "None", dict: "a dict", ca.SX: "an expression"}
+_WORDS = {
+    str: "a text",
+    bool: "True or False",
+    type(None): "None",
+    dict: "a dict",
+    ca.SX: "an expression",
+    np.ndarray: "an array",
+}

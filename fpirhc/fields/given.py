@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 import reprlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from importlib import import_module
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 60
+_SHORT.maxdict = 2
 
 
 def described(value: object) -> str:
@@ -46,14 +48,14 @@ def mended(expected: Expected, value: object) -> str:
         return f"write {int(value)}"
     if inspect.isroutine(value) and contract is not None:
         return "call it and give its result, or give a value"
-    return ""
+    return _part_that_fits(expected, value) if contract is not None else ""
 
 
-def call_of(one: type) -> str:
-    """Return how a value of the class is written: "Sigmoid(gain=...)"."""
-    makes: Callable[..., object] = getattr(one, "__init__")  # noqa: B009 -- the class's own, whatever its call does
+def call_of(one: type | Callable[..., object]) -> str:
+    """Return how a value of the class, or a call of the function, is written: "Sigmoid(gain=...)"."""
+    makes: Callable[..., object] = getattr(one, "__init__") if isinstance(one, type) else one  # noqa: B009
     try:
-        parameters = list(inspect.signature(makes).parameters.values())[1:]
+        parameters = list(inspect.signature(makes).parameters.values())[isinstance(one, type) :]
     except ValueError:
         parameters = []
     needed = [
@@ -71,11 +73,22 @@ def _mended_text(expected: Expected, text: str, contract: type | None) -> str:
             continue
     if contract is None:
         return ""
-    members = {_plain(name): member for name, member in _public(contract)}
+    loaded = getattr(contract, "LOADED", "").format(repr(text))
+    members = {_plain(name): member for name, member in _public(contract) if member is not contract or not loaded}
     close = get_close_matches(_plain(text), members, n=1, cutoff=0.5)
     if close:
         return f"write fp.{call_of(members[close[0]])}"
+    if loaded:
+        return f"write {loaded}"
     return f"one of {', '.join(sorted(m.__name__ for m in members.values()))}" if members else ""
+
+
+def _part_that_fits(expected: Expected, value: object) -> str:
+    """Which part of the value is what is expected, such as the problem of a loaded file."""
+    if isinstance(value, Mapping):
+        return next((f"give one of its entries, such as [{k!r}]" for k, v in value.items() if expected.fits(v)), "")
+    names = [f.name for f in fields(value)] if is_dataclass(value) and not isinstance(value, type) else []
+    return next((f"give its .{name}" for name in names if expected.fits(getattr(value, name))), "")
 
 
 def _public(contract: type) -> Iterator[tuple[str, type]]:

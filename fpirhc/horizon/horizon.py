@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Count, Duration
-from fpirhc.plant.integrators import Integrator, RungeKutta4
+from fpirhc.plant.integrators import USUAL, Integrator
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,8 @@ class Horizon(Checked):
     Args:
         stages: number of stages N.
         step: length of one stage, s, over which the input is constant.
-        discretisation: integrator of the model over one stage: RungeKutta4(), Euler(), ImplicitMidpoint(), RadauIIA().
+        discretisation: integrator of the model over one stage: RungeKutta4(), Euler(), ImplicitMidpoint(), RadauIIA(). A
+            map has none: a stage is a whole number of its steps.
         terminal: names of states that must meet the reference at the end of the horizon.
         blocks: lengths of blocks of stages over which the inputs are held (move blocking); they add up to the stages. Empty: every
             stage has inputs of its own.
@@ -35,7 +36,7 @@ class Horizon(Checked):
 
     stages: Count
     step: Duration
-    discretisation: Integrator = field(default_factory=RungeKutta4)
+    discretisation: Integrator = USUAL
     terminal: tuple[str, ...] = ()
     blocks: tuple[int, ...] = ()
     margins: Mapping[str, Sequence[float]] = field(

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import NotSupported
+from fpirhc.plant.instant import nominal_responses, response_orders
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Matrix
 from fpirhc.task.reference import Reference
@@ -55,11 +56,11 @@ def feedforward(plant: Plant, outputs: Matrix, responses: Matrix, p: Matrix) -> 
     Raises:
         NotSupported: see `reference_state`.
     """
-    return plant.inverse_function(reference_state(plant, outputs), responses[list(plant.face.controlled_indices)], p)
+    return plant.inverse_function(reference_state(plant, outputs), nominal_responses(plant, outputs, responses), p)
 
 
 def output_feedback(plant: Plant, x: Matrix, outputs: Matrix, p: Matrix, rate: float) -> Matrix:
-    """Return sum_{k<r} C(r, k) rate^(r-k) e^(k) of every controlled output, with which its error decays at that rate.
+    """Return sum_{k<r} C(r, k) rate^(r-k) e^(k) of every controlled output, with which its error decays; 0 for order 0.
 
     Args:
         plant: the plant.
@@ -71,8 +72,7 @@ def output_feedback(plant: Plant, x: Matrix, outputs: Matrix, p: Matrix, rate: f
     face, calm = plant.face, ca.DM.zeros(len(plant.names))
     error = outputs - plant.output_function(x, ca.DM.zeros(plant.input.size), p, calm)
     sums = []
-    for index in face.controlled_indices:
-        name, order = face.names[index], face.orders[index]
+    for name, order in response_orders(plant).items():
         places = [face.state.elements.index(name + "'" * k) for k in range(order)]
         sums.append(sum(math.comb(order, k) * rate ** (order - k) * error[place] for k, place in enumerate(places)))
     return ca.vertcat(*sums)
@@ -104,9 +104,8 @@ def nominal_motion(
     for k, place in known:
         entries[k] = outputs[place]
     at, p = ca.vertcat(*entries), ca.MX(ca.DM(plant.approximate))
-    needed = plant.inverse_function(
-        at, r[list(plant.face.controlled_indices)] + output_feedback(plant, at, outputs, p, rate), p
-    )
+    wanted = nominal_responses(plant, outputs, r)
+    needed = plant.inverse_function(at, wanted + output_feedback(plant, at, outputs, p, rate), p)
     command = ca.fmin(ca.fmax(needed, ca.DM(bounds[0])), ca.DM(bounds[1]))
     step = ca.Function("fpirhc_nominal", [x, outputs, r], [advance(at, command, p), at, command])
     outputs_at, responses_at = reference.function(plant).map(times.size)(times[None, :])

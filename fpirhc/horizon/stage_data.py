@@ -12,7 +12,7 @@ from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import kind
-from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.reference import Reference
 
 
@@ -56,8 +56,8 @@ def stage_data(
     """
     looked_up = signals is not None and not signals.is_a("SXFunction")
     matrix = kind(reference.opaque or plant.inverse_opaque or looked_up)
-    t, given = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
-    p = given if signals is None else signals(t + horizon.step / 2, given)
+    t, of_cycle = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
+    p = of_cycle if signals is None else signals(t + horizon.step / 2, of_cycle)
     motion = [matrix.sym("x", plant.output.size), matrix.sym("r", len(plant.face.names))] if previewed else []
     state, response = motion or reference.function(plant)(t)
     zero = matrix.zeros(plant.input.size)
@@ -66,7 +66,7 @@ def stage_data(
     joined = bool(live) and not (horizon.blocks or horizon.terminal or horizon.margins)
     rows = [matrix.sym("live", live)] if joined else []
     stage = ca.densify(ca.vertcat(t, state, needed, p, *rows))
-    one = ca.Function("fpirhc_stage_data", [t, *motion, given, *rows], [stage])
+    one = ca.Function("fpirhc_stage_data", [t, *motion, of_cycle, *rows], [stage])
     start, parameters = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
     columns = dict(zip(("states", "responses"), motion, strict=False))
     tables = [ca.MX.sym(name, m.numel(), horizon.stages + 1) for name, m in columns.items()]
@@ -101,6 +101,8 @@ def shifted_reference(plant: Plant, layout: Layout, nodes: int) -> ca.Function:
 
         d^(k)(t + tau) = sum_{j >= k} d^(j)(t) tau^(j-k) / (j-k)!,    j < r.
 
+    In the cycles T of a map these are divided differences, and tau^n is tau (tau - T) ... (tau - (n - 1) T), as Newton has it.
+
     The errors of the model's outputs plus d are those of the model's outputs where d is subtracted from the reference.
 
     Args:
@@ -116,10 +118,16 @@ def shifted_reference(plant: Plant, layout: Layout, nodes: int) -> ca.Function:
     for k, element in enumerate(elements):
         higher = [i for i, e in enumerate(elements) if e.startswith(element) and not e[len(element) :].strip("'")]
         powers = [elements[i].count("'") - element.count("'") for i in higher]
-        terms = (error[i] * later**n / math.factorial(n) for i, n in zip(higher, powers, strict=True))
+        terms = (error[i] * _power(later, n, plant) / math.factorial(n) for i, n in zip(higher, powers, strict=True))
         difference[place.start + k] = sum(terms, start=ca.SX(0))
     one = ca.Function("fpirhc_shifted_column", [column, now, x, y, p], [ca.densify(column - difference)])
     sizes = {"x": x.numel(), "y": y.numel(), "p": p.numel()}
     data, arguments = ca.MX.sym("data", layout.size, nodes), [ca.MX.sym(name, size) for name, size in sizes.items()]
     repeated = [ca.repmat(v, 1, nodes) for v in (data[layout.slice("time"), 0], *arguments)]
     return ca.Function("fpirhc_shifted_reference", [data, *arguments], [one.map(nodes)(data, *repeated)])
+
+
+def _power(time: Expression, exponent: int, plant: Plant) -> Expression:
+    if plant.step is None:
+        return time**exponent
+    return math.prod((time - k * plant.sampling for k in range(exponent)), start=ca.SX(1))

@@ -27,6 +27,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stage, linear_stage
 from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.active import active_limits, directions, largest_return
@@ -96,6 +97,7 @@ class Certificate:
         ]
 
 
+@checked_call
 def certify(plan: Plan, *, gain: float = 1.0) -> Certificate:
     """Return what is known about a plan.
 

@@ -9,6 +9,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.base import Optimiser, judge
@@ -134,6 +135,7 @@ class Plan:
         return cost, stationarity, feasibility
 
 
+@checked_call
 def solve(
     ocp: OptimalControl,
     optimiser: Optimiser,

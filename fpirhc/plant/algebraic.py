@@ -14,7 +14,6 @@ Reference: K. E. Brenan, S. L. Campbell, L. R. Petzold, Numerical Solution of In
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -27,6 +26,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Few
 from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.symbolic.expression import total
+from fpirhc.symbolic.functions import nan_where
 from fpirhc.symbolic.layout import Expression, Named
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ class Algebraic(Checked):
             at = at - step
         left = total(ca.fabs(step[k]) > SMALL * (1 + ca.fabs(at[k])) for k in range(len(self.names)))
         # NaN is on neither side of a comparison, so arriving is asked for and not missing.
-        return ca.vertcat(*(ca.if_else(left < 0.5, at[k], math.nan) for k in range(len(self.names))))
+        return at + nan_where(ca.logic_not(left < 0.5))
 
 
 def check_algebraic(plant: Plant, algebraic: Algebraic, views: tuple[Named, ...], mistakes: Mistakes) -> None:

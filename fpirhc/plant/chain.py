@@ -43,8 +43,10 @@ def _chain(plant: Plant, name: str, count: int, symbols: Symbols) -> list[Expres
     """The coordinate or output and its first `count` derivatives."""
     x, u, p, w = symbols
     if name not in plant.coordinates:
-        return lie_derivatives(plant, output_expression(plant, name, x, p), count, (x, u, p, w))
+        return lie_derivatives(plant, output_expression(plant, name, x, u, p), count, (x, u, p, w))
     elements, place = plant.state.elements, plant.names.index(name)
+    if plant.step is not None:
+        return lie_derivatives(plant, x[place], count, (x, u, p, w))
     rate = plant.forced_derivative_function(x, u, p, w)
     chain: list[Expression] = []
     for k in range(count + 1):

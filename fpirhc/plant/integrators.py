@@ -27,6 +27,11 @@ class Integrator(Checked, ABC):
         """Whether the step holds operations that scalar expressions cannot."""
         return False
 
+    @property
+    def steps_maps(self) -> bool:
+        """Whether it moves maps; False for what integrates differential equations."""
+        return False
+
     def finer(self, times: int) -> Integrator | None:  # noqa: ARG002
         """The same method with about `times` times the work; None where it has no such setting."""
         return None
@@ -134,6 +139,10 @@ class Cvodes(Integrator):
         xm, um, pm, wm = (ca.MX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))
         x_next = solver(x0=xm, p=ca.vertcat(um, pm, wm))["xf"]
         return ca.Function("fpirhc_cvodes_step", [xm, um, pm, wm], [x_next], ["x", "u", "p", "w"], ["x_next"])
+
+
+USUAL = RungeKutta4()
+"""The integrator of a problem, or of a horizon, that names none: this very object. A map has its own steps in its place."""
 
 
 def runge_kutta_4(rate: Callable[[Expression], Expression], x: Expression, h: float) -> Expression:

@@ -6,14 +6,16 @@ one is solved by Newton's method, and an input that Newton's method does not fin
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import casadi as ca
 
-from fpirhc.errors import Mistakes
+from fpirhc.errors import Mistakes, NotInvertible
 from fpirhc.fields.user_code import called, named_results, scalar_expression
+from fpirhc.plant.plant_functions import by_name
+from fpirhc.symbolic.expression import expression, graph
+from fpirhc.symbolic.functions import nan_where
 from fpirhc.symbolic.layout import Expression, Named
 
 if TYPE_CHECKING:
@@ -22,14 +24,26 @@ if TYPE_CHECKING:
 INVERSE_TOLERANCE = 1e-8  # relative response error beyond which an input of Newton's method is NaN
 
 
+def inverse_function(plant: Plant) -> ca.Function:
+    """Return the Function (state, response of the controlled coordinates, parameters) -> input.
+
+    Raises:
+        NotInvertible: the inputs and the controlled coordinates differ in number.
+    """
+    if len(plant.controlled_names) != len(plant.inputs):
+        raise NotInvertible(f"{len(plant.controlled_names)} controlled coordinates need as many inputs")
+    if plant.inverse is not None:
+        return inverse_by_user(plant, plant.inverse)
+    return inverse_of_affine(plant) if plant.affine else inverse_by_newton(plant)
+
+
 def inverse_by_user(plant: Plant, inverse: Callable[..., Mapping[str, Expression]]) -> ca.Function:
     """Function (state, response, parameters) -> input, made of the user's `inverse`."""
     x, _, p = plant.symbols()
     r = ca.SX.sym("r", len(plant.controlled_names))
     wanted = Named(plant.controlled_names, r, "coordinate")
-    commands = named_results(
-        "inverse", called("inverse", inverse, *plant._derivatives(x), wanted, plant._parameters(p))
-    )
+    *derivatives, parameters = by_name(plant, x, p)
+    commands = named_results("inverse", called("inverse", inverse, *derivatives, wanted, parameters))
     mistakes = Mistakes("inverse")
     for name in plant.inputs:
         if name not in commands:
@@ -62,5 +76,8 @@ def inverse_by_newton(plant: Plant) -> ca.Function:
     xm, rm, pm = (ca.MX.sym(n, s) for n, s in (("x", x.numel()), ("r", r.numel()), ("p", p.numel())))
     root = finder(ca.DM.zeros(len(plant.inputs)), xm, rm, pm)
     residual = ca.norm_inf(error(root, xm, rm, pm))
-    solved = residual <= INVERSE_TOLERANCE * (1 + ca.norm_inf(rm))
-    return ca.Function("fpirhc_inverse", [xm, rm, pm], [ca.if_else(solved, root, math.nan)], ["x", "r", "p"], ["u"])
+    # NaN is on neither side of a comparison, so arriving is asked for and not missing.
+    lost = ca.logic_not(residual <= INVERSE_TOLERANCE * (1 + ca.norm_inf(rm)))
+    return ca.Function(
+        "fpirhc_inverse", [xm, rm, pm], [root + graph(nan_where(expression(lost)))], ["x", "r", "p"], ["u"]
+    )

@@ -1,10 +1,11 @@
-"""Outputs y = h(x, p): quantities that are controlled or judged and are expressions of the state.
+"""Outputs y = h(x, p) or h(x, u, p): quantities that are controlled or judged and are expressions of the state, or of the inputs.
 
 The derivatives of an output are Lie derivatives along the plant's motion, with the input held,
 
     y_0 = h(x, p),    y_{k+1} = dy_k/dx x'(x, u, p, w),
 
-and its relative order r is the first k for which y_k depends on an input, decided from the symbols. The *face* of a plant is a
+and its relative order r is the first k for which y_k depends on an input, decided from the symbols; it is 0 where the output itself
+does. The *face* of a plant is a
 light plant whose coordinates are the outputs, y^(r) = u, with the state (y, y', ..., y^(r-1)). Reference, tracking law, judging and
 sensors take the face; inverse, response and horizon take the plant.
 
@@ -25,6 +26,8 @@ from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.expected import takes
 from fpirhc.fields.user_code import called, scalar_expression
+from fpirhc.plant.maps import shifted
+from fpirhc.plant.plant_functions import by_name
 from fpirhc.symbolic.layout import Expression, Named
 
 if TYPE_CHECKING:
@@ -39,7 +42,7 @@ class Output(Checked):
 
     Args:
         unit: of the output.
-        expression: function of the arguments of the response without the inputs; it returns one scalar.
+        expression: function of the arguments of the response, with or without the inputs; it returns one scalar.
         response_disturbance: name of a parameter that a model believes to add to the response y^(r) and to nothing else, as
             estimators of disturbances do; empty: none. The inverse has it in every cycle. A plan is made without it, as if the
             response were the model's, which is how a plan is made behind a deformation.
@@ -50,15 +53,16 @@ class Output(Checked):
     response_disturbance: str = field(default="", kw_only=True, metadata={"setting": False})
 
 
-def output_expression(plant: Plant, name: str, x: Expression, p: Expression) -> Expression:
-    """Return h(x, p) of one output.
+def output_expression(plant: Plant, name: str, x: Expression, u: Expression, p: Expression) -> Expression:
+    """Return h(x, u, p) of one output.
 
     Raises:
         InvalidProblem: the function fails, or does not return one scalar.
     """
     what, expression = f"outputs: '{name}'", plant.outputs[name].expression
-    value = called(what, expression, *plant._derivatives(x), plant._parameters(p))
-    return scalar_expression(what, value, of=expression, symbols=(x, p))
+    arguments = by_name(plant, x, p)
+    arguments = arguments if takes(expression, len(arguments)) else plant.views(x, u, p)
+    return scalar_expression(what, called(what, expression, *arguments), of=expression, symbols=(x, u, p))
 
 
 def lie_derivatives(plant: Plant, value: Expression, count: int, symbols: Symbols) -> list[Expression]:
@@ -66,14 +70,13 @@ def lie_derivatives(plant: Plant, value: Expression, count: int, symbols: Symbol
 
     Args:
         plant: the plant.
-        value: expression of x and p.
+        value: expression of x, u and p.
         count: number of derivatives.
         symbols: x, u, p, and the forcing w.
     """
-    x, u, p, w = symbols
-    rate, chain = plant.forced_derivative_function(x, u, p, w), [value]
+    chain = [value]
     for _ in range(count):
-        chain.append(ca.jtimes(chain[-1], x, rate))
+        chain.append(_along(plant, chain[-1], symbols))
     return chain
 
 
@@ -90,13 +93,23 @@ def without_disturbances(plant: Plant) -> Plant:
     return replace(plant, outputs={n: replace(one, response_disturbance="") for n, one in plant.outputs.items()})
 
 
+def _along(plant: Plant, value: Expression, symbols: Symbols) -> Expression:
+    """The derivative of an expression along the motion, or of a map its divided difference, with the input held."""
+    if plant.step is not None:
+        return shifted(plant, value, symbols)
+    x, u, p, w = symbols
+    return ca.jtimes(value, x, plant.forced_derivative_function(x, u, p, w))
+
+
 def output_order(plant: Plant, name: str) -> int | None:
-    """Return the relative order of an output: the first derivative that depends on an input; None where none does."""
+    """Return the relative order of an output: the first derivative that depends on an input, or 0; None where none does."""
     x, u, p = plant.symbols()
-    w = ca.SX.zeros(len(plant.names))
-    rate, value = plant.forced_derivative_function(x, u, p, w), output_expression(plant, name, x, p)
+    symbols = x, u, p, ca.SX.zeros(len(plant.names))
+    value = output_expression(plant, name, x, u, p)
+    if ca.jacobian_sparsity(value, u).nnz():
+        return 0
     for order in range(1, plant.state.size + 1):
-        value = ca.jtimes(value, x, rate)
+        value = _along(plant, value, symbols)
         if ca.jacobian_sparsity(value, u).nnz():
             return order
     return None
@@ -105,10 +118,15 @@ def output_order(plant: Plant, name: str) -> int | None:
 def face_of(plant: Plant) -> Plant:
     """Return the light plant whose coordinates are the outputs.
 
-    An output that no input reaches has the order one.
+    An output that no input reaches has the order one, and so has one of order 0 (see `fpirhc.plant.instant`).
     """
     orders = {name: output_order(plant, name) or 1 for name in plant.outputs}
-    return light_plant(plant, {name: one.unit for name, one in plant.outputs.items()}, orders, plant.controlled_names)
+    units = {name: one.unit for name, one in plant.outputs.items()}
+    light = light_plant(plant, units, orders, plant.controlled_names)
+    vars(light)["instant_names"] = (
+        plant.instant_names
+    )  # the property of a light plant, which has no expressions to find them from
+    return light
 
 
 def light_plant(
@@ -142,18 +160,20 @@ def light_plant(
         ranges={},
         outputs={},
         algebraic=None,
+        next=None,
     )
 
 
 def check_outputs(plant: Plant, mistakes: Mistakes) -> None:
     """Add every mistake of the outputs to `mistakes`."""
     for name, one in plant.outputs.items():
-        expected = max(plant.orders) + 1
-        if not takes(one.expression, expected):
+        lower = max(plant.orders, default=0)
+        if not (takes(one.expression, lower + 1) or takes(one.expression, lower + 2)):
             first = ["x"] if plant.words[0] == "state" else ["q", "v", "a", *(f"d{k}" for k in range(3, 12))]
-            names = ", ".join([*first[: expected - 1], "p"])
+            names = ", ".join(first[:lower])
             mistakes.add(
-                f"outputs: the expression of '{name}' is called as function({names}); it takes other arguments"
+                f"outputs: the expression of '{name}' is called as function({names}, p), or as function({names}, u, p) where the "
+                "command moves it at once; it takes other arguments"
             )
             continue
         try:
@@ -163,8 +183,8 @@ def check_outputs(plant: Plant, mistakes: Mistakes) -> None:
 
 
 def _check_one(plant: Plant, name: str, mistakes: Mistakes) -> None:
-    x, _, p = plant.symbols()
-    value = ca.SX(output_expression(plant, name, x, p))
+    x, u, p = plant.symbols()
+    value = ca.SX(output_expression(plant, name, x, u, p))
     if name in plant.coordinates and not ca.is_equal(value, x[plant.state.elements.index(name)], 1):
         mistakes.add(f"outputs: '{name}' has the name of a coordinate, but is another expression; rename the output")
         return

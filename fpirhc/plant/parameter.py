@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 
 from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
@@ -64,6 +64,23 @@ def check_parameters(parameters: Mapping[str, Parameter], mistakes: Mistakes) ->
             mistakes.add(f"parameter '{name}': {mistake}")
         if not isinstance(parameter.unit, str) or not parameter.unit:
             mistakes.add(f"parameter '{name}' has no unit; write unit='kg' (or '1' for none)")
+
+
+def with_exact_values(parameters: Mapping[str, Parameter], exact: Iterable[float]) -> dict[str, Parameter]:
+    """Return the parameters with other exact values, in their order.
+
+    Raises:
+        InvalidProblem: a value that is not finite or outside its bounds.
+    """
+    # A spread is around the value of the problem file, and not around another plant's.
+    others = {
+        name: replace(one, exact=float(value), spread=None)
+        for (name, one), value in zip(parameters.items(), exact, strict=True)
+    }
+    mistakes = Mistakes("plant")
+    check_parameters(others, mistakes)
+    mistakes.raise_if_any()
+    return others
 
 
 def _bounds_mistake(parameter: Parameter) -> str:

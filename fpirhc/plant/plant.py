@@ -14,6 +14,7 @@ themselves are not converted anywhere.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -24,21 +25,18 @@ import numpy as np
 
 from fpirhc.errors import Mistakes, NotInvertible, NotSupported
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.user_code import called
+from fpirhc.fields.kinds import Few
+from fpirhc.plant import by_states, by_steps, output_functions, plant_functions
 from fpirhc.plant.algebraic import Algebraic
-from fpirhc.plant.inverse import inverse_by_newton, inverse_by_user, inverse_of_affine
-from fpirhc.plant.outputs import (
-    Output,
-    believed_disturbance,
-    check_outputs,
-    face_of,
-    lie_derivatives,
-    output_expression,
-)
-from fpirhc.plant.parameter import Parameter, check_parameters
+from fpirhc.plant.instant import instant_outputs, response_orders
+from fpirhc.plant.inverse import inverse_function
+from fpirhc.plant.maps import check_map, next_function, over
+from fpirhc.plant.outputs import Output, check_outputs, face_of
+from fpirhc.plant.parameter import Parameter, check_parameters, with_exact_values
 from fpirhc.plant.plant_check import check_names, check_ranges, check_response
 from fpirhc.plant.plant_view import plant_facts, plant_table
 from fpirhc.plant.structural_order import structural_order
+from fpirhc.plant.units import derivative_unit
 from fpirhc.summary import line
 from fpirhc.symbolic.layout import Expression, Named, Signal, scalar, vector
 
@@ -67,6 +65,9 @@ class Plant(Checked):
         outputs: name -> Output(unit, function of (q, q', ..., p)): the quantities that follow a reference, where these are not the
             coordinates themselves. Their relative orders are found from the symbols.
         time_unit: unit of time of the equations ('s', 'ms', 'day'), and so of every time and rate of the problem.
+        step: of a map, the time from one state to the next; None: differential equations. See `Plant.of_map`.
+        next: of a map, the function of (x, u, p) that returns {state: its value one step later}.
+        steps: of a map, how many a control cycle has, with the command held; `Problem` counts them.
 
     Raises:
         InvalidProblem: all mistakes together.
@@ -85,10 +86,16 @@ class Plant(Checked):
     algebraic: Algebraic | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
     outputs: Mapping[str, Output] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
     time_unit: str = field(default="s", kw_only=True, metadata={"setting": False})
+    step: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    next: Callable[..., Mapping[str, Expression]] | None = field(
+        default=None, kw_only=True, metadata={"setting": "where given"}
+    )
+    steps: Few = field(default=1, kw_only=True, metadata={"setting": "where given"})
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("plant")
         check_names(self, mistakes)
+        check_map(self, mistakes)
         check_parameters(self.parameters, mistakes)
         mistakes.raise_if_any()
         check_ranges(self, mistakes)
@@ -97,52 +104,8 @@ class Plant(Checked):
         check_outputs(self, mistakes)
         mistakes.raise_if_any()
 
-    @classmethod
-    def of_states(
-        cls,
-        *,
-        states: Mapping[str, str],
-        inputs: Mapping[str, str],
-        parameters: Mapping[str, Parameter],
-        rates: Callable[..., Mapping[str, Expression]],
-        outputs: Mapping[str, Output],
-        controlled: Sequence[str] | None = None,
-        inverse: Callable[..., Mapping[str, Expression]] | None = None,
-        ranges: Mapping[str, tuple[float, float]] | None = None,
-        algebraic: Algebraic | None = None,
-        time_unit: str = "s",
-    ) -> Plant:
-        """Return the plant x' = f(x, u, p), y = h(x, p): every state is a coordinate of order one, and the outputs have references.
-
-        Args:
-            states: name -> unit of every state.
-            inputs: name -> unit of every input.
-            parameters: name -> Parameter(approximate, exact, unit).
-            rates: function of (x, u, p) that returns {state: its derivative with respect to time}.
-            outputs: name -> Output(unit, function of (x, p)).
-            controlled: outputs on which a tracking law and a deformation act, as many as there are inputs; None: all.
-            inverse: optional function of (x, r, p) that returns {input: command} for wanted highest derivatives r of the controlled
-                outputs; see `Plant`.
-            ranges: physical range (lowest, highest) of states by name.
-            algebraic: quantities that equations tie to the state at every instant; see `Plant`.
-            time_unit: unit of time of the equations.
-
-        Raises:
-            InvalidProblem: all mistakes together.
-        """
-        return cls(
-            coordinates=states,
-            inputs=inputs,
-            parameters=parameters,
-            response=rates,
-            order=1,
-            controlled=controlled,
-            inverse=inverse,
-            ranges=ranges or {},
-            outputs=outputs,
-            algebraic=algebraic,
-            time_unit=time_unit,
-        )
+    of_states = classmethod(by_states.of_states)
+    of_map = classmethod(by_steps.of_map)
 
     def __repr__(self) -> str:
         return line(self, *plant_facts(self))
@@ -164,15 +127,16 @@ class Plant(Checked):
 
     @property
     def words(self) -> tuple[str, str]:
-        """What a coordinate and the response are called: "state" and "rates" where the plant is given by its states."""
-        by_states = bool(self.outputs) and set(self.orders) == {1}
-        return ("state", "rates") if by_states else ("coordinate", "response")
+        """What a coordinate and the response are called: "state" and "rates", or "next", where the plant is given by its states."""
+        if self.next is not None:
+            return "state", "next"
+        return ("state", "rates") if self.outputs and set(self.orders) == {1} else ("coordinate", "response")
 
     @cached_property
     def state(self) -> Signal:
         """The state vector's signal: q, q', ... below the highest derivative."""
         names, units = [], []
-        for k in range(max(self.orders)):
+        for k in range(max(self.orders, default=0)):
             for c, r in zip(self.names, self.orders, strict=True):
                 if r > k:
                     names.append(c + "'" * k)
@@ -230,6 +194,11 @@ class Plant(Checked):
         return face_of(self) if self.outputs else self
 
     @cached_property
+    def instant_names(self) -> tuple[str, ...]:
+        """Outputs of order 0, which the command moves at once."""
+        return instant_outputs(self)
+
+    @cached_property
     def output(self) -> Signal:
         """The signal of what is measured of the face: the state without outputs, else y, y', ... below each relative order."""
         return replace(self.face.state, name="output") if self.outputs else self.state
@@ -237,27 +206,12 @@ class Plant(Checked):
     @cached_property
     def output_function(self) -> ca.Function:
         """Function (state, input, parameters, forcing) -> y, y', ... of the face; without outputs the state."""
-        x, u, p = self.symbols()
-        w = ca.SX.sym("w", len(self.names))
-        chains = {
-            name: lie_derivatives(self, output_expression(self, name, x, p), order, (x, u, p, w))
-            for name, order in zip(self.face.names, self.face.orders, strict=True)
-            if self.outputs
-        }
-        entries = [chains[e.rstrip("'")][e.count("'")] for e in self.output.elements] if self.outputs else [x]
-        return ca.Function(
-            "fpirhc_outputs", [x, u, p, w], [ca.densify(ca.vertcat(*entries))], ["x", "u", "p", "w"], ["y"]
-        )
+        return output_functions.output_function(self)
 
     @cached_property
     def known_by_outputs(self) -> tuple[int, ...]:
         """For every entry of the state its place among y, y', ...; -1 where it is none of these, and so has no reference."""
-        x, u, p = self.symbols()
-        if not self.outputs:
-            return tuple(range(self.state.size))
-        entries = ca.vertsplit(self.output_function(x, u, p, ca.SX.zeros(len(self.names))))
-        equal = [[k for k, e in enumerate(entries) if ca.is_equal(e, x[i], 1)] for i in range(x.numel())]
-        return tuple(places[0] if places else -1 for places in equal)
+        return output_functions.known_by_outputs(self)
 
     @cached_property
     def time(self) -> Signal:
@@ -274,8 +228,9 @@ class Plant(Checked):
         return tuple(self.derivative_unit(u, r) for u, r in zip(self.coordinates.values(), self.orders, strict=True))
 
     def response_signal(self, name: str) -> Signal:
-        """Return a signal that holds a highest derivative of every controlled quantity."""
-        units = [self.face.response_units[k] for k in self.face.controlled_indices]
+        """Return a signal that holds a highest derivative of every controlled quantity; of order 0 it is the quantity."""
+        face = self.face.coordinates
+        units = [self.derivative_unit(face[n], order) for n, order in response_orders(self).items()]
         return vector(name, self.controlled_names, units)
 
     @cached_property
@@ -294,17 +249,30 @@ class Plant(Checked):
         Raises:
             InvalidProblem: a parameter that is not finite or outside its bounds.
         """
-        named = zip(self.parameters.items(), exact, strict=True)
-        # A spread is around the value of the problem file, and not around another plant's.
-        parameters = {name: replace(one, exact=float(value), spread=None) for (name, one), value in named}
-        mistakes = Mistakes("plant")
-        check_parameters(parameters, mistakes)
-        mistakes.raise_if_any()
+        parameters = with_exact_values(self.parameters, exact)
         other = copy(self)
         # No other cached property depends on the exact values.
         other.__dict__.pop("exact", None)
         object.__setattr__(other, "parameters", parameters)
         return other
+
+    @property
+    def sampling(self) -> float:
+        """Time from one state of a map to the next that a controller sees: the control cycle; NaN for differential equations."""
+        return math.nan if self.step is None else self.step * self.steps
+
+    def over(self, cycle: float) -> Plant:
+        """Return the plant as a controller with this cycle sees it: a map's steps with the command held, or the plant itself.
+
+        Raises:
+            InvalidValue: the cycle is no whole number of the map's steps; the next ones are named.
+        """
+        return self if self.step is None else over(self, cycle)
+
+    @cached_property
+    def next_function(self) -> ca.Function:
+        """Function (state, input, parameters, forcing) -> state of a map one control cycle later."""
+        return next_function(self)
 
     def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Return new symbols of the state, the input and the parameters, with the sizes of this plant."""
@@ -318,65 +286,32 @@ class Plant(Checked):
     @cached_property
     def response_function(self) -> ca.Function:
         """Function (state, input, parameters) -> highest derivative of every coordinate (n)."""
-        x, u, p = self.symbols()
-        views = self.views(x, u, p)
-        if self.algebraic is not None:
-            views = (*views, self.algebraic.view(self.algebraic_function(x, u, p)))
-        responses = called(self.words[1], self.response, *views)
-        column = ca.vertcat(*(ca.SX(responses[c]) for c in self.names))
-        return ca.Function("fpirhc_response", [x, u, p], [ca.densify(column)], ["x", "u", "p"], ["r"])
+        return plant_functions.response_function(self)
 
     def views(self, x: Expression, u: Expression, p: Expression) -> tuple[Named, ...]:
         """Return the arguments of the response by name, without algebraic states: q, q', ..., u, p."""
-        return (*self._derivatives(x), Named(self.input.elements, u, "input"), self._parameters(p))
+        *derivatives, parameters = plant_functions.by_name(self, x, p)
+        return (*derivatives, Named(self.input.elements, u, "input"), parameters)
 
     @cached_property
     def algebraic_function(self) -> ca.Function:
         """Function (state, input, parameters) -> algebraic states (nz); empty without any."""
-        x, u, p = self.symbols()
-        solution = ca.SX(0, 1)
-        if self.algebraic is not None:
-            solution = self.algebraic.solved(self.views(x, u, p), ca.vertcat(x, u, p))
-        return ca.Function("fpirhc_algebraic", [x, u, p], [ca.densify(solution)], ["x", "u", "p"], ["z"])
+        return plant_functions.algebraic_function(self)
 
     @cached_property
     def controlled_response_function(self) -> ca.Function:
         """Function (state, input, parameters) -> highest derivative of the controlled coordinates or outputs."""
-        x, u, p = self.symbols()
-        if self.outputs:
-            calm, face = ca.SX.zeros(len(self.names)), self.face
-            orders = {name: face.orders[face.names.index(name)] for name in self.controlled_names}
-            chains = {
-                name: lie_derivatives(self, output_expression(self, name, x, p), order, (x, u, p, calm))
-                for name, order in orders.items()
-            }
-            entries = (chain[-1] + believed_disturbance(self, name, p) for name, chain in chains.items())
-            responses = ca.densify(ca.vertcat(*entries))
-        else:
-            responses = self.response_function(x, u, p)[list(self.controlled_indices)]
-        return ca.Function("fpirhc_controlled_response", [x, u, p], [responses], ["x", "u", "p"], ["r"])
+        return output_functions.controlled_response_function(self)
 
     @cached_property
     def forced_derivative_function(self) -> ca.Function:
         """Function (state, input, parameters, forcing) -> dx/dt; `forcing` (n) adds to the responses."""
-        x, u, p = self.symbols()
-        w = ca.SX.sym("w", len(self.names))
-        responses = self.response_function(x, u, p) + w
-        rates = []
-        for element in self.state.elements:
-            higher = element + "'"
-            if higher in self.state.elements:
-                rates.append(x[self.state.elements.index(higher)])
-            else:
-                rates.append(responses[self.names.index(element.rstrip("'"))])
-        return ca.Function("fpirhc_derivative", [x, u, p, w], [ca.vertcat(*rates)], ["x", "u", "p", "w"], ["xdot"])
+        return plant_functions.forced_derivative_function(self)
 
     @cached_property
     def derivative_function(self) -> ca.Function:
         """Function (state, input, parameters) -> dx/dt, undisturbed."""
-        x, u, p = self.symbols()
-        rate = self.forced_derivative_function(x, u, p, ca.SX.zeros(len(self.names)))
-        return ca.Function("fpirhc_free_derivative", [x, u, p], [rate], ["x", "u", "p"], ["xdot"])
+        return plant_functions.derivative_function(self)
 
     @cached_property
     def affine(self) -> bool:
@@ -398,25 +333,4 @@ class Plant(Checked):
         Raises:
             NotInvertible: the inputs and the controlled coordinates differ in number.
         """
-        if len(self.controlled_names) != len(self.inputs):
-            raise NotInvertible(f"{len(self.controlled_names)} controlled coordinates need as many inputs")
-        if self.inverse is not None:
-            return inverse_by_user(self, self.inverse)
-        return inverse_of_affine(self) if self.affine else inverse_by_newton(self)
-
-    def _derivatives(self, x: Expression) -> list[Named]:
-        views = []
-        for k in range(max(self.orders)):
-            holders = [c for c, r in zip(self.names, self.orders, strict=True) if r > k]
-            views.append(Named(holders, x[list(self.indices(k))], self.words[0]))
-        return views
-
-    def _parameters(self, p: Expression) -> Named:
-        return Named(tuple(self.parameters), p, "parameter")
-
-
-def derivative_unit(unit: str, derivative: int, time: str = "s") -> str:
-    """Return the unit of a time derivative, with the unit of time: 'm' -> 'm/s' -> 'm/s^2'."""
-    if derivative == 0:
-        return unit
-    return f"{unit}/{time}" if derivative == 1 else f"{unit}/{time}^{derivative}"
+        return inverse_function(self)

@@ -19,13 +19,15 @@ from fpirhc.symbolic.layout import Expression
 if TYPE_CHECKING:
     from fpirhc.plant.plant import Plant
 
+HIGHEST_ORDER = 20  # every derivative is a state with a name of its own: a mistyped 10**9 would fill the memory
+
 
 def check_names(plant: Plant, mistakes: Mistakes) -> None:
     """Add every mistake in names, units, orders and the choice of controlled coordinates to `mistakes`."""
     outputs = {name: one.unit for name, one in plant.outputs.items()}
-    quantities = "states" if plant.outputs and plant.order == 1 else "coordinates"
+    quantities = "states" if plant.next is not None or (plant.outputs and plant.order == 1) else "coordinates"
     for what, group in ((quantities, plant.coordinates), ("inputs", plant.inputs), ("outputs", outputs)):
-        if not group and what != "outputs":
+        if not group and what != "outputs" and not (what == quantities and plant.outputs):
             mistakes.add(f"{what} are empty; name at least one, with its unit")
         for name, unit in group.items():
             if not isinstance(unit, str) or not unit:
@@ -76,10 +78,10 @@ def check_response(plant: Plant, mistakes: Mistakes) -> None:
     expected = len(arguments_of_step)
     if not takes(plant.response, expected):
         arguments = len(inspect.signature(plant.response).parameters)
-        lower = ["x"] if function == "rates" else ["q", "v", "a"] + [f"d{k}" for k in range(3, 12)]
+        lower = ["x"] if quantity == "state" else ["q", "v", "a"] + [f"d{k}" for k in range(3, 12)]
         mistakes.add(
-            f"{function} takes {arguments} argument(s); with order {max(plant.orders)} it is called as "
-            f"{function}({', '.join([*lower[: max(plant.orders)], 'u', 'p', *(['z'] if algebraic else [])])})"
+            f"{function} takes {arguments} argument(s); with order {max(plant.orders, default=0)} it is called as "
+            f"{function}({', '.join([*lower[: max(plant.orders, default=0)], 'u', 'p', *(['z'] if algebraic else [])])})"
         )
         return
     try:
@@ -89,6 +91,9 @@ def check_response(plant: Plant, mistakes: Mistakes) -> None:
         return
     mistakes.unknown(f"{function}: {quantity}", response, plant.coordinates)
     for c, r in zip(plant.names, plant.orders, strict=True):
+        if c not in response and plant.next is not None:
+            mistakes.add(f"next does not give the value of state '{c}' one step later; return it too")
+            continue
         if c not in response:
             mistakes.add(f"{function} does not give the derivative {c}{chr(39) * r} of {quantity} '{c}'; return it too")
             continue
@@ -112,10 +117,15 @@ def _check_order_numbers(plant: Plant, mistakes: Mistakes) -> None:
     for order in orders:
         if not isinstance(order, int) or isinstance(order, bool) or order < 1:
             mistakes.add(f"order must be a whole number of at least 1, got {order!r}")
+        elif order > HIGHEST_ORDER:
+            mistakes.add(
+                f"order is {order}, and the highest possible is {HIGHEST_ORDER}: the response has one argument per lower "
+                "derivative; give the order of the derivative that the response returns"
+            )
 
 
 def _check_inverse(plant: Plant, inverse: Callable[..., Mapping[str, Expression]], mistakes: Mistakes) -> None:
-    arguments = max(plant.orders) + 2
+    arguments = max(plant.orders, default=0) + 2
     if not takes(inverse, arguments):
         mistakes.add(
             f"inverse is called with {arguments} arguments: the derivatives below the order, responses, parameters"
@@ -135,6 +145,11 @@ def _check_orders(plant: Plant, mistakes: Mistakes) -> None:
         order = structural_order(plant, name)
         if order is None:
             mistakes.add(f"no input reaches coordinate '{name}', however often it is differentiated")
+        elif order != stated and plant.next is not None:
+            mistakes.add(
+                f"an input reaches state '{name}' only after {order} steps; write it as an output, whose order is found: "
+                f"outputs={{'{name}': Output(unit, lambda x, p: x.{name})}}"
+            )
         elif order != stated:
             mistakes.add(
                 f"order of '{name}' is given as {stated}, but its response has no input: the first derivative that an "

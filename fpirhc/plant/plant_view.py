@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 def plant_facts(plant: Plant) -> tuple[str, ...]:
     """Return what sums up a plant: its coordinates or outputs with their orders, its inputs, the number of its parameters."""
     if plant.outputs:
-        face = zip(plant.face.names, plant.face.orders, strict=True)
+        face = zip(plant.face.names, _orders(plant), strict=True)
         shown = ", ".join(f"{name} of relative order {order}" for name, order in face)
         states = f"{plant.state.size} states"
         return f"outputs {shown}", states, f"inputs {', '.join(plant.inputs)}", f"{len(plant.parameters)} parameters"
@@ -27,7 +27,7 @@ def plant_table(plant: Plant) -> str:
         (name, f"coordinate, order {order}", unit, "", "")
         for (name, unit), order in zip(plant.coordinates.items(), plant.orders, strict=True)
     ]
-    face = zip(plant.face.coordinates.items(), plant.face.orders, strict=True) if plant.outputs else ()
+    face = zip(plant.face.coordinates.items(), _orders(plant), strict=True) if plant.outputs else ()
     rows += [(name, f"output, relative order {order}", unit, "", "") for (name, unit), order in face]
     rows += [(name, "input", unit, "", "") for name, unit in plant.inputs.items()]
     rows += [
@@ -44,3 +44,9 @@ def plant_table(plant: Plant) -> str:
     if plant.controlled is not None:
         notes.append(f"Controlled: {', '.join(plant.controlled)}.")
     return table("Plant", ("name", "is", "unit", "model", "plant"), rows, notes)
+
+
+def _orders(plant: Plant) -> list[int]:
+    """Relative orders of the outputs."""
+    face = zip(plant.face.names, plant.face.orders, strict=True)
+    return [0 if name in plant.instant_names else order for name, order in face]

@@ -15,9 +15,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
+from typing import ClassVar
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, Mistakes, ProblemFileError, nearest
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.fields.given import call_of, described
 from fpirhc.problem_files.importing import imported
 from fpirhc.problem_files.importing import line_of as _at
@@ -45,6 +47,9 @@ class Task:
         metrics: all metrics of the problem's runs.
         pictures: further pictures for the report.
     """
+
+    LOADED: ClassVar[str] = "fp.load_problem({})"
+    """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
 
     name: str
     path: Path
@@ -122,6 +127,7 @@ def find_problem(name_or_path: str) -> Path:
     raise ProblemFileError(f"problem '{name_or_path}' is unknown.{nearest(name_or_path, shipped)}")
 
 
+@checked_call
 def load_problem(name_or_path: str) -> Task:
     """Import a problem file and check its definitions.
 

@@ -46,8 +46,8 @@ def _responses(name: str, run: Run, shorten: Shorten) -> list[Chart]:
         return []
     charts = []
     for c in run.layout["deformed"].elements:
-        asked, real = run[f"deformed.{c}"], run[f"plant_realised.{c}"]
-        expected = np.concatenate([real[:1], asked[:-1]])
+        requested, real = run[f"deformed.{c}"], run[f"plant_realised.{c}"]
+        expected = np.concatenate([real[:1], requested[:-1]])
         lines = [("the model expected", expected), ("the reality did", real)]
         title = f"{name}: response of {c}, belief and reality"
         charts.append({**_chart(title, run.unit(f"deformed.{c}"), lines, shorten), "only": name})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -62,6 +62,9 @@ def show(comparison: Comparison, report: Path) -> None:
     _table(comparison).show(console)
     if sum(e.optimality is not None for e in comparison.entries) > 1:
         _plans(comparison).show(console)
+    for entry in comparison.entries:
+        if entry.run.stop:
+            say(console, f"{entry.name} ended early: {entry.run.stop}")
     for line in comparison.information:
         say(console, line)
     for entry in comparison.entries:
@@ -158,9 +161,15 @@ def _table(comparison: Comparison) -> Folding:
 def _row(entry: Entry, shown: Sequence[Metric]) -> list[str]:
     metrics, cycle = entry.metrics, entry.cycle
     numbers = [c.text(c.number(metrics), missing="", none="-") for c in shown]
-    fine = metrics.statuses.get("OK", 0) / max(sum(metrics.statuses.values()), 1)
-    status = "ended early" if entry.run.stop else "ok" if fine == 1 else f"ok {100 * fine:.3g} %"
+    status = "ended early" if entry.run.stop else status_shares(metrics.statuses)
     return [entry.name, *numbers, f"{cycle.median:.2g}" if cycle else "", status]
+
+
+def status_shares(statuses: Mapping[str, int]) -> str:
+    """The shares of cycles whose status is not ok, such as 'not converged 1.67 %'; 'ok' where there are none."""
+    cycles = sum(statuses.values())
+    other = {name: count for name, count in statuses.items() if count and name != "OK"}
+    return ", ".join(f"{k.lower().replace('_', ' ')} {100 * v / cycles:.3g} %" for k, v in other.items()) or "ok"
 
 
 def _plans(comparison: Comparison) -> Folding:

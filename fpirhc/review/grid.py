@@ -22,8 +22,10 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from fpirhc.plant.instant import nominal_responses
 from fpirhc.plant.mismatch import exact_ranges
 from fpirhc.review.inner import inner_motion, inner_places
+from fpirhc.symbolic.expression import kind
 from fpirhc.task.problem import Problem
 
 _POINTS = 41
@@ -121,9 +123,8 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
     """
     real, problem = problem if problem.symbolic_reality else None, problem.of_model
     plant = problem.plant
-    function = problem.reference.function(plant)
     times = np.linspace(0.0, problem.duration, _POINTS)
-    nominal = function.map(_POINTS)(times[None, :])
+    nominal = _nominal(problem).map(_POINTS)(times[None, :])
     states, responses = (np.asarray(v.full()).T for v in nominal)
     states = np.full((_POINTS, plant.state.size), np.nan) if plant.outputs else states
     ranges = exact_ranges(plant, mismatch)
@@ -136,9 +137,14 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
         inner = ()
     else:
         states[:, list(inner)] = own
-    return ReviewGrid(
-        problem, times, states, responses[:, list(plant.face.controlled_indices)], rows, inner, mismatch, real
-    )
+    return ReviewGrid(problem, times, states, responses, rows, inner, mismatch, real)
+
+
+def _nominal(problem: Problem) -> ca.Function:
+    """Function time -> (nominal state or outputs, nominal responses of the controlled ones)."""
+    t = kind(problem.reference.opaque).sym("t")
+    outputs, responses = problem.reference.function(problem.plant)(t)
+    return ca.Function("fpirhc_wanted", [t], [outputs, nominal_responses(problem.plant, outputs, responses)])
 
 
 def parameter_box(problem: Problem, mismatch: float) -> dict[str, tuple[float, float]]:

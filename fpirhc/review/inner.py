@@ -16,6 +16,7 @@ import numpy as np
 from fpirhc.errors import FpirhcError
 from fpirhc.horizon.nominal import output_feedback
 from fpirhc.horizon.transcription import transcribe
+from fpirhc.plant.instant import nominal_responses
 from fpirhc.symbolic.expression import kind
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem import Problem
@@ -74,7 +75,7 @@ def _integrator(problem: Problem, places: list[int], times: np.ndarray) -> ca.Fu
     for place, entry in zip(places, range(len(places)), strict=True):
         rows[place] = inner[entry]
     state = ca.vertcat(*rows)
-    wanted = response[list(plant.face.controlled_indices)]
+    wanted = nominal_responses(plant, nominal, response)
     if plant.outputs:
         decay = min(_DECAYS / problem.duration, _FASTEST / problem.period)
         wanted = wanted + output_feedback(plant, state, nominal, p, decay)

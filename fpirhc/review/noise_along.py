@@ -39,8 +39,8 @@ class Noisy:
             NotContractive: gain and pole with which noise grows.
         """
         spreads = [noise_spread(j, self.covariance, gain, pole).step for j in self.jacobians]
-        moved = [b @ s @ b.T for b, s in zip(self.inverses, spreads, strict=True)]
-        return np.asarray(np.sqrt(np.max([np.diag(m) for m in moved], axis=0)))
+        covariances = [b @ s @ b.T for b, s in zip(self.inverses, spreads, strict=True)]
+        return np.asarray(np.sqrt(np.max([np.diag(m) for m in covariances], axis=0)))
 
 
 def noisy_points(grid: ReviewGrid, controller: Controller, noise: Mapping[str, float] | None) -> Noisy:

@@ -10,6 +10,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import NotSupported
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.plant.mismatch import check_mismatch
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
@@ -85,6 +86,7 @@ class Prediction:
         return [*errors, *((f"tube of {s}", number(v)) for s, v in self.half_width.items())]
 
 
+@checked_call
 def predict_response(
     problem: Problem, controller: Controller, *, mismatch: float | None = None, seed: int = 0, compiled: bool = True
 ) -> Prediction:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked, resolved
 from fpirhc.errors import FpirhcError, InvalidValue
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.review.answer import Answer, Review, Verdict
 from fpirhc.review.chatter import chatter_small
 from fpirhc.review.commands import commands_inside
@@ -23,6 +24,7 @@ from fpirhc.review.maps import largest_product
 from fpirhc.review.margins import margins_enough
 from fpirhc.review.neighbourhood import spectrum_near
 from fpirhc.review.nominal_runs import NominalRuns
+from fpirhc.review.of_order_zero import controls_order_zero, review_of_order_zero
 from fpirhc.review.orders import relative_orders
 from fpirhc.review.pays import pays
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, known_questions
@@ -39,6 +41,7 @@ from fpirhc.review.zero_dynamics import zero_dynamics, zero_dynamics_rate
 from fpirhc.task.problem import Problem
 
 
+@checked_call
 def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch: float, seed: int) -> Review:
     """Return the answers to all questions that can be answered before a run.
 
@@ -55,6 +58,8 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
         NotInvertible: the inputs and the controlled coordinates differ in number.
     """
     grid = review_grid(problem, mismatch, seed)
+    if controls_order_zero(grid):
+        return review_of_order_zero(grid, controllers)
     general = [well_posed(grid), relative_orders(grid), inverse_exists(grid), commands_inside(grid)]
     reach = horizon_long_enough(grid)
     more = (question.ask(grid) for question in known_questions(ProblemQuestion))
@@ -105,8 +110,8 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: N
 
 def _more(case: Case) -> list[Answer]:
     """Answers to the questions that are found by discovery."""
-    asked = (q for q in known_questions(ControllerQuestion) if _concerns(q, case.controller))
-    answers = (question.ask(case) for question in asked if not question.doubts)
+    questions = (q for q in known_questions(ControllerQuestion) if _concerns(q, case.controller))
+    answers = (question.ask(case) for question in questions if not question.doubts)
     return [answer for answer in answers if answer is not None]
 
 

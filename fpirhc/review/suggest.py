@@ -21,6 +21,7 @@ from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import InvalidName, InvalidValue, NotContractive, NotSupported, nearest
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.review.grid import review_grid
 from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import loops_along
@@ -67,6 +68,7 @@ class Suggestion:
         return [*own, *steps, *((f"rms error of {c} from noise", number(v)) for c, v in self.floor.items())]
 
 
+@checked_call
 def suggest(
     problem: Problem,
     controller: Controller,
@@ -89,11 +91,11 @@ def suggest(
         or coordinate. NotSupported: a controller without adaptation; a response that is estimated, whose noise must
         be given. NotInvertible: see `review`. NotContractive: eigenvalues that no gain suits.
     """
-    chosen = resolved(problem, controller)
-    _check(chosen, ringing)
+    ready = resolved(problem, controller)
+    _check(ready, ringing)
     budget = _budget(problem, chatter)
     grid = review_grid(problem, 0.0, 0)
-    noisy = noisy_points(grid, chosen, noise)
+    noisy = noisy_points(grid, ready, noise)
     sign, largest = _largest_eigenvalue(noisy.jacobians)
 
     def fits(size: float) -> bool:
@@ -101,11 +103,11 @@ def suggest(
 
     size = _largest_within(fits, 1 / largest)
     pole = filter_pole(size * largest, ringing)
-    deformation = _with(chosen.deformation, sign * size, pole)
+    deformation = _with(ready.deformation, sign * size, pole)
     own = getattr(deformation, deformation.gain_name, None)
     name, value = ("effective gain", sign * size) if own is None else (deformation.gain_name, float(own))
     predicted = dict(zip(problem.plant.inputs, map(float, noisy.steps(sign * size, pole)), strict=True))
-    floor = _floor(loops_along(grid, chosen).ideal, noisy, problem)
+    floor = _floor(loops_along(grid, ready).ideal, noisy, problem)
     return Suggestion(deformation, sign * size, pole, name, value, predicted, floor)
 
 

@@ -31,6 +31,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.review.grid import each, review_grid
 from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import ideal_loops
@@ -45,6 +46,7 @@ _KEPT = 1e-8  # of the range: what a limit may be passed by
 Margins = Mapping[str, tuple[float, ...]]
 
 
+@checked_call
 def tightened(
     problem: Problem,
     controller: Controller,
@@ -77,6 +79,7 @@ def tightened(
     return planned
 
 
+@checked_call
 def state_margins(
     problem: Problem,
     controller: Controller,
@@ -155,8 +158,8 @@ def _deviations(nominal: NominalRun, exact: np.ndarray) -> np.ndarray:
     believed, rows = (np.tile(p, (nominal.cycles, 1)) for p in (nominal.believed, exact))
     still = np.zeros((nominal.cycles, len(plant.names)))
     own = each(plant.inverse_function, nominal.states[:-1], nominal.desired, believed)
-    moved = each(advance, nominal.states[:-1], errors.command, rows, still)
-    deviations = moved - each(advance, nominal.states[:-1], own, believed, still)
+    states_next = each(advance, nominal.states[:-1], errors.command, rows, still)
+    deviations = states_next - each(advance, nominal.states[:-1], own, believed, still)
     if not np.isfinite(deviations).all():
         raise NotSupported("no margins: the predicted deviations do not stay finite")
     return np.asarray(deviations[min(round(problem.measure_from / problem.period), nominal.cycles - 1) :])

@@ -2,7 +2,7 @@
 
 from fpirhc.sensing.base import DerivativeEstimator
 from fpirhc.sensing.measured import Measured
-from fpirhc.sensing.positions import PositionDifference, SavitzkyGolay
+from fpirhc.sensing.positions import PositionDifference, SavitzkyGolay, StepDifference
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.sensing.sensor import Sensor
 from fpirhc.sensing.state_filter import StateVariableFilter
@@ -17,5 +17,6 @@ __all__ = [
     "Sensing",
     "Sensor",
     "StateVariableFilter",
+    "StepDifference",
     "VelocityDifference",
 ]

@@ -21,9 +21,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import TypeAlias
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.fields.checked import Checked
+from fpirhc.plant.instant import response_orders
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.layout import Expression, Signal
@@ -37,6 +39,11 @@ class DerivativeEstimator(Checked, ABC):
     @property
     def measures_all(self) -> bool:
         """Whether state and response are both measured, so that nothing is estimated."""
+        return False
+
+    @property
+    def of_steps(self) -> bool:
+        """Whether it takes differences of a map's steps; False for derivatives with respect to time."""
         return False
 
     @abstractmethod
@@ -93,13 +100,28 @@ def known_by_positions(plant: Plant, measured: Sequence[str]) -> tuple[str, ...]
 
 
 def response_names(plant: Plant) -> tuple[str, ...]:
-    """Names of the highest derivatives of the controlled coordinates: "q1''"."""
-    return tuple(plant.names[k] + "'" * plant.orders[k] for k in plant.controlled_indices)
+    """Names of the highest derivatives of the controlled coordinates: "q1''"; of order 0 it is the output's own name."""
+    return tuple(name + "'" * order for name, order in response_orders(plant).items())
+
+
+def quantities(plant: Plant) -> tuple[str, ...]:
+    """Names of all that a sensor may show: states, outputs and their derivatives, and the highest ones of controlled quantities."""
+    return tuple(dict.fromkeys((*plant.state.elements, *plant.face.state.elements, *response_names(plant.face))))
+
+
+def values_of(plant: Plant, x: ca.SX, u: ca.SX, p: ca.SX) -> dict[str, ca.SX]:
+    """Return everything that a sensor may show as expressions of the state and the input that acted, by name."""
+    responses = ca.vertsplit(plant.controlled_response_function(x, u, p))
+    named = dict(zip(plant.state.elements, ca.vertsplit(x), strict=True))
+    if plant.outputs:
+        outputs = plant.output_function(x, u, p, np.zeros(len(plant.names)))
+        named = {**dict(zip(plant.output.elements, ca.vertsplit(outputs), strict=True)), **named}
+    return {**named, **dict(zip(response_names(plant.face), responses, strict=True))}
 
 
 def names_of_responses(plant: Plant, signal: Signal) -> tuple[str, ...]:
     """Names of the entries of a signal of responses: highest derivatives of coordinates, and others as they are."""
-    orders = dict(zip(plant.names, plant.orders, strict=True))
+    orders = {**dict(zip(plant.names, plant.orders, strict=True)), **dict.fromkeys(plant.instant_names, 0)}
     return tuple(e + "'" * orders.get(e, 0) for e in signal.elements)
 
 

@@ -30,13 +30,13 @@ class Model:
 
     Args:
         plant: the model.
-        advance: Function (state, input, parameters, forcing) -> state one cycle later.
+        move: Function (state, input, parameters, forcing, share) -> state after that share of a cycle.
         start: first state, shape (nx,).
         measured: names of the measured quantities.
     """
 
     plant: Plant
-    advance: ca.Function
+    move: ca.Function
     start: np.ndarray
     measured: tuple[str, ...]
 
@@ -50,7 +50,8 @@ class Evidence:
         known: state elements that follow from these alone: measured, or derivatives of measured coordinates.
         command: it acted until the sample was taken.
         parameters: of the model.
-        moves: 1 where the sample is one cycle later than the last one; 0 for a sample that still shows the start.
+        moves: share of a cycle by which the sample is later than the last one: 1, or 0 for a sample that still shows the start.
+            Where samples are late by a fraction of a cycle, the first one that moves shows a mean with the start, and so a share.
         counts: 1 where the sample was taken in this run, and is not the start again that fills a dead time.
     """
 
@@ -86,6 +87,11 @@ class Belief(Checked, ABC):
             plant: the model.
             known: state elements that follow from what is measured.
         """
+
+    @property
+    def opaque(self) -> bool:
+        """Whether its step is built as a graph of calls; False: as scalar code."""
+        return False
 
     def uses(self, measured: tuple[str, ...]) -> tuple[str, ...]:
         """Names of the measured quantities that correct the state; by default all."""

@@ -23,8 +23,8 @@ class Measured(DerivativeEstimator):
         return True
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
-        """The whole state and every controlled coordinate's highest derivative."""
-        return plant.state.elements + response_names(plant)
+        """The whole state and every controlled coordinate's highest derivative; an output of order 0 is both, and measured once."""
+        return tuple(dict.fromkeys(plant.state.elements + response_names(plant)))
 
     def answers(self, plant: Plant) -> tuple[str, ...]:
         """The highest derivatives."""
@@ -34,10 +34,11 @@ class Measured(DerivativeEstimator):
         """Block that names the measured quantities."""
         del period, start
         realised = plant.response_signal("realised")
+        responses = [seen.elements.index(name) for name in response_names(plant)]
 
         def step(s: Signals) -> dict[str, Expression]:
             both = getattr(s, seen.name)
-            return {"state": both[: plant.state.size], "realised": both[plant.state.size :]}
+            return {"state": both[: plant.state.size], "realised": both[responses]}
 
         return Block("estimate", Layout((seen,)), Layout((plant.state, realised)), step)
 

@@ -10,7 +10,7 @@ instant it is the kernel of Kalman's observability matrix, without its powers of
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -40,12 +40,20 @@ def members(basis: np.ndarray) -> list[int]:
     return [k for k, row in enumerate(basis) if np.abs(row).max(initial=0.0) > 1e-6]
 
 
-def slowest(slopes: Sequence[np.ndarray], basis: np.ndarray) -> float:
-    """Return the largest real part of the poles with which these errors move, in 1 / unit of time; negative: all decay."""
+def slowest(
+    slopes: Sequence[np.ndarray], basis: np.ndarray, growth: Callable[[np.ndarray], np.ndarray] = np.real
+) -> float:
+    """Return the largest real part of the poles with which these errors move, in 1 / unit of time; negative: all decay.
+
+    Args:
+        slopes: Jacobians of the rates.
+        basis: of the errors.
+        growth: of poles; of a map's divided differences it is not the real part (`fpirhc.plant.maps.decay_rates`).
+    """
     if not basis.shape[1]:
         return -np.inf
     dual = np.linalg.pinv(basis)
-    return max(float(np.linalg.eigvals(dual @ a @ basis).real.max()) for a in slopes)
+    return max(float(growth(np.linalg.eigvals(dual @ a @ basis)).max()) for a in slopes)
 
 
 def _kernel(matrix: np.ndarray) -> np.ndarray:

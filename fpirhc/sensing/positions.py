@@ -121,6 +121,38 @@ class PositionDifference(_Finite):
 
 
 @dataclass(frozen=True)
+class StepDifference(_Finite):
+    """The divided differences of a map's last steps, delta^s y = (s-th backward difference) / T^s.
+
+    The one of relative order n is exact, with no average: the difference up to this cycle is the response to the request of n
+    cycles ago. So it is n - 1 cycles later than the ideal pair, and pairs are complete from cycle n on. The lower differences are
+    those of s cycles ago; `fpirhc.controllers.steps_ahead` brings them to this cycle by the model.
+    """
+
+    @property
+    def of_steps(self) -> bool:
+        """Whether it takes differences of a map's steps: it does."""
+        return True
+
+    def coefficients(self, order: int) -> Array:
+        """Alternating binomial coefficients."""
+        rows = np.zeros((order + 1, order + 1))
+        for s in range(order + 1):
+            rows[s, : s + 1] = backward_difference(s)
+        return rows
+
+    def weights(self, order: int, period: float) -> Array:
+        """One for the request of n cycles ago."""
+        del period
+        return np.eye(order)[-1]
+
+    def delay(self, order: int, period: float) -> float:
+        """(n - 1)."""
+        del period
+        return float(order - 1)
+
+
+@dataclass(frozen=True)
 class SavitzkyGolay(_Finite):
     """A polynomial fitted to the window by least squares: the response at its centre, the state at its newest sample.
 
@@ -191,4 +223,4 @@ class SavitzkyGolay(_Finite):
         return (self.window - 1) / 2 - 0.5
 
 
-EXAMPLES = (PositionDifference(), SavitzkyGolay(window=11, degree=4))
+EXAMPLES = (PositionDifference(), StepDifference(), SavitzkyGolay(window=11, degree=4))

@@ -25,8 +25,9 @@ import numpy as np
 from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import Array, DerivativeEstimator, response_names
+from fpirhc.sensing.base import Array, DerivativeEstimator, quantities, response_names
 from fpirhc.sensing.belief import Belief
+from fpirhc.sensing.coverage import uncovered
 from fpirhc.sensing.measured import Measured
 from fpirhc.sensing.sensor import Sensor
 from fpirhc.symbolic.block import Block
@@ -44,11 +45,13 @@ class Sensing(Checked):
 
     Args:
         sensors: by name of the measured quantity, which is a state element ("q1", "q1'") or, where the estimator measures it, the
-            highest derivative of a controlled coordinate ("q1''"). A quantity that is not named is measured perfectly.
+            highest derivative of a controlled coordinate ("q1''"). A quantity that is not named is measured perfectly. Of a plant
+            with outputs, coordinates are its outputs; with a belief, states may be measured beside them.
         estimator: of state and response from the measured quantities: Measured, VelocityDifference, LowPassDifference,
             PositionDifference, SavitzkyGolay, StateVariableFilter.
         measured: names of the quantities that sensors show; None: all that the estimator needs.
-        belief: how the states that no sensor shows are known: ModelStates, KalmanFilter. See `fpirhc.sensing.belief`.
+        belief: how the states that no sensor shows are known: ModelStates, KalmanFilter, MovingHorizonStates. See
+            `fpirhc.sensing.belief`.
     """
 
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
@@ -64,17 +67,23 @@ class Sensing(Checked):
     @property
     def estimates(self) -> bool:
         """Whether state or response are estimated, so that a controller's step begins with raw measurements."""
-        return not self.estimator.measures_all or self.measured is not None
+        return not self.estimator.measures_all or self.measured is not None or self.belief is not None
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
-        """Names of the measured quantities: state elements, and highest derivatives of controlled coordinates."""
+        """Names of the measured quantities: states, outputs, and highest derivatives of controlled ones."""
         if self.measured is None:
-            return self.estimator.measures(plant)
-        return tuple(n for n in (*plant.state.elements, *response_names(plant)) if n in self.measured)
+            return self.estimator.measures(plant.face)
+        return tuple(n for n in quantities(plant) if n in self.measured)
 
     def known(self, plant: Plant) -> tuple[str, ...]:
-        """State elements that follow from what is measured."""
-        return self.estimator.known(plant, self.measures(plant))
+        """State elements that follow from what is measured; a measured output is known as itself alone."""
+        measures, elements = self.measures(plant), plant.state.elements
+        shown = self.estimator.known(plant.face, measures)
+        if not plant.outputs:
+            return shown
+        pairs = zip(elements, plant.known_by_outputs, strict=True)
+        by_outputs = {e for e, place in pairs if place >= 0 and plant.output.elements[place] in shown}
+        return tuple(e for e in elements if e in by_outputs or e in measures)
 
     def believed(self, plant: Plant) -> tuple[str, ...]:
         """State elements that a controller is given from the belief."""
@@ -82,7 +91,7 @@ class Sensing(Checked):
 
     def believed_response(self, plant: Plant) -> tuple[str, ...]:
         """Quantities that the response follows from and no sensor shows."""
-        return tuple(n for n in self.estimator.answers(plant) if n not in self.measures(plant))
+        return tuple(n for n in self.estimator.answers(plant.face) if n not in self.measures(plant))
 
     def check(self, plant: Plant) -> None:
         """Raise if a sensor's quantity is unknown or not measured, or the estimator cannot serve the plant.
@@ -91,7 +100,7 @@ class Sensing(Checked):
             InvalidProblem: all mistakes together.
         """
         mistakes = Mistakes("sensing")
-        measures, every = self.measures(plant), plant.state.elements + response_names(plant)
+        measures, every = self.measures(plant), quantities(plant)
         mistakes.unknown("sensors: quantity", self.sensors, every)
         for name in self.sensors:
             if name in every and name not in measures:
@@ -99,10 +108,12 @@ class Sensing(Checked):
                 what = f"'{name}' is estimated by {type(by).__name__}, not measured"
                 mistakes.add(f"sensors: {what}; sensors are those of {', '.join(measures)}")
         mistakes.unknown("measured: quantity", self.measured or (), every)
-        checks = (self.estimator.check, lambda _: self._check_belief(plant, mistakes))
-        for check in checks:
+        for mistake in uncovered(plant, self.estimator, self.measured, measures, self.belief):
+            mistakes.add(mistake)
+        parts = (lambda: self.estimator.check(plant.face), lambda: self.belief and self.belief.check(plant, measures))
+        for part in parts:
             try:
-                check(plant)
+                part()
             except FpirhcError as error:
                 mistakes.add(str(error))
         mistakes.raise_if_any()
@@ -133,60 +144,35 @@ class Sensing(Checked):
             columns += [(lost.random(times.size) < sensor.dropout).astype(float)] if sensor.dropout else []
         return np.column_stack(columns) if columns else np.zeros((times.size, 0))
 
-    def raw(self, plant: Plant, start: Array, late: Wait | None, resting: Array) -> Signal:
+    def raw(self, plant: Plant, first: Mapping[str, float], late: Wait | None) -> Signal:
         """Signal of the raw measurements as they arrive, with their values at the start.
 
         Args:
             plant: the plant that is measured.
-            start: first state of the problem, shape (nx,).
+            first: value at the start of everything that a sensor may show, by name.
             late: dead time of the measurement; None: none.
-            resting: response at the start, shape (n,).
         """
         names = self.measures(plant)
-        first = _start(plant, start, names, resting)
-        return vector(
-            "arrived" if late is not None else "measured", names, [_unit(plant, n) for n in names], first.tolist()
-        )
+        name = "arrived" if late is not None else "measured"
+        return vector(name, names, [_unit(plant, n) for n in names], [first[n] for n in names])
 
     def blocks(
-        self, plant: Plant, start: Array, late: Wait | None, true: tuple[Signal, Signal], resting: Array
+        self, plant: Plant, first: Mapping[str, float], late: Wait | None, true: Sequence[Signal]
     ) -> list[Block]:
-        """Blocks from the true state and response to the raw measurements that arrive.
+        """Blocks from the true motion and response to the raw measurements that arrive.
 
         Args:
             plant: the plant that is measured.
-            start: first state of the problem, shape (nx,).
+            first: value at the start of everything that a sensor may show, by name.
             late: dead time of the measurement; None: none.
-            true: signals of the true state and response.
-            resting: response at the start, shape (n,).
+            true: signals of the true state, of the outputs where the plant has some, and of the response.
         """
-        arriving = self.raw(plant, start, late, resting)
+        arriving = self.raw(plant, first, late)
         measured = replace(arriving, name="measured", start=())
         sensors = self._sensor_block(plant, true, measured, arriving.start_vector())
         return (
             [sensors, delay_block("see", measured, arriving, [late] * measured.size)] if late is not None else [sensors]
         )
-
-    def _check_belief(self, plant: Plant, mistakes: Mistakes) -> None:
-        """Add a mistake where a quantity is neither measured nor believed, or a belief stands without need."""
-        names, measured = self.estimator.measures(plant), self.measures(plant)
-        missing = [n for n in names if n not in measured]
-        if self.measured is not None and not measured:
-            mistakes.add(
-                "measured: name at least one quantity; Sensing() without it measures all that the estimator needs"
-            )
-        elif self.belief is not None and self.measured is None:
-            mistakes.add(
-                f"belief: everything that {type(self.estimator).__name__} needs is measured; name what sensors show: "
-                f"Sensing(measured={list(measured)!r}, ...)"
-            )
-        elif self.belief is None and missing:
-            mistakes.add(
-                f"measured: {type(self.estimator).__name__} also needs {', '.join(missing)}; measure it, or state how it is "
-                "believed: Sensing(measured=..., belief=ModelStates())"
-            )
-        if self.belief is not None:
-            self.belief.check(plant, measured)
 
     def _columns(self) -> tuple[str, ...]:
         noisy = [(n, "noise", s.noise is not None) for n, s in self.sensors.items()]
@@ -194,22 +180,25 @@ class Sensing(Checked):
         pairs = [p for both in zip(noisy, lossy, strict=True) for p in both]
         return tuple(f"{n} {what}" for n, what, there in pairs if there)
 
-    def _sensor_block(self, plant: Plant, true: tuple[Signal, Signal], measured: Signal, first: Array) -> Block:
-        """Block (true state, true response, random series) -> measured quantities."""
-        every = plant.state.elements + response_names(plant)
+    def _sensor_block(self, plant: Plant, true: Sequence[Signal], measured: Signal, first: Array) -> Block:
+        """Block (true motion, true response, random series) -> measured quantities."""
+        every = [e for signal in true[:-1] for e in signal.elements] + list(response_names(plant.face))
         columns, drawn = self._columns(), self.drawn
         lossy = [n for n in measured.elements if f"{n} lost" in columns]
         starts = [float(first[measured.elements.index(n)]) for n in lossy]
         memory = (Signal("sensor_last", tuple(lossy), start=tuple(starts)),) if lossy else ()
 
         def step(s: Signals) -> dict[str, Expression]:
-            both = ca.vertcat(getattr(s, true[0].name), getattr(s, true[1].name))
-            seen = {n: both[every.index(n)] for n in measured.elements}
+            column = ca.vertcat(*(getattr(s, signal.name) for signal in true))
+            seen = {n: column[every.index(n)] for n in measured.elements}
             for name, sensor in self.sensors.items():
                 if sensor.noise is not None:
                     seen[name] = seen[name] + s.sensing[columns.index(f"{name} noise")]
                 if sensor.quantum is not None:
-                    seen[name] = sensor.quantum * ca.floor(seen[name] / sensor.quantum + 0.5)
+                    quantum = float(
+                        sensor.quantum
+                    )  # not live: a division by a symbol rounds otherwise than one by a number
+                    seen[name] = quantum * ca.floor(seen[name] / quantum + 0.5)
                 if sensor.dropout:
                     lost = s.sensing[columns.index(f"{name} lost")] > 0.5
                     seen[name] = ca.if_else(lost, s.sensor_last[lossy.index(name)], seen[name])
@@ -219,13 +208,9 @@ class Sensing(Checked):
         return Block("sensors", Layout((*true, *drawn)), Layout((measured,)), step, Layout(memory))
 
 
-def _start(plant: Plant, start: Array, names: tuple[str, ...], response: Array) -> Array:
-    """The measured quantities at the start."""
-    known = dict(zip(plant.state.elements + response_names(plant), np.concatenate([start, response]), strict=True))
-    return np.array([known[n] for n in names])
-
-
 def _unit(plant: Plant, name: str) -> str:
-    if name in plant.state.elements:
-        return plant.state.entry_units[plant.state.elements.index(name)]
-    return plant.response_units[plant.names.index(name.rstrip("'"))]
+    for signal in (plant.state, plant.output):
+        if name in signal.elements:
+            return signal.entry_units[signal.elements.index(name)]
+    face = plant.face
+    return face.response_units[face.names.index(name.rstrip("'"))]

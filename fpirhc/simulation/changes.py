@@ -55,12 +55,12 @@ def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Nu
         return InForce(problem, live.controller, numbers, (), [(0.0, numbers)])
     ready, controller, numbers = first.changed(settings)
     record: list[tuple[float, Mapping[str, float]]] = [(0.0, numbers)] if numbers else []
-    patches, asked = [], dict(first.flat(settings))
+    patches, settings_now = [], dict(first.flat(settings))
     for time in sorted(changes):
         if not 0 <= time < problem.duration:
             raise InvalidValue(f"a change of settings at {time!r} s: expected a time in [0, {problem.duration:g}) s")
-        asked |= first.flat(changes[time])
-        _, _, values = first.changed(asked)
+        settings_now |= first.flat(changes[time])
+        _, _, values = first.changed(settings_now)
         cycle = int(np.ceil(time / problem.period - 1e-9))
         patches.append((cycle, *patch(loop, values)))
         record.append((cycle * problem.period, values))

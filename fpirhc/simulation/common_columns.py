@@ -23,12 +23,16 @@ _MOTION = (
 def with_common_columns(layout: Layout, log: np.ndarray) -> tuple[Layout, np.ndarray]:
     """Return layout and log, shape (cycles, layout.size), with 'plant_state', 'plant_realised' and 'true_error'.
 
+    'plant_state' has the states of the model that the plant that moves has.
+
     'true_error' is the reference minus the plant's state of the judged coordinates, at the same time.
     """
+    # A loop that logs what is true logs all of it: a reality may lack states that the controller believes in.
+    true = any(name in layout for name in _SAME)
     added = [
         (_renamed(layout[logged], name), log[:, layout.slice(logged)])
         for name, logged in _SAME.items()
-        if name not in layout and logged in layout
+        if logged in layout and not true
     ]
     if "true_error" not in layout and "error" in layout:
         added.append((_renamed(layout["error"], "true_error"), _true_error(layout, log)))

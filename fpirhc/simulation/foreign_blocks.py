@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import casadi as ca
 
 from fpirhc.controllers.base import like
+from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
-from fpirhc.task.foreign import quantities
 from fpirhc.task.problem import Problem
 
 SENT = "_acting"  # signal of the inputs that the reality is sent
@@ -23,25 +25,30 @@ def foreign_signals(problem: Problem) -> tuple[Signal, ...]:
     return vector(_RAW, tuple(measures), tuple(measures.values())), scalar(_HELD)
 
 
-def measures_all(problem: Problem) -> bool:
-    """Whether a foreign reality measures the model's whole state and the controlled responses."""
-    return problem.foreign is not None and set(quantities(problem.plant)) <= set(problem.foreign.measures)
+def shows_truth(problem: Problem) -> bool:
+    """Whether a foreign reality measures everything that is judged: the model's whole state or outputs, and their responses."""
+    if problem.foreign is None:
+        return False
+    plant = problem.plant
+    return {*plant.output.elements, *response_names(plant.face)} <= set(problem.foreign.measures)
 
 
-def foreign_block(problem: Problem, state: Signal, response: Signal) -> Block:
-    """Block (answer) -> state and response in the model's order, and the answer as it came; what is not measured is zero."""
+def foreign_block(problem: Problem, motion: Sequence[Signal], response: Signal) -> Block:
+    """Block (answer) -> motion and response in the model's order, and the answer as it came; what is not measured is zero."""
     assert problem.foreign is not None
-    names = list(problem.foreign.measures)
-    every, size = list(quantities(problem.plant)), problem.plant.state.size
+    names, answered = list(problem.foreign.measures), response_names(problem.plant.face)
     raw, held = foreign_signals(problem)
+    wanted = {**{signal.name: signal.elements for signal in motion}, response.name: answered}
 
     def step(s: Signals) -> dict[str, Expression]:
         answer = s._foreign
-        column = ca.vertcat(*(answer[names.index(n)] if n in names else 0 for n in every))
-        shown = {state.name: column[:size], response.name: column[size:]}
+        shown = {
+            signal: ca.vertcat(*(answer[names.index(n)] if n in names else 0 for n in elements))
+            for signal, elements in wanted.items()
+        }
         return {**shown, "foreign": answer, "foreign_held": s._foreign_held}
 
-    writes = (state, response, like(raw, "foreign"), scalar("foreign_held"))
+    writes = (*motion, response, like(raw, "foreign"), scalar("foreign_held"))
     return Block("sense", Layout((raw, held)), Layout(writes), step)
 
 

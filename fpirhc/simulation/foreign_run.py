@@ -42,8 +42,8 @@ def run_foreign(
     """
     foreign, cycles = problem.foreign, problem.cycles
     assert foreign is not None
-    memory, *given = evaluator.arguments
-    *random, answer, held = given
+    memory, *inputs = evaluator.arguments
+    *random, answer, held = inputs
     log, ranges, bridged = np.empty((cycles, trace.size)), ranges_of(problem, trace), 0
     memory[:], held[0] = start, 0.0
     answer[:] = foreign.first(seed)
@@ -66,7 +66,7 @@ def run_foreign(
         reading = foreign.read(k * problem.period, sent.copy())
         bridged = 0 if reading.values is not None else bridged + 1
         if bridged > foreign.holds and k + 1 < cycles:
-            return log[: k + 1], stopped(problem, k + 1, reading.mistake)
+            return log[: k + 1], stopped(problem, k + 1, reading.mistake) + foreign.remedy
         held[0] = float(reading.values is None)
         if reading.values is not None:
             answer[:] = reading.values

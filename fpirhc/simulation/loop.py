@@ -20,11 +20,14 @@ from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.own_reference import given_signals, own_signals
 from fpirhc.controllers.plausible import plausible_range
-from fpirhc.controllers.seeing import compose_seeing, first_estimates, seeing_blocks
+from fpirhc.controllers.seeing import compose_seeing, first_estimates, first_shown, seeing_blocks
 from fpirhc.plant.chain import derivatives_function
+from fpirhc.plant.instant import response_orders
 from fpirhc.plant.plant import Plant
-from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, measures_all, sending_block
+from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, sending_block, shows_truth
+from fpirhc.simulation.map_blocks import with_true_response
 from fpirhc.simulation.outside_blocks import outside_blocks, real_name
+from fpirhc.simulation.true_motion import true_motion
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -164,12 +167,14 @@ def _sense_blocks(problem: Problem, other: Response | None, *, predicts: bool) -
 
 def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], Shown]:
     """Blocks of the true motion, response and error; and the signals that sensors see."""
-    motion = measured_signals(problem.plant)
+    motion = true_motion(problem)
     hidden = tuple(like(s, f"_seen_{s.name}") for s in motion), like(response.signal, "_seen")
-    if problem.foreign is not None and not measures_all(problem):
+    if problem.foreign is not None and not shows_truth(problem):
         return [_sense_block(problem, hidden[0], Response(hidden[1], response.function))], hidden
     true = tuple(like(s, f"plant_{s.name}") for s in motion), like(response.signal, "plant_realised")
     sense = _sense_block(problem, true[0], Response(true[1], response.function))
+    if problem.sensing.estimator.of_steps:
+        sense = with_true_response(problem, sense, true[0][-1], true[1])
     blocks = [sense, _truth_block(problem, true[0][-1])]
     if problem.symbolic_reality is None or not problem.symbolic_reality.seen:
         return blocks, true
@@ -187,13 +192,15 @@ def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
     plant, late, sensing = problem.plant, problem.dead_time.measurement_wait(problem.period), problem.sensing
     first, resting = first_estimates(problem)
     starts = (problem.start_state, first) if plant.outputs else (first,)
-    states = [*zip(shown[0], measured_signals(plant), starts, strict=True)]
+    given = sensing.belief is None  # a believed state is the controller's own
+    states = [*zip(shown[0], measured_signals(plant), starts, strict=True)] if given else []
     if not sensing.ideal:
-        *others, (seen, _, _) = states
-        sensors = [*_late_states(others, late), *sensing.blocks(plant.face, first, late, (seen, shown[1]), resting)]
+        others = states[:-1]
+        all_shown = first_shown(problem)
+        sensors = [*_late_states(others, late), *sensing.blocks(plant, all_shown, late, (*shown[0], shown[1]))]
         if sensing.estimates:
             return sensors
-        raw = sensing.raw(plant.face, first, late, resting)
+        raw = sensing.raw(plant, all_shown, late)
         return [*sensors, on_face(plant, sensing.estimator.block(plant.face, problem.period, first, raw))]
     assert late is not None
     realised = replace(shown[1], name="realised", start=tuple(map(float, resting)))
@@ -214,14 +221,17 @@ def _truth_block(problem: Problem, motion: Signal) -> Block:
     """Block (time, true state or outputs) -> true error of the judged ones."""
     plant = problem.plant
     places = [plant.output.elements.index(c) for c in problem.judged_names]
+    own = [motion.elements.index(c) for c in problem.judged_names]  # what moves may not have every state of the model
     writes = Layout((error_signal(problem, "true_error"),))
     if own_signals(problem):
         reads = Layout((like(plant.output, "reference"), motion))
-        return Block("truth", reads, writes, lambda s: {"true_error": (s.reference - getattr(s, motion.name))[places]})
+        return Block(
+            "truth", reads, writes, lambda s: {"true_error": s.reference[places] - getattr(s, motion.name)[own]}
+        )
     function = problem.reference.function(plant)
 
     def step(s: Signals) -> dict[str, Expression]:
-        return {"true_error": (function(s.time)[0] - getattr(s, motion.name))[places]}
+        return {"true_error": function(s.time)[0][places] - getattr(s, motion.name)[own]}
 
     return Block("truth", Layout((plant.time, motion)), writes, step, opaque=problem.reference.opaque)
 
@@ -232,8 +242,7 @@ def _own_response(problem: Problem, *, seen: bool) -> Response:
     if problem.symbolic_reality is not None:
         return Response(plant.response_signal("realised"), problem.symbolic_reality.response_function(plant, seen=seen))
     if plant.outputs:
-        orders = dict(zip(plant.face.names, plant.face.orders, strict=True))
-        function = derivatives_function(plant, [(name, orders[name]) for name in plant.controlled_names])
+        function = derivatives_function(plant, list(response_orders(plant).items()))
         return Response(plant.response_signal("realised"), function)
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
@@ -256,12 +265,14 @@ def _sense_block(problem: Problem, motion: Sequence[Signal], response: Response)
     Runge-Kutta evaluation of this cycle. Outputs are those of the moving plant, with its exact parameters.
     """
     if problem.foreign is not None:
-        return foreign_block(problem, motion[0], response.signal)
+        return foreign_block(problem, motion, response.signal)
     reality = problem.symbolic_reality
     reads, writes = _real_signals(problem), (*motion, response.signal)
     state_of = None if reality is None else reality.state_function(problem.plant, seen=False)
-    outputs_of = problem.plant.output_function if reality is None else reality.output_function(problem.plant)
     own = () if reality is None else (like(reality.plant.state, REALITY_STATE),)
+    outputs = motion[-1:] if problem.plant.outputs else ()
+    states = motion[: len(motion) - len(outputs)]
+    outputs_of = problem.plant.output_function if reality is None else reality.output_function(problem.plant)
     shifts = bool(disturbed_outputs(problem))
     if shifts:
         reads, own = (*reads, disturbance_signal(problem)), (*own, logged_signal(problem))
@@ -269,14 +280,15 @@ def _sense_block(problem: Problem, motion: Sequence[Signal], response: Response)
     def step(s: Signals) -> dict[str, Expression]:
         now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
         values = {response.signal.name: response.function(*now)}
-        values |= {signal.name: outputs_of(*now) for signal in motion[1:]}
+        values |= {signal.name: outputs_of(*now) for signal in outputs}
         if shifts:
             below, answered = added(problem, s.disturbance)
             sums = {response.signal.name: answered, motion[-1].name: below}
             values |= {name: values[name] + more for name, more in sums.items()} | {LOGGED: below}
         if state_of is None:
             return {motion[0].name: s._state_before, **values}
-        return {motion[0].name: state_of(*now), REALITY_STATE: s._state_before, **values}
+        values |= {signal.name: state_of(*now) for signal in states}
+        return {REALITY_STATE: s._state_before, **values}
 
     return Block("sense", Layout(reads), Layout((*writes, *own)), step)
 

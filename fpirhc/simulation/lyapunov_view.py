@@ -26,6 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fpirhc.controllers.base import Controller
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Feedback
@@ -79,6 +80,7 @@ class LyapunovView:
         )
 
 
+@checked_call
 def lyapunov_view(problem: Problem, controller: Controller, run: Run) -> LyapunovView | None:
     """Return V and its bound along a run, or None.
 

@@ -30,8 +30,8 @@ def outside_blocks(problem: Problem, controller: Controller) -> list[Block]:
         assert values is not None
         blocks.append(_block("outside", problem, real, values, "signals", (_HELD, _NOW)))
     if model.signal_names:
-        told = model_values(model, controller.told(problem)) or _unchanged(model)
-        blocks.append(_block("told", problem, model, told, "signals_told", ("parameters", "")))
+        believed = model_values(model, controller.told(problem)) or _unchanged(model)
+        blocks.append(_block("told", problem, model, believed, "signals_told", ("parameters", "")))
     return blocks
 
 

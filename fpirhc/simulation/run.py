@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, ClassVar, cast
 
 import numpy as np
 
@@ -30,13 +30,16 @@ class Run:
         controller: its name.
         seed: of disturbances and noise.
         period: of the control cycle.
-        layout: the logged signals. Every run has 'plant_state' and 'plant_realised', state and response of the plant, and
-            'true_error', the reference minus the plant's state at the same time.
+        layout: the logged signals. Every run has 'plant_state' and 'plant_realised', response of the plant and those states of
+            the model that it has, and 'true_error', the reference minus the plant's state at the same time.
         log: values of all signals, shape (cycles, layout.size), read-only.
         stop: why the run ended early; None for a run that finished.
         compiled: whether the loop ran as compiled C.
         settings: of problem and controller, as plain data.
     """
+
+    LOADED: ClassVar[str] = "fp.load_run({})"
+    """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
 
     problem: str
     controller: str

@@ -19,6 +19,7 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError, OutputError
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.fields.kinds import Positive
 from fpirhc.simulation.common_columns import with_common_columns
 from fpirhc.symbolic.layout import Layout, Signal
@@ -75,6 +76,7 @@ def save_run(run: Run, path: Path) -> None:
         raise OutputError(f"cannot write the run to '{path}': {error.strerror}") from None
 
 
+@checked_call
 def load_run(path: str | Path) -> Run:
     """Read a run that `Run.save` wrote.
 

@@ -28,9 +28,11 @@ Judgement = tuple[Signal, np.ndarray]
 
 
 def judgements(problem: Problem, controller: Controller, layout: Layout, log: np.ndarray) -> list[Judgement]:
-    """Return 'cost' by term where the problem has a cost, and 'contraction' where the controller adapts."""
+    """Return 'cost' by term where there is one of states that really are, and 'contraction' where the controller adapts."""
     judged = []
-    if problem.cost is not None and problem.horizon is not None:
+    # A cost of states that the reality does not have is nobody's.
+    whole = "plant_state" in layout and layout["plant_state"].elements == problem.plant.state.elements
+    if problem.cost is not None and problem.horizon is not None and whole:
         judged.append(_costs(problem, layout, log))
     gain = controller.deformation.effective_gain()
     of_responses = controller.response(problem) is None and not controller.deforms_target
@@ -69,14 +71,14 @@ def _contraction_outside(problem: Problem, controller: Controller, layout: Layou
     plant, own = problem.real_plant, controller.model_plant(problem)
     times = log[:, layout.slice("time")].ravel() + problem.period / 2
     real = rows_of(real_values(plant, problem.signals), times, plant.exact)
-    told = rows_of(model_values(own, controller.told(problem)), times, controller.parameters(own))
+    believed = rows_of(model_values(own, controller.told(problem)), times, controller.parameters(own))
     modelled = problem if own is problem.plant else replace(problem, plant=own)
 
     def jacobians(rows: np.ndarray) -> np.ndarray:
         if problem.symbolic_reality is None:
-            return response_jacobians(own, states[rows], deformed[rows], real[rows], told[rows])
-        moved = log[rows][:, layout.slice(REALITY_STATE)]
-        return sampled_jacobians(modelled, moved, states[rows], deformed[rows], told[rows], real[rows])
+            return response_jacobians(own, states[rows], deformed[rows], real[rows], believed[rows])
+        real_states = log[rows][:, layout.slice(REALITY_STATE)]
+        return sampled_jacobians(modelled, real_states, states[rows], deformed[rows], believed[rows], real[rows])
 
     return factors_along(len(log), jacobians, controller.deformation.effective_gain())
 

@@ -14,10 +14,13 @@ def raw_measurements(run: Run) -> np.ndarray:
     """Return what the controller of a run was given in every cycle, shape (cycles, number of measurements).
 
     It is what the sensors show, as it arrives; state and response where both are measured. `Stepper.step_measured` takes its rows.
+    Of a plant with outputs the state stands before raw measurements of these, unless it is believed.
     """
     for name in ("arrived", "measured"):
         if name in run.layout:
-            return np.ascontiguousarray(run[name])
+            # A state that is logged before the measurements is not made from them.
+            state_measured = "output" in run.layout and run.layout.names.index("state") < run.layout.names.index(name)
+            return np.ascontiguousarray(np.hstack([run["state"], run[name]]) if state_measured else run[name])
     return np.hstack([run[name] for name in ("state", "output", "realised") if name in run.layout])
 
 

@@ -26,11 +26,11 @@ def set_point_table(problem: Problem, setpoints: Setpoints | None, cycles: int) 
         InvalidName: a coordinate without set-point; the nearest one is offered.
         InvalidValue: no steps, or a set-point that is not finite, or outside the range or the limits of its state.
     """
-    given, steps = given_signals(problem), _steps(problem, setpoints)
-    if not given:
+    signals, steps = given_signals(problem), _steps(problem, setpoints)
+    if not signals:
         return np.zeros((cycles, 0))
     names = problem.plant.face.names
-    windows = given[0].size // len(names)
+    windows = signals[0].size // len(names)
     step = problem.horizon.step if problem.horizon is not None else 0.0
     times = (np.arange(cycles) * problem.period)[:, None] + step * np.arange(windows)
     columns = [_values(problem, name, steps[name], times) for name in names]

@@ -15,6 +15,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.describe import describe
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.simulation.changes import Changes, in_force
 from fpirhc.simulation.common_columns import with_common_columns
 from fpirhc.simulation.foreign_run import Patch, run_foreign, stopped
@@ -98,8 +99,8 @@ class Simulator:
         problem, controller = force.problem, force.controller
         start = start_memory(self.loop, problem, controller, force.numbers)
         common = (problem, start, self.loop.trace, self.evaluator, seed, disturbed, progress)
-        chosen = _run_chunks if problem.foreign is None else _run_foreign
-        logged, stop = chosen(*common, force.patches, setpoints)
+        run_cycles = _run_chunks if problem.foreign is None else _run_foreign
+        logged, stop = run_cycles(*common, force.patches, setpoints)
         layout, log = with_common_columns(self.loop.trace, logged)
         log.setflags(write=False)
         step_limit = controller.deformation.largest_step()
@@ -126,6 +127,7 @@ class Simulator:
         return Run(problem.name, title, seed, problem.period, layout, log, stop, self.compiled, facts)
 
 
+@checked_call
 def simulator(
     problem: Problem,
     controller: Controller,
@@ -161,6 +163,7 @@ def simulator(
     return Simulator(problem, ready, loop, evaluator, bool(backend and backend.compiled), reason, settings)
 
 
+@checked_call
 def simulate(
     problem: Problem,
     controller: Controller,

@@ -4,43 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import isnan
-from typing import NoReturn, Protocol, cast
+from typing import NoReturn
 
-import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
-from fpirhc.controllers.gate import HELD, Gate
-from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
-from fpirhc.controllers.own_reference import given_signals
+from fpirhc.controllers.gate import HELD
+from fpirhc.controllers.live_settings import Numbers, live_settings
 from fpirhc.controllers.plausible import plausible_range
-from fpirhc.controllers.seeing import compose_seeing, raw_signal
-from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidName, InvalidShape, InvalidValue, NotSupported
-from fpirhc.sensing.base import names_of_responses
-from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, Watch, machine_step
+from fpirhc.errors import ConcurrentUse
+from fpirhc.fields.checked import Checked
+from fpirhc.simulation.machine import FINGERPRINT, Watch
+from fpirhc.simulation.numbers_now import NumbersNow
 from fpirhc.simulation.sample import numbers as numbers_of
 from fpirhc.simulation.sample import one_number
-from fpirhc.simulation.set_points import SetpointsNow, set_points_now
-from fpirhc.status import Status
-from fpirhc.symbolic.block import Composite
-from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.simulation.set_points import SetpointsNow
+from fpirhc.simulation.step_arguments import NOT_WRITTEN, NOTHING, StepArguments
+from fpirhc.simulation.step_composition import composed_step, measures, refuse_unbounded
 from fpirhc.symbolic.layout import Layout
-from fpirhc.symbolic.live import PREFIX
 from fpirhc.symbolic.native import native
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
 
-class _View(Protocol):
-    """A memoryview of float64 as it is used here; its stub has views of bytes only."""
-
-    def __getitem__(self, k: int) -> float: ...
-    def __setitem__(self, k: int | slice, value: object) -> None: ...
-    def __len__(self) -> int: ...
-
-
-class Stepper:
+class Stepper(Checked):
     """One controller, ready to be called once per control cycle.
 
         stepper = Stepper(problem, controller)
@@ -49,10 +37,12 @@ class Stepper:
 
     All memory is in the argument: the same arguments give the same command. `trace()` returns every signal of the last step.
 
-    Where the problem's sensing estimates state or response, the estimator is part of the step, which is given what the sensors
-    show, in the order of `measures`:
+    A plant with outputs is measured by these, too, `step(..., output=...)`. Where the problem's sensing estimates state or
+    response, the estimator is part of the step, which is given what the sensors show, in the order of `measures`:
 
         command, memory = stepper.step_measured(time, measured, memory)
+
+    Where the outputs of a plant are estimated, its state stands before them, unless it is believed.
 
     A bad sample skips the cycle: one that is not finite, outside its plausible range, or (with `max_age`) out of date. The command
     is the last one, every memory stays as it was, the status is BAD_SAMPLE, and the signal 'skipped' counts. Before the first good
@@ -65,7 +55,8 @@ class Stepper:
     With live settings, `Stepper(problem, controller, live=["deformation.gain"])`, a step may change numbers without another build,
     `stepper.step(..., settings={"deformation.gain": -0.4})`. `numbers` are in force until the next change. Numbers that a setting
     does not accept are refused: the old ones stay, `refused` counts, and `why_refused` states the last reason. Restarts begin with
-    the memory of the build, and SATURATED is judged by the limits of the build.
+    the memory of the build, and SATURATED is judged by the limits of the build. Set-points of the reference change in the same way,
+    `stepper.step(..., setpoints={"q1": 2.5})`, and need no live setting; `setpoints` are in force.
     """
 
     def __init__(
@@ -96,38 +87,38 @@ class Stepper:
         Raises:
             InvalidProblem: an unknown name or a wrong interval in `plausible`.
             InvalidName: a live setting that does not exist.
-            NotSupported: outputs behind an estimator; an optimiser without a bound of its time; a setting that cannot be live.
+            NotSupported: an optimiser without a bound of its time; a setting that cannot be live.
             CompileError: the compiler fails on a controller with live settings.
         """
-        if problem.plant.outputs and problem.sensing.estimates:
-            raise NotSupported(
-                "a stepper behind an estimator is not covered for outputs: it would be given raw measurements and the state; leave "
-                "the estimator out, and give it `output`"
-            )
-        self._live = live_settings(problem, controller, live)
-        ready = checked(problem, self._live.controller)
+        settings = live_settings(problem, controller, live)
+        ready = checked(problem, settings.controller)
         if bounded:
-            _refuse_unbounded(ready)
-        plausible_ranges = plausible_range(problem, plausible)
-        self._composite, self.memory = _composed(self._live, ready, plausible_ranges, max_age, watch or Watch())
+            refuse_unbounded(ready)
+        ranges = plausible_range(problem, plausible)
+        self._composite, self.memory = composed_step(settings, ready, ranges, max_age, watch or Watch())
         backend = native(self._composite.function, required=bool(live)) if compiled else None
         self.compiled = bool(backend and backend.compiled)
         self.signals: Layout = self._composite.trace
+        self.measures = measures(problem, ready)  # names of the raw measurements
         self.why_failed = ""
-        self._ages = max_age is not None
         self._may_fail = self._composite.opaque  # scalar code cannot fail
-        self._bind(
-            backend.function if backend else self._composite.function, ready.parameters(ready.model_plant(problem))
-        )
-        self.measures = _measures(problem, ready)  # names of the raw measurements
-        self.refused, self.why_refused = 0, ""
-        self.numbers: dict[str, float] = self._live.start
-        self._force(self.numbers)
+        function = backend.function if backend else self._composite.function
+        parameters = ready.parameters(ready.model_plant(problem))
+        arguments = StepArguments(function, self._composite, problem, parameters, ages=max_age is not None)
+        self._now = NumbersNow(settings, self._composite, arguments.settings, arguments.setpoints)
+        self.estimates, self.beside = arguments.estimates, arguments.beside
+        self._tokens = [True]
+        self._fingerprint = float(self.memory[FINGERPRINT].start[0])
+        # Attributes of the stepper itself are found faster in every step.
+        self._arguments, self._evaluate = arguments, arguments.evaluator.evaluate
+        self._time, self._state, self._realised = arguments.time, arguments.state, arguments.realised
+        self._memory, self._command = arguments.memory, arguments.command
+        self._new_command, self._new_memory = arguments.command_next.copy, arguments.memory_next.copy
+        self._more = arguments.ages or bool(arguments.beside)
 
     def start(self) -> np.ndarray:
         """Return the memory of the controller before its first cycle, with the settings in force."""
-        remembered = self._composite.derived(self.numbers).memory() if self.numbers else {}
-        return self._composite.memory.pack(remembered)
+        return self._now.memory()
 
     def step(
         self,
@@ -149,12 +140,13 @@ class Stepper:
             realised: the measured response of the controlled coordinates to the last command; any finite value in the first cycle,
                 and for a controller that does not adapt.
             memory: from `start` or from the step before.
-            output: the measured outputs and their derivatives of a plant that has outputs, as `Plant.output` lays them out.
+            output: the measured outputs and their derivatives of a plant that has outputs, as `Plant.output` lays them out. Where
+                they are estimated, use `step_measured`.
             taken: time stamp of the sample, s; None: it was taken at `time`. Read with `max_age` only.
             settings: numbers of live settings from this step on, by path. Checks and derived numbers are computed in Python before
-                 the step, a tenth of a millisecond for gains and some tens for the weights of a horizon; see `change`.
-            setpoints: set-points from this step on, by coordinate: a number, or where they are announced one number per node of the
-                 horizon; see `aim`.
+                the step, a tenth of a millisecond for gains and some tens for the weights of a horizon; see `change`.
+            setpoints: set-points from this step on, by coordinate or output: a number, or where they are announced one number per
+                node of the horizon; see `aim`.
 
         Raises:
             InvalidShape: a wrong number of entries, named.
@@ -171,19 +163,18 @@ class Stepper:
             if settings or setpoints or isinstance(time, bool):
                 self._take(time, settings, setpoints)
             try:
-                # A view takes arrays of float64 of its own shape and nothing else; numpy's assignment broadcasts, and is slower.
                 self._time[0] = time
                 self._state[:] = state
                 self._realised[:] = realised
                 self._memory[:] = memory
             except (TypeError, ValueError, NotImplementedError):
-                self._accept(time, state, realised, memory)
+                self._arguments.accept(time, state, realised, memory, self.measures)
             if self._memory[0] != self._fingerprint:
-                self._inspect()
-            if self._ages or self.outputs:
-                self._take_more(time, taken, output)
+                self._arguments.refuse_foreign_memory()
+            if self._more:
+                self._arguments.take_more(time, taken, output)
             if self._may_fail:
-                self._command[0] = _NOT_WRITTEN
+                self._command[0] = NOT_WRITTEN
             try:
                 self._evaluate()
             except RuntimeError as error:
@@ -210,17 +201,20 @@ class Stepper:
             time: s.
             measured: what the sensors show, in the order of `measures`; late by the dead time of the measurement, as it arrives.
             memory: from `start` or from the step before.
-            taken: time stamp of the sample, as in `step`.
-            settings: numbers of live settings from this step on, as in `step`.
-            setpoints: as in `step`.
+            taken, settings, setpoints: as in `step`.
 
         Raises:
             FpirhcError: as in `step`.
         """
-        if self.estimates:
-            return self.step(time, measured, _NOTHING, memory, taken=taken, settings=settings, setpoints=setpoints)
+        if self.estimates and not self.beside:
+            return self.step(time, measured, NOTHING, memory, taken=taken, settings=settings, setpoints=setpoints)
         column = numbers_of("measured", measured, len(self.measures))
-        state, seen, realised = np.split(column, [len(self._state), len(self._state) + self.outputs])
+        if self.estimates:
+            seen, raw = np.split(column, [self.beside])
+            return self.step(
+                time, raw, NOTHING, memory, output=seen, taken=taken, settings=settings, setpoints=setpoints
+            )
+        state, seen, realised = np.split(column, [len(self._state), len(self._state) + self.beside])
         return self.step(
             time, state, realised, memory, output=seen, taken=taken, settings=settings, setpoints=setpoints
         )
@@ -231,20 +225,10 @@ class Stepper:
         Raises:
             InvalidName: a setting that is not live.
         """
-        asked = {path: value for path, value in self.numbers.items() if path in self._live.paths}
-        try:
-            _, _, numbers = self._live.changed({**asked, **self._live.flat(settings)})
-            self._force(numbers)
-        except InvalidName:
-            raise
-        except FpirhcError as error:
-            self.refused, self.why_refused = self.refused + 1, str(error)
-            return False
-        self.numbers = numbers
-        return True
+        return self._now.change(settings)
 
     def aim(self, setpoints: SetpointsNow) -> bool:
-        """Put set-points in force from the next step on, by coordinate, and return whether they were accepted.
+        """Put set-points in force from the next step on, by coordinate or output, and return whether they were accepted.
 
         A set-point that is not finite, or outside the range or the limits of its state, is refused with all others of the call: the
         old ones stay, `refused` counts, and `why_refused` states the reason.
@@ -253,33 +237,27 @@ class Stepper:
             InvalidName: a coordinate without set-point.
             InvalidShape: neither one number nor one per node.
         """
-        try:
-            row = set_points_now(self._live.problem, setpoints, self._setpoints)
-        except InvalidValue as error:
-            self.refused, self.why_refused = self.refused + 1, str(error)
-            return False
-        self._setpoints[:] = row
-        return True
+        return self._now.aim(setpoints)
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The live settings in force, by path."""
+        return self._now.numbers
 
     @property
     def setpoints(self) -> dict[str, float | list[float]]:
-        """The set-points in force, by coordinate; where they are announced, one per node of the horizon."""
-        names = self._live.problem.plant.names
-        rows = self._setpoints.reshape(-1, len(names)).T
-        return {
-            name: row.tolist() if row.size > 1 else float(row[0])
-            for name, row in zip(names, rows, strict=True)
-            if row.size
-        }
+        """The set-points in force, by coordinate or output; where they are announced, one per node of the horizon."""
+        return self._now.setpoints
 
-    def _force(self, numbers: Mapping[str, float]) -> None:
-        """Write the settings and what follows from them into the arguments; nothing is written where something is refused."""
-        if not numbers:
-            return
-        values = {PREFIX + path: np.array([value]) for path, value in numbers.items()}
-        values |= self._composite.derived(numbers).signals
-        for name, argument in self._settings.items():
-            argument[:] = values[name]
+    @property
+    def refused(self) -> int:
+        """Number of changes that were refused."""
+        return self._now.refused
+
+    @property
+    def why_refused(self) -> str:
+        """Reason of the last change that was refused."""
+        return self._now.why_refused
 
     def stale(self) -> dict[str, str]:
         """Return what follows from live settings by way of Python, and what becomes of a device that goes on with the old number.
@@ -287,7 +265,7 @@ class Stepper:
         Gains, scales, limits, weights and dead times themselves are data, and may be written at any time. An empty text
         says that the number must not stay as it was: change the settings that it follows from only where Python computes it.
         """
-        return dict(self._composite.derived(self.numbers).stale) if self.numbers else {}
+        return self._now.stale()
 
     def trace(self) -> dict[str, np.ndarray]:
         """Return every signal of the last step by name.
@@ -302,38 +280,9 @@ class Stepper:
         except IndexError:
             _refuse_thread()
         try:
-            return {name: value.copy() for name, value in self.signals.unpack(self._trace).items()}
+            return {name: value.copy() for name, value in self.signals.unpack(self._arguments.trace).items()}
         finally:
             self._tokens.append(token)
-
-    def _bind(self, function: ca.Function, parameters: np.ndarray) -> None:
-        """Views of the arguments and results, once for all steps."""
-        self._tokens = [True]
-        self._evaluator = Evaluator(function)
-        self._evaluate = self._evaluator.evaluate
-        arguments = dict(zip(function.name_in(), self._evaluator.arguments, strict=True))
-        arguments["parameters"][:] = parameters
-        places = {name: k + 1 for k, name in enumerate(self._composite.reads.names)}  # after the memory
-        self._settings = {name: self._evaluator.arguments[places[name]] for name in self._composite.settings.names}
-        self._setpoints = np.zeros(0)
-        for signal in given_signals(self._live.problem):
-            self._setpoints = self._evaluator.arguments[places[signal.name]]
-            self._setpoints[:] = signal.start_vector()
-        memory_next, self._trace, command = self._evaluator.results
-        self._new_command, self._new_memory = command.copy, memory_next.copy
-        raw = raw_signal(self._live.problem)
-        self.estimates = raw is not None  # whether the step begins with raw measurements
-        sample = ("state", "realised") if raw is None else (raw.name,)
-        self.outputs = (
-            self._live.problem.plant.output.size if self._live.problem.plant.outputs else 0
-        )  # entries of `output`
-        self._output = _view(arguments["output"] if self.outputs else _NOTHING)
-        self._memory, self._time, self._state, *rest = (_view(arguments[n]) for n in ("memory", "time", *sample))
-        self._realised = rest[0] if rest else _view(_NOTHING)
-        self._memory_array = arguments["memory"]
-        self._taken = _view(arguments["taken"]) if self._ages else self._time
-        self._command = _view(command)
-        self._fingerprint = float(self.memory[FINGERPRINT].start[0])
 
     def _take(self, time: object, settings: Numbers | None, setpoints: SetpointsNow | None) -> None:
         """Put numbers in force, and refuse a truth value as time."""
@@ -344,89 +293,12 @@ class Stepper:
         if isinstance(time, bool):
             one_number("time", time)
 
-    def _take_more(self, time: float, taken: float | None, output: np.ndarray | None) -> None:
-        """Take the time stamp of the sample, and measured outputs, where the step reads them."""
-        if self._ages:
-            self._taken[0] = one_number("taken", time if taken is None else taken)
-        if self.outputs:
-            self._output[:] = numbers_of("output", output, self.outputs)
-
-    def _accept(self, time: object, state: object, realised: object, memory: object) -> None:
-        """Take arguments that are no arrays of float64, or say what is wrong with them."""
-        first = "measured" if self.estimates else "state"
-        if self.estimates and np.size(cast(float, realised)):
-            raise InvalidShape(
-                f"this controller estimates its state and response from {', '.join(self.measures)}: use "
-                "step_measured(time, measured, memory) with these, in this order"
-            )
-        values = {first: (self._state, state), "memory": (self._memory, memory)}
-        if not self.estimates:
-            values["realised"] = (self._realised, realised)
-        checked_values = {name: numbers_of(name, value, len(view)) for name, (view, value) in values.items()}
-        self._time[0] = one_number("time", time)
-        for name, (view, _) in values.items():
-            view[:] = checked_values[name]
-
-    def _inspect(self) -> None:
-        """Raise for another controller's memory; a memory of NaN is a restart."""
-        number = self._memory[0]
-        if isnan(number):
-            return
-        raise InvalidValue(
-            "argument 'memory' is not this controller's: it comes from another controller, another problem, or other settings; "
-            "begin with start()"
-        )
-
     def _failed(self, why: str) -> tuple[np.ndarray, np.ndarray]:
         """The last command and the memory as it was, after a solver that raised or failed."""
         self.why_failed = why
-        memory = np.where(np.isfinite(self._memory_array), self._memory_array, self.memory.start())
-        self._trace[self.signals.slice("status")] = int(Status.SOLVER_FAILED)
-        self._trace[self.signals.slice("command")] = memory[self.memory.slice(HELD)]
-        memory[self.memory.slice(f"{SKIPPED}_before")] += 1
-        self._trace[self.signals.slice(SKIPPED)] = memory[self.memory.slice(f"{SKIPPED}_before")]
+        memory = self._arguments.hold(self.memory, self.signals)
         return memory[self.memory.slice(HELD)].copy(), memory
-
-
-def _composed(
-    live: LiveSettings, ready: Controller, plausible: Mapping[str, Interval], max_age: float | None, watch: Watch
-) -> tuple[Composite, Layout]:
-    """The step behind its gate and the layout of its memory. Gate and watch have the numbers of the build, and no live ones."""
-    gates: list[Gate] = []
-
-    def compose(problem: Problem, controller: Controller) -> Composite:
-        inner = compose_seeing(problem, controller)
-        gates.append(Gate(live.problem, inner, plausible=plausible, max_age=max_age))
-        return machine_step(live.problem, ready, gates[-1], watch)
-
-    composite = live.composed(compose) if live.paths else compose(live.problem, ready)
-    return composite, gates[-1].named(composite.memory)
-
-
-_NOTHING = np.zeros(0)
-_NOT_WRITTEN = float("nan")  # the gate's command is finite: what is still NaN was not written
-
-
-def _measures(problem: Problem, controller: Controller) -> tuple[str, ...]:
-    """Names of what a step is given: the state and the responses, or what the sensors show."""
-    raw, plant, own = raw_signal(problem), problem.plant, controller.response(problem)
-    if raw is not None:
-        return raw.elements
-    outputs = plant.output.elements if plant.outputs else ()
-    responses = plant.response_signal("realised") if own is None else own.signal
-    return (*plant.state.elements, *outputs, *names_of_responses(plant.face, responses))
-
-
-def _view(array: np.ndarray) -> _View:
-    return cast(_View, memoryview(array.data))
 
 
 def _refuse_thread() -> NoReturn:
     raise ConcurrentUse("this Stepper is in use by another thread: one stepper serves one thread, build one for each")
-
-
-def _refuse_unbounded(controller: Controller) -> None:
-    planner = controller.planner
-    why = planner.optimiser.unbounded if planner is not None else ""
-    if why:
-        raise NotSupported(f"{why}; Stepper(..., bounded=False) accepts it away from a machine")

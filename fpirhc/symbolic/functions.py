@@ -80,6 +80,15 @@ def _nearest_even(x: Expression) -> Expression:
     return upper - ca.logic_and(upper - x == 0.5, ca.fmod(upper, 2) != 0)
 
 
+def nan_where(failed: Expression) -> Expression:
+    """Return NaN where a condition (1 or 0) holds, and zero elsewhere.
+
+    It is computed, because the constant NaN in a loop is the mark of a live setting that was lost. Its derivative is zero where
+    the condition does not hold, so it spoils no gradient there.
+    """
+    return ca.asin(2 * failed)
+
+
 def entry_at(values: Expression, place: Expression) -> Expression:
     """Return the entry of a column at a place that is known at run time; zero beyond its ends.
 

@@ -38,7 +38,7 @@ def transition(rate: Entry, time: Entry, order: int) -> list[list[Entry]]:
     return [[decay * entry for entry in row] for row in terms]
 
 
-def moved(phi: Sequence[Sequence[Entry]], z: Expression, held: Expression) -> Expression:
+def after_motion(phi: Sequence[Sequence[Entry]], z: Expression, held: Expression) -> Expression:
     """Return z after the motion with the transition Phi while w = `held`."""
     apart = [z[0] - held, *(z[k] for k in range(1, len(phi)))]
     # At rest every difference is exactly zero, and so z stays exactly where it is.
@@ -52,6 +52,20 @@ def highest(rate: Entry, z: Expression, held: Expression, order: int) -> Express
     for j in range(1, order):
         value = value - math.comb(order, j) * power(rate, order - j) * z[j]
     return value
+
+
+def differences(rate: Entry, step: float, z: Expression, held: Expression, order: int) -> list[Expression]:
+    """Return y and its divided forward differences over steps of a map, up to the order m, for w = `held`.
+
+    With the distance d = z - w b they are the first entries of ((Phi(T) - I) / T)^j d.
+    """
+    phi = transition(rate, step, order)
+    apart, values = [z[0] - held, *(z[k] for k in range(1, order))], [z[0]]
+    for _ in range(order):
+        later = [sum(entry * a for entry, a in zip(row, apart, strict=True)) for row in phi]
+        apart = [(after - before) / step for after, before in zip(later, apart, strict=True)]
+        values.append(apart[0])
+    return values
 
 
 def _nilpotent(rate: Entry, order: int) -> list[list[Entry]]:

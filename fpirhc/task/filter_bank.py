@@ -14,7 +14,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.symbolic.live import is_live
-from fpirhc.task.equal_poles import Entry, highest, moved, transition
+from fpirhc.task.equal_poles import Entry, after_motion, differences, highest, transition
 
 GIVEN = "setpoints"  # signal from outside: the set-points in force, then those of the next nodes
 OWN = "_reference_own"  # the filters' state, what is given, and a live rate
@@ -65,7 +65,9 @@ class FilterBank:
         """Return the filters' state one cycle later inside a step, with the set-points held."""
         parts, points = self._split(getattr(s, FILTER)), getattr(s, GIVEN)
         phis = [transition(self.rate, period, order) for order in self.orders.values()]
-        return ca.vertcat(*(moved(phi, z, points[k]) for k, (phi, z) in enumerate(zip(phis, parts, strict=True))))
+        return ca.vertcat(
+            *(after_motion(phi, z, points[k]) for k, (phi, z) in enumerate(zip(phis, parts, strict=True)))
+        )
 
     def motion(self, ahead: float) -> ca.Function:
         """Function (t, own signal) -> (state, response), now or after some time with the set-points held."""
@@ -73,7 +75,7 @@ class FilterBank:
         z, points, rate = self._parts(own)
         if ahead:
             phis = [transition(rate, ahead, order) for order in self.orders.values()]
-            z = [moved(phi, z[k], points[k, 0]) for k, phi in enumerate(phis)]
+            z = [after_motion(phi, z[k], points[k, 0]) for k, phi in enumerate(phis)]
         state, response = arranged(self.plant, self._chains(z, points[:, 0], rate))
         results = [ca.densify(state), ca.densify(response)]
         return ca.Function("fpirhc_reference_now", [ca.SX.sym("t"), own], results, ["t", "own"], ["state", "response"])
@@ -94,7 +96,7 @@ class FilterBank:
         for node in range(stages + 1):
             held = points[:, min(node, self.nodes - 1)]
             columns.append(arranged(self.plant, self._chains(z, held, rate)))
-            z = [moved(phi, z[k], held[k]) for k, phi in enumerate(phis)]
+            z = [after_motion(phi, z[k], held[k]) for k, phi in enumerate(phis)]
         tables = [ca.densify(ca.horzcat(*parts)) for parts in zip(*columns, strict=True)]
         return ca.Function("fpirhc_reference_preview", [own], tables, ["own"], ["states", "responses"])
 
@@ -108,8 +110,11 @@ class FilterBank:
         return self._split(own[:size]), points, own[size + count] if is_live(self.rate) else self.rate
 
     def _chains(self, z: Sequence[Expression], held: Expression, rate: Entry) -> list[Expression]:
-        """(y, y', ..., y^(m)) of every coordinate."""
+        """(y, y', ..., y^(m)) of every coordinate; of a map the divided differences."""
         orders = enumerate(self.orders.values())
+        if self.plant.step is not None:
+            step = self.plant.sampling
+            return [ca.vertcat(*differences(rate, step, z[k], held[k], order)) for k, order in orders]
         return [ca.vertcat(z[k], highest(rate, z[k], held[k], order)) for k, order in orders]
 
 

@@ -22,6 +22,8 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero
 from fpirhc.plant.plant import Plant
 
+_LONGEST = 60  # characters of an answer that are shown
+
 
 class Body(Protocol):
     """What a foreign reality must be able to do."""
@@ -53,7 +55,7 @@ class Foreign(Checked):
     Args:
         body: object with `reset(seed)` and `step(time, command)`, see `Body`.
         measures: name -> unit of every measured quantity, in the order of its answers: elements of the model's state ("q1", "q1'"),
-            and, where the response is measured, highest derivatives of controlled coordinates ("q1''").
+            outputs and their derivatives, and, where the response is measured, highest derivatives of what is controlled ("q1''").
         holds: consecutive bad answers that are bridged with the last good one; the next one ends the run. 0: the first ends it.
         deadline: longest wall time of an answer, s; a later one is bad. None: the body may take its time, as a simulator does.
         clock: function that returns the wall time, s.
@@ -74,6 +76,13 @@ class Foreign(Checked):
                 raise InvalidValue(
                     f"Foreign: its body {type(self.body).__name__} has no method {name}(...); it needs reset and step"
                 )
+
+    @property
+    def remedy(self) -> str:
+        """What bridges bad answers."""
+        if not self.holds:
+            return "; Foreign(holds=1) bridges a bad answer with the last good one"
+        return f", after {self.holds} in a row that were held; Foreign(holds={self.holds + 1}) bridges one more"
 
     @property
     def symbolic(self) -> None:
@@ -126,23 +135,43 @@ class Foreign(Checked):
     def _answer(self, ask: Callable[[], npt.ArrayLike], method: str, *, timed: bool) -> Reading:
         who, begin = f"{method} of {type(self.body).__name__}", self.clock()
         try:
-            answer = np.asarray(ask(), dtype=float)
-        except Exception as error:  # noqa: BLE001  # whatever a stranger's object raises is a bad answer, which has a policy
-            return Reading(None, f"{who} raised {type(error).__name__}: {error}")
+            given = ask()
+        except (Exception, SystemExit) as error:  # noqa: BLE001  # whatever a stranger's object raises is a bad answer
+            return Reading(None, f"{who} raised {type(error).__name__}: {' '.join(str(error).split())}")
         elapsed = self.clock() - begin
+        answer = _real_numbers(given)
+        expected = f"{len(self.measures)} numbers: {', '.join(self.measures)}"
+        if answer is None:
+            return Reading(None, f"{who} returned {_short(given)}, expected {expected}")
         if answer.shape != (len(self.measures),):
-            expected = f"({len(self.measures)},) for {', '.join(self.measures)}"
             return Reading(None, f"{who} returned the shape {answer.shape}, expected {expected}")
         if not np.isfinite(answer).all():
             place = int(np.argmin(np.isfinite(answer)))
-            return Reading(None, f"{who} returned {list(self.measures)[place]} = {answer[place]}")
+            return Reading(
+                None, f"{who} returned {list(self.measures)[place]} = {answer[place]}, expected a finite number"
+            )
         if timed and self.deadline is not None and elapsed > self.deadline:
             return Reading(None, f"{who} took {elapsed:.3g} s, and its deadline is {self.deadline:.3g} s")
         return Reading(answer)
 
 
+def _real_numbers(answer: object) -> np.ndarray | None:
+    """The answer as real numbers; None where it is none."""
+    try:
+        column = np.asarray(answer)
+        return column.astype(float) if column.dtype.kind in "biuf" else None
+    except (TypeError, ValueError):  # rows of different lengths, or an object that refuses to become an array
+        return None
+
+
+def _short(answer: object) -> str:
+    text = " ".join(repr(answer).split())
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+
+
 def quantities(model: Plant) -> dict[str, str]:
-    """Return the unit of every quantity of a model that can be measured: state elements and controlled responses."""
-    states = dict(zip(model.state.elements, model.state.entry_units, strict=True))
-    responses = {model.names[k] + "'" * model.orders[k]: model.response_units[k] for k in model.controlled_indices}
-    return {**states, **responses}
+    """Return the unit of every quantity of a model that can be measured: state elements, outputs, and controlled responses."""
+    face, signals = model.face, (model.state, model.output)
+    shown = {name: unit for s in signals for name, unit in zip(s.elements, s.entry_units, strict=True)}
+    responses = {face.names[k] + "'" * face.orders[k]: face.response_units[k] for k in face.controlled_indices}
+    return {**shown, **responses}

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -15,11 +16,13 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Duration
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.horizon.regular_gain import singular_gain
+from fpirhc.horizon.regular_gain import Bounds, nominal_run, singular_gain
 from fpirhc.horizon.stage_check import check_stage
 from fpirhc.plant.algebraic import unsolved
-from fpirhc.plant.integrators import Integrator, RungeKutta4
+from fpirhc.plant.integrators import USUAL, Integrator
+from fpirhc.plant.map_steps import motion_of
 from fpirhc.plant.plant import Plant
+from fpirhc.plant.signals_in_outputs import differentiated_signals
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line
 from fpirhc.symbolic.live import nominal
@@ -27,7 +30,9 @@ from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.foreign import Foreign
 from fpirhc.task.limits import Limits
-from fpirhc.task.outside import External, check_signals, real_values, rows_of, signals_of
+from fpirhc.task.map_task import check_map_task, settle_maps
+from fpirhc.task.needed import needed_measurements, needed_names
+from fpirhc.task.outside import External, check_signals, not_held, real_values, rows_of, signals_of
 from fpirhc.task.problem_view import problem_facts, problem_table
 from fpirhc.task.reality import Reality
 from fpirhc.task.reference import Reference
@@ -54,7 +59,7 @@ class Problem(Checked):
         sensing: sensors and estimator between the plant and the controller; ideal by default.
         horizon: stages over which a receding-horizon controller plans.
         cost: of such a plan.
-        integrator: of the simulated plant.
+        integrator: of the simulated plant; a map has none.
         input_before: inputs before the first cycle, by name. The first rate and the first weight of a rate are counted from them,
             and they act until the first command arrives. An input that is not named has the value of `DeadTime(before=...)`, or
             else zero, moved into its limits.
@@ -69,6 +74,9 @@ class Problem(Checked):
         InvalidProblem: all mistakes together.
     """
 
+    LOADED: ClassVar[str] = "fp.load_problem({}).problem"
+    """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
+
     plant: Plant
     reference: Reference
     start: Mapping[str, float]
@@ -80,7 +88,7 @@ class Problem(Checked):
     sensing: Sensing = field(default_factory=Sensing)
     horizon: Horizon | None = None
     cost: Cost | None = None
-    integrator: Integrator = field(default_factory=RungeKutta4)
+    integrator: Integrator = USUAL
     measure_from: float = 0.0
     judged: Sequence[str] | None = None
     input_before: Mapping[str, float] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
@@ -90,6 +98,8 @@ class Problem(Checked):
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("problem")
+        settle_maps(self, mistakes)
+        mistakes.raise_if_any()
         _check_times(self, mistakes)
         _check_start(self, mistakes)
         plant = self.plant
@@ -109,15 +119,17 @@ class Problem(Checked):
             lambda: self.reference.function(plant),
             lambda: check_steps(plant.face, self.limits, self.reference.set_points),
             lambda: self.dead_time.check(plant, self.period),
-            lambda: self.sensing.check(plant.face),
-            lambda: self.symbolic_reality.check(plant) if self.symbolic_reality else None,
-            lambda: self.foreign.check(plant, self.sensing.measures(plant)) if self.foreign else None,
+            lambda: self.sensing.check(plant),
+            lambda: self.symbolic_reality.check(plant, self._needed) if self.symbolic_reality else None,
+            lambda: self.foreign.check(plant, needed_measurements(plant, self.sensing)) if self.foreign else None,
         )
         for check in checks:
             try:
                 check()
             except FpirhcError as error:
                 mistakes.add(str(error))
+        mistakes.raise_if_any()
+        check_map_task(self, mistakes)
         mistakes.raise_if_any()
         check_stage(plant, self.cost, self.limits, mistakes)
         _check_inverse(self, mistakes)
@@ -191,7 +203,8 @@ class Problem(Checked):
     @property
     def real_integrator(self) -> Integrator:
         """Integrator of the plant that a run moves."""
-        return (self.symbolic_reality.integrator if self.symbolic_reality else None) or self.integrator
+        chosen = (self.symbolic_reality.integrator if self.symbolic_reality else None) or self.integrator
+        return motion_of(self.real_plant, chosen, USUAL)
 
     @cached_property
     def real_start(self) -> np.ndarray:
@@ -215,6 +228,11 @@ class Problem(Checked):
         for name in self.plant.outputs:
             if name in self.disturbances:
                 self.disturbances[name].derivative(instants, 1)
+
+    @property
+    def _needed(self) -> frozenset[str]:
+        """Names of the model's coordinates and outputs that what moves must have."""
+        return needed_names(self.plant, self.sensing, self.judged)
 
     @property
     def _plants(self) -> tuple[Plant, ...]:
@@ -342,28 +360,24 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
     plant = problem.plant
     if not plant.outputs:
         return
-    if problem.foreign is not None:
+    smooth = not_held(problem.signals, differentiated_signals(plant))
+    if smooth:
         mistakes.add(
-            "reality: a foreign reality measures coordinates of the model, and a plant with outputs has more to measure; "
-            "write the outputs as coordinates"
+            f"signals: the derivatives of outputs depend on {', '.join(smooth)}, whose own derivatives nobody states; state it in "
+            "steps, Samples(times, values), which hold between their times, or choose an output on whose derivatives it does not act"
         )
-    if problem.signals:
-        mistakes.add(
-            f"signals: {', '.join(problem.signals)} from outside have derivatives of their own in those of outputs, which is not "
-            "covered; leave them out, or write the outputs as coordinates"
-        )
-    if problem.sensing.measured is not None or problem.sensing.belief is not None:
-        mistakes.add("sensing: believed states are not covered for outputs; leave measured and belief out")
     if len(plant.inputs) == len(plant.controlled or plant.outputs):
-        bounds = nominal(problem.limits).input_bounds(plant)
-        start, ends = (
-            tuple(map(float, problem.start_state)),
-            (tuple(map(float, bounds[0])), tuple(map(float, bounds[1]))),
-        )
-        times = problem.period, problem.cycles
-        singular = singular_gain(plant, problem.reference, problem.integrator, start, ends, times)
+        states, inputs = nominal_run(plant, problem.reference, *nominal_start(problem))
+        singular = singular_gain(plant, states, inputs, problem.period)
         if singular:
             mistakes.add(f"outputs: {singular}")
+
+
+def nominal_start(problem: Problem) -> tuple[Integrator, tuple[float, ...], Bounds, tuple[float, int]]:
+    """Return integrator, start, bounds of the inputs, and times of the model's nominal run, as `nominal_run` takes them."""
+    lower, upper = nominal(problem.limits).input_bounds(problem.plant)
+    bounds = tuple(map(float, lower)), tuple(map(float, upper))
+    return problem.integrator, tuple(map(float, problem.start_state)), bounds, (problem.period, problem.cycles)
 
 
 def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:

@@ -61,7 +61,7 @@ def _others(problem: Problem) -> list[tuple[str, str]]:
         rows.append(("reality", f"{type(problem.foreign.body).__name__}, outside"))
     if not problem.sensing.ideal:
         rows.append(("sensing", "with sensors or an estimator"))
-    believed = problem.sensing.believed(problem.plant.face)
+    believed = problem.sensing.believed(problem.plant)
     if believed:
         rows.append(("measured", ", ".join(problem.sensing.measures(problem.plant))))
         rows.append(("believed", f"{', '.join(believed)}, by {type(problem.sensing.belief).__name__}"))

@@ -12,7 +12,7 @@ itself as its model. The exact values of the model's own parameters move nothing
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -22,6 +22,7 @@ from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.algebraic import unsolved
 from fpirhc.plant.chain import derivatives_function, input_reaches_at
+from fpirhc.plant.instant import response_orders
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.settling import settled
@@ -34,8 +35,9 @@ class Reality(Checked):
     """The plant that a run moves, where it is not the model's.
 
     Args:
-        plant: with the model's inputs, and a coordinate of the same name and unit for every coordinate of the model. Its exact
-            parameters act; the approximate ones are not used, unless it is the model of an `ExactModel`.
+        plant: with the model's inputs, and a coordinate or an output of the same name and unit for what is measured, controlled or
+            judged of the model; without a belief that is all of it. Its exact parameters act; the approximate ones are not used,
+            unless it is the model of an `ExactModel`.
         start: first values of states that the model does not have. Those that are not named settle: their rates are zero while
             the model's states and the inputs before the first cycle are held.
         integrator: of its motion; None: the problem's.
@@ -68,8 +70,13 @@ class Reality(Checked):
         """
         return replace(self, plant=self.plant.with_exact(exact))
 
-    def check(self, model: Plant) -> None:
+    def check(self, model: Plant, needed: Collection[str] | None = None) -> None:
         """Raise if the reality cannot stand for what the model describes.
+
+        Args:
+            model: of the problem.
+            needed: names of the model's coordinates that it must have; None: all. What else it has under the same name has the same
+                unit.
 
         Raises:
             InvalidProblem: all mistakes together.
@@ -87,7 +94,10 @@ class Reality(Checked):
                 f"its time is in {self.plant.time_unit}, the model's in {model.time_unit}; write both in one unit"
             )
         for name, unit in model.coordinates.items():
-            _check_output(self, model, name, unit, mistakes)
+            if needed is None or name in needed:
+                _check_output(self, model, name, unit, mistakes)
+            elif self.plant.coordinates.get(name, unit) != unit:
+                mistakes.add(_other_unit(self.plant, name, name, unit))
         if model.outputs and self.seen:
             mistakes.add(
                 "seen: what is measured of a model with outputs are the outputs of the same names; write the sensor there"
@@ -96,28 +106,36 @@ class Reality(Checked):
             _check_expression(self, model, name, mistakes)
         mistakes.raise_if_any()
 
+    def shown(self, model: Plant) -> tuple[str, ...]:
+        """Return the names of the model's states that it has, in the model's order."""
+        own = dict(zip(model.names, self._names(model, seen=True), strict=True))
+        return tuple(e for e in model.state.elements if own[e.rstrip("'")] in self.plant.coordinates)
+
     def state_function(self, model: Plant, *, seen: bool) -> ca.Function:
-        """Function (state, input, parameters, forcing) of the reality -> state in the model's coordinates, shape (nx,).
+        """Function (state, input, parameters, forcing) of the reality -> the model's states that it has, in the order of `shown`.
 
         Args:
             model: whose state is wanted.
             seen: whether it is the measured one; else the judged one.
         """
         names = dict(zip(model.names, self._names(model, seen=seen), strict=True))
-        wanted = [(names[e.rstrip("'")], e.count("'")) for e in model.state.elements]
+        wanted = [(names[e.rstrip("'")], e.count("'")) for e in self.shown(model)]
         return derivatives_function(self.plant, wanted)
 
     def response_function(self, model: Plant, *, seen: bool) -> ca.Function:
         """Function (state, input, parameters, forcing) of the reality -> the model's controlled responses."""
         if model.outputs:
-            orders = dict(zip(model.face.names, model.face.orders, strict=True))
-            return derivatives_function(self.plant, [(name, orders[name]) for name in model.controlled_names])
+            return derivatives_function(self.plant, list(response_orders(model).items()))
         names = self._names(model, seen=seen)
         return derivatives_function(self.plant, [(names[k], model.orders[k]) for k in model.controlled_indices])
 
     def output_function(self, model: Plant) -> ca.Function:
-        """Function (state, input, parameters, forcing) of the reality -> the model's outputs and their derivatives."""
-        return derivatives_function(self.plant, [(e.rstrip("'"), e.count("'")) for e in model.output.elements])
+        """Function (state, input, parameters, forcing) of the reality -> the model's outputs and their derivatives.
+
+        Without outputs these are the states of the model that it has.
+        """
+        elements = model.output.elements if model.outputs else self.shown(model)
+        return derivatives_function(self.plant, [(e.rstrip("'"), e.count("'")) for e in elements])
 
     def start_state(self, model: Plant, start: np.ndarray, command: np.ndarray) -> np.ndarray:
         """Return the first state of the reality, shape (its nx,).
@@ -179,7 +197,8 @@ class Reality(Checked):
             raise InvalidProblem(f"reality: the rate of its state '{wrong}' is not finite at the start")
         stiff = stiffness(plant, integrator, period, start, command, plant.exact)
         if stiff:
-            raise InvalidProblem(f"reality: {stiff}")
+            what, _, remedy = stiff.partition("; use ")
+            raise InvalidProblem(f"reality: {what}; use Reality(..., {remedy})")
 
     def check_as_model(self, model: Plant) -> None:
         """Raise if a controller of the model cannot have this reality as its model: both need the same coordinates and orders.
@@ -191,6 +210,7 @@ class Reality(Checked):
         differences = [
             f"the coordinate {c}, which the controller is not given" for c in plant.names if c not in model.names
         ]
+        differences += [f"no coordinate {c}, which the model has" for c in model.names if c not in plant.names]
         differences += [
             f"the order {plant.orders[plant.names.index(c)]} of {c} in place of {order}"
             for c, order in zip(model.names, model.orders, strict=True)
@@ -201,6 +221,8 @@ class Reality(Checked):
             differences = ["its coordinates in another order"]
         if tuple(plant.outputs) != tuple(model.outputs):
             differences.append("other outputs")
+        if (plant.step is None) != (model.step is None):
+            differences.append("differential equations, and the model is a map")
         if not differences and (plant.controlled or tuple(plant.outputs) or plant.names) != model.controlled_names:
             differences = [
                 f"other controlled coordinates (write controlled={model.controlled_names!r} in its plant too)"
@@ -233,15 +255,16 @@ def _check_output(reality: Reality, model: Plant, name: str, unit: str, mistakes
     plant, own = reality.plant, reality.seen.get(name, name)
     if own not in plant.coordinates:
         if name not in reality.seen:
+            followed = not model.outputs and name in (model.controlled or model.names)
+            believed = "" if followed else ", or have it believed: Sensing(measured=..., belief=ModelStates())"
             mistakes.add(
                 f"it has no coordinate '{name}', which the model has and the controller is given; add it, or name the one that is "
-                f"measured in its place: Reality(seen={{'{name}': ...}}). Its coordinates: {', '.join(plant.coordinates)}"
+                f"measured in its place: Reality(seen={{'{name}': ...}}){believed}. Its coordinates: {', '.join(plant.coordinates)}"
             )
         return
     for one in sorted({own, name} & set(plant.coordinates)):
         if plant.coordinates[one] != unit:
-            units = f"in {plant.coordinates[one]}, the model's '{name}' in {unit}"
-            mistakes.add(f"its coordinate '{one}' is {units}; write both in one unit")
+            mistakes.add(_other_unit(plant, one, name, unit))
     order = model.orders[model.names.index(name)]
     at_once = input_reaches_at(plant, own, order - 1)
     if at_once is not None:
@@ -251,6 +274,11 @@ def _check_output(reality: Reality, model: Plant, name: str, unit: str, mistakes
         )
     elif not model.outputs and name in (model.controlled or model.names) and structural_order(plant, own) is None:
         mistakes.add(f"no input reaches its coordinate '{own}', however often it is differentiated")
+
+
+def _other_unit(plant: Plant, own: str, name: str, unit: str) -> str:
+    units = f"in {plant.coordinates[own]}, the model's '{name}' in {unit}"
+    return f"its coordinate '{own}' is {units}; write both in one unit"
 
 
 def _check_expression(reality: Reality, model: Plant, name: str, mistakes: Mistakes) -> None:
@@ -265,6 +293,8 @@ def _check_expression(reality: Reality, model: Plant, name: str, mistakes: Mista
         return
     if units[name] != unit:
         mistakes.add(f"its '{name}' is in {units[name]}, the model's in {unit}; write both in one unit")
+    if name in model.instant_names:
+        return
     order = model.face.orders[model.face.names.index(name)]
     at_once = input_reaches_at(plant, name, order - 1)
     if at_once is not None:

@@ -1,4 +1,4 @@
-"""References: the nominal motion and its derivatives, as a function of time.
+"""References: the nominal motion and its derivatives, as a function of time; of a map its divided forward differences.
 
 Every reference gives one Function t -> (nominal state, nominal response): the coordinates with all derivatives that the
 plant's state has, and the highest derivative of each. Derivatives come from automatic differentiation. Whatever is decided before a
@@ -14,6 +14,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
@@ -54,7 +55,8 @@ class Reference(Checked, ABC):
         t = matrix.sym("t")
         motion = {name: matrix(value) for name, value in self.coordinates(t).items()}
         _check(plant, motion, what)
-        derivatives = {c: _differentiate(motion[c], t, r) for c, r in zip(plant.names, plant.orders, strict=True)}
+        by = _differentiate if plant.step is None else _differences(plant.sampling)
+        derivatives = {c: by(motion[c], t, r) for c, r in zip(plant.names, plant.orders, strict=True)}
         state = [derivatives[e.rstrip("'")][e.count("'")] for e in plant.state.elements]
         response = [derivatives[c][r] for c, r in zip(plant.names, plant.orders, strict=True)]
         results = [ca.densify(ca.vertcat(*state)), ca.densify(ca.vertcat(*response))]
@@ -194,6 +196,20 @@ def _differentiate(value: Expression, t: Expression, order: int) -> list[Express
     for _ in range(order):
         derivatives.append(ca.jacobian(derivatives[-1], t))
     return derivatives
+
+
+def _differences(step: float) -> Callable[[Expression, Expression, int], list[Expression]]:
+    """The divided forward differences of a motion along the steps of a map, in place of its derivatives."""
+
+    def differences(value: Expression, t: Expression, order: int) -> list[Expression]:
+        nodes = [value] + [ca.substitute(value, t, t + k * step) for k in range(1, order + 1)]
+        column = []
+        for k in range(order + 1):
+            column.append(nodes[0] / step**k)
+            nodes = [later - earlier for earlier, later in pairwise(nodes)]
+        return column
+
+    return differences
 
 
 def _check(plant: Plant, motion: Mapping[str, Expression], what: str) -> None:

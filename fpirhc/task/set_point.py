@@ -23,7 +23,7 @@ from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import nominal
-from fpirhc.task.equal_poles import highest, transition
+from fpirhc.task.equal_poles import differences, highest, transition
 from fpirhc.task.filter_bank import FILTER, FilterBank, arranged
 from fpirhc.task.reference import Reference, Steps
 from fpirhc.task.steps import pairs
@@ -87,7 +87,8 @@ class Setpoint(Reference):
         plant = plant.face
         self._check_names(plant)
         t = ca.SX.sym("t")
-        state, response = arranged(plant, [self._along_values(name, m, t) for name, m in self._orders(plant).items()])
+        chains = [self._along_values(plant, name, m, t) for name, m in self._orders(plant).items()]
+        state, response = arranged(plant, chains)
         results = [ca.densify(state), ca.densify(response)]
         return ca.Function("fpirhc_reference", [t], results, ["t"], ["state", "response"])
 
@@ -157,8 +158,15 @@ class Setpoint(Reference):
             name, order = plant.names[k], plant.orders[k]
             if self._orders(plant)[name] == order:
                 for time, change in self._changes(name):
-                    jumps.setdefault(time, []).append(nominal(self.rate) ** order * change)
+                    jumps.setdefault(time, []).append(self._jump(plant, order) * change)
         return max((float(np.linalg.norm(together)) for together in jumps.values()), default=0.0)
+
+    def _jump(self, plant: Plant, order: int) -> float:
+        """Jump of the response at a set-point that changes by one."""
+        rate = nominal(self.rate)
+        if plant.step is None:
+            return float(rate**order)
+        return float(ca.evalf(differences(rate, plant.sampling, ca.SX.zeros(order), ca.SX(1.0), order)[-1]))
 
     def _bank(self, plant: Plant, stages: int) -> FilterBank:
         return FilterBank(plant, self._orders(plant), self.rate, stages + 1 if self.announced else 1)
@@ -177,7 +185,7 @@ class Setpoint(Reference):
         before = [self._rest(name), *(value for _, value in steps[:-1])]
         return [(time, value - old) for (time, value), old in zip(steps, before, strict=True) if value != old]
 
-    def _along_values(self, name: str, order: int, t: Expression) -> Expression:
+    def _along_values(self, plant: Plant, name: str, order: int, t: Expression) -> Expression:
         """(y, y', ..., y^(m)) of one coordinate along `values`: a sum of step responses."""
         rate, rest = nominal(self.rate), self._rest(name)
         z, held = [expression(ca.SX(rest)), *[expression(ca.SX(0))] * (order - 1)], expression(ca.SX(rest))
@@ -186,6 +194,8 @@ class Setpoint(Reference):
             z = [entry + change * ((1.0 if k == 0 else 0.0) - phi[k][0]) for k, entry in enumerate(z)]
             held = held + change * (t >= time * (1 - _ON_TIME))
         column = ca.vertcat(*z)
+        if plant.step is not None:
+            return ca.vertcat(*differences(rate, plant.sampling, column, held, order))
         return ca.vertcat(column, highest(rate, column, held, order))
 
     def _check_names(self, plant: Plant) -> None:

@@ -65,12 +65,12 @@ class Shifted(Reference):
     def block(self, plant: Plant, stages: int, period: float) -> Block:
         """Return the block that packs what is given."""
         del period
-        given = self.given(plant, stages)
+        signals = self.given(plant, stages)
 
         def step(s: Signals) -> dict[str, Expression]:
-            return {_OWN: ca.vertcat(*(getattr(s, signal.name) for signal in given), s.time)}
+            return {_OWN: ca.vertcat(*(getattr(s, signal.name) for signal in signals), s.time)}
 
-        return Block("target", Layout((plant.time, *given)), Layout(self.own(plant, stages)), step)
+        return Block("target", Layout((plant.time, *signals)), Layout(self.own(plant, stages)), step)
 
     def motion_now(self, plant: Plant, stages: int, ahead: float = 0.0) -> ca.Function:
         """Function (t, own signal) -> (state, response), now or after some time with the shift held."""
@@ -111,9 +111,9 @@ class Shifted(Reference):
 
     def _symbols(self, plant: Plant, stages: int) -> tuple[Expression, Expression, list[Expression], ca.DM]:
         """Time, the own signal, its parts, and the matrix that puts the shift into the state."""
-        matrix, given = kind(self.opaque), self.given(plant, stages)
+        matrix, signals = kind(self.opaque), self.given(plant, stages)
         own = matrix.sym("own", self.own(plant, stages)[0].size)
-        ends = np.cumsum([0, *(signal.size for signal in given), 1]).tolist()
+        ends = np.cumsum([0, *(signal.size for signal in signals), 1]).tolist()
         places = ca.DM(plant.state.size, len(plant.controlled_names))
         for column, name in enumerate(plant.controlled_names):
             places[plant.state.elements.index(name), column] = 1

@@ -7,13 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
+import numpy as np
 
+from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import numbers
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
-from fpirhc.symbolic.live import is_live
+from fpirhc.symbolic.live import is_live, nominal
 
 ROOM = 10.0  # times the largest response that a law may ask for, because a model may be wrong by a factor
 
@@ -106,6 +108,29 @@ def bumpless(s: Signals, gains: Sequence[float]) -> tuple[Expression, dict[str, 
     now = numbers(gains)
     factor = ca.if_else(now == 0, 1, s.integral_gain / ca.if_else(now == 0, 1, now))
     return factor * s._integral_before, {"integral_gain_next": now}
+
+
+def check_modes(law: object, plant: Plant, gains: Sequence[float]) -> None:
+    """Raise if a law with these gains has a mode that does not decay in the cycles of a map; elsewhere nothing is checked.
+
+    Args:
+        law: for the message.
+        plant: that it acts on.
+        gains: lowest derivative first; with delta for the derivatives the modes are z = 1 + T times their roots.
+
+    Raises:
+        InvalidValue: a pole z on or outside the unit circle.
+    """
+    if plant.step is None:
+        return
+    poles = 1 + plant.sampling * np.roots([1.0, *reversed([float(nominal(g)) for g in gains])])
+    if np.abs(poles).max() >= 1:
+        worst = complex(poles[int(np.abs(poles).argmax())])
+        shown = f"{worst.real:.3g}" if abs(worst.imag) < 1e-6 * abs(worst) else f"{worst:.3g}"
+        raise InvalidValue(
+            f"{law!r}: in the map's cycles of {plant.sampling:g} {plant.time_unit} a mode of the error has the pole z = {shown} "
+            f"and does not decay; use a rate below {2 / plant.sampling:g} 1/{plant.time_unit} ({1 / plant.sampling:g} is deadbeat)"
+        )
 
 
 def error_signal(plant: Plant) -> Signal:

@@ -40,7 +40,7 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import power
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.tracking.base import Tracking
-from fpirhc.tracking.error import ROOM, Useful, error_chains, integral_delay, integral_update, law_signals
+from fpirhc.tracking.error import ROOM, Useful, check_modes, error_chains, integral_delay, integral_update, law_signals
 
 MOST = 20_000  # cycles of memory: the memory has a fixed size
 _REACH = 20.0  # memory x rate by default
@@ -120,6 +120,7 @@ class Fractional(Tracking):
 
     def law(self, plant: Plant, period: float) -> Block:
         """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
+        check_modes(self, plant, [self.rate])
         cycles, size = self.cycles(period), len(plant.controlled_names)
         past = tuple(f"{c}@{j}" for c in plant.controlled_names for j in range(1, cycles + 1))
         memory = Layout((Signal("decay_past", past), Signal("decay_first", plant.controlled_names)))

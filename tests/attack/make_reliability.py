@@ -117,7 +117,7 @@ def commands() -> str:
 def problems() -> str:
     """Problem files with mistakes."""
     import pytest
-    from test_mistakes import raw_error
+    from raw_errors import raw_error
 
     warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -10,18 +10,22 @@ import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, closing_blocks, fed, like
+from fpirhc.controllers.mirror import MEASURED_TIME
+from fpirhc.controllers.own_reference import own_signals
+from fpirhc.controllers.response_pairs import ResponsePairs
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
 from fpirhc.controllers.rivals.reference_model import companion
 from fpirhc.controllers.tracked import bounded, desired_blocks
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
+from fpirhc.errors import NotSupported
 from fpirhc.learning.rules.base import Pair, Rule
 from fpirhc.members import Example
 from fpirhc.plant.regressor import Combination
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.following import following
-from fpirhc.symbolic.layout import Expression
+from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.symbolic.live import live_numbers, settled
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.error import error_chains, integral_signal
@@ -38,6 +42,10 @@ class AdaptiveInverseDynamics(Controller):
     M_hat^-1, so the bounds must keep M_hat positive definite. A deformation keeps the errors small whatever p_hat is. Then the
     Lyapunov rule learns slowly, because it learns from these errors; a Projection learns as fast as without a deformation.
 
+    Behind dead time the rule pairs the errors with the response of the same instant: state and reference are those at which the
+    response was realised, and the command is the one that acted then. The estimate reaches the plant late, so the gains of a
+    Lyapunov rule must fall as the dead time grows. A deformation needs its own pairing, `Paired`.
+
     Args:
         tracking: the law that gives the desired response.
         rule: moves the estimate: LyapunovRule or Projection.
@@ -45,8 +53,8 @@ class AdaptiveInverseDynamics(Controller):
         combinations: expressions of parameters that enter linearly as a whole, by name.
         deformation: the fixed-point map between desired response and request.
 
-    `check` raises NotSupported where the plant is not fully actuated mechanics or has dead time, and InvalidValue where
-    parameters enter nonlinearly or the bounds do not keep the mass matrix positive definite.
+    `check` raises NotSupported where the plant is not fully actuated mechanics, or set-points stand behind dead time, and
+    InvalidValue where parameters enter nonlinearly or the bounds do not keep the mass matrix positive definite.
 
     References:
         J. J. Craig, P. Hsu, S. S. Sastry, Adaptive control of mechanical manipulators, Int. J. Robotics Research 6(2), 1987.
@@ -64,8 +72,18 @@ class AdaptiveInverseDynamics(Controller):
         return True
 
     def check(self, problem: Problem) -> None:
-        """Raise if plant, bounds or rule do not fit, as `Learning.check` does."""
-        self._learning.check(problem, inverts=True, reads_response=True)
+        """Raise if plant, bounds or rule do not fit, as `Learning.check` does.
+
+        Raises:
+            NotSupported: errors of an earlier instant, to set-points.
+        """
+        self._learning.check(problem, inverts=True)
+        late = ResponsePairs(problem, problem.dead_time).waiting
+        if late and own_signals(problem) and not self.rule.reads_response:
+            raise NotSupported(
+                f"{type(self.rule).__name__} pairs a response with the error of the same instant, and behind dead time or an "
+                "estimator set-points are not remembered for it; use Projection, or a Trajectory"
+            )
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, tracking, learn, deform, invert, limit, judge, running, tracking update."""
@@ -92,19 +110,33 @@ class AdaptiveInverseDynamics(Controller):
         )
         fixed = self.lyapunov_row() if rows is None else np.zeros(0)
 
-        def gradient(s: Signals, estimate: Expression) -> Pair:
-            matrix, _ = equation(s.state, s.realised, s._command_before, estimate, s.parameters)
-            chains = error_chains(plant, s._target - s.state)
+        target, reads = self._target(problem)
+
+        def gradient(s: Signals, state: Expression, estimate: Expression) -> Pair:
+            matrix, _ = equation(state, s.realised, s._command_before, estimate, s.parameters)
+            chains = error_chains(plant, target(s) - state)
             if self.tracking.integral:
                 chains = [[s._integral_used[k], *chain] for k, chain in enumerate(chains)]
             weights = fixed if rows is None else ca.vertsplit(getattr(s, rows.signal.name))
             along = [sum(w * e for w, e in zip(weights, chain, strict=True)) for chain in chains]
             return matrix, ca.vertcat(*along)
 
-        reads = (like(plant.state, "_target"), integral_signal(plant, "_integral_used"))
+        reads = (*reads, integral_signal(plant, "_integral_used"))
         if rows is None:
             return learning.block(problem, reads, gradient)
         return replace(learning.block(problem, (*reads, *rows.reads.signals), gradient), derived=rows.derived)
+
+    def _target(self, problem: Problem) -> tuple[Callable[[Signals], Expression], tuple[Signal, ...]]:
+        """The reference when the response was realised, and what it reads; no sample is older than the start."""
+        plant, pairs = problem.plant, ResponsePairs(problem, problem.dead_time)
+        if not pairs.waiting or own_signals(problem):
+            return lambda s: s._target, (like(plant.state, "_target"),)
+        reference = problem.reference.function(plant)
+
+        def then(s: Signals) -> Expression:
+            return reference(ca.fmax(getattr(s, MEASURED_TIME) - pairs.late, 0))[0]
+
+        return then, (replace(plant.time, name=MEASURED_TIME),)
 
     def lyapunov_row(self) -> np.ndarray:
         """Return B^T P: the weights of (e_int, e, e'), or of (e, e') without the integral, in w."""

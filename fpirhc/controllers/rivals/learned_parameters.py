@@ -26,7 +26,7 @@ from fpirhc.symbolic.expression import Signals, is_finite, pair
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 
-Gradient = Callable[[Signals, Expression], Pair]  # (signals, estimate) -> (G, w)
+Gradient = Callable[[Signals, Expression, Expression], Pair]  # (signals, state of the response, estimate) -> (G, w)
 _STATES = 25  # places along the reference at which the mass matrix is tried
 _CORNERS = 4096  # corners of the box that are tried at most
 _DEFINITE = 1e-9  # smallest over largest eigenvalue of a mass matrix that counts as positive definite
@@ -50,17 +50,15 @@ class Learning:
         """Return the plant's regressor for the learned parameters."""
         return Regressor(problem.plant, tuple(self.bounds), self.combinations)
 
-    def check(self, problem: Problem, *, inverts: bool, reads_response: bool) -> None:
+    def check(self, problem: Problem, *, inverts: bool) -> None:
         """Raise if plant, bounds, or rule do not fit each other.
 
         Args:
             problem: with the plant.
             inverts: whether the controller inverts the mass matrix.
-            reads_response: whether the controller pairs a command with its response.
 
         Raises:
-            NotSupported: the plant is not fully actuated, not of order 2, or has no symmetric mass matrix; there is dead time
-                where the controller pairs command and response.
+            NotSupported: the plant is not fully actuated, not of order 2, or has no symmetric mass matrix.
             InvalidValue: parameters enter nonlinearly, a first estimate is outside its bounds, or the bounds admit a mass matrix
                 that is not positive definite where the controller inverts it.
         """
@@ -68,11 +66,6 @@ class Learning:
         regressor = self.regressor(problem)
         self.rule.check(self.bounds)
         _check_bounds(regressor, self.bounds)
-        if reads_response and (problem.dead_time.inputs or problem.dead_time.measurement):
-            raise NotSupported(
-                "the last command and the response measured now belong together only without dead time; use SlotineLi without "
-                "a deformation, or a controller that does not learn"
-            )
         states = _states(problem)
         resting = states * [name in problem.plant.coordinates for name in problem.plant.state.elements]
         coefficients = _mass_coefficients(regressor, states)
@@ -115,7 +108,7 @@ class Learning:
             state, command, waiting = pairs.pair(s, s._command_before)
             old = ca.if_else(running, s.learned, clip(regressor.theta_function(s.parameters), lower, upper))
             evidence = Evidence(
-                lambda: gradient(s, old),
+                lambda: gradient(s, state, old),
                 lambda: pair(equation(state, s.realised, command, old, s.parameters)),
                 s._clipped_before,
             )

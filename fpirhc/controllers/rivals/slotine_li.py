@@ -73,7 +73,7 @@ class SlotineLi(Controller):
 
     def check(self, problem: Problem) -> None:
         """Raise if plant, bounds or rule do not fit, as `Learning.check` does, or the damping does not name every coordinate."""
-        self._learning.check(problem, inverts=self._deforms, reads_response=self._deforms)
+        self._learning.check(problem, inverts=self._deforms)
         odd = sorted(set(self.damping) ^ set(problem.plant.names))
         if odd:
             raise InvalidValue(
@@ -125,8 +125,8 @@ class SlotineLi(Controller):
     def _learn_block(self, problem: Problem, regressor: Regressor) -> Block:
         slope = problem.plant.response_signal("_velocity_slope" if self._deforms else "desired")
 
-        def gradient(s: Signals, estimate: Expression) -> Pair:
-            del estimate
+        def gradient(s: Signals, state: Expression, estimate: Expression) -> Pair:
+            del state, estimate  # law and error of this cycle belong together; no response is read
             matrix, _ = regressor.split_function(s.state, s._velocity, getattr(s, slope.name), s.parameters)
             return matrix, s.sliding
 

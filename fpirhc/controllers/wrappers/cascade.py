@@ -13,7 +13,8 @@ The output measured now belongs to targets of the past. So it is paired with the
 Without pairing the iteration is r_k = G(r_{k-1}, y_k, reference): it goes on while the output is under way, and a plant that is
 slower than its cycle limit-cycles at small gains.
 
-While the command stands at a limit the shift does not grow, so it does not wind up.
+While the command stands at a limit the shift may shrink, or move back from the limit, and nothing else, so it does not wind up. It
+moves back where its change has the other direction than what the limit took off the model's response, f(u_unclipped) - f(u).
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, compose_controller, embedded, reference_block
+from fpirhc.controllers.base import Controller, compose_controller, embedded, like, reference_block
+from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.target_pairing import ThroughModel
 from fpirhc.deformation.base import Deformation, Demand, Mirror
 from fpirhc.errors import NotContractive, NotSupported
@@ -36,6 +38,7 @@ from fpirhc.task.problem import Problem
 from fpirhc.task.shifted import SHIFT, Shifted
 
 _RENAMED = {"reference": "target", "error": "target_error"}  # what the inner controller calls these
+_COMMANDS = {"_unclipped_last": "command_unclipped", "_command_last": "command"}
 _SAMPLES = 200
 
 
@@ -76,6 +79,10 @@ class Cascade(Controller):
     def planner(self) -> None:
         """None: plans of the inner controller follow the target, and not the reference of the problem."""
 
+    def unadapted(self) -> Controller:
+        """Return the inner controller: without a shift its target is the reference."""
+        return self.controller.unadapted()
+
     def stated(self, problem: Problem) -> Cascade:
         """Return the cascade with lag and dead time of its pairing as numbers."""
         return self if self.paired is None else replace(self, paired=self.paired.stated(problem))
@@ -85,13 +92,17 @@ class Cascade(Controller):
         del problem, mirror
         return "`paired` already compares with the model; use the map itself"
 
+    def outputs_unusable(self, problem: Problem) -> str:
+        """Return the reason of the inner controller: the shift itself is one of the measured outputs."""
+        return self.controller.outputs_unusable(self.inner_problem(problem))
+
     def demand(self, problem: Problem) -> Demand:
-        """Return the size of the reference's controlled coordinates, which the shift may have to make up for at once."""
+        """Return the size of the reference's controlled quantities, which the shift may have to make up for at once."""
         plant, function = problem.plant, problem.reference.function(problem.plant)
         times = np.linspace(0.0, problem.duration, _SAMPLES)
-        states = np.array([np.asarray(function(t)[0].full()).ravel() for t in times])
-        places = [plant.state.elements.index(n) for n in plant.controlled_names]
-        outputs = np.vstack([problem.start_state[places], states[:, places]])
+        motion = np.array([np.asarray(function(t)[0].full()).ravel() for t in times])
+        places = [plant.output.elements.index(n) for n in plant.controlled_names]
+        outputs = np.vstack([problem.start_output[places], motion[:, places]])
         return Demand(float(np.linalg.norm(np.ptp(outputs, axis=0))), sudden=True)
 
     def check(self, problem: Problem) -> None:
@@ -122,36 +133,45 @@ class Cascade(Controller):
         reference, shift = reference_block(problem), self._shift_block(problem)
         inner = compose_controller(self.inner_problem(problem), self.controller)
         written = {*reference.writes.names, *shift.writes.names}
-        return [reference, shift, _renamed(inner, written)], [Delay(scalar("clipped_last"), "clipped")]
+        last = (
+            Delay(scalar("clipped_last"), "clipped"),
+            *(Delay(like(problem.plant.input, last), source) for last, source in _COMMANDS.items()),
+        )
+        return [reference, shift, _renamed(inner, written)], list(last)
 
     def _shift_block(self, problem: Problem) -> Block:
-        """Block (reference, state, whether the last command was clipped) -> shift of the target."""
+        """Block (reference, measured outputs, what a limit did to the last command) -> shift of the target."""
         plant, names = problem.plant, problem.plant.controlled_names
-        places, pairing = [plant.state.elements.index(n) for n in names], self.paired
-        units = tuple(plant.coordinates[n] for n in names)
-        start = tuple(map(float, problem.start_state[places]))
+        seen, pairing = plant.output, self.paired
+        places, units = [seen.elements.index(n) for n in names], tuple(plant.face.coordinates[n] for n in names)
+        start = tuple(map(float, problem.start_output[places]))
         own = self.deformation.memory(names)
         last = Signal("shift_last", names, units), Signal("target_last", names, units, start), scalar("shift_cycles")
+        response = plant.controlled_response_function
         memory = Layout((*last, *(pairing.memory(problem) if pairing else ()))) + own
 
         def step(s: Signals) -> dict[str, Expression]:
-            wanted, output, before = s.reference[places], s.state[places], s.shift_last
+            wanted, output, before = s.reference[places], getattr(s, seen.name)[places], s.shift_last
             in_force = pairing.in_force(problem, s, wanted) if pairing else s.target_last
             undeformed = in_force - before if pairing else wanted
-            kept = {m: getattr(s, m) for m in own.names}
-            request, after = self.deformation.step(in_force, output, undeformed, kept)
+            remembered = {m: getattr(s, m) for m in own.names}
+            request, after = self.deformation.step(in_force, output, undeformed, remembered)
             change = request - undeformed
             running = ca.logic_and(s.shift_cycles > problem.warm_up_cycles - 0.5, is_finite(change))
-            grows = ca.logic_and(s.clipped_last > 0.5, ca.fabs(change) > ca.fabs(before))
+            beyond, sent = (response(s.state, getattr(s, u), s.parameters) for u in _COMMANDS)
+            onwards = ca.logic_not(ca.dot(change - before, beyond - sent) < 0)  # NaN is no way back
+            grows = ca.logic_and(ca.logic_and(s.clipped_last > 0.5, onwards), ca.fabs(change) > ca.fabs(before))
             shift = ca.if_else(running, ca.if_else(grows, before, change), before)
             target = wanted + shift
             paired = pairing.remembered(problem, s, wanted, shift) if pairing else {}
             counted = {"shift_cycles_next": ca.fmin(s.shift_cycles + 1, problem.warm_up_cycles)}
-            own_next = {f"{m}_next": ca.if_else(running, after[m], kept[m]) for m in own.names}
+            own_next = {f"{m}_next": ca.if_else(running, after[m], remembered[m]) for m in own.names}
             held = {"shift_last_next": shift, "target_last_next": target, **counted}
             return {SHIFT: shift, "shift": shift, **held, **paired, **own_next}
 
-        reads = Layout((Signal("reference", plant.state.elements), plant.state, scalar("clipped_last")))
+        commands = (like(plant.input, name) for name in _COMMANDS)
+        measured = (*measured_signals(plant), plant.parameter)
+        reads = Layout((Signal("reference", seen.elements), *measured, scalar("clipped_last"), *commands))
         writes = Layout((Signal(SHIFT, names, units), Signal("shift", names, units)))
         return Block("shift", reads, writes, step, memory)
 

@@ -79,6 +79,11 @@ class Estimating(Controller):
         """Whether a new estimate changes the command in every cycle."""
         return self.at_once or self.estimator.acts_at_once or self.controller.model_acts_at_once
 
+    def maps_unusable(self, problem: Problem) -> str:
+        """Return why not: the estimators' models add to derivatives."""
+        del problem
+        return "its estimators add what they learn to derivatives with respect to time"
+
     def linear_around(self, inner: Controller) -> Controller:
         """Return the inner controller: near the reference the parameters are those of the start."""
         return inner

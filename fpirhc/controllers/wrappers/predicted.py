@@ -28,7 +28,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, embedded, like
-from fpirhc.controllers.mirror import MEASURED, MEASURED_OUTPUT
+from fpirhc.controllers.mirror import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
 from fpirhc.controllers.output_ahead import output_ahead
 from fpirhc.controllers.own_reference import own_signals
 from fpirhc.deformation.base import Deformation
@@ -36,6 +36,7 @@ from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.members import Example
 from fpirhc.plant.integrators import RungeKutta4
+from fpirhc.plant.map_steps import motion_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
@@ -112,8 +113,8 @@ class ByModel(Predictor):
         return tuple(map(float, problem.inputs_before))
 
     def advance(self, plant: Plant, period: float) -> ca.Function:
-        """Return one Runge-Kutta step of the model as a Function."""
-        step = RungeKutta4().step(plant, period)
+        """Return one Runge-Kutta step of the model, or one cycle of a map, as a Function."""
+        step = motion_of(plant, RungeKutta4(), RungeKutta4()).step(plant, period)
         x, u, p = plant.symbols()
         w = ca.SX.sym("w", len(plant.names))
         return ca.Function("fpirhc_predict", [x, u, p, w], [step(x, u, p, w)])
@@ -237,6 +238,11 @@ class Predicted(Controller):
         """
         self.controller.check(problem)
         self.by.check(problem.plant)
+        if problem.plant.step is not None and self.by.residual_time is not None:
+            raise NotSupported(
+                f"Predicted(by={self.by!r}): a residual compares the response with the model's at this state, and the response "
+                "of a map belongs to the state of the last cycle; use by=ByModel()"
+            )
         if self.controller.response(problem) is not None and self.by != ByModel():
             raise NotSupported(
                 f"Predicted: {self.by} compares the responses of the plant's controlled coordinates, but "
@@ -254,7 +260,7 @@ class Predicted(Controller):
         ahead = {"time": like(plant.time, "time_ahead"), "state": like(plant.state, "state_ahead")}
         if plant.outputs:
             ahead["output"] = like(plant.output, "output_ahead")
-        feeds = {**ahead, MEASURED: plant.state, MEASURED_OUTPUT: plant.output}
+        feeds = {**ahead, MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: plant.time}
         sent = self.by.sent(plant)
         before = Signal("_sent_before", sent.elements, sent.units, self.by.sent_at_start(problem))
         ahead_by = _Lead(self._cycles(problem), self._length(problem), self.inputs)

@@ -18,8 +18,8 @@ from fpirhc.optimisers.limited_turn.state import State
 
 def trial(call: Call, s: State, p: Expansion) -> Interior:
     """Return slacks, elastics and multipliers after the step to p; the multipliers stay near mu / t."""
-    moved = s["t"] + s["alpha"] * s["dt"], s["e"] + s["alpha"] * s["de"]
-    t, e = (ca.if_else(s["descends"], a, b) for a, b in zip(call.limits.path(p, s["mu"]), moved, strict=True))
+    stepped = s["t"] + s["alpha"] * s["dt"], s["e"] + s["alpha"] * s["de"]
+    t, e = (ca.if_else(s["descends"], a, b) for a, b in zip(call.limits.path(p, s["mu"]), stepped, strict=True))
     z = s["z"] + s["alpha_dual"] * s["dz"]
     safe = ca.if_else(call.limits.present, t, 1)
     near = ca.fmin(ca.fmax(z, s["mu"] / (1e8 * safe)), 1e8 * s["mu"] / safe)

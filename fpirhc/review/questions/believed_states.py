@@ -18,7 +18,7 @@ TEXT = "Are the believed states right after a while?"
 def right_after_a_while(grid: ReviewGrid) -> Answer | None:
     """Return which errors no measurement corrects, and their slowest pole; None where every state is measured or estimated."""
     problem = grid.problem
-    believed = problem.sensing.believed(problem.plant.face)
+    believed = problem.sensing.believed(problem.plant)
     if not believed:
         return None
     try:

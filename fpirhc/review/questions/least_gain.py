@@ -56,13 +56,13 @@ def _least_factor(case: Case) -> float | None:
     """Smallest factor of the map's gain from which on gains converge; None where none of those tried does."""
     controller, loops = case.controller, case.loops
     gain = controller.deformation.effective_gain()
-    chosen = np.unique(np.linspace(0, len(loops.places) - 1, _POINTS).astype(int))
+    samples = np.unique(np.linspace(0, len(loops.places) - 1, _POINTS).astype(int))
     lower = controller.with_deformation(controller.deformation.with_effective_gain(_LOWER * gain))
     try:
-        others = loops_at(case.grid, lower, [loops.places[k] for k in chosen])
+        others = loops_at(case.grid, lower, [loops.places[k] for k in samples])
     except (FpirhcError, np.linalg.LinAlgError):
         return None
-    own = [loops.loops[k].dynamics for k in chosen]
+    own = [loops.loops[k].dynamics for k in samples]
     slopes = [(f - other.dynamics) / (1 - _LOWER) for f, other in zip(own, others, strict=True)]
     factors = np.geomspace(_SMALLEST, _LARGEST, _STEPS)
 

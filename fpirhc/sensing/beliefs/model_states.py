@@ -46,9 +46,7 @@ class ModelStates(Belief):
         calm = np.zeros(len(model.plant.names))
 
         def predicted(evidence: Evidence, memory: Remembered) -> Expression:
-            before = memory["belief_state"]
-            after = model.advance(before, evidence.command, evidence.parameters, calm)
-            return ca.if_else(evidence.moves, after, before)
+            return model.move(memory["belief_state"], evidence.command, evidence.parameters, calm, evidence.moves)
 
         return predicted
 

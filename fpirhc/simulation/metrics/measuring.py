@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from fpirhc.errors import InvalidName, nearest
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.simulation.metrics.base import Metric
 from fpirhc.simulation.metrics.discovery import known_metrics
 from fpirhc.simulation.run import Run
@@ -108,6 +109,7 @@ class Metrics:
         return table("Metrics", ("metric", "value", "unit"), rows)
 
 
+@checked_call
 def measure(problem: Problem, run: Run, metrics: Sequence[Metric] | None = None) -> Metrics:
     """Return the metrics of a run.
 

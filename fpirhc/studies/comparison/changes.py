@@ -90,13 +90,13 @@ def scales(problem: Problem) -> dict[str, float]:
     function = problem.reference.function(plant)
     times = np.linspace(0.0, problem.duration, _SAMPLES)
     states = np.asarray(function.map(_SAMPLES)(times[None, :])[0].full())
-    asked = np.column_stack([problem.start_output, states])
-    chosen = {}
+    wanted = np.column_stack([problem.start_output, states])
+    ranges = {}
     for name in problem.judged_names:
-        row = asked[plant.output.elements.index(name)]
+        row = wanted[plant.output.elements.index(name)]
         moves = np.ptp(row) > ROUNDING * max(1.0, float(np.abs(row).max()))
-        chosen[name] = float(np.ptp(row)) if moves else _tolerance(problem, name)
-    return chosen
+        ranges[name] = float(np.ptp(row)) if moves else _tolerance(problem, name)
+    return ranges
 
 
 def _tolerance(problem: Problem, name: str) -> float:

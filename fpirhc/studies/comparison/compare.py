@@ -10,10 +10,11 @@ from typing import Any
 
 from fpirhc.contraction import ContractionReport, Spectrum, assess_gain
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import checked, resolved, without_deformation
+from fpirhc.controllers.contract import checked, resolved
 from fpirhc.deformation.base import innermost
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, NotSupported, nearest
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.response_prediction import Prediction, predict_response
 from fpirhc.simulation.changes import Changes
@@ -194,6 +195,7 @@ def select(task: Task, names: Sequence[str] | None) -> dict[str, Controller]:
     return {name: task.controllers[name] for name in names}
 
 
+@checked_call
 def compare(
     task: Task,
     *,
@@ -354,7 +356,7 @@ def _predicted(problem: Problem, controller: Controller, compiled: bool) -> Pred
 def _pair(controllers: Mapping[str, Controller], name: str) -> str | None:
     """The controller with the same settings and no adaptation."""
     try:
-        wanted = describe(without_deformation(controllers[name]))
+        wanted = describe(controllers[name].unadapted())
     except NotSupported:
         return None
     plain = ((n, c) for n, c in controllers.items() if not c.deformation.adapts)

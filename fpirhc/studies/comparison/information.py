@@ -58,10 +58,11 @@ def sentences(problem: Problem, known: Mapping[str, Information]) -> tuple[str, 
 
 
 def _given(problem: Problem) -> str:
-    plant, sensing = problem.plant.face, problem.sensing
-    names = sensing.measures(plant) if sensing.estimates else (*plant.state.elements, *response_names(plant))
-    if problem.plant.outputs:  # the state too, as it is believed
-        names = (*problem.plant.state.elements, *(n for n in names if n not in problem.plant.state.elements))
+    plant, sensing = problem.plant, problem.sensing
+    names = sensing.measures(plant) if sensing.estimates else (*plant.face.state.elements, *response_names(plant.face))
+    if plant.outputs and sensing.belief is None:  # the state too
+        names = (*plant.state.elements, *(n for n in names if n not in plant.state.elements))
+    names = tuple(dict.fromkeys(names))  # an output of order 0 is its own response
     text = f"all controllers are given {', '.join(names)} in every cycle of {problem.period:g} {problem.time_unit}"
     late = problem.dead_time.measurement
     text += f", {late:g} {problem.time_unit} late" if late else ""

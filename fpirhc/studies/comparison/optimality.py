@@ -57,16 +57,16 @@ def measure_optimality(
         return None
     times, states = (run[feeds[n] if feeds.get(n) in run.layout.names else n] for n in ("time", "state"))
     model = ready.model_plant(problem)
-    told = ready.told(problem)
+    known = ready.told(problem)
     other = (
-        replace(problem, plant=model, reality=None, signals=signals_of(model, told))
+        replace(problem, plant=model, reality=None, signals=signals_of(model, known))
         if model is not problem.plant
         else problem
     )
     planned = planner.planned(other)
     assert planned.horizon is not None
     assert planned.cost is not None
-    ahead = previewed_values(model, told)
+    ahead = previewed_values(model, known)
     limits, start = planned.limits, planned.start_state
     ocp = transcribe(planned.plant, planned.reference, planned.horizon, planned.cost, limits, ahead, start)
     try:
@@ -79,7 +79,7 @@ def measure_optimality(
     plans = np.arange(stride, run.cycles, stride)
     rows = plans[np.unique(np.linspace(0, plans.size - 1, SAMPLES).astype(int))] if plans.size else plans
     times = np.ravel(times)
-    parameters = rows_of(model_values(model, told), times + problem.period / 2, ready.parameters(model))
+    parameters = rows_of(model_values(model, known), times + problem.period / 2, ready.parameters(model))
     seen = run[feeds["output"] if feeds.get("output") in run.layout.names else "output"] if of_measured else states
     excess = []
     for row in rows:

@@ -119,13 +119,16 @@ def _samples(stepper: Stepper, run: Run) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _step_of(stepper: Stepper) -> Callable[[float, np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    if not stepper.estimates and not stepper.outputs:
+    if not stepper.estimates and not stepper.beside:
         return stepper.step
-    if stepper.outputs:
-        size = stepper.outputs
+    if not stepper.estimates:
+        size = stepper.beside
         return lambda now, seen, realised, memory: stepper.step(
             now, seen[:-size], realised, memory, output=seen[-size:]
         )
+    if stepper.beside:  # by itself: `step_measured` would have to split the sample in every cycle
+        size = stepper.beside
+        return lambda now, seen, realised, memory: stepper.step(now, seen[size:], realised, memory, output=seen[:size])
     return lambda now, measured, _, memory: stepper.step_measured(now, measured, memory)
 
 
@@ -133,10 +136,10 @@ def measure_cycle(problem: Problem, controller: Controller, run: Run, *, compile
     """Replay the run's measurements through the controller, one call per cycle, and return the times.
 
     The replay repeats the computations of the run: the controller starts afresh and has the same measurements.
-    The result is None for a run of fewer than two cycles, and for outputs behind an estimator, which a stepper does not cover.
+    The result is None for a run of fewer than two cycles.
     """
     cycles = min(run.cycles, REPLAYED)
-    if cycles < 2 or (problem.plant.outputs and problem.sensing.estimates):
+    if cycles < 2:
         return None
     stepper = Stepper(problem, controller, compiled=compiled, bounded=False)
     memory = stepper.start()

@@ -64,11 +64,11 @@ def judge(plain: Entry, adaptive: Entry, scales: Mapping[str, float]) -> Finding
     if lost or not changes:
         text = f"{adaptive.name} and {plain.name} cannot be compared: the error of {', '.join(lost) or 'nothing'} is no number."
         return Finding(text, Outcome.NOT_COMPARABLE, pair)
-    asked = {n: c for n, c in changes.items() if adaptive.weighed is None or n in adaptive.weighed} or changes
-    counted = major(asked)
+    weighed = {n: c for n, c in changes.items() if adaptive.weighed is None or n in adaptive.weighed} or changes
+    counted = major(weighed)
     outcome = outcome_of(counted)
-    beside = _minor(adaptive, [c for n, c in asked.items() if n not in counted])
-    beside += _not_weighed(adaptive, [c for n, c in changes.items() if n not in asked])
+    beside = _minor(adaptive, [c for n, c in weighed.items() if n not in counted])
+    beside += _not_weighed(adaptive, [c for n, c in changes.items() if n not in weighed])
     text = _SENTENCES[outcome](plain, adaptive, list(counted.values())) + beside
     if outcome is not Outcome.BETTER:
         text += _causes(plain, adaptive)

@@ -11,6 +11,7 @@ from typing import Any
 
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import Values
 from fpirhc.simulation.metrics import Metric
@@ -99,6 +100,7 @@ def _apart(one: Summary) -> str:
     return f"{signed(one.difference.median)} ({signed(one.difference.low)} to {signed(one.difference.high)})"
 
 
+@checked_call
 def compare_scenarios(
     task: Task,
     *,

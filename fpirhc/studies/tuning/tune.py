@@ -23,6 +23,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.fields.kinds import CountOrZero
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import current_setting, is_whole, with_settings
@@ -110,6 +111,7 @@ class Tuning:
         }
 
 
+@checked_call
 def tune(
     task: Task,
     *,

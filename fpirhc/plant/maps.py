@@ -1,0 +1,165 @@
+"""Maps x+ = f(x, u, p): plants that step, and have no differential equation.
+
+A map with steps of T moves by divided differences where a differential equation moves by derivatives,
+
+    (delta x)_k = (x_{k+1} - x_k) / T = (f(x_k, u_k, p) - x_k) / T,
+
+and the chain of an output is made of them, y_{j+1} = (y_j(f(x, u, p), p) - y_j(x, p)) / T. The relative order r is the number of
+steps until an input shows, the same in shifts and in divided differences. What is written for derivatives is written for maps, and
+for T -> 0 it is what it was.
+
+A controller sees the plant in its own cycles. Where a cycle has k steps, its map is f applied k times with the command held, T is
+the cycle, and the relative order is counted in cycles: an input that shows after three steps shows in one cycle of three steps.
+
+References:
+    R. H. Middleton, G. C. Goodwin, Improved finite word length characteristics in digital control using delta operators, IEEE
+    Transactions on Automatic Control 31(11), 1986.
+    S. Monaco, D. Normand-Cyrot, Minimum-phase nonlinear discrete-time systems and feedback stabilization, CDC 1987 (order).
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.fields.user_code import called, scalar_expression
+from fpirhc.symbolic.layout import Expression, Named
+
+if TYPE_CHECKING:
+    from fpirhc.plant.plant import Plant
+
+_WHOLE = 1e-6  # share of a step by which a cycle may differ from a whole number of steps
+
+
+@dataclass(frozen=True, eq=False)
+class Differences:
+    """The divided differences of a map, as a function of (x, u, p) that returns {state: (f - x) / T}.
+
+    Args:
+        next: function of (x, u, p) that returns {state: its value one step later}.
+        states: names.
+        step: T.
+    """
+
+    next: Callable[..., Mapping[str, Expression]]
+    states: tuple[str, ...]
+    step: float
+
+    @property
+    def __signature__(self) -> inspect.Signature:
+        """The signature of the map, so that a wrong number of arguments is named as that of the map."""
+        return inspect.signature(self.next)
+
+    def __call__(self, x: Named, *others: Named) -> object:
+        """Return the differences; what is not a mapping, or not the value of a state, stays as it is and is refused as such."""
+        values = self.next(x, *others)
+        if not isinstance(values, Mapping):
+            return values
+        scalars = ca.SX | ca.MX | ca.DM | int | float
+        return {
+            name: (value - x[name]) / self.step if name in self.states and isinstance(value, scalars) else value
+            for name, value in values.items()
+        }
+
+
+def check_map(plant: Plant, mistakes: Mistakes) -> None:
+    """Add every mistake of the steps to `mistakes`."""
+    if plant.step is None:
+        if plant.next is not None or plant.steps != 1:
+            mistakes.add("step is missing: a map needs the length of its step; write Plant.of_map(..., step=...)")
+        return
+    step = plant.step
+    if isinstance(step, bool) or not isinstance(step, int | float) or not (math.isfinite(step) and step > 0):
+        mistakes.add(f"step must be a positive number, in {plant.time_unit}, got {step!r}")
+    elif plant.next is not None and set(plant.orders) != {1}:
+        mistakes.add("order: every state of a map has the order 1; later steps are found from outputs")
+    elif plant.next is not None and getattr(plant.response, "next", None) is not plant.next:
+        mistakes.add(
+            "response: that of a map is the difference of its steps; give the map alone, Plant.of_map(next=...)"
+        )
+
+
+def over(plant: Plant, cycle: float) -> Plant:
+    """Return the map over one control cycle: as many steps with the command held as the cycle has.
+
+    Args:
+        plant: a map.
+        cycle: length of the control cycle.
+
+    Raises:
+        InvalidValue: the cycle is no whole number of steps; the next ones are named.
+    """
+    assert plant.step is not None
+    ratio = cycle / plant.step
+    count = round(ratio)
+    if count < 1 or abs(ratio - count) > _WHOLE:
+        unit, below = plant.time_unit, math.floor(ratio)
+        lengths = [f"{k * plant.step:g} {unit}" for k in (below, below + 1) if k > 0]
+        raise InvalidValue(
+            f"period {cycle:g} {unit} is no whole number of the map's steps of {plant.step:g} {unit}; use {' or '.join(lengths)}"
+        )
+    return plant if count == plant.steps else replace(plant, steps=count)
+
+
+def next_function(plant: Plant) -> ca.Function:
+    """Function (state, input, parameters, forcing) -> state one control cycle later.
+
+    In each of the cycle's steps x+ = f(x, u, p) + step * forcing: a forcing adds to the divided differences.
+    """
+    assert plant.step is not None
+    x, u, p = plant.symbols()
+    w = ca.SX.sym("w", len(plant.names))
+    if plant.next is None:
+        after = x + plant.sampling * plant.forced_derivative_function(x, u, p, w)
+        return ca.Function("fpirhc_next", [x, u, p, w], [after], ["x", "u", "p", "w"], ["x_next"])
+    one = ca.Function("fpirhc_step", [x, u, p], [_one_step(plant, plant.next, x, u, p)])
+    after = x
+    for _ in range(plant.steps):
+        after = one(after, u, p) + plant.step * w
+    return ca.Function("fpirhc_next", [x, u, p, w], [after], ["x", "u", "p", "w"], ["x_next"])
+
+
+def shifted(plant: Plant, value: Expression, symbols: tuple[ca.SX, ca.SX, ca.SX, ca.SX]) -> Expression:
+    """Return the divided difference of an expression of the state over one control cycle.
+
+    Args:
+        plant: a map.
+        value: expression of x, u, p and w.
+        symbols: x, u, p and the forcing w; what the value has of u, p and w is held.
+    """
+    x, u, p, w = symbols
+    return (ca.substitute(ca.SX(value), x, plant.next_function(x, u, p, w)) - value) / plant.sampling
+
+
+def decay_rates(modes: np.ndarray, cycle: float) -> np.ndarray:
+    """Return log|1 + T s| / T of eigenvalues s of a map's divided differences: negative where the mode decays, -inf where it ends.
+
+    Args:
+        modes: eigenvalues.
+        cycle: T.
+    """
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(np.abs(1 + cycle * modes)) / cycle)
+
+
+def growth_of(plant: Plant) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the function from eigenvalues of the rates to the rates with which modes grow: the real part, or that of a map."""
+    return np.real if plant.step is None else partial(decay_rates, cycle=plant.sampling)
+
+
+def _one_step(plant: Plant, step: Callable[..., Mapping[str, Expression]], x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
+    views = plant.views(x, u, p)
+    if plant.algebraic is not None:
+        views = (*views, plant.algebraic.view(plant.algebraic_function(x, u, p)))
+    values = called("next", step, *views)
+    symbols = (x, u, p)
+    entries = [scalar_expression(f"next of '{name}'", values[name], of=step, symbols=symbols) for name in plant.names]
+    return ca.densify(ca.vertcat(*(ca.SX(entry) for entry in entries)))

@@ -1,0 +1,46 @@
+"""A review of a problem whose controlled outputs have the order 0: what is known before a run, and what is not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import checked
+from fpirhc.errors import FpirhcError
+from fpirhc.review.answer import Answer, Review, Verdict
+from fpirhc.review.commands import commands_inside
+from fpirhc.review.grid import ReviewGrid
+from fpirhc.review.inverse import inverse_exists
+from fpirhc.review.orders import relative_orders
+from fpirhc.review.well_posed import well_posed
+
+_NOT_COVERED = (
+    "not covered for outputs of order 0: the linear loop, in which an output is a state, and with it convergence, gains and "
+    "zero dynamics"
+)
+
+
+def controls_order_zero(grid: ReviewGrid) -> bool:
+    """Return whether an output of order 0 is controlled."""
+    plant = grid.problem.plant
+    return bool(set(plant.controlled_names) & set(plant.instant_names))
+
+
+def review_of_order_zero(grid: ReviewGrid, controllers: Mapping[str, Controller]) -> Review:
+    """Return the answers about a problem whose controlled outputs have the order 0.
+
+    Args:
+        grid: points and draws of the problem.
+        controllers: by name.
+    """
+    general = (well_posed(grid), relative_orders(grid), inverse_exists(grid), commands_inside(grid))
+    rest = Answer("What do the other questions say?", Verdict.UNKNOWN, _NOT_COVERED, "Run it and compare.")
+    return Review((*general, rest), {name: _of(grid, one) for name, one in controllers.items()}, grid.mismatch)
+
+
+def _of(grid: ReviewGrid, controller: Controller) -> tuple[Answer, ...]:
+    try:
+        checked(grid.real or grid.problem, controller)
+    except FpirhcError as error:
+        return (Answer("Does the controller fit the problem?", Verdict.NO, str(error), "See the message."),)
+    return ()

@@ -1,0 +1,43 @@
+"""A mass whose model is too heavy, and the answers of its review by question."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+
+import fpirhc as fp
+
+PERIOD = 1e-3  # s
+
+
+def mass(**settings) -> fp.Problem:
+    """M q'' = u - k q, the model's mass 1.5 times too large."""
+    plant = fp.Plant(
+        coordinates={"q": "m"},
+        inputs={"u": "N"},
+        parameters={"m": fp.Parameter(1.5, 1.0, "kg"), "k": fp.Parameter(6.0, 10.0, "N/m")},
+        response=lambda q, v, u, p: {"q": (u.u - p.k * q.q) / p.m},
+    )
+    settings_in_use: dict[str, Any] = {
+        "reference": fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(3 * t)}),
+        "start": {"q": 0.0},
+        "period": PERIOD,
+        "duration": 4.0,
+    }
+    return fp.Problem(plant=plant, **(settings_in_use | settings))
+
+
+def torque(gain: float = -0.5, rate: float = 6.0, scale: float = 20.0) -> fp.ComputedTorque:
+    return fp.ComputedTorque(fp.Exponential(rate=rate), fp.Sigmoid(gain=gain, scale=scale))
+
+
+def answers(problem: fp.Problem, controller=None, mismatch: float = 0.0) -> dict[str, fp.Answer]:
+    """All answers by question."""
+    controllers = {"it": torque() if controller is None else controller}
+    return {a.question: a for a in fp.review(problem, controllers, mismatch=mismatch, seed=0).answers}
+
+
+def about(result: dict[str, fp.Answer], words: str) -> fp.Answer:
+    [question] = [q for q in result if words in q]
+    return result[question]

@@ -1,0 +1,371 @@
+"""Outputs that are measured while the states behind them are believed; steppers that are given raw measurements of outputs.
+
+Laws: the right model believes what is; a filter of an output is the filter of the books; outputs that are coordinates and known
+change no signal; raw measurements of a run give its commands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.observed import free_errors
+from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
+from fpirhc.sensing.belief import Belief
+from fpirhc.simulation.sample import raw_measurements
+from fpirhc.status import Status
+from fpirhc.studies.comparison.timing import measure_cycle
+
+LAW = fp.Exponential(rate=1.0)
+PLAIN, FPI = fp.ComputedTorque(LAW), fp.ComputedTorque(LAW, fp.Affine(-1.0))
+E0, STEEP = 93.0, 1.4
+FILTER = fp.KalmanFilter(
+    measured={"depth": 0.3}, noise={"C": 0.05, "E": 0.05, "R": 0.02}, start={"C": 0.2, "E": 0.2, "R": 0.1}
+)
+
+
+def curve(level: Any, half: Any) -> Any:
+    return E0 / (1 + (level / half) ** STEEP)
+
+
+def drug(believed: float = 4.0) -> fp.Plant:
+    """C' = u - C - (C - R) / 2, R' = (C - R) / 10, E' = (C - E) / 2, depth = E0 / (1 + (E / half)^g)."""
+    return fp.Plant.of_states(
+        states={"C": "mg/l", "R": "mg/l", "E": "mg/l"},
+        inputs={"u": "mg/l/min"},
+        parameters={"half": fp.Parameter(approximate=believed, exact=4.0, unit="mg/l")},
+        rates=lambda x, u, p: {"C": u.u - x.C - 0.5 * (x.C - x.R), "R": 0.1 * (x.C - x.R), "E": 0.5 * (x.C - x.E)},
+        outputs={"depth": fp.Output("1", lambda x, p: curve(x.E, p.half))},
+        time_unit="min",
+    )
+
+
+def sedated(belief: Belief | None, believed: float = 4.0, **changes: Any) -> fp.Problem:
+    """The depth from 74 to 50 and on to 40; it alone is measured."""
+    plant, first = drug(believed), curve(1.5, 4.0)
+
+    def motion(t: Any) -> dict[str, Any]:
+        return {"depth": 50 + (first - 50) * (1 + t / 2) * ca.exp(-t / 2) - 10 / (1 + ca.exp(10 - t))}
+
+    settings: dict[str, Any] = {
+        "sensing": fp.Sensing({}, fp.PositionDifference(), measured=["depth"], belief=belief),
+        "limits": fp.Limits(inputs={"u": (0.0, 40.0)}),
+        "start": {"C": 1.5, "R": 1.5, "E": 1.5},
+        "period": 1 / 12,
+        "duration": 20.0,
+        "measure_from": 3.0,
+    }
+    return fp.Problem(plant=plant, reference=fp.Trajectory(motion), **(settings | changes))
+
+
+def run(problem: fp.Problem, controller: Controller, seed: int = 0) -> fp.Run:
+    return fp.simulate(problem, controller, seed=seed, compiled=False)
+
+
+# What is believed
+
+
+@pytest.mark.parametrize("late", [0.0, 2 / 12], ids=["at once", "two cycles late"])
+@pytest.mark.parametrize("belief", [fp.ModelStates(), fp.ModelStates(corrected=False), FILTER], ids=str)
+def test_a_right_model_believes_what_is(belief: Belief, late: float) -> None:
+    """With exact parameters the states are the plant's, as late as the measurement is; the outputs are estimated."""
+    problem = sedated(belief, dead_time=fp.DeadTime(inputs={"u": 1.5 / 12}, measurement=late), duration=6.0)
+    result, cycles = run(problem, PLAIN), round(late * 12)
+    believed, true = result["state"], result["plant_state"]
+    assert np.ptp(true, axis=0).min() > 0.5
+    np.testing.assert_allclose(believed[cycles:], true[: len(true) - cycles], atol=1e-11)
+    difference = np.diff(result["plant_output.depth"])[:5] * 12
+    np.testing.assert_allclose(result["output.depth'"][1 + cycles : 6 + cycles], difference, atol=1e-9)
+
+
+def test_a_filter_of_an_output_is_that_of_the_books() -> None:
+    """Against a recursion in numpy with a wrong curve: rates by hand, Jacobians by the complex step, to 1e-10."""
+    sensors = {"depth": fp.Sensor(noise=fp.Noise(0.3))}
+    sensing = fp.Sensing(sensors, fp.PositionDifference(), measured=["depth"], belief=FILTER)
+    problem = sedated(FILTER, believed=5.0, sensing=sensing, duration=8.0)
+    result, h = run(problem, PLAIN), 1 / 12
+
+    def rate(x: Any, u: float, w: Any) -> Any:
+        c, r, e = x
+        return np.array([u - c - 0.5 * (c - r), 0.1 * (c - r), 0.5 * (c - e)]) + w
+
+    def advance(x: Any, u: float, w: Any) -> Any:
+        k1 = rate(x, u, w)
+        k2 = rate(x + h / 2 * k1, u, w)
+        k3 = rate(x + h / 2 * k2, u, w)
+        k4 = rate(x + h * k3, u, w)
+        return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+    def slope(function: Callable[[Any], Any], at: np.ndarray) -> np.ndarray:
+        return np.column_stack([np.atleast_1d(function(at + 1e-30j * e)).imag / 1e-30 for e in np.eye(3)])
+
+    def moved(x: np.ndarray, p: np.ndarray, u: float) -> tuple[np.ndarray, np.ndarray]:
+        a, b = slope(lambda z: advance(z, u, 0.0), x), slope(lambda w: advance(x, u, w), np.zeros(3))
+        return advance(x, u, 0.0), a @ p @ a.T + b @ np.diag([0.05, 0.02, 0.05]) ** 2 @ b.T
+
+    x, p = np.array([1.5, 1.5, 1.5]), np.diag([0.2, 0.1, 0.2]) ** 2  # C, R, E
+    for k, measured in enumerate(raw_measurements(result)):
+        x, p = moved(x, p, result["command"][k - 1, 0]) if k else (x, p)
+        c = slope(lambda z: curve(z[2], 5.0), x)
+        gain = p @ c.T / (c @ p @ c.T + 0.3**2)
+        x, p = x + gain @ (measured - curve(x[2], 5.0)), p - gain @ c @ p
+        np.testing.assert_allclose(result["state"][k], x, atol=1e-10)
+    assert np.abs(result["state"] - result["plant_state"]).max() > 0.3
+
+
+def test_a_measured_state_beside_the_output_corrects_what_is_believed() -> None:
+    """A blood sample in every cycle: the plasma is known, and the wrong curve moves the other states less."""
+    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["depth", "C"], belief=fp.ModelStates())
+    problem = sedated(None, believed=5.0, sensing=sensing, disturbances={"u": fp.Step(at=2.0, size=0.5)})
+    result = run(problem, PLAIN)
+    alone = run(replace(problem, sensing=replace(sensing, measured=["depth"])), PLAIN)
+    assert sensing.known(problem.plant) == ("C",)
+    assert np.array_equal(result["state.C"], result["plant_state.C"])
+    errors = [np.abs(r["state.E"] - r["plant_state.E"]).max() for r in (result, alone)]
+    assert errors[0] < 0.05 * errors[1]
+
+
+TWO_MASS = fp.load_problem("two_mass")
+
+
+@pytest.mark.parametrize("name", ["CTC", "CTC+FPI (eq 6)"])
+def test_outputs_that_are_coordinates_and_known_change_no_signal(name: str) -> None:
+    """All states follow from the measured positions: the belief has nothing to add, bit by bit."""
+    problem = replace(
+        TWO_MASS.problem, duration=0.2, measure_from=0.1, horizon=None, cost=None,
+        sensing=fp.Sensing({"q1": fp.Sensor(noise=fp.Noise(1e-6))}, fp.PositionDifference()),
+    )  # fmt: skip
+    same = {"q1": fp.Output("m", lambda q, v, p: q.q1), "q2": fp.Output("m", lambda q, v, p: q.q2)}
+    believed = replace(problem.sensing, measured=["q1", "q2"], belief=fp.ModelStates())
+    outputs = replace(problem, plant=replace(problem.plant, outputs=same), sensing=believed)
+    law = fp.ComputedTorque(fp.Exponential(6.0), fp.Affine(-0.05) if "FPI" in name else fp.Identity())
+    plain, other = (run(p, law, seed=1) for p in (problem, outputs))
+    assert outputs.sensing.known(outputs.plant) == outputs.plant.state.elements
+    for signal in ("state", "realised", "command", "true_error"):
+        assert np.array_equal(plain[signal], other[signal]), signal
+
+
+def test_a_reality_shows_its_output_and_starts_elsewhere_than_the_belief() -> None:
+    """The real patient starts with other levels; the filter finds them from the depth, the model alone does not."""
+    first = {"C": 2.5, "R": 0.5, "E": 2.5}
+    real = fp.Reality(drug(), start=first)
+    start = replace(FILTER, start={"C": 1.0, "R": 1.0, "E": 1.0})
+    errors = []
+    for belief in (start, fp.ModelStates()):
+        result = run(sedated(belief, reality=real, duration=12.0), PLAIN)
+        assert tuple(result["plant_state"][0]) == tuple(first.values())
+        assert result["state.E"][0] != first["E"]
+        errors.append(np.abs(result["state"] - result["plant_state"])[-1].max())
+    assert errors[0] < 0.1 * errors[1]
+
+
+ANAESTHESIA = fp.load_problem(str(Path(__file__).resolve().parents[1] / "problems/gallery/anaesthesia.py"))
+COMPARTMENTS = fp.KalmanFilter(
+    measured={"bis": 0.5},
+    noise={"C1": 0.3, "C2": 0.02, "C3": 0.02, "Ce": 0.1},
+    start={"C1": 0.3, "C2": 0.1, "C3": 0.1, "Ce": 0.3},
+)
+BELIEFS = {"known": None, "model": fp.ModelStates(), "filter": COMPARTMENTS}
+
+
+@pytest.fixture(scope="module")
+def bis_errors() -> dict[tuple[str, str], float]:
+    """Rms error of the depth by what is known of the compartments, and controller; the bis alone is measured."""
+    errors = {}
+    for known, belief in BELIEFS.items():
+        measured = None if belief is None else ["bis"]
+        sensing = fp.Sensing({}, fp.PositionDifference(), measured=measured, belief=belief)
+        problem = replace(ANAESTHESIA.problem, sensing=sensing)
+        for name in ("CTC", "CTC+FPI"):
+            result = run(problem, ANAESTHESIA.controllers[name])
+            errors[known, name] = fp.measure(problem, result).rms_error["bis"]
+    return errors
+
+
+@pytest.mark.parametrize("known", ["model", "filter"])
+def test_adaptation_works_with_believed_compartments(bis_errors: dict[tuple[str, str], float], known: str) -> None:
+    """The bis is measured and the compartments are those of a wrong patient: FPI helps as with known ones, .021 beside .022."""
+    assert bis_errors[known, "CTC+FPI"] < 0.35 * bis_errors[known, "CTC"]
+    assert bis_errors[known, "CTC+FPI"] < 1.02 * bis_errors["known", "CTC+FPI"]
+
+
+def test_an_exact_model_referenced_form_changes_nothing() -> None:
+    """Where the response is measured, the model's response is that at the believed state, and with an exact model the same."""
+    sensing = fp.Sensing({}, fp.Measured(), belief=fp.ModelStates())
+    problem, form = sedated(None, sensing=sensing, duration=5.0), fp.ModelReferenced(fp.Affine(-0.5))
+    plain, referenced = (run(problem, fp.ExactModel(fp.ComputedTorque(LAW, d))) for d in (fp.Identity(), form))
+    np.testing.assert_allclose(referenced["command"], plain["command"], atol=1e-9)
+    wrong = sedated(None, believed=5.0, sensing=sensing)
+    errors = [
+        fp.measure(wrong, run(wrong, fp.ComputedTorque(LAW, d))).rms_error["depth"] for d in (fp.Identity(), form)
+    ]
+    assert errors[1] < 0.6 * errors[0]
+
+
+def test_predictions_start_from_what_is_believed() -> None:
+    """Behind late commands and samples, with the right model: the commands are those with states that are given."""
+    late = fp.DeadTime(inputs={"u": 2 / 12}, measurement=1 / 12)
+    controller = fp.Predicted(PLAIN, inputs=2 / 12, measurement=1 / 12)
+    runs = [run(sedated(b, dead_time=late, duration=6.0), controller) for b in (None, fp.ModelStates())]
+    np.testing.assert_allclose(runs[1]["command"], runs[0]["command"], atol=1e-8)
+    assert np.ptp(runs[0]["command"]) > 1
+
+
+def test_a_comparison_says_what_is_measured_and_what_is_believed() -> None:
+    file = replace(
+        TWO_MASS, problem=sedated(FILTER, duration=2.0, measure_from=0.0), controllers={"CTC": PLAIN, "FPI": FPI}
+    )
+    comparison = fp.compare(replace(file, headline=("CTC", "FPI")), seed=0, compiled=False)
+    said = next(line for line in comparison.information if line.startswith("all controllers"))
+    assert "are given depth in every cycle" in said
+    assert said.endswith("C, R, E are believed (KalmanFilter)")
+
+
+FIGURES = {"known": (0.117, 0.0217), "model": (0.078, 0.0210), "filter": (0.070, 0.0207)}
+
+
+@pytest.mark.parametrize("known", FIGURES)
+def test_figures_are_those_of_the_page(bis_errors: dict[tuple[str, str], float], known: str) -> None:
+    errors = [bis_errors[known, name] for name in ("CTC", "CTC+FPI")]
+    assert errors == pytest.approx(FIGURES[known], rel=0.01)
+
+
+# Steppers are given raw measurements
+
+
+def noisy(problem: fp.Problem) -> fp.Problem:
+    """The depth with noise, rounding and lost samples."""
+    sensor = fp.Sensor(noise=fp.Noise(0.01), quantum=1e-3, dropout=0.05)
+    return replace(problem, duration=6.0, sensing=replace(problem.sensing, sensors={"depth": sensor}))
+
+
+LATE = fp.DeadTime(inputs={"u": 1 / 12}, measurement=1.5 / 12)
+
+
+def given(estimator: Any) -> fp.Problem:
+    """Estimated outputs beside a state that is given."""
+    return noisy(sedated(None, sensing=fp.Sensing(estimator=estimator)))
+
+
+RAW: dict[str, Callable[[], fp.Problem]] = {
+    "differences": lambda: given(fp.PositionDifference()),
+    "savitzky-golay": lambda: given(fp.SavitzkyGolay(window=5, degree=3)),
+    "filter": lambda: given(fp.StateVariableFilter(bandwidth=6.0)),
+    "velocity": lambda: replace(given(fp.VelocityDifference()), dead_time=LATE),
+    "model": lambda: replace(noisy(sedated(fp.ModelStates())), dead_time=LATE),
+    "Kalman": lambda: noisy(sedated(FILTER)),
+}
+
+
+@pytest.mark.parametrize("name", RAW)
+def test_raw_measurements_of_a_run_give_its_commands(name: str) -> None:
+    """Bit by bit; a bad sample leaves estimators and beliefs as they were."""
+    problem = RAW[name]()
+    controller = fp.ComputedTorque(LAW, fp.Affine(-0.2))
+    result = run(problem, controller, seed=2)
+    anything = dict.fromkeys(problem.sensing.measures(problem.plant), (-np.inf, np.inf))
+    stepper = fp.Stepper(problem, controller, compiled=False, plausible=anything)
+    memory, measured = stepper.start(), raw_measurements(result)
+    states = () if problem.sensing.belief else problem.plant.state.elements
+    assert stepper.measures == (*states, *problem.sensing.measures(problem.plant))
+    for k in range(result.cycles):
+        if k == 10:
+            held, after = stepper.step_measured(float(result.time[k]), measured[k] * np.nan, memory)
+            assert Status(int(stepper.trace()["status"][0])) == Status.BAD_SAMPLE
+            assert [stepper.memory.columns[i] for i in np.flatnonzero(after != memory)] == ["skipped_before"]
+            assert np.array_equal(held, result["command"][k - 1])
+        command, memory = stepper.step_measured(float(result.time[k]), measured[k], memory)
+        assert np.array_equal(command, result["command"][k]), k
+    assert np.ptp(result["command"]) > 1
+    assert measure_cycle(problem, controller, result, compiled=False) is not None
+
+
+# What is known before a run
+
+
+def test_a_review_says_what_cannot_be_observed() -> None:
+    """All levels show in the depth along the nominal run; a tissue that only drains does not, and decays."""
+
+    def answer(problem: fp.Problem) -> Any:
+        answers = fp.review(problem, {"CTC": PLAIN}, mismatch=0.0, seed=0).problem
+        return next(a for a in answers if a.question == "Are the believed states right after a while?")
+
+    assert free_errors(sedated(FILTER)).states == ()
+    assert "show in depth" in answer(sedated(FILTER)).evidence
+    of_model = answer(sedated(fp.ModelStates()))
+    assert of_model.verdict == "yes"
+    slowest = np.linalg.eigvals([[-1.5, 0.5], [0.1, -0.1]]).max()
+    assert of_model.numbers["pole"] == pytest.approx(slowest, rel=1e-9)
+    stays = answer(replace(integrating("y"), sensing=replace(integrating("y").sensing, belief=fp.ModelStates())))
+    assert stays.verdict == "no"
+    assert stays.change == "Measure z, or a quantity that depends on it."
+
+
+def integrating(measured: str) -> fp.Problem:
+    """Y' = u measured; the state z = the integral of y shows nowhere and stays."""
+    plant = fp.Plant.of_states(
+        states={"y": "m", "z": "m s"},
+        inputs={"u": "m/s"},
+        parameters={},
+        rates=lambda x, u, p: {"y": u.u, "z": x.y},
+        outputs={"y": fp.Output("m", lambda x, p: x.y)},
+    )
+    belief = fp.KalmanFilter(measured={measured: 0.1}, noise={"y": 1.0})
+    return fp.Problem(
+        plant=plant, reference=fp.Trajectory(lambda t: {"y": ca.sin(t)}), start={"y": 0.0, "z": 0.0}, period=0.1, duration=2.0,
+        sensing=fp.Sensing({}, fp.PositionDifference(), measured=["y"], belief=belief),
+    )  # fmt: skip
+
+
+WRONG: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
+    "output that nobody measures": (
+        lambda: sedated(None, sensing=fp.Sensing({}, fp.PositionDifference(), measured=["C"], belief=fp.ModelStates())),
+        InvalidProblem,
+        "PositionDifference needs depth, and outputs that are controlled are measured or estimated, never believed",
+    ),
+    "derivative that nobody measures": (
+        lambda: sedated(None, sensing=fp.Sensing({}, fp.Measured(), measured=["depth"], belief=fp.ModelStates())),
+        InvalidProblem,
+        r"Measured needs depth', depth'', and outputs .* such as PositionDifference\(\)",
+    ),
+    "state without a belief": (
+        lambda: sedated(None, sensing=fp.Sensing({}, fp.PositionDifference(), measured=["depth", "C"])),
+        InvalidProblem,
+        "C is given as it is to controllers of a plant with outputs, unless a belief is stated",
+    ),
+    "unknown quantity": (
+        lambda: sedated(None, sensing=fp.Sensing({}, fp.PositionDifference(), measured=["dept"], belief=fp.ModelStates())),
+        InvalidProblem,
+        "measured: quantity 'dept' is unknown. Did you mean 'depth'",
+    ),
+    "filter of what is not measured": (
+        lambda: sedated(replace(FILTER, measured={"C": 0.1})),
+        InvalidProblem,
+        "no sensor shows 'C'; those of .* are depth",
+    ),
+    "not observed": (
+        lambda: run(integrating("y"), PLAIN),
+        NotSupported,
+        "KalmanFilter: z cannot be observed along the reference from y",
+    ),
+    "twin": (
+        lambda: run(sedated(FILTER), fp.ComputedTorque(LAW, fp.ModelReferenced(fp.Affine(-0.5)))),
+        NotSupported,
+        "it compares with a twin of the plant behind the estimator",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_mistakes_are_named(what: str) -> None:
+    make, kind, message = WRONG[what]
+    with pytest.raises(kind, match=f"(?s){message}"):
+        make()

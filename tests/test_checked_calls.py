@@ -1,0 +1,117 @@
+"""A wrong argument of a function is one error that names all of them, before anything runs, with what to write instead."""
+
+from __future__ import annotations
+
+import inspect
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+import fpirhc as fp
+from fpirhc.errors import InvalidField
+from fpirhc.fields.checked_call import checks_of
+from fpirhc.fields.expected import Anything
+
+TASK = fp.load_problem("two_mass")
+PROBLEM, CTC = TASK.problem, TASK.controllers["CTC"]
+
+CALLS: dict[str, tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]] = {
+    "a name of a controller": (
+        fp.simulate,
+        (PROBLEM, "RHC"),
+        {"seed": 0},
+        "simulate.controller: expected a Controller, got the text 'RHC'; write controllers['RHC'] of a loaded problem file",
+    ),
+    "a name of a problem": (
+        fp.simulate,
+        ("two_mass", CTC),
+        {"seed": 0},
+        "simulate.problem: expected a Problem, got the text 'two_mass'; write fp.load_problem('two_mass').problem",
+    ),
+    "a loaded file": (
+        fp.simulate,
+        (TASK, CTC),
+        {"seed": 0},
+        "simulate.problem: expected a Problem, got a value of the class Task; give its .problem",
+    ),
+    "all controllers": (fp.simulate, (PROBLEM, {"CTC": CTC}), {"seed": 0}, "give one of its entries, such as ['CTC']"),
+    "a forgotten argument": (
+        fp.simulate,
+        (PROBLEM, CTC),
+        {},
+        "simulate needs seed; write simulate(problem=..., controller=..., seed=...)",
+    ),
+    "a misspelt argument": (
+        fp.simulate,
+        (PROBLEM, CTC),
+        {"seed": 0, "compile": False},
+        "simulate has no argument 'compile'. Did you mean 'compiled'?",
+    ),
+    "a seed that is no number": (
+        fp.simulate,
+        (PROBLEM, CTC),
+        {"seed": "a"},
+        "simulate.seed: expected a whole number, got the text 'a'",
+    ),
+    "a problem in place of its file": (
+        fp.compare,
+        ("two_mass",),
+        {"seed": 0},
+        "compare.task: expected a Task, got the text 'two_mass'; write fp.load_problem('two_mass')",
+    ),
+    "one controller for a review": (
+        fp.review,
+        (PROBLEM, CTC),
+        {"seed": 0, "mismatch": 0.0},
+        "review.controllers: expected {name: a Controller}, got a value of the class ComputedTorque",
+    ),
+    "a file of a run": (
+        fp.measure,
+        (PROBLEM, "run.npz"),
+        {},
+        "measure.run: expected a Run, got the text 'run.npz'; write fp.load_run('run.npz')",
+    ),
+    "a stepper of a name": (
+        fp.Stepper,
+        (PROBLEM, "CTC"),
+        {},
+        "Stepper.controller: expected a Controller, got the text 'CTC'; write controllers['CTC'] of a loaded problem file",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_wrong_arguments_are_named(name):
+    """The place is that of the caller."""
+    function, arguments, named, words = CALLS[name]
+    with pytest.raises(InvalidField) as caught:
+        function(*arguments, **named)
+    assert words in str(caught.value)
+    assert caught.value.place.startswith("test_checked_calls.py, line")
+
+
+def test_all_mistakes_of_a_call_come_at_once():
+    """Two wrong values and a missing one."""
+    simulate: Any = fp.simulate
+    with pytest.raises(InvalidField, match=r"(?s)3 mistakes.*needs seed.*problem.*controller"):
+        simulate("two_mass", "CTC")
+
+
+def test_a_checked_function_is_still_that_function():
+    """Its name, signature and docstring are its own, and another process can load it."""
+    assert pickle.loads(pickle.dumps(fp.simulate)) is fp.simulate
+    assert list(inspect.signature(fp.simulate).parameters)[:2] == ["problem", "controller"]
+    assert (fp.simulate.__doc__ or "").startswith("Run the closed loop")
+
+
+CHECKED = [one for one in (getattr(fp, name) for name in fp.__all__) if hasattr(one, "__wrapped__")]
+
+
+@pytest.mark.parametrize("function", CHECKED, ids=lambda one: one.__name__)
+def test_every_annotation_is_read(function):
+    """A class that a module imports for type checkers only would be checked by nothing."""
+    assert len(CHECKED) >= 19
+    expected = checks_of(inspect.unwrap(function)).expected
+    assert [name for name, one in expected.items() if isinstance(one, Anything)] == []

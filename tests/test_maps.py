@@ -1,0 +1,219 @@
+"""Maps x+ = f(x, u, p): plants that step, and have no differential equation.
+
+Laws: a run is the loop that is written by hand in numpy; a cycle of several steps is the map applied as often; the order of an
+output is counted in cycles; what does not fit a map is refused by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.errors import FpirhcError, InvalidProblem
+
+T = 10.0  # s, one step
+RATE = 0.04  # 1/s
+FISH = {
+    "growth": fp.Parameter(approximate=0.02, exact=0.03, unit="1/s"),
+    "caught": fp.Parameter(approximate=1.0, exact=0.7, unit="1"),
+}
+
+
+def grown(x: Any, u: Any, p: Any) -> dict[str, Any]:
+    """A stock that grows to its limit of one and is caught: the logistic map with harvest."""
+    return {"stock": x.stock + T * (p.growth * x.stock * (1 - x.stock) - p.caught * u.catch)}
+
+
+def fishery(**changes: Any) -> fp.Plant:
+    """The stock as a map with steps of 10 s."""
+    arguments = {
+        "states": {"stock": "1"},
+        "inputs": {"catch": "1/s"},
+        "parameters": FISH,
+        "next": grown,
+        "step": T,
+        "ranges": {"stock": (0.0, 2.0)},
+    }
+    return fp.Plant.of_map(**{**arguments, **changes})
+
+
+def task(plant: fp.Plant | None = None, **changes: Any) -> fp.Problem:
+    """The stock follows a slow wave."""
+    arguments: dict[str, Any] = {
+        "plant": plant or fishery(),
+        "reference": fp.Trajectory(lambda t: {"stock": 0.5 + 0.1 * ca.sin(2e-3 * t)}),
+        "start": {"stock": 0.3},
+        "period": T,
+        "duration": 600.0,
+    }
+    return fp.Problem(**{**arguments, **changes})
+
+
+def simulated(problem: fp.Problem, controller: Any, seed: int = 0) -> fp.Run:
+    """A run in the virtual machine."""
+    return fp.simulate(problem, controller, seed=seed, compiled=False)
+
+
+def by_hand(cycles: int, steps: int, gain: float) -> tuple[np.ndarray, np.ndarray]:
+    """States and commands of computed torque with the plain affine iteration, in numpy alone."""
+    period = T * steps
+    slow, fast = [(p.approximate, p.exact) for p in FISH.values()]
+
+    def model(x: float, u: float, k: int) -> float:
+        for _ in range(steps):
+            x = x + T * ((slow[k]) * x * (1 - x) - fast[k] * u)
+        return x
+
+    def wanted(x: float, value: float) -> float:
+        """The command with which the model is at the value one cycle later, by Newton's method."""
+        u = 0.0
+        for _ in range(50):
+            slope = (model(x, u + 1e-7, 0) - model(x, u - 1e-7, 0)) / 2e-7
+            u -= (model(x, u, 0) - value) / slope
+        return u
+
+    x, integral, before, last = 0.3, 0.0, 0.0, 0.0
+    states, commands = [], []
+    for k in range(cycles):
+        now, later = (0.5 + 0.1 * np.sin(2e-3 * period * n) for n in (k, k + 1))
+        error = now - x
+        if k == 0:
+            integral = -2 * error / RATE
+        desired = (later - now) / period + 2 * RATE * error + RATE**2 * integral
+        request = before + gain * (desired - (x - last) / period) if k and gain else desired
+        u = wanted(x, x + period * request)
+        states.append(x)
+        commands.append(u)
+        integral, before, last = integral + period * error, request, x
+        x = model(x, u, 1)
+    return np.array(states), np.array(commands)
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.5])
+@pytest.mark.parametrize("steps", [1, 3])
+def test_a_run_is_the_loop_by_hand(steps: int, gain: float) -> None:
+    """With one step the response is affine, and with three steps Newton's method inverts it on both sides."""
+    problem = task(period=T * steps, duration=20 * T * steps)
+    rate = fp.Exponential(rate=RATE)
+    run = simulated(problem, fp.ComputedTorque(rate, fp.Affine(gain=-2 * gain) if gain else fp.Identity()))
+    states, commands = by_hand(20, steps, gain)
+    assert run["status"].max() == 0
+    tolerance = 1e-13 if steps == 1 else 1e-9  # Newton's method of both sides
+    assert np.abs(run["state"][:, 0] - states).max() <= tolerance
+    assert np.abs(run["command"][:, 0] - commands).max() <= tolerance
+
+
+def test_a_cycle_of_three_steps_is_the_map_three_times() -> None:
+    """To the last bit: no integrator, and no difference that is multiplied back."""
+    problem = task(period=3 * T, duration=30 * T)
+    run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=0.01)))
+    growth, caught = (p.exact for p in FISH.values())
+    for k in range(9):
+        x, u = run["plant_state"][k, 0], run["command"][k, 0]
+        for _ in range(3):
+            x = x + T * (growth * x * (1 - x) - caught * u)
+        assert run["plant_state"][k + 1, 0] == x
+
+
+def test_the_response_is_the_difference_of_the_last_cycle() -> None:
+    run = simulated(task(), fp.ComputedTorque(fp.Exponential(rate=RATE)))
+    stock = run["plant_state"][:, 0]
+    assert np.array_equal(run["plant_realised"][1:, 0], (stock[1:] - stock[:-1]) / T)
+    assert np.allclose(run["realised"][1:, 0], run["plant_realised"][1:, 0], rtol=0, atol=1e-15)
+
+
+def chain(order: int) -> fp.Plant:
+    """x1+ = x2, x2+ = x3, ..., xr+ = a x1 + b u, controlled at x1."""
+    names = [f"x{k}" for k in range(1, order + 1)]
+
+    def shifted(x: Any, u: Any, p: Any) -> dict[str, Any]:
+        return {**{n: x[m] for n, m in pairwise(names)}, names[-1]: p.a * x.x1 + p.b * u.u}
+
+    parameters = {"a": fp.Parameter(0.4, 0.4, "1"), "b": fp.Parameter(2.0, 2.0, "1")}
+    return fp.Plant.of_map(
+        states=dict.fromkeys(names, "m"),
+        inputs={"u": "N"},
+        parameters=parameters,
+        next=shifted,
+        step=T,
+        outputs={"y": fp.Output("m", lambda x, p: x.x1)},
+    )
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_the_order_is_counted_in_cycles(order: int) -> None:
+    """In single steps it is the length of the chain; a cycle as long as the chain sees the input in one."""
+    plant = chain(order)
+    assert plant.face.orders == (order,)
+    assert plant.over(order * T).face.orders == (1,)
+    assert plant.over(T) is plant
+
+
+BAD: dict[str, tuple[Callable[[], object], str]] = {
+    "period": (
+        lambda: task(period=15.0),
+        r"period 15 s is no whole number of the map's steps of 10 s; use 10 s or 20 s",
+    ),
+    "short period": (lambda: task(period=4.0), r"no whole number of the map's steps of 10 s; use 10 s$"),
+    "integrator": (
+        lambda: task(integrator=fp.RungeKutta4()),
+        r"integrator: RungeKutta4\(substeps=1\) integrates differential equations; the plant is a map, leave it out",
+    ),
+    "discretisation": (
+        lambda: task(horizon=fp.Horizon(stages=3, step=T, discretisation=fp.Euler())),
+        r"horizon: discretisation: Euler\(substeps=1\) integrates differential equations",
+    ),
+    "stage": (lambda: task(horizon=fp.Horizon(stages=3, step=15.0)), r"does not divide the horizon step 15 s"),
+    "estimator": (
+        lambda: task(sensing=fp.Sensing(estimator=fp.PositionDifference())),
+        r"PositionDifference estimates derivatives with respect to time, which a map does not have",
+    ),
+    "step": (lambda: fishery(step=-1.0), r"step must be a positive number, in s, got -1.0"),
+    "state": (
+        lambda: fishery(next=lambda x, u, p: {}),
+        r"next does not give the value of state 'stock' one step later",
+    ),
+    "unknown": (
+        lambda: fishery(next=lambda x, u, p: {"stock": x.stock + u.catch, "fish": 1}),
+        r"state 'fish' is unknown",
+    ),
+    "arguments": (lambda: fishery(next=lambda x, u: {}), r"it is called as next\(x, u, p\)"),
+    "text": (
+        lambda: fishery(next=lambda x, u, p: {"stock": "x"}),
+        r"next of 'stock' must be one scalar expression, got the text 'x'",
+    ),
+    "no input": (
+        lambda: fishery(next=lambda x, u, p: {"stock": x.stock}, outputs={"y": fp.Output("1", lambda x, p: x.stock)}),
+        r"no input reaches 'y'",
+    ),
+    "later": (
+        lambda: replace(chain(2), outputs={}, controlled=("x1",)),
+        r"an input reaches state 'x1' only after 2 steps; write it as an output",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_what_does_not_fit_a_map_is_refused(what: str) -> None:
+    build, message = BAD[what]
+    with pytest.raises(FpirhcError, match=message):
+        build()
+
+
+def test_a_map_as_reality_needs_a_map_as_model() -> None:
+    rates = fp.Plant.of_states(
+        states={"stock": "1"},
+        inputs={"catch": "1/s"},
+        parameters={},
+        rates=lambda x, u, p: {"stock": -u.catch},
+        outputs={"stock": fp.Output("1", lambda x, p: x.stock)},
+    )
+    with pytest.raises(InvalidProblem, match="it is a map, and the model has differential equations"):
+        task(rates, reality=fp.Reality(fishery(outputs={"stock": fp.Output("1", lambda x, p: x.stock)})))

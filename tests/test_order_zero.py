@@ -1,0 +1,236 @@
+"""Outputs of order 0: the command moves them at once, and an iteration on targets makes up for a wrong static map.
+
+The foreign plant is a heating element: P = u^2 / (R (1 + alpha theta)), C theta' = P - G theta. Its power follows the voltage u at
+once and drifts with the temperature theta, which is measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.controllers.base import Controller
+from fpirhc.errors import InvalidProblem, NotSupported
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.studies.comparison.compare import compare
+
+STATIC = fp.FeedforwardOnly()
+COLD, WARMER = 20.0, 4e-3  # Ohm, 1/K
+HEAT, LOSS = 50.0, 2.0  # J/K, W/K
+
+
+def affine(gain: float) -> fp.Affine:
+    """The affine map with this effective gain."""
+    return fp.Affine(gain=-2 * gain)
+
+
+def resistance(x: Any, p: Any) -> Any:
+    return p.cold * (1 + p.warmer * x.theta)
+
+
+def element(cold: float = 14.0, warmer: float = 0.0, **settings: Any) -> fp.Plant:
+    """The heating element, with what the model believes of its resistance."""
+    return fp.Plant.of_states(
+        states={"theta": "K"},
+        inputs={"u": "V"},
+        parameters={
+            "cold": fp.Parameter(approximate=cold, exact=COLD, unit="Ohm"),
+            "warmer": fp.Parameter(approximate=warmer, exact=WARMER, unit="1/K"),
+        },
+        rates=lambda x, u, p: {"theta": (u.u**2 / resistance(x, p) - LOSS * x.theta) / HEAT},
+        outputs={"power": fp.Output("W", lambda x, u, p: u.u**2 / resistance(x, p))},
+        **{"inverse": lambda x, r, p: {"u": ca.sqrt(r.power * resistance(x, p))}, **settings},
+    )
+
+
+def heated(plant: fp.Plant, **settings: Any) -> fp.Problem:
+    """A power that swings, from a cold start."""
+    values: dict[str, Any] = {
+        "reference": fp.Trajectory(lambda t: {"power": 200 + 60 * ca.sin(t / 5)}),
+        "start": {"theta": 10.0},
+        "input_before": {"u": 60.0},
+        "period": 0.1,
+        "duration": 40.0,
+        "measure_from": 5.0,
+    }
+    return fp.Problem(plant=plant, **{**values, **settings})
+
+
+def simulated(problem: fp.Problem, controller: Controller) -> fp.Run:
+    """A run in the virtual machine."""
+    return fp.simulate(problem, controller, seed=1, compiled=False)
+
+
+def rms(problem: fp.Problem, controller: Controller) -> float:
+    return float(fp.measure(problem, simulated(problem, controller)).rms_error["power"])
+
+
+def test_the_order_is_found_from_the_symbols() -> None:
+    plant = element()
+    assert plant.instant_names == ("power",)
+    assert "power of relative order 0" in repr(plant)
+    named_only = fp.Plant.of_states(
+        states={"a": "m"}, inputs={"u": "1"}, parameters={}, rates=lambda x, u, p: {"a": u.u},
+        outputs={"y": fp.Output("m", lambda x, u, p: 2 * x.a + 0 * u.u)},
+    )  # fmt: skip
+    assert named_only.instant_names == ()
+    assert named_only.face.orders == (1,)
+
+
+def test_response_and_nominal_response_are_the_output_itself() -> None:
+    """Logged: the measured power under the last voltage, and the reference at the end of the cycle."""
+    problem = heated(element())
+    run = simulated(problem, STATIC)
+    assert run.layout["realised"].entry_units == ("W",)
+    assert np.array_equal(run["realised"], run["output"])
+    ohms = COLD * (1 + WARMER * run["state.theta"])
+    assert run["output.power"][1:] == pytest.approx(run["command.u"][:-1] ** 2 / ohms[1:], rel=1e-12)
+    assert run["desired.power"][:-1] == pytest.approx(run["reference.power"][1:], rel=1e-12)
+    assert run["command.u"] == pytest.approx(np.sqrt(14.0 * run["desired.power"]), rel=1e-12)
+
+
+def test_an_exact_model_leaves_the_drift_of_one_cycle() -> None:
+    """The voltage fits the temperature at the beginning of a cycle, so the error halves with the period."""
+    errors = [rms(heated(element(), period=period, duration=20.0), fp.ExactModel(STATIC)) for period in (0.4, 0.2, 0.1)]
+    assert errors[0] < 4.0
+    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.1)
+    assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.05)
+
+
+def test_the_shift_is_that_of_the_recursion_by_hand() -> None:
+    """y_k belongs to reference_k + shift_{k-1}: shift_k = shift_{k-1} - a (y_k - reference_k)."""
+    gain = 0.4
+    run = simulated(heated(element()), fp.Cascade(STATIC, affine(gain)))
+    shift = 0.0
+    for k in range(run.cycles):
+        shift = shift - gain * (run["output.power"][k] - run["reference.power"][k]) if k else 0.0
+        assert run["shift.power"][k] == pytest.approx(shift, abs=1e-10)
+
+
+def test_a_wrong_static_map_is_made_up_for() -> None:
+    """Without iteration a quarter of the power is missing; with it the error is that of one cycle, whatever the gain."""
+    problem = heated(element())
+    without = rms(problem, STATIC)
+    assert without > 50
+    for gain in (0.3, 0.6, 1.0):
+        assert rms(problem, fp.Cascade(STATIC, affine(gain))) < 0.06 * without, gain
+        assert rms(problem, fp.Cascade(STATIC, affine(gain), paired=None)) < 0.06 * without, gain
+
+
+def test_set_points_noise_and_dead_time() -> None:
+    """Unannounced set-points, a noisy wattmeter, and a voltage that acts two cycles late."""
+    problem = heated(
+        element(),
+        reference=fp.Setpoint({"power": [(0.0, 150.0), (10.0, 250.0)]}, rate=2.0),
+        sensing=fp.Sensing({"power": fp.Sensor(noise=fp.Noise(0.5))}),
+        dead_time=fp.DeadTime(inputs={"u": 0.2}, before={"u": 60.0}),
+    )
+    run = simulated(problem, fp.Cascade(STATIC, affine(0.3)))
+    assert np.std(run["output.power"] - run["plant_output.power"]) == pytest.approx(0.5, rel=0.2)
+    assert np.array_equal(run["realised"], run["output"])
+    assert not np.array_equal(run["plant_realised"], run["realised"])
+    settled = (run.time > 15) | ((run.time > 5) & (run.time < 10))
+    assert np.abs(run["true_error.power"][settled]).max() < 3.0  # W; the element is still warming up
+
+
+def test_a_stepper_does_what_the_loop_does() -> None:
+    problem, controller = heated(element(), duration=2.0, measure_from=0.0), fp.Cascade(STATIC, affine(0.4))
+    run = simulated(problem, controller)
+    stepper = fp.Stepper(problem, controller, compiled=False)
+    memory = stepper.start()
+    for k in range(run.cycles):
+        sample = run["state"][k], run["realised"][k]
+        command, memory = stepper.step(run.time[k], *sample, memory, output=run["output"][k])
+        assert np.array_equal(command, run["command"][k])
+
+
+def test_a_review_says_what_it_covers() -> None:
+    """Order, inverse and commands are answered; the linear loop is named as not covered."""
+    answers = fp.review(heated(element()), {"static": STATIC}, mismatch=0.0, seed=0)
+    by_question = {a.question: a for a in answers.problem}
+    assert by_question["Are the relative orders those of the plant?"].evidence.startswith("power 0")
+    assert str(by_question["Does the inverse exist along the reference?"].verdict) == "yes"
+    assert "not covered for outputs of order 0" in answers.problem[-1].evidence
+
+
+def test_a_comparison_says_that_the_output_is_measured() -> None:
+    """And judges the iteration beside its inner controller, with the null test of the pair."""
+    problem = heated(element(), duration=10.0)
+    controllers: dict[str, Controller] = {"static": STATIC, "iterated": fp.Cascade(STATIC, affine(0.5))}
+    task = Task("element", Path("element.py"), "A heating element", "", problem, controllers)
+    compared = compare(task, seed=0, compiled=False)
+    assert "all controllers are given theta, power in every cycle of 0.1 s" in compared.information
+    assert [entry.information.uses for entry in compared.entries if entry.information] == [
+        ("theta",),
+        ("theta", "power"),
+    ]
+    assert "iterated lowers the rms error of power" in compared.verdict[0]
+
+
+def test_an_output_of_order_zero_may_be_judged_beside_a_controlled_one() -> None:
+    """The temperature is controlled by computed torque; the power is measured and judged."""
+    plant = element(COLD, WARMER, inverse=None)
+    outputs = {"theta": fp.Output("K", lambda x, p: x.theta), **plant.outputs}
+    squared = replace(
+        plant,
+        outputs={**outputs, "power": fp.Output("W", lambda x, u, p: u.u / resistance(x, p))},
+        response=lambda x, u, p: {"theta": (u.u / resistance(x, p) - LOSS * x.theta) / HEAT},
+        controlled=("theta",),
+    )
+    problem = heated(
+        squared,
+        reference=fp.Trajectory(lambda t: {"theta": 30 + 0 * t, "power": 60.0 + 0 * t}),
+        judged=("theta", "power"),
+        input_before={},
+    )
+    run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=0.5)))
+    assert abs(run["error.theta"][-1]) < 1e-3
+    assert run["error.power"][-1] == pytest.approx(0.0, abs=1e-2)
+    planned = replace(problem, horizon=fp.Horizon(stages=4, step=0.5), cost=fp.Quadratic(outputs={"theta": 1.0}))
+    with pytest.raises(NotSupported, match="power depends on the command too"):
+        simulated(planned, fp.RecedingHorizon(fp.FixedPoint(iterations=2, tolerance=1e-3)))
+
+
+REFUSED: dict[str, tuple[Callable[[], Controller], dict[str, Any], str]] = {
+    "tracking law": (
+        lambda: fp.ComputedTorque(fp.Exponential(rate=1.0)),
+        {},
+        r"ComputedTorque .* order 0 \(power\).* FeedforwardOnly",
+    ),
+    "inside a cascade": (
+        lambda: fp.Cascade(fp.ComputedTorque(fp.Exponential(rate=1.0)), affine(0.4)),
+        {},
+        "Cascade does not cover outputs of order 0",
+    ),
+    "estimator": (
+        lambda: STATIC,
+        {"sensing": fp.Sensing(estimator=fp.PositionDifference())},
+        "need none; leave the estimator out",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_has_no_meaning_for_order_zero_is_refused(name: str) -> None:
+    make, settings, words = REFUSED[name]
+    with pytest.raises(NotSupported, match=words):
+        simulated(heated(element(), **settings), make())
+
+
+def test_feedforward_alone_is_refused_where_errors_would_add_up() -> None:
+    plant = replace(element(), outputs={"hot": fp.Output("K", lambda x, p: x.theta**2)}, inverse=None)
+    problem = heated(plant, reference=fp.Trajectory(lambda t: {"hot": 100.0 + 0 * t}))
+    with pytest.raises(NotSupported, match="the error of hot would add up"):
+        simulated(problem, STATIC)
+
+
+def test_an_expression_with_other_arguments_is_named() -> None:
+    with pytest.raises(InvalidProblem, match=r"called as function\(x, p\), or as function\(x, u, p\)"):
+        replace(element(), outputs={"power": fp.Output("W", lambda x: x.theta)})
