@@ -121,6 +121,8 @@ class Instance(Expected):
             ca.DM,
         ):  # every kind of expression passes for every other: see symbolic.expression
             return isinstance(value, ca.SX | ca.MX | ca.DM | int | float)
+        if self.one is np.ndarray:  # whatever numpy makes an array of numbers of
+            return isinstance(value, np.ndarray | ca.DM | list | tuple)
         return isinstance(value, np.bool_ if isinstance(value, np.bool_) and self.one is bool else self.one)
 
     def contract(self) -> type | None:
@@ -280,4 +282,11 @@ def _container(origin: type, arguments: tuple[typing.Any, ...]) -> Expected:
 
 
 _OFTEN = (float, int)
-_WORDS = {str: "a text", bool: "True or False", type(None): "None", dict: "a dict", ca.SX: "an expression"}
+_WORDS = {
+    str: "a text",
+    bool: "True or False",
+    type(None): "None",
+    dict: "a dict",
+    ca.SX: "an expression",
+    np.ndarray: "an array",
+}

@@ -194,6 +194,8 @@ def loop_matrices(problem: Problem, controller: Controller) -> LoopMatrices:
     """
     if problem.plant.outputs and not problem.sensing.ideal:
         raise NotSupported("the linear loop behind sensors or estimators is not covered for outputs")
+    if problem.plant.outputs and "output" in controller.feeds:
+        raise NotSupported("the linear loop of predicted outputs is not covered: a wrong model predicts other outputs")
     elements = straightened(problem).plant.state.elements
     judged = tuple(elements.index(c) for c in problem.judged_names if c in elements)
     return matrices_of(linear_problem(problem, controller), controller, judged)

@@ -16,7 +16,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Duration
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.horizon.regular_gain import Bounds, singular_gain
+from fpirhc.horizon.regular_gain import Bounds, nominal_run, singular_gain
 from fpirhc.horizon.stage_check import check_stage
 from fpirhc.plant.algebraic import unsolved
 from fpirhc.plant.integrators import USUAL, Integrator
@@ -367,7 +367,8 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
             "steps, Samples(times, values), which hold between their times, or choose an output whose derivatives it is not in"
         )
     if len(plant.inputs) == len(plant.controlled or plant.outputs):
-        singular = singular_gain(plant, problem.reference, *nominal_start(problem))
+        states, inputs = nominal_run(plant, problem.reference, *nominal_start(problem))
+        singular = singular_gain(plant, states, inputs, problem.period)
         if singular:
             mistakes.add(f"outputs: {singular}")
 
