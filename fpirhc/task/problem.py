@@ -369,7 +369,7 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
     if smooth:
         mistakes.add(
             f"signals: the derivatives of outputs depend on {', '.join(smooth)}, whose own derivatives nobody states; state it in "
-            "steps, Samples(times, values), which hold between their times, or choose another output"
+            "steps, Samples(times, values), which hold between their times, or choose an output whose derivatives it is not in"
         )
     if len(plant.inputs) == len(plant.controlled or plant.outputs):
         states, inputs = nominal_run(plant, problem.reference, *nominal_start(problem))
