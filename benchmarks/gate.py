@@ -19,20 +19,19 @@ import numpy as np
 
 import fpirhc as fp
 from fpirhc.controllers.gate import Gate
-from fpirhc.simulation.loop import start_memory
-from fpirhc.simulation.simulate import CHUNK, simulator
+from fpirhc.simulation.simulate import simulator
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+from in_turns import Work, compared, loop_time
 from table import write_table
 
 TASK = fp.load_problem("two_mass")
 CONTROLLERS = ("CTC", "CTC+FPI (eq 6)", "RHC", "RHC+FPI")
 REPEATS = 41
 STEPS = 10_000  # by hand
-Work = Callable[[], float]  # process time, s
 
 
 class Open(Gate):
@@ -59,21 +58,7 @@ class Open(Gate):
 
 def cycles(name: str) -> Work:
     """Process time of the compiled loop alone."""
-    ready = simulator(TASK.problem, TASK.controllers[name])
-    log = np.empty((CHUNK, ready.loop.trace.size))
-    start = start_memory(ready.loop, ready.problem, ready.controller)
-
-    def work() -> float:
-        evaluator = ready.evaluator
-        evaluator.arguments[0][:] = start
-        evaluator.redirect(1, log)
-        begin = time.process_time()
-        for _ in range(ready.problem.cycles // CHUNK):
-            evaluator.evaluate()
-            evaluator.arguments[0][:] = evaluator.results[0].reshape(CHUNK, -1)[-1]
-        return time.process_time() - begin
-
-    return work
+    return loop_time(simulator(TASK.problem, TASK.controllers[name]))
 
 
 def steps(name: str) -> Work:
@@ -96,11 +81,7 @@ def price(name: str, what: str, make: Callable[[str], Work], count: int) -> list
     with patch("fpirhc.simulation.loop.Gate", Open), patch("fpirhc.simulation.step_composition.Gate", Open):
         works = [make(name)]
     works.append(make(name))
-    orders = [(0, 1) if k % 2 else (1, 0) for k in range(REPEATS)]
-    times = np.array([[t for _, t in sorted((k, works[k]()) for k in order)] for order in orders])
-    without, behind = 1e6 * times.min(axis=0) / count
-    low, middle, high = 100 * (np.quantile(times[:, 1] / times[:, 0], (0.25, 0.5, 0.75)) - 1)
-    return [f"{name}, {what}", f"{without:.3f} us", f"{behind:.3f} us", f"{middle:+.1f} % ({low:+.1f} to {high:+.1f})"]
+    return [f"{name}, {what}", *compared(works, count, REPEATS)]
 
 
 def main() -> None:

@@ -210,6 +210,15 @@ def test_an_exact_model_referenced_form_changes_nothing() -> None:
     assert errors[1] < 0.6 * errors[0]
 
 
+def test_predictions_start_from_what_is_believed() -> None:
+    """Behind late commands and samples, with the right model: the commands are those with states that are given."""
+    late = fp.DeadTime(inputs={"u": 2 / 12}, measurement=1 / 12)
+    controller = fp.Predicted(PLAIN, inputs=2 / 12, measurement=1 / 12)
+    runs = [run(sedated(b, dead_time=late, duration=6.0), controller) for b in (None, fp.ModelStates())]
+    np.testing.assert_allclose(runs[1]["command"], runs[0]["command"], atol=1e-8)
+    assert np.ptp(runs[0]["command"]) > 1
+
+
 def test_a_comparison_says_what_is_measured_and_what_is_believed() -> None:
     file = replace(
         TWO_MASS, problem=sedated(FILTER, duration=2.0, measure_from=0.0), controllers={"CTC": PLAIN, "FPI": FPI}

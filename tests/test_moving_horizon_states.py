@@ -271,7 +271,7 @@ def test_a_foreign_reactor_is_believed_alike() -> None:
 
 
 def test_without_bounds_the_horizon_goes_astray_too() -> None:
-    """What helps is the bound: a window alone finds the solution behind zero, which explains the pressure as well."""
+    """What helps is the bound: a window alone goes behind zero, where the sum falls too, and finds no way back."""
     for result in pressures(fp.MovingHorizonStates(**KNOWN, window=10)):
         assert result["state.A"][-1] < -1
 

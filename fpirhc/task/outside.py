@@ -23,7 +23,7 @@ from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import kind
-from fpirhc.task.samples import Course, course_function, is_opaque, span_of
+from fpirhc.task.samples import Course, course_function, is_held, is_opaque, span_of
 
 
 class External(Checked, ABC):
@@ -138,6 +138,12 @@ def as_told(plant: Plant, signals: Mapping[str, External]) -> dict[str, External
         course = one.told
         made[name] = Known(nominal[name] if course is None else course, preview=one.preview or course is None)
     return made
+
+
+def not_held(signals: Mapping[str, External], names: Sequence[str]) -> tuple[str, ...]:
+    """Return those of some signals that change between jumps, really or as the model is told."""
+    courses = {name: (signals[name].values, signals[name].told) for name in names if name in signals}
+    return tuple(n for n, both in courses.items() if not all(c is None or is_held(c) for c in both))
 
 
 def rows_of(function: ca.Function | None, times: np.ndarray, parameters: np.ndarray) -> np.ndarray:
