@@ -242,8 +242,36 @@ def test_a_moving_horizon_comes_to_the_true_pressure(window: int) -> None:
         assert result["state"].min() > 0
 
 
+class Batch:
+    """The reactor outside, by its exact solution A(t) = 3 / (1 + 6 k t); its gauge shows the sum."""
+
+    def reset(self, seed: int) -> np.ndarray:
+        """The pressure at the start."""
+        del seed
+        return self.shown(0.0)
+
+    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+        """The pressure one cycle later."""
+        del command
+        return self.shown(time + 0.1)
+
+    def shown(self, time: float) -> np.ndarray:
+        """The pressure."""
+        a = 3 / (1 + 6 * 0.16 * time)
+        return np.array([a + 1 + (3 - a) / 2])
+
+
+def test_a_foreign_reactor_is_believed_alike() -> None:
+    """The same batch as an object outside, of which nothing is known but its pressure: the same estimates, to its integrator."""
+    problem = batch(fp.MovingHorizonStates(**KNOWN, window=5, bounds=INSIDE))
+    foreign = replace(problem, reality=fp.Foreign(Batch(), measures={"P": "bar"}))
+    one, other = run(problem, PRESSURE, seed=3), run(foreign, PRESSURE, seed=3)
+    np.testing.assert_allclose(other["state"], one["state"], atol=1e-5)
+    assert abs(other["state.A"][-1] - 3 / (1 + 6 * 0.16 * 9.9)) < 0.02
+
+
 def test_without_bounds_the_horizon_goes_astray_too() -> None:
-    """What helps is the bound: a window alone finds the solution behind zero, which explains the pressure as well."""
+    """What helps is the bound: a window alone goes behind zero, where the sum falls too, and finds no way back."""
     for result in pressures(fp.MovingHorizonStates(**KNOWN, window=10)):
         assert result["state.A"][-1] < -1
 

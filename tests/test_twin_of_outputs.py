@@ -74,7 +74,7 @@ def test_an_exact_model_is_left_alone(estimator, wait):
     np.testing.assert_allclose(other["plant_output"], one["plant_output"], atol=1e-9)
 
 
-@pytest.mark.parametrize("estimator", (*ESTIMATORS[:3], fp.Measured()), ids=repr)
+@pytest.mark.parametrize("estimator", [*ESTIMATORS[:3], fp.Measured()], ids=repr)
 def test_it_works_behind_an_estimator_as_where_the_response_is_measured(estimator):
     """The model is wrong in inertia and output: rms errors of 1.5 mm become .07 to .11 mm, and .069 mm with a measured response."""
     problem = task(estimator, duration=2.0, measure_from=1.2)
@@ -108,6 +108,14 @@ def test_an_output_that_is_a_coordinate_has_the_twin_of_the_coordinate():
     assert np.abs(runs[1]["state"] - runs[0]["plant_state"]).max() < 2e-3 * np.abs(runs[0]["plant_state"]).max()
     both = [np.abs(r["true_error"][500:]).max() for r in runs]
     assert both[1] == pytest.approx(both[0], rel=0.05)
+
+
+def test_under_a_prediction_the_twin_sees_what_is_measured():
+    """The controller acts on outputs ahead, the twin compares those of the samples: an exact model is left alone."""
+    late = WAITS["both"]
+    problem = task(fp.PositionDifference(), exact=True, dead_time=late)
+    one, other = (run(problem, fp.Predicted(c, inputs=2e-3, measurement=2e-3)) for c in (PLAIN, referenced(problem)))
+    np.testing.assert_allclose(other["plant_output"], one["plant_output"], atol=1e-9)
 
 
 def test_samples_late_by_a_fraction_are_refused():

@@ -15,7 +15,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.mirror_path import MEASURED, Path
+from fpirhc.controllers.mirror_path import MEASURED, MEASURED_OUTPUT, Path, measured_output
 from fpirhc.controllers.twin import drift, memory_moves
 from fpirhc.sensing.base import values_of
 from fpirhc.symbolic.block import Block
@@ -48,7 +48,7 @@ def twin_of_outputs(path: Path) -> Block:
         offset = ca.if_else(waits, s.mirror_offset, ahead @ s.mirror_offset)
         sample = shown(at, end, parameters, offset)
         motion, response, *memories = estimate.function(sample, *(getattr(s, m.name) for m in own))
-        away = getattr(s, plant.output.name) - motion
+        away = getattr(s, MEASURED_OUTPUT) - motion
         move = ca.if_else(is_finite(away), away, 0)  # what is not finite must not be remembered
         given = getattr(s, MEASURED)
         given = ca.if_else(is_finite(given), given, at)
@@ -59,7 +59,7 @@ def twin_of_outputs(path: Path) -> Block:
         return {"_modelled": response, **remembered}
 
     memory = Layout((*path.memory, *_starts(problem), *own))
-    reads, writes = Layout((*path.reads, plant.output)), Layout((plant.response_signal("_modelled"),))
+    reads, writes = Layout((*path.reads, measured_output(plant))), Layout((plant.response_signal("_modelled"),))
     return Block("mirror", reads, writes, step, memory, opaque=problem.integrator.opaque)
 
 

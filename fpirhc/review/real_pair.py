@@ -23,7 +23,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.errors import NotSupported
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.linear import LinearLoop, linear_parameters, linear_problem, matrices_of, response_slopes
+from fpirhc.review.linear import LinearLoop, cycle_of, linear_parameters, linear_problem, matrices_of, response_slopes
 from fpirhc.review.loops import plan_gains_at
 from fpirhc.review.stand_in import linear_stand_in
 from fpirhc.symbolic.layout import Expression, Named
@@ -95,6 +95,8 @@ def real_loops(grid: ReviewGrid, controller: Controller, points: Sequence[RealPo
     """
     assert grid.real is not None
     problem, model, reality = grid.real, grid.problem.plant, _reality(grid.real)
+    if model.outputs:
+        raise NotSupported("a reality beside outputs has other inner states than the model; simulate it")
     if controller.model_plant(problem) is not model:
         raise NotSupported("its model is the reality")
     believed = controller.parameters(model)
@@ -135,8 +137,9 @@ def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Ext
     modes = _beyond(np.linalg.eigvals(a), np.linalg.eigvals(reduced))
     slow = 1j * _SLOW * float(np.abs(modes).min(initial=np.inf))
     gain = d + c @ np.linalg.solve(slow * np.eye(len(a)) - a, b) if modes.size else d
-    of_model = response_slopes(model)(grid.states[point.place], point.command, believed)[1]
-    assumed = np.asarray(of_model.full())[list(model.controlled_indices)]
+    x, u, p = model.symbols()
+    by_input = ca.Function("fpirhc_gain", [x, u, p], [ca.jacobian(model.controlled_response_function(x, u, p), u)])
+    assumed = np.asarray(by_input(grid.states[point.place], point.command, believed).full())
     return Extra(modes, np.linalg.eigvals(gain @ np.linalg.inv(assumed)))
 
 
@@ -161,9 +164,8 @@ def linear_reality(plant: Plant) -> Plant:
     names = [f"d{k}" for k in range(max(plant.orders))] + ["u", "p"]
     vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(name, kind) for name in names])
     order = dict(zip(plant.names, plant.orders, strict=True))
-    return Plant(
-        plant.coordinates, plant.inputs, parameters, response, order, plant.controlled, time_unit=plant.time_unit
-    )
+    names_and_units = plant.coordinates, plant.inputs, parameters, response, order, plant.controlled
+    return Plant(*names_and_units, time_unit=plant.time_unit, step=cycle_of(plant))
 
 
 def _places(plant: Plant) -> list[tuple[int, int]]:

@@ -48,7 +48,7 @@ class Interior:
             distances, slopes = ca.vertcat(distances, direction * (x[place] - end)), ca.vertcat(slopes, slope)
         return distances, slopes, [d**2 / self.barrier for d in ca.vertsplit(distances)] if self.ends else []
 
-    def kept(self, before: Expression, after: Expression) -> Expression:
+    def bounded(self, before: Expression, after: Expression) -> Expression:
         """Return a state that has at least a tenth of the distance from every bound that another state has."""
         entries = ca.vertsplit(after)
         for place, end, direction in self.ends:

@@ -77,11 +77,11 @@ class Smoother:
         passed, *data = self.forward.mapaccum(count)(first, states, rows, filled, *beyond, same)
         before = ca.horzcat(first, passed[:, :-1])
         turned = [v[:, list(range(count))[::-1]] for v in (before, *data)]
-        _, moves, smooth = self.backward.mapaccum(count)(ca.DM.zeros(size), *turned)
+        _, changes, smooth = self.backward.mapaccum(count)(ca.DM.zeros(size), *turned)
         forth = list(range(count))[::-1]
         guess, change = ca.SX.sym("x", size), ca.SX.sym("d", size)
-        kept = ca.Function("fpirhc_kept", [guess, change], [self.interior.kept(guess, guess + change)])
-        results = [kept.map(count)(states, moves[:, forth]), smooth[:, forth[:-1]]]
+        bounded = ca.Function("fpirhc_bounded", [guess, change], [self.interior.bounded(guess, guess + change)])
+        results = [bounded.map(count)(states, changes[:, forth]), smooth[:, forth[:-1]]]
         return ca.Function("fpirhc_smooth", [states, noises, mean, covariance, rows, p], results)
 
     @cached_property
@@ -118,9 +118,9 @@ class Smoother:
             deviation = deviation + gain * innovation
             gains.append(gain)
             scaled.append(innovation / spread)
-        moved, slope, effect = self._moved(x, w, row_next, p)
+        later, slope, effect = self._motion(x, w, row_next, p)
         covariance = slope @ covariance @ slope.T + effect @ self._white @ effect.T
-        deviation = moved - x_next + slope @ deviation - effect @ w
+        deviation = later - x_next + slope @ deviation - effect @ w
         after = ca.vertcat(deviation, ca.vec((covariance + covariance.T) / 2))
         data = [slope, effect, slopes.T, ca.horzcat(*gains), ca.vertcat(*scaled)]
         results = [after, *(ca.vec(v) for v in data)]
@@ -190,7 +190,7 @@ class Smoother:
         counts = row[0] > 0.5
         return ca.if_else(counts, errors, 0), ca.if_else(counts, slopes, 0), variances
 
-    def _moved(self, x: ca.SX, w: ca.SX, row: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+    def _motion(self, x: ca.SX, w: ca.SX, row: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
         """The next state, and its Jacobians with respect to state and noise."""
         u, acted = self._acted(row, p)
         names, places = self.model.plant.names, list(self.noise)

@@ -90,11 +90,11 @@ reality = replace(metanet, outputs={"emission": fp.Output("kg/h", emission)})
 
 problem = fp.Problem(
     plant=model,
-    reality=fp.Reality(reality, start=SETTLED, integrator=fp.Euler(substeps=6)),
+    reality=fp.Reality(reality, start=SETTLED),
     reference=fp.Trajectory(lambda t: {"emission": 2140 + 25 * ca.sin(2 * ca.pi * t)}),
     start={"w2": 50.0},
     input_before={"r": 0.3},
-    period=1 / 60,  # h
+    period=1 / 60,  # h, six steps of METANET
     duration=3.0,  # h
     limits=fp.Limits(inputs={"r": (0.0, LARGEST)}),
     signals={"demand": fp.Unknown(lambda t: 2500 + 80 * ca.sin(2 * ca.pi * t / 1.7)), "ramp_demand": fp.Known(1100.0)},

@@ -138,7 +138,7 @@ class MovingHorizonStates(Belief):
         def predicted(evidence: Evidence, memory: Remembered) -> Expression:
             newest = memory[_STATES][-size:]
             after = model.move(newest, evidence.command, evidence.parameters, calm, evidence.moves)
-            return smoother.interior.kept(newest, after)
+            return smoother.interior.bounded(newest, after)
 
         return predicted
 
