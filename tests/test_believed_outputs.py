@@ -366,11 +366,6 @@ WRONG: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
         NotSupported,
         "KalmanFilter: z cannot be observed along the reference from y",
     ),
-    "twin": (
-        lambda: run(sedated(FILTER), fp.ComputedTorque(LAW, fp.ModelReferenced(fp.Affine(-0.5)))),
-        NotSupported,
-        "it compares with a twin of the plant behind the estimator",
-    ),
 }  # fmt: skip
 
 
