@@ -217,3 +217,47 @@ def test_a_map_as_reality_needs_a_map_as_model() -> None:
     )
     with pytest.raises(InvalidProblem, match="it is a map, and the model has differential equations"):
         task(rates, reality=fp.Reality(fishery(outputs={"stock": fp.Output("1", lambda x, p: x.stock)})))
+
+
+def test_disturbances_and_signals_act_as_in_the_loop_by_hand() -> None:
+    """A disturbance of a state adds to its difference in every step; a signal has the sample of its step."""
+    rain = [0.01, -0.02, 0.03, 0.0, 0.015, -0.01, 0.02, 0.005]
+
+    def watered(x: Any, u: Any, p: Any) -> dict[str, Any]:
+        return {"stock": x.stock + T * (p.growth * x.stock * (1 - x.stock) - p.caught * u.catch) + p.rain}
+
+    plant = fishery(next=watered, parameters={**FISH, "rain": fp.outside(nominal=0.0, unit="1")})
+    problem = task(
+        plant,
+        duration=70.0,
+        signals={"rain": fp.Unknown(fp.Samples(T * np.arange(8), rain, "zero"))},
+        disturbances={"stock": fp.Step(at=25.0, size=2e-3)},
+    )
+    run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=RATE)))
+    growth, caught = (p.exact for p in FISH.values())
+    x = 0.3
+    for k in range(7):
+        assert run["plant_state"][k, 0] == pytest.approx(x, abs=1e-15)
+        pushed = T * 2e-3 if run["disturbance"][k, 0] else 0.0
+        x = x + T * (growth * x * (1 - x) - caught * run["command"][k, 0]) + rain[k] + pushed
+    assert 0 < np.count_nonzero(run["disturbance"]) < 7
+
+
+# A fishery, year by year
+
+
+@pytest.mark.parametrize(("name", "described"), [("CTC", 4.21), ("CTC+FPI", 0.75), ("RHC", 2.39), ("RHC+FPI", 0.40)])
+def test_the_shipped_fishery_does_what_its_description_says(name: str, described: float) -> None:
+    loaded = fp.load_problem("fishery")
+    run = simulated(loaded.problem, loaded.controllers[name])
+    [rms] = fp.measure(loaded.problem, run).rms_error.values()
+    assert rms == pytest.approx(described, abs=0.005)
+
+
+def test_the_shipped_fishery_is_the_recursion_of_its_source() -> None:
+    loaded = fp.load_problem("fishery")
+    run = simulated(loaded.problem, loaded.controllers["CTC+FPI"])
+    adults, recruits = 60.0, 60.0
+    for k, effort in enumerate(run["command"][:, 0]):
+        assert run["plant_state"][k] == pytest.approx([adults, recruits], abs=1e-11)
+        adults, recruits = (0.6 - 0.3 * effort) * adults + recruits, 2.0 * adults * np.exp(-adults / 100.0)

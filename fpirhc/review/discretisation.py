@@ -13,14 +13,14 @@ QUESTION = "Does the discretisation of the horizon follow the plant?"
 
 
 def discretisation_follows(grid: ReviewGrid) -> Answer | None:
-    """Return how far the poles of one stage are from exp(lambda h) at the start of the reference; None without a horizon."""
+    """Return how far poles of a stage are from exp(lambda h) at the start of the reference; None without one or for a map."""
     return stage_follows(grid, grid.problem.plant.approximate, QUESTION)
 
 
 def stage_follows(grid: ReviewGrid, believed: np.ndarray, question: str) -> Answer | None:
     """Return the same for a model with the believed parameters, shape (np,)."""
     problem, plant = grid.problem, grid.problem.plant
-    if problem.horizon is None:
+    if problem.horizon is None or plant.step is not None:
         return None
     h, discretisation = problem.horizon.step, problem.horizon.discretisation
     place = first_place(grid, believed)

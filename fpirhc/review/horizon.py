@@ -8,6 +8,8 @@ import numpy as np
 import scipy.linalg
 
 from fpirhc.errors import FpirhcError
+from fpirhc.plant.maps import growth_of
+from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.linear import response_slopes
@@ -52,7 +54,7 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
 
 def _slowest(grid: ReviewGrid) -> float:
     """Longest time constant of the model alone; infinite where a mode neither decays nor grows."""
-    rates = np.abs(np.linalg.eigvals(_model(grid)[0]).real)
+    rates = np.abs(growth_of(grid.problem.plant)(np.linalg.eigvals(_model(grid)[0])))
     return float(1 / rates.min()) if rates.min() > 1e-9 else float("inf")
 
 
@@ -65,11 +67,19 @@ def _growth(grid: ReviewGrid, gain: PlanGain) -> float:
     step = grid.problem.horizon.step
     a, b = _model(grid)
     nx, nu = b.shape
-    held = scipy.linalg.expm(step * np.block([[a, b], [np.zeros((nu, nx + nu))]]))[:nx]
+    rates = np.block([[a, b], [np.zeros((nu, nx + nu))]])
+    held = _transition(grid.problem.plant, rates, step)[:nx]
     feedback = np.hstack([gain.state, gain.before])
     stage = np.vstack([held[:, :nx] @ np.eye(nx, nx + nu) + held[:, nx:] @ feedback, feedback])
     radius = float(np.abs(np.linalg.eigvals(stage)).max())
     return 0.0 if abs(radius - 1) < _STILL else math.log(radius) / step
+
+
+def _transition(plant: Plant, rates: np.ndarray, time: float) -> np.ndarray:
+    """The matrix by which x' = rates x moves in that time; of a map (1 + T rates)^n in n cycles."""
+    if plant.step is None:
+        return np.asarray(scipy.linalg.expm(time * rates))
+    return np.linalg.matrix_power(np.eye(len(rates)) + plant.sampling * rates, round(time / plant.sampling))
 
 
 def _model(grid: ReviewGrid) -> tuple[np.ndarray, np.ndarray]:

@@ -18,6 +18,7 @@ from fpirhc.horizon.nominal import output_feedback
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.plant.instant import nominal_responses
 from fpirhc.symbolic.expression import kind
+from fpirhc.symbolic.layout import Expression
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem import Problem
 
@@ -26,6 +27,7 @@ _STEPS = 100_000
 _DECAYS = 20.0  # times in a run, by which the error of outputs at the start decays
 _FASTEST = 0.1  # of the cycle, the rate of this decay
 _SHORTEST = 2000  # steps of a run at least
+_WHOLE = 1e-6  # share of a cycle by which a time may be rounded
 
 
 def inner_places(problem: Problem) -> tuple[int, ...]:
@@ -53,9 +55,24 @@ def inner_motion(
     Returns:
         For every draw the states, shape (m, len(places)); None where they do not stay finite.
     """
-    steps = _integrator(problem, list(places), times)
     start = problem.start_state[list(places)]
+    if problem.plant.step is not None:
+        step = _cycle(problem, list(places))
+        return [_motion_of_map(step, problem.period, start, row, times) for row in draws]
+    steps = _integrator(problem, list(places), times)
     return [_motion(steps, start, row) for row in draws]
+
+
+def _motion_of_map(
+    step: ca.Function, period: float, start: np.ndarray, parameters: np.ndarray, times: np.ndarray
+) -> np.ndarray | None:
+    """States of the cycle in which every time lies."""
+    cycles = np.floor(times / period + _WHOLE).astype(int)
+    count = max(int(cycles[-1]), 1)
+    starts, held = period * np.arange(count), np.repeat(parameters[:, None], count, axis=1)
+    later = np.asarray(step.mapaccum("fpirhc_inner", count)(start, starts[None, :], held).full()).T
+    rows = np.vstack([start, later])[cycles]
+    return rows if np.isfinite(rows).all() else None
 
 
 def _motion(steps: ca.Function, start: np.ndarray, parameters: np.ndarray) -> np.ndarray | None:
@@ -66,20 +83,17 @@ def _motion(steps: ca.Function, start: np.ndarray, parameters: np.ndarray) -> np
     return np.vstack([start, rows]) if np.isfinite(rows).all() else None
 
 
+def _cycle(problem: Problem, places: list[int]) -> ca.Function:
+    """Function (inner states, time, parameters) -> inner states of a map one cycle later."""
+    plant = problem.plant
+    t, p, inner, state, command = _on_reference(problem, places)
+    after = plant.next_function(state, command, p, np.zeros(len(plant.names)))[places]
+    return ca.Function("fpirhc_inner_cycle", [inner, t, p], [ca.densify(after)])
+
+
 def _integrator(problem: Problem, places: list[int], times: np.ndarray) -> ca.Function:
     plant = problem.plant
-    matrix = kind(problem.reference.opaque or plant.inverse_opaque)
-    t, p, inner = matrix.sym("t"), matrix.sym("p", plant.parameter.size), matrix.sym("z", len(places))
-    nominal, response = problem.reference.function(plant)(t)
-    rows = [inner[0]] * plant.state.size if plant.outputs else [nominal[k] for k in range(plant.state.size)]
-    for place, entry in zip(places, range(len(places)), strict=True):
-        rows[place] = inner[entry]
-    state = ca.vertcat(*rows)
-    wanted = nominal_responses(plant, nominal, response)
-    if plant.outputs:
-        decay = min(_DECAYS / problem.duration, _FASTEST / problem.period)
-        wanted = wanted + output_feedback(plant, state, nominal, p, decay)
-    command = plant.inverse_function(state, wanted, p)
+    t, p, inner, state, command = _on_reference(problem, places)
     rate = plant.forced_derivative_function(state, command, p, np.zeros(len(plant.names)))[places]
     # Friction at a reversal is at rest until it is not: a step must not pass over the whole reversal.
     longest = max(problem.period, problem.duration / _SHORTEST)
@@ -92,6 +106,23 @@ def _integrator(problem: Problem, places: list[int], times: np.ndarray) -> ca.Fu
     }
     system = {"x": inner, "p": p, "t": t, "ode": rate}
     return ca.integrator("fpirhc_inner", "cvodes", system, float(times[0]), [float(v) for v in times[1:]], options)
+
+
+def _on_reference(problem: Problem, places: list[int]) -> tuple[Expression, ...]:
+    """Symbols of time, parameters and inner states, and the state and the command while the others are on the reference."""
+    plant = problem.plant
+    matrix = kind(problem.reference.opaque or plant.inverse_opaque)
+    t, p, inner = matrix.sym("t"), matrix.sym("p", plant.parameter.size), matrix.sym("z", len(places))
+    nominal, response = problem.reference.function(plant)(t)
+    rows = [inner[0]] * plant.state.size if plant.outputs else [nominal[k] for k in range(plant.state.size)]
+    for place, entry in zip(places, range(len(places)), strict=True):
+        rows[place] = inner[entry]
+    state = ca.vertcat(*rows)
+    wanted = nominal_responses(plant, nominal, response)
+    if plant.outputs:
+        decay = min(_DECAYS / problem.duration, _FASTEST / problem.period)
+        wanted = wanted + output_feedback(plant, state, nominal, p, decay)
+    return t, p, inner, state, plant.inverse_function(state, wanted, p)
 
 
 def _weighed(problem: Problem) -> set[int]:

@@ -180,9 +180,16 @@ def linear_plant(plant: Plant, sign: float) -> Plant:
     names = [f"d{k}" for k in range(max(plant.orders))] + ["u", "p"]
     vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(name, kind) for name in names])
     order = dict(zip(plant.names, plant.orders, strict=True))
-    return Plant(
-        plant.coordinates, plant.inputs, parameters, response, order, plant.controlled_names, time_unit=plant.time_unit
-    )
+    names_and_units = plant.coordinates, plant.inputs, parameters, response, order, plant.controlled_names
+    return Plant(*names_and_units, time_unit=plant.time_unit, step=cycle_of(plant))
+
+
+def cycle_of(plant: Plant) -> float | None:
+    """Return the step of a linear plant in place of a map: the control cycle; None for differential equations.
+
+    Its responses are divided differences, y_{k+1} = y_k + T (A x + B u), so it is the map's own linearisation.
+    """
+    return None if plant.step is None else plant.sampling
 
 
 def loop_matrices(problem: Problem, controller: Controller) -> LoopMatrices:
@@ -192,10 +199,15 @@ def loop_matrices(problem: Problem, controller: Controller) -> LoopMatrices:
         FpirhcError: every error that the controller raises about a linear plant.
         NotSupported: a memory of too many entries; sensors of outputs.
     """
-    if problem.plant.outputs and not problem.sensing.ideal:
+    steps = problem.sensing.estimator.of_steps and not problem.sensing.sensors and problem.sensing.belief is None
+    if problem.plant.outputs and not problem.sensing.ideal and not steps:
         raise NotSupported("the linear loop behind sensors or estimators is not covered for outputs")
     if problem.plant.outputs and "output" in controller.feeds:
         raise NotSupported("the linear loop of predicted outputs is not covered: a wrong model predicts other outputs")
+    if steps and max(problem.plant.face.orders) > 1:
+        raise NotSupported(
+            "the linear loop of a map is not covered for orders above 1, whose next outputs are predicted"
+        )
     elements = straightened(problem).plant.state.elements
     judged = tuple(elements.index(c) for c in problem.judged_names if c in elements)
     return matrices_of(linear_problem(problem, controller), controller, judged)

@@ -137,13 +137,16 @@ def _recursion(nominal: NominalRun, deformation: Deformation, exact: np.ndarray)
 
 
 def _answer_block(plant: Plant) -> Block:
-    """Block (state, command before, exact parameters) -> realised."""
+    """Block (state, command before, exact parameters) -> realised; that of a map begins at the state before."""
     reads = (plant.state, like(plant.input, "_command_before"), like(plant.parameter, "_exact"))
+    before = () if plant.step is None else (like(plant.state, "state_answered"),)
 
     def step(s: Any) -> dict[str, Expression]:
-        return {"realised": plant.controlled_response_function(s.state, s._command_before, s._exact)}
+        at = s.state_answered if before else s.state
+        realised = plant.controlled_response_function(at, s._command_before, s._exact)
+        return {"realised": realised, **({"state_answered_next": s.state} if before else {})}
 
-    return Block("answer", Layout(reads), Layout((plant.response_signal("realised"),)), step)
+    return Block("answer", Layout(reads), Layout((plant.response_signal("realised"),)), step, Layout(before))
 
 
 def _judge_block(plant: Plant) -> Block:
@@ -161,6 +164,8 @@ def _judge_block(plant: Plant) -> Block:
 
     def step(s: Any) -> dict[str, Expression]:
         first, last = (respond(x, s.command, s._exact) for x in (s.state, s._state_after))
+        if plant.step is not None:  # a map has one response over the whole cycle
+            return {"response_error": first - s.desired, "response_force": first - s.desired}
         own = inverse(s.state, s.desired, s.parameters)
         of_model = 0.5 * (s.desired + respond(s._state_after, own, s.parameters))
         return {"response_error": first - s.desired, "response_force": 0.5 * (first + last) - of_model}

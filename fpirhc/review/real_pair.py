@@ -24,7 +24,7 @@ from fpirhc.errors import NotSupported
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.review.carried import carrying
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.linear import LinearLoop, linear_parameters, linear_problem, matrices_of, response_slopes
+from fpirhc.review.linear import LinearLoop, cycle_of, linear_parameters, linear_problem, matrices_of, response_slopes
 from fpirhc.review.loops import plan_gains_at
 from fpirhc.review.reduced import outer_slopes, reduced
 from fpirhc.review.stand_in import linear_stand_in
@@ -165,9 +165,8 @@ def linear_reality(plant: Plant) -> Plant:
     names = [f"d{k}" for k in range(max(plant.orders))] + ["u", "p"]
     vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(name, kind) for name in names])
     order = dict(zip(plant.names, plant.orders, strict=True))
-    return Plant(
-        plant.coordinates, plant.inputs, parameters, response, order, plant.controlled, time_unit=plant.time_unit
-    )
+    names_and_units = plant.coordinates, plant.inputs, parameters, response, order, plant.controlled
+    return Plant(*names_and_units, time_unit=plant.time_unit, step=cycle_of(plant))
 
 
 def _places(plant: Plant) -> list[tuple[int, int]]:

@@ -15,8 +15,10 @@ _CYCLES = 3.0  # of lag that it should bear
 
 
 def fast_enough(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer | None:
-    """Return the smallest a lambda beside the one that the plain form needs; None for other forms and laws without known poles."""
+    """Return the smallest a lambda beside the one that the plain form needs; None for other forms, unknown poles, and maps."""
     law = law_of(grid, controller)
+    if grid.problem.plant.step is not None:
+        return None  # the linear loop of a map is exact
     if law is None or not controller.deformation.slows_desired:
         return None
     rate, poles = law
@@ -37,10 +39,10 @@ def fast_enough(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answ
 def bears_lag(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer | None:
     """Return the longest unknown lag with which the fast modes are still damped.
 
-    None for laws without known poles, and where the response is late already.
+    None for laws without known poles, for maps, and where the response is late already.
     """
     law, period, unit = law_of(grid, controller), grid.problem.period, grid.problem.time_unit
-    if law is None or grid.problem.response_delay > 0:
+    if law is None or grid.problem.response_delay > 0 or grid.problem.plant.step is not None:
         return None
     (rate, poles), product = law, _products(controller, own)[1]
     longest = bearable_lag(product, period, rate, poles, damping=_DAMPING)

@@ -93,6 +93,8 @@ def advice(plant: Plant, integrator: Integrator, step: float, place: Place) -> s
 def stiff_advice(grid: ReviewGrid, believed: np.ndarray, *, planned: bool) -> str:
     """Return what to change where a step of the horizon or of the simulated plant grows by itself; empty where none does."""
     problem, plant = grid.problem, grid.problem.plant
+    if plant.step is not None:
+        return ""
     try:
         place, horizon, cycle = first_place(grid, believed), problem.horizon, problem.integrator
         if planned and horizon is not None and step_poles(plant, horizon.discretisation, horizon.step, place).unstable:

@@ -31,6 +31,11 @@ class StandIn(Controller):
     tracking: Tracking
     deformation: Deformation
 
+    def maps_unusable(self, problem: Problem) -> str:
+        """Return nothing: the plan's feedback is that of the map's stages."""
+        del problem
+        return ""
+
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Blocks reference, tracking, deform, invert, limit, judge, tracking update."""
         return tracked_blocks(problem, self.tracking, self.deformation)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
+from fpirhc.plant.maps import growth_of
 from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
@@ -25,11 +26,15 @@ _STILL = 1e-4  # growth over the run, as a share, below which a mode is neutral
 
 
 def zero_dynamics_rate(grid: ReviewGrid) -> float | None:
-    """Return the largest real part of the zero dynamics along the reference, per unit of time; None where there are none."""
+    """Return the largest real part of the zero dynamics along the reference, per unit of time; None where there are none.
+
+    Of a map it is the largest rate with which one of its modes grows; minus infinity where all end within a few cycles.
+    """
     if not _inside(straightened(grid.problem).plant):
         return None
     modes = zero_dynamics_modes(grid, [k for k in range(len(grid.times)) if np.isfinite(grid.commands[0, k]).all()])
-    return max((float(one.real.max()) for one in modes), default=float("nan"))
+    growth = growth_of(grid.problem.plant)
+    return max((float(growth(one).max()) for one in modes), default=float("nan"))
 
 
 def zero_dynamics_modes(grid: ReviewGrid, places: Sequence[int]) -> list[np.ndarray]:
@@ -89,6 +94,8 @@ def zero_dynamics(problem: Problem, rate: float | None, planned: bool, loops: Lo
 
 def _text(problem: Problem, rate: float) -> str:
     unit = problem.rate_unit
+    if rate == -np.inf:
+        return "stable: while the reference is followed they end within as many cycles as they have states"
     if not np.isfinite(rate):
         return "their rate is not known: the reference has no finite command"
     if abs(rate) * problem.duration <= _STILL:

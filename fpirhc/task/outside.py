@@ -142,7 +142,7 @@ def as_told(plant: Plant, signals: Mapping[str, External]) -> dict[str, External
 
 def not_held(signals: Mapping[str, External], names: Sequence[str]) -> tuple[str, ...]:
     """Return those of some signals that change between jumps, really or as the model is told."""
-    courses = {name: (signals[name].real, signals[name].told) for name in names if name in signals}
+    courses = {name: (signals[name].values, signals[name].told) for name in names if name in signals}
     return tuple(n for n, both in courses.items() if not all(c is None or is_held(c) for c in both))
 
 

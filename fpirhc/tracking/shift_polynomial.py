@@ -53,7 +53,7 @@ class ShiftPolynomial(LinearLaw):
     largest: Sequence[float] = field(default=(), metadata={"setting": "where given"})
 
     def __post_init__(self) -> None:
-        every = [self.poles] if isinstance(self.poles, int | float) else list(self.poles)
+        every = [self.poles] if not isinstance(self.poles, Sequence) else list(self.poles)
         outside = [z for z in every if not abs(z) < 1]
         if outside or not every:
             wrong = f"{outside[0]:g} is not inside the unit circle" if outside else "there is none"
@@ -73,7 +73,7 @@ class ShiftPolynomial(LinearLaw):
             InvalidValue: another number of poles than modes.
         """
         degree = order + 1 if self.integral else order
-        if isinstance(self.poles, int | float):
+        if not isinstance(self.poles, Sequence):
             rate = (1 - self.poles) / self.step
             return tuple(math.comb(degree, s) * power(rate, degree - s) for s in range(degree))
         if len(self.poles) != degree:
@@ -100,12 +100,12 @@ class ShiftPolynomial(LinearLaw):
     @property
     def speed(self) -> float | None:
         """(1 - z) / T of the fastest mode."""
-        every = [self.poles] if isinstance(self.poles, int | float) else list(self.poles)
+        every = [self.poles] if not isinstance(self.poles, Sequence) else list(self.poles)
         return max(abs(1 - z) for z in every) / self.step
 
     def feedback(self, order: int) -> Feedback:
         """The gains for that order."""
-        rate = (1 - self.poles) / self.step if isinstance(self.poles, int | float) else None
+        rate = (1 - self.poles) / self.step if not isinstance(self.poles, Sequence) else None
         return Feedback(self.gains(order), self.integral, self.bumpless, rate)
 
 

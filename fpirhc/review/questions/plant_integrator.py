@@ -15,9 +15,9 @@ _POINTS = 5  # of the reference
 
 
 def integrator_follows(grid: ReviewGrid) -> Answer | None:
-    """Return how far the poles of one cycle are from those of the plant; None for an integrator that controls its own error."""
+    """Return how far poles of a cycle are from those of the plant; None for a map and for methods that control their error."""
     problem, plant = grid.problem, grid.problem.plant
-    if problem.integrator.opaque:
+    if problem.integrator.opaque or problem.integrator.steps_maps:
         return None
     usable = [k for k in range(len(grid.times)) if np.isfinite(grid.commands[0, k]).all()]
     points = [usable[k] for k in np.unique(np.linspace(0, len(usable) - 1, _POINTS).astype(int))] if usable else []

@@ -1,0 +1,286 @@
+"""Maps beside what is known of them: exact discretisations of linear plants, the limit of short steps, and plans by hand.
+
+References: scipy.signal.cont2discrete; the same controllers on the differential equation; finite sums in numpy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.signal import cont2discrete
+
+import fpirhc as fp
+from fpirhc.controllers.base import Controller
+from fpirhc.errors import FpirhcError
+from fpirhc.problem_files.problem_file import Task
+
+A = np.array([[-1.0, 1.0], [-2.0, -0.6]])  # y' = v - y, v' = -2 y - 0.6 v + 1.5 u
+B = np.array([[0.0], [1.5]])
+WRONG = 0.7  # of the plant's input effect, the model's
+EFFECT = {"effect": fp.Parameter(WRONG, 1.0, "1")}
+SPEED = {"v": fp.Output("m/s", lambda x, _: x.v)}
+NAMES: dict[str, Any] = {"states": {"y": "m", "v": "m/s"}, "inputs": {"force": "N"}, "parameters": EFFECT}
+
+
+def discretised(period: float) -> fp.Plant:
+    """The linear plant with the command held over the period, as scipy has it."""
+    a, b, *_ = cont2discrete((A, B, np.eye(2), np.zeros((2, 1))), period)
+
+    def next_state(x: Any, u: Any, p: Any) -> dict[str, Any]:
+        after = ca.DM(a) @ ca.vertcat(x.y, x.v) + ca.DM(b) * p.effect * u.force
+        return {"y": after[0], "v": after[1]}
+
+    return fp.Plant.of_map(**NAMES, next=next_state, step=period, outputs=SPEED)
+
+
+def differential(period: float) -> fp.Plant:
+    """The same plant as a differential equation."""
+    del period
+
+    def rates(x: Any, u: Any, p: Any) -> dict[str, Any]:
+        return {"y": x.v - x.y, "v": -2.0 * x.y - 0.6 * x.v + 1.5 * p.effect * u.force}
+
+    return fp.Plant.of_states(**NAMES, rates=rates, outputs=SPEED)
+
+
+def euler(period: float) -> fp.Plant:
+    """A mass on a spring in Euler's steps, controlled in its position, which its input reaches after two steps."""
+
+    def next_state(x: Any, u: Any, p: Any) -> dict[str, Any]:
+        return {"y": x.y + period * x.v, "v": x.v + period * (-2.0 * x.y - 0.6 * x.v + 1.5 * p.effect * u.force)}
+
+    return fp.Plant.of_map(**NAMES, next=next_state, step=period, outputs={"y": fp.Output("m", lambda x, _: x.y)})
+
+
+def spring(period: float) -> fp.Plant:
+    """The mass on a spring as a differential equation of second order."""
+    del period
+    return fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"force": "N"},
+        parameters=EFFECT,
+        response=lambda q, v, u, p: {"y": -2.0 * q.y - 0.6 * v.y + 1.5 * p.effect * u.force},
+    )
+
+
+def task(plant: fp.Plant, period: float, **changes: Any) -> fp.Problem:
+    """Six seconds of a wave, from rest."""
+    start, name = dict.fromkeys(plant.names, 0.0), plant.controlled_names[0]
+    arguments: dict[str, Any] = {
+        "plant": plant,
+        "reference": fp.Trajectory(lambda t: {name: 0.5 * ca.sin(0.8 * t)}),
+        "start": start,
+        "period": period,
+        "duration": 6.0,
+    }
+    return fp.Problem(**{**arguments, **changes})
+
+
+def simulated(problem: fp.Problem, controller: Controller) -> fp.Run:
+    """A run in the virtual machine."""
+    return fp.simulate(problem, controller, seed=0, compiled=False)
+
+
+def test_with_the_same_commands_the_states_are_the_same_at_the_samples() -> None:
+    """The differential equation of a run, integrated by CVODES, is at the samples where the map is."""
+    period = 0.1
+    problem = task(differential(period), period, integrator=fp.Cvodes(1e-12))
+    run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=1.0)))
+    step = discretised(period).next_function
+    pairs = zip(run["state"], run["command"], strict=True)
+    after = np.array([step(x, u, 1.0, np.zeros(2)).full().ravel() for x, u in pairs])
+    assert np.abs(after[:-1] - run["state"][1:]).max() < 1e-9
+
+
+LAW = fp.Exponential(rate=3.0)
+FORMS = {"none": fp.Identity(), "model-referenced": fp.ModelReferenced(fp.Affine(gain=-1.0))}
+
+
+PAIRS = {"exact": (discretised, differential), "order two": (euler, spring)}
+
+
+def error_of(problem: fp.Problem, controller: Controller) -> np.ndarray:
+    """True errors of a run."""
+    run = simulated(problem, controller)
+    return np.asarray(run["true_error" if "true_error" in run.layout else "error"][:, 0])
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+@pytest.mark.parametrize("form", FORMS)
+def test_for_short_steps_the_map_is_the_differential_equation(form: str, pair: str) -> None:
+    """The same law, with derivatives and with differences: halving the step halves what is between the errors."""
+    between = []
+    for period in (0.02, 0.01, 0.005):
+        controller = fp.ComputedTorque(LAW, FORMS[form])
+        of_map, of_rates = (error_of(task(make(period), period), controller) for make in PAIRS[pair])
+        between.append(float(np.abs(of_map - of_rates).max()))
+    assert between[0] < 0.02
+    ratios = np.array(between[:-1]) / between[1:]
+    assert np.all((ratios > 1.7) & (ratios < 2.3)), (between, ratios)
+
+
+# Plans
+
+
+def harvested(x: Any, u: Any, p: Any) -> dict[str, Any]:
+    """A stock that is caught; one step is a tenth of a unit of time."""
+    return {"stock": x.stock + 0.1 * (p.growth * x.stock * (1 - x.stock) - u.catch)}
+
+
+@cache
+def stock(steps: int = 1) -> fp.Problem:
+    """A stock with a horizon of six stages of two cycles, a cycle of `steps` maps."""
+    plant = fp.Plant.of_map(
+        states={"stock": "1"},
+        inputs={"catch": "1"},
+        parameters={"growth": fp.Parameter(0.8, 1.1, "1")},
+        next=harvested,
+        step=0.1,
+    )
+    period = 0.1 * steps
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"stock": 0.5 + 0.1 * ca.sin(0.3 * t)}),
+        start={"stock": 0.3},
+        period=period,
+        duration=40 * period,
+        measure_from=20 * period,
+        horizon=fp.Horizon(stages=6, step=2 * period),
+        cost=fp.Quadratic(states={"stock": 1.0}, deviation={"catch": 0.05}),
+    )
+
+
+def planned_by_hand(problem: fp.Problem, growth: float) -> float:
+    """First input of the first plan: the sums of the cost written out, and minimised by scipy."""
+    plant, steps = problem.plant, problem.plant.steps
+    h = problem.horizon.step if problem.horizon else 0.0
+    motion, inverse = problem.reference.function(plant), plant.inverse_function
+    times = h * np.arange(7)
+    wanted = np.array([float(motion(t)[0]) for t in times])
+    needed = np.array([float(inverse(motion(t)[0], motion(t)[1], growth)) for t in times])
+
+    def residuals(inputs: np.ndarray) -> np.ndarray:
+        x, parts = 0.3, []
+        for k, u in enumerate(inputs):
+            parts += [np.sqrt(h) * (x - wanted[k]), np.sqrt(0.05 * h) * (u - needed[k])]
+            for _ in range(2 * steps):
+                x = x + 0.1 * (growth * x * (1 - x) - u)
+        return np.array([*parts, np.sqrt(h) * (x - wanted[6])])
+
+    best = least_squares(residuals, needed[:6], jac="3-point", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    return float(best.x[0])
+
+
+OPTIMISER = fp.FixedPoint(iterations=20, tolerance=1e-12)
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_a_plan_is_the_minimum_by_hand(steps: int) -> None:
+    problem = stock(steps)
+    run = simulated(replace(problem, duration=problem.period * 4, measure_from=0.0), fp.RecedingHorizon(OPTIMISER))
+    assert run["planned"][0, 0] == pytest.approx(planned_by_hand(problem, 0.8), abs=1e-7)
+    assert np.array_equal(run["planned"][0], run["planned"][1])  # a stage has two cycles
+
+
+def test_a_plan_on_a_wrong_model_is_cured_by_the_iteration() -> None:
+    """Shares of the error that are left, beside the exact model as the bound."""
+    iteration = fp.ModelReferenced(fp.Affine(gain=-1.6))
+    controllers = {
+        "RHC": fp.RecedingHorizon(OPTIMISER),
+        "RHC+FPI": fp.RecedingHorizon(OPTIMISER, iteration),
+        "exact": fp.ExactModel(fp.RecedingHorizon(OPTIMISER)),
+        "tracked": fp.RecedingHorizon(OPTIMISER, iteration, replanning=fp.FromPlan(fp.Exponential(rate=2.0))),
+    }
+    rms = {}
+    for name, controller in controllers.items():
+        run = simulated(stock(), controller)
+        rms[name] = float(np.sqrt((run["true_error"][20:] ** 2).mean()))
+    assert rms["RHC+FPI"] < 0.2 * rms["RHC"]
+    assert rms["tracked"] < 0.2 * rms["RHC"]
+    assert rms["exact"] < rms["RHC"]
+
+
+# Ways of running
+
+
+def test_compiled_code_and_a_stepper_give_the_run() -> None:
+    """The stepper is given the stock alone: the difference over the last cycle is its own."""
+    problem = replace(stock(), horizon=None, cost=None)
+    controller = fp.ComputedTorque(fp.ShiftPolynomial(0.5, step=0.1), FORMS["model-referenced"])
+    run = fp.simulate(problem, controller, seed=0)
+    assert np.abs(run["command"] - simulated(problem, controller)["command"]).max() < 1e-13
+    stepper = fp.Stepper(problem, controller)
+    assert stepper.measures == ("stock",)
+    memory, commands = stepper.start(), []
+    for t, sample in zip(run.time, run["measured"], strict=True):
+        command, memory = stepper.step_measured(t, sample, memory)
+        commands.append(command)
+    assert np.abs(np.array(commands) - run["command"]).max() < 1e-13
+
+
+def test_outputs_of_a_map_run_on_a_stepper() -> None:
+    problem = task(discretised(0.1), 0.1)
+    controller = fp.ComputedTorque(fp.ShiftPolynomial(0.5, step=0.1), FORMS["model-referenced"])
+    run = simulated(problem, controller)
+    stepper = fp.Stepper(problem, controller, compiled=False)
+    memory, commands = stepper.start(), []
+    samples = {"y": run["plant_state.y"], "v": run["plant_state.v"]}
+    for k, t in enumerate(run.time):
+        command, memory = stepper.step_measured(t, np.array([samples[n][k] for n in stepper.measures]), memory)
+        commands.append(command)
+    assert np.abs(np.array(commands) - run["command"]).max() < 1e-13
+
+
+def test_gains_and_poles_are_live() -> None:
+    problem = replace(stock(), horizon=None, cost=None)
+    controller = fp.ComputedTorque(fp.ShiftPolynomial(0.5, step=0.1), fp.ModelReferenced(fp.Affine(gain=-1.0)))
+    other = fp.ComputedTorque(fp.ShiftPolynomial(0.2, step=0.1), fp.ModelReferenced(fp.Affine(gain=-1.4)))
+    live = ["tracking.poles", "deformation.map.gain"]
+    simulator = fp.simulator(problem, controller, live=live, compiled=False)
+    run = simulator.run(seed=0, settings={"tracking.poles": 0.2, "deformation.map.gain": -1.4})
+    assert np.abs(run["command"] - simulated(problem, other)["command"]).max() < 1e-12
+
+
+def test_scenarios_draw_parameters_of_a_map(tmp_path: Path) -> None:
+    """In every one of them the growth is another one, and the iteration helps."""
+    problem = replace(stock(), horizon=None, cost=None)
+    law = fp.ShiftPolynomial(0.7, step=0.1, integral=False)
+    controllers = {"CTC": fp.ComputedTorque(law), "CTC+FPI": fp.ComputedTorque(law, FORMS["model-referenced"])}
+    task = Task("stock", Path(__file__), "A stock", "", problem, controllers)
+    study = fp.compare_scenarios(task, count=6, percent=30.0, seed=0, folder=tmp_path, compiled=False)
+    assert [one.failures for one in study.summaries] == [0, 0]
+    assert study["CTC+FPI"].worst < study["CTC"].median
+
+
+REFUSED = {
+    "PID": (lambda: fp.PID(proportional={"stock": 1.0}), "PID does not cover maps: its law is written for derivatives"),
+    "Estimating": (
+        lambda: fp.Estimating(
+            fp.ComputedTorque(LAW),
+            fp.RecursiveLeastSquares({"growth": fp.Uncertain(0.1, 2.0, 0.3)}, {"stock": 0.1}, 5.0),
+        ),
+        "Estimating does not cover maps: its estimators add what they learn to derivatives",
+    ),
+    "lag": (
+        lambda: fp.ComputedTorque(LAW, fp.ModelReferenced(fp.Affine(gain=-1.0), lag=0.1)),
+        "a map has no lag, and no dead time of parts of a cycle",
+    ),
+    "residual": (
+        lambda: fp.Predicted(fp.ComputedTorque(LAW), inputs=0.1, by=fp.ByModel(residual_time=1.0)),
+        "the response of a map belongs to the state of the last cycle",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_controllers_that_do_not_cover_maps_are_refused(what: str) -> None:
+    make, message = REFUSED[what]
+    with pytest.raises(FpirhcError, match=message):
+        simulated(replace(stock(), horizon=None, cost=None), make())
