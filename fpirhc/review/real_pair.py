@@ -135,7 +135,9 @@ def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Ext
     slopes = [ca.densify(ca.jacobian(v, w)) for v in (rate, response) for w in (x, u)]
     values = ca.Function("fpirhc_modes", [x, u, p], slopes)(point.real, point.command, plant.exact)
     a, b, c, d = (np.asarray(m.full()) for m in values)
-    modes = _beyond(np.linalg.eigvals(a), np.linalg.eigvals(reduced(a, outer_slopes(reality, model, point.real, point.command))))
+    modes = _beyond(
+        np.linalg.eigvals(a), np.linalg.eigvals(reduced(a, outer_slopes(reality, model, point.real, point.command)))
+    )
     slow = 1j * _SLOW * float(np.abs(modes).min(initial=np.inf))
     gain = d + c @ np.linalg.solve(slow * np.eye(len(a)) - a, b) if modes.size else d
     x, u, p = model.symbols()
