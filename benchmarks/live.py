@@ -15,14 +15,12 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
-
 import fpirhc as fp
 from fpirhc.problem_files.settings import with_settings
-from fpirhc.simulation.loop import start_memory
-from fpirhc.simulation.simulate import CHUNK, Simulator, simulator
+from fpirhc.simulation.simulate import simulator
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+from in_turns import compared, loop_time
 from table import write_table
 
 TASK = fp.load_problem("two_mass")
@@ -47,33 +45,10 @@ def paths(names: Sequence[str]) -> list[str]:
     return [p for n in names for p in ([f"{n}.Q1", f"{n}.Q2"] if n == "limits.inputs" else [n])]
 
 
-def cycles(ready: Simulator) -> Callable[[], float]:
-    """Process time of the loop alone."""
-    log = np.empty((CHUNK, ready.loop.trace.size))
-    start = start_memory(ready.loop, ready.problem, ready.controller, ready.live.start)
-
-    def work() -> float:
-        evaluator = ready.evaluator
-        evaluator.arguments[0][:] = start
-        evaluator.redirect(1, log)
-        begin = time.process_time()
-        for _ in range(ready.problem.cycles // CHUNK):
-            evaluator.evaluate()
-            evaluator.arguments[0][:] = evaluator.results[0].reshape(CHUNK, -1)[-1]
-        return time.process_time() - begin
-
-    return work
-
-
 def cost(name: str, live: Sequence[str]) -> list[str]:
     """Row: microseconds of a cycle without and with live settings, and the ratio."""
-    works = [cycles(simulator(TASK.problem, TASK.controllers[name], live=p)) for p in ((), live)]
-    orders = [(0, 1) if k % 2 else (1, 0) for k in range(REPEATS)]
-    times = np.array([[t for _, t in sorted((k, works[k]()) for k in order)] for order in orders])
-    plain, lively = 1e6 * times.min(axis=0) / TASK.problem.cycles
-    low, middle, high = 100 * (np.quantile(times[:, 1] / times[:, 0], (0.25, 0.5, 0.75)) - 1)
-    difference = f"{middle:+.1f} % ({low:+.1f} to {high:+.1f})"
-    return [f"{name}, {len(live)} live", f"{plain:.3f} us", f"{lively:.3f} us", difference]
+    works = [loop_time(simulator(TASK.problem, TASK.controllers[name], live=p)) for p in ((), live)]
+    return [f"{name}, {len(live)} live", *compared(works, TASK.problem.cycles, REPEATS)]
 
 
 def study(name: str, numbers: Callable[[int], dict[str, float]]) -> list[str]:

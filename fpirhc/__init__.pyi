@@ -93,6 +93,7 @@ from .sensing import (
 )
 from .sensing.beliefs.kalman_filter import KalmanFilter
 from .sensing.beliefs.model_states import ModelStates
+from .sensing.beliefs.moving_horizon_states import MovingHorizonStates
 from .simulation.lyapunov_view import LyapunovView, lyapunov_view
 from .simulation.machine import Watch
 from .simulation.metrics import Metric, Metrics, measure
@@ -197,6 +198,7 @@ __all__ = [
     "ModelReferenced",
     "ModelStates",
     "MovingHorizon",
+    "MovingHorizonStates",
     "Noise",
     "Normal",
     "Osqp",

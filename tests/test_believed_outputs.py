@@ -197,6 +197,47 @@ def test_adaptation_works_with_believed_compartments(bis_errors: dict[tuple[str,
     assert bis_errors[known, "CTC+FPI"] < 1.02 * bis_errors["known", "CTC+FPI"]
 
 
+def test_an_exact_model_referenced_form_changes_nothing() -> None:
+    """Where the response is measured, the model's response is that at the believed state, and with an exact model the same."""
+    sensing = fp.Sensing({}, fp.Measured(), belief=fp.ModelStates())
+    problem, form = sedated(None, sensing=sensing, duration=5.0), fp.ModelReferenced(fp.Affine(-0.5))
+    plain, referenced = (run(problem, fp.ExactModel(fp.ComputedTorque(LAW, d))) for d in (fp.Identity(), form))
+    np.testing.assert_allclose(referenced["command"], plain["command"], atol=1e-9)
+    wrong = sedated(None, believed=5.0, sensing=sensing)
+    errors = [
+        fp.measure(wrong, run(wrong, fp.ComputedTorque(LAW, d))).rms_error["depth"] for d in (fp.Identity(), form)
+    ]
+    assert errors[1] < 0.6 * errors[0]
+
+
+def test_predictions_start_from_what_is_believed() -> None:
+    """Behind late commands and samples, with the right model: the commands are those with states that are given."""
+    late = fp.DeadTime(inputs={"u": 2 / 12}, measurement=1 / 12)
+    controller = fp.Predicted(PLAIN, inputs=2 / 12, measurement=1 / 12)
+    runs = [run(sedated(b, dead_time=late, duration=6.0), controller) for b in (None, fp.ModelStates())]
+    np.testing.assert_allclose(runs[1]["command"], runs[0]["command"], atol=1e-8)
+    assert np.ptp(runs[0]["command"]) > 1
+
+
+def test_a_comparison_says_what_is_measured_and_what_is_believed() -> None:
+    file = replace(
+        TWO_MASS, problem=sedated(FILTER, duration=2.0, measure_from=0.0), controllers={"CTC": PLAIN, "FPI": FPI}
+    )
+    comparison = fp.compare(replace(file, headline=("CTC", "FPI")), seed=0, compiled=False)
+    said = next(line for line in comparison.information if line.startswith("all controllers"))
+    assert "are given depth in every cycle" in said
+    assert said.endswith("C, R, E are believed (KalmanFilter)")
+
+
+FIGURES = {"known": (0.117, 0.0217), "model": (0.078, 0.0210), "filter": (0.070, 0.0207)}
+
+
+@pytest.mark.parametrize("known", FIGURES)
+def test_figures_are_those_of_the_page(bis_errors: dict[tuple[str, str], float], known: str) -> None:
+    errors = [bis_errors[known, name] for name in ("CTC", "CTC+FPI")]
+    assert errors == pytest.approx(FIGURES[known], rel=0.01)
+
+
 # Steppers are given raw measurements
 
 
@@ -263,6 +304,9 @@ def test_a_review_says_what_cannot_be_observed() -> None:
     assert of_model.verdict == "yes"
     slowest = np.linalg.eigvals([[-1.5, 0.5], [0.1, -0.1]]).max()
     assert of_model.numbers["pole"] == pytest.approx(slowest, rel=1e-9)
+    stays = answer(replace(integrating("y"), sensing=replace(integrating("y").sensing, belief=fp.ModelStates())))
+    assert stays.verdict == "no"
+    assert stays.change == "Measure z, or a quantity that depends on it."
 
 
 def integrating(measured: str) -> fp.Problem:

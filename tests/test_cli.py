@@ -7,34 +7,12 @@ import os
 from pathlib import Path
 
 import pytest
+from line import line_text
 
 import fpirhc as fp
 from fpirhc.cli.main import main
 
-GOOD = '''"""A mass on a line with a wrong gain."""
-import casadi as ca
-import fpirhc as fp
-
-plant = fp.Plant(
-    coordinates={"y": "m"},
-    inputs={"u": "N"},
-    parameters={"b": fp.Parameter(approximate=1.0, exact=1.6, unit="1/kg"), "k": fp.Parameter(2.0, 5.0, "1/s^2")},
-    response=lambda q, v, u, p: {"y": p.b * u.u - p.k * q.y},
-)
-problem = fp.Problem(
-    plant=plant,
-    reference=fp.Trajectory(lambda t: {"y": ca.sin(2 * t)}),
-    start={"y": 0.5},
-    period=1e-3,
-    duration=2.0,
-    measure_from=1.0,
-)
-tracking = fp.Exponential(rate=6.0)
-controllers = {
-    "CTC": fp.ComputedTorque(tracking),
-    "CTC+FPI": fp.ComputedTorque(tracking, fp.Sigmoid(gain=-0.5)),
-}
-'''
+GOOD = line_text("period=1e-3, duration=2.0, measure_from=1.0")
 
 
 @pytest.fixture
@@ -109,8 +87,8 @@ BAD = {
     "misspelt input": (("u.u", "u.v"), "input 'v' is unknown"),
     "approximate None": (("approximate=1.0", "approximate=None"), "Parameter.approximate: expected a number, got None"),
     "misspelt public name": (("fp.Sigmoid", "fp.Sigmod"), "Did you mean 'Sigmoid'"),
-    "raises on import": (("tracking =", "1 / 0\ntracking ="), "line.py, line 19: 1 / 0"),
-    "syntax error": (("problem = fp", "problem = = fp"), "line.py, line 11"),
+    "raises on import": (("tracking =", "1 / 0\ntracking ="), "line.py, line 20: 1 / 0"),
+    "syntax error": (("problem = fp", "problem = = fp"), "line.py, line 14"),
     "no controllers": (("controllers =", "others ="), "it must define controllers"),
     "start not finite": (('"y": 0.5', '"y": float("nan")'), "Problem.start['y']: expected a number, got nan"),
     "unknown field": (("measure_from", "measure_form"), "measure_form"),
@@ -193,7 +171,7 @@ def test_without_a_compiler_it_says_so(folder, capsys, monkeypatch):
     assert "because compilation is turned off (FPIRHC_CC=none)" in capsys.readouterr().err
 
 
-HORIZON = """    measure_from=1.0,
+HORIZON = """measure_from=1.0,
     horizon=fp.Horizon(stages=10, step=1e-2),
     cost=fp.Quadratic(states={"y": 100.0, "y'": 1.0}, deviation={"u": 1e-2}),
     limits=fp.Limits(inputs={"u": (-30.0, 30.0)}),
@@ -205,7 +183,7 @@ PLANNERS = """controllers = {
 
 
 def _receding(folder: Path) -> None:
-    text = GOOD.replace("    measure_from=1.0,\n", HORIZON).replace("controllers = {\n", PLANNERS)
+    text = GOOD.replace("measure_from=1.0,\n", HORIZON).replace("controllers = {\n", PLANNERS)
     (folder / "line.py").write_text(text + 'headline = ("RHC", "RHC+FPI")\n')
 
 

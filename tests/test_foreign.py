@@ -75,9 +75,12 @@ def broken(answer):
 
 BAD: dict[str, tuple[Any, str]] = {
     "raises": (broken, "step of Faulty raised OSError: cable is out"),
-    "wrong shape": (lambda a: a[:2], r"returned the shape \(2,\), expected \(3,\) for y, y', y''"),
-    "no number": (lambda a: a * [1, np.nan, 1], "returned y' = nan"),
-    "text": (lambda _: "on", "raised ValueError"),
+    "wrong shape": (lambda a: a[:2], r"returned the shape \(2,\), expected 3 numbers: y, y', y''"),
+    "no number": (lambda a: a * [1, np.nan, 1], "returned y' = nan, expected a finite number"),
+    "text": (lambda _: "on", "returned 'on', expected 3 numbers: y, y', y''"),
+    "nothing": (lambda _: None, "returned None, expected 3 numbers"),
+    "complex": (lambda a: a * 1j, "expected 3 numbers"),
+    "ragged": (lambda a: [a, 1.0], "expected 3 numbers"),
 }
 
 
@@ -131,6 +134,7 @@ def test_bad_answer_ends_the_run_and_loses_nothing(kind):
     assert result.stop is not None
     assert re.search(message, result.stop)
     assert "at t = 0.1 s (cycle 100)" in result.stop
+    assert result.stop.endswith("Foreign(holds=1) bridges a bad answer with the last good one")
     assert result.cycles == 100
     assert np.array_equal(result["command"], run(outside(problem))["command"][:100])
 
@@ -159,7 +163,7 @@ def test_bad_answers_are_held_as_stated(kind):
     assert np.array_equal(two["state"][100:102], two["state"][[99, 99]])
     three = run(replace(problem, reality=fp.Foreign(Faulty(problem, bad, range(100, 103)), MEASURES, holds=2)))
     assert three.cycles == 102
-    assert three.stop is not None
+    assert str(three.stop).endswith("after 2 in a row that were held; Foreign(holds=3) bridges one more")
 
 
 def test_answer_after_the_deadline():

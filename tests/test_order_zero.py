@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -17,6 +18,8 @@ import pytest
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import InvalidProblem, NotSupported
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.studies.comparison.compare import compare
 
 STATIC = fp.FeedforwardOnly()
 COLD, WARMER = 20.0, 4e-3  # Ohm, 1/K
@@ -158,10 +161,17 @@ def test_a_review_says_what_it_covers() -> None:
 
 
 def test_a_comparison_says_that_the_output_is_measured() -> None:
+    """And judges the iteration beside its inner controller, with the null test of the pair."""
     problem = heated(element(), duration=10.0)
-    outcome = fp.compare(problem, {"static": STATIC, "iterated": fp.Cascade(STATIC, affine(0.5))}, seed=0, timing=False)
-    assert "static: uses theta" in outcome.information
-    assert "iterated: uses theta, power" in outcome.information
+    controllers: dict[str, Controller] = {"static": STATIC, "iterated": fp.Cascade(STATIC, affine(0.5))}
+    task = Task("element", Path("element.py"), "A heating element", "", problem, controllers)
+    compared = compare(task, seed=0, compiled=False)
+    assert "all controllers are given theta, power in every cycle of 0.1 s" in compared.information
+    assert [entry.information.uses for entry in compared.entries if entry.information] == [
+        ("theta",),
+        ("theta", "power"),
+    ]
+    assert "iterated lowers the rms error of power" in compared.verdict[0]
 
 
 def test_an_output_of_order_zero_may_be_judged_beside_a_controlled_one() -> None:

@@ -417,7 +417,6 @@ def test_a_gain_that_vanishes_on_the_way_is_named_for_several_inputs_too() -> No
 
 
 NOT_COVERED: dict[str, tuple[Callable[[], Controller], str]] = {
-    "predicting": (lambda: fp.Predicted(fp.ComputedTorque(TRACK), inputs=1), "Predicted does not cover outputs"),
     "from plan": (lambda: fp.RecedingHorizon(OPTIMISER, replanning=fp.FromPlan(TRACK)), "FromPlan tracks"),
     "tracked": (
         lambda: fp.RecedingHorizon(OPTIMISER, replanning=fp.FromMeasurementTracked(TRACK)),
@@ -546,10 +545,3 @@ def test_the_verdict_on_an_output_is_what_a_run_does(gain: float, verdict: str) 
     assert str(answers["Does the deformation converge?"].verdict) == verdict
     chatter = np.ptp(np.diff(simulated(problem, controller)["command.u"][600:]))
     assert (chatter > 1.0) == (verdict == "no")
-
-
-def test_a_review_names_what_it_does_not_cover() -> None:
-    review = fp.review(planned(), {"plan": fp.RecedingHorizon(OPTIMISER, fp.Affine(-1.0))}, mismatch=0.0, seed=0)
-    assert any("not covered for outputs" in a.evidence for a in review.problem)
-    assert any("plan is not covered for outputs" in a.evidence for a in review.controllers["plan"])
-    assert review.ready

@@ -16,6 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from line import EXACT, line_text
 from scipy import stats
 
 import fpirhc as fp
@@ -33,35 +34,9 @@ from fpirhc.studies.scenarios.paired import summarise, verdict
 from fpirhc.studies.scenarios.processes import DEATHS, Workers
 from fpirhc.studies.scenarios.score import outcome, ranges, relative_error
 
-LINE = '''"""A mass on a line with a wrong gain, pushed by noise."""
-import casadi as ca
-import fpirhc as fp
-
-plant = fp.Plant(
-    coordinates={"y": "m"},
-    inputs={"u": "N"},
-    parameters={
-        "b": fp.Parameter(approximate=1.0, exact=1.6, unit="1/kg", bounds=(0.5, 2.4)),
-        "k": fp.Parameter(2.0, 5.0, "1/s^2"),
-    },
-    response=lambda q, v, u, p: {"y": p.b * u.u - p.k * q.y},
+LINE = line_text(
+    "period=5e-3, duration=1.5, measure_from=0.5, disturbances={'u': fp.Noise(0.1)}", bounds="(0.5, 2.4)", more=EXACT
 )
-problem = fp.Problem(
-    plant=plant,
-    reference=fp.Trajectory(lambda t: {"y": ca.sin(2 * t)}),
-    start={"y": 0.5},
-    period=5e-3,
-    duration=1.5,
-    measure_from=0.5,
-    disturbances={"u": fp.Noise(0.1)},
-)
-tracking = fp.Exponential(rate=6.0)
-controllers = {
-    "CTC": fp.ComputedTorque(tracking),
-    "CTC+FPI": fp.ComputedTorque(tracking, fp.Sigmoid(gain=-0.5)),
-    "CTC exact": fp.ExactModel(fp.ComputedTorque(tracking)),
-}
-'''
 SETTINGS: dict[str, Any] = {"percent": 20.0, "seed": 5, "compiled": False}
 
 

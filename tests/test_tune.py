@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from line import EXACT, line_text
 
 import fpirhc as fp
 from fpirhc.cli.main import main
@@ -17,35 +18,14 @@ from fpirhc.problem_files.settings import current_setting, is_whole
 from fpirhc.studies.tuning.objective import PENALTY, objective
 from fpirhc.studies.tuning.tuned_file import read_tuned, with_tuned
 
-LINE = '''"""A mass on a line with a wrong gain."""
-import casadi as ca
-import fpirhc as fp
-
-plant = fp.Plant(
-    coordinates={"y": "m"},
-    inputs={"u": "N"},
-    parameters={"b": fp.Parameter(approximate=1.0, exact=1.6, unit="1/kg"), "k": fp.Parameter(2.0, 5.0, "1/s^2")},
-    response=lambda q, v, u, p: {"y": p.b * u.u - p.k * q.y},
-)
-problem = fp.Problem(
-    plant=plant,
-    reference=fp.Trajectory(lambda t: {"y": ca.sin(2 * t)}),
-    start={"y": 0.5},
-    period=5e-3,
-    duration=1.5,
-    measure_from=0.5,
-)
-tracking = fp.Exponential(rate=6.0)
-controllers = {
-    "CTC": fp.ComputedTorque(tracking),
-    "CTC+FPI": fp.ComputedTorque(tracking, fp.Sigmoid(gain=-0.1, scale=20.0)),
-    "CTC exact": fp.ExactModel(fp.ComputedTorque(tracking)),
-}
-tuning = {
+TUNING = """tuning = {
     "CTC": {"tracking.rate": fp.Span(2.0, 12.0)},
     "CTC+FPI": {"deformation.gain": fp.LogSpan(-6.0, -0.05)},
 }
-'''
+"""
+LINE = line_text(
+    "period=5e-3, duration=1.5, measure_from=0.5", "fp.Sigmoid(gain=-0.1, scale=20.0)", more=EXACT + TUNING
+)
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ class ExitCode(IntEnum):
     ANSWERED_NO = 1, "an answer is no"
     BAD_INPUT = 2, "bad input: a name, a value, a problem file, or an option"
     NOT_WRITABLE = 3, "a file or folder cannot be written, or holds results of something else"
-    ENDED_EARLY = 4, "a run ended early because a signal was not finite, or a plan did not converge"
+    ENDED_EARLY = 4, "a run ended early (its reason is named), or a plan did not converge"
     CHANGED = 5, "a metric changed"
     NO_BASELINE = 6, "a baseline is missing, stale, damaged, edited by hand, or of a newer format"
     FAULTY_INSTALLATION = 7, "a check of the installation failed"

@@ -127,7 +127,7 @@ class Controller(Checked, ABC):
 
     @property
     def feeds(self) -> Mapping[str, str]:
-        """Signals that the inner controller is given under other names: 'time', 'state', 'realised' or 'parameters' -> name."""
+        """Signals that the inner controller is given under other names: 'time', 'state', 'output', 'realised' or 'parameters'."""
         return {} if self.inner is None else self.inner.feeds
 
     def linear_around(self, inner: Controller) -> Controller:

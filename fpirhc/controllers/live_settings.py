@@ -2,7 +2,7 @@
 
     live = live_settings(problem, controller, ["deformation.gain", "cost.states.q1", "limits.inputs.Q1"])
 
-A path begins at the controller, or at the problem for its cost, limits and reference. The path of an interval stands for its
+A path begins at the controller, or at the problem for cost, limits, reference and sensing. The path of an interval stands for its
 finite ends, 'limits.inputs.Q1.0' and '.1'. Automatic settings of the controller, such as the scale of a sigmoid, are recomputed
 from the others.
 """
@@ -26,7 +26,7 @@ from fpirhc.symbolic.live import PREFIX, copied, live_number
 from fpirhc.symbolic.paths import changed_at, content_at, names_in
 from fpirhc.task.problem import Problem
 
-_OF_PROBLEM = ("cost", "limits", "dead_time", "reference")
+_OF_PROBLEM = ("cost", "limits", "dead_time", "reference", "sensing")
 _ALWAYS_DATA = "parameters (exact and approximate) and the start are data of every loop; they need no live setting"
 Numbers = Mapping[str, float | Sequence[float]]  # by path; a pair for an interval
 

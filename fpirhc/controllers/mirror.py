@@ -14,7 +14,15 @@ from dataclasses import replace
 import casadi as ca
 
 from fpirhc.controllers.map_mirror import map_mirror
-from fpirhc.controllers.mirror_path import MEASURED, MEASURED_TIME, NONE, Path, measured_state
+from fpirhc.controllers.mirror_path import (
+    MEASURED,
+    MEASURED_OUTPUT,
+    MEASURED_TIME,
+    NONE,
+    Path,
+    measured_output,
+    measured_state,
+)
 from fpirhc.controllers.twin import BEFORE, twin_block
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.queue import every
@@ -24,7 +32,7 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
 
-__all__ = ["MEASURED", "MEASURED_TIME", "measured_reads", "mirror_blocks", "with_measured_state"]
+__all__ = ["MEASURED", "MEASURED_OUTPUT", "MEASURED_TIME", "measured_reads", "mirror_blocks", "with_measured_state"]
 
 
 def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
@@ -47,7 +55,7 @@ def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Bloc
 
 
 def with_measured_state(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
-    """Return the blocks, and before them one that writes the measured state, and its time, where a block reads them.
+    """Return the blocks, and before them one that writes the measured state or outputs, and their time, where a block reads them.
 
     Args:
         plant: the plant.
@@ -56,7 +64,7 @@ def with_measured_state(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
     writes = measured_reads(plant, blocks)
     if not writes:
         return list(blocks)
-    sources = {MEASURED: plant.state, MEASURED_TIME: plant.time}
+    sources = {MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: plant.time}
     reads = tuple(sources[w.name] for w in writes)
     first = Block(
         "measured", Layout(reads), Layout(writes), lambda s: {w.name: getattr(s, sources[w.name].name) for w in writes}
@@ -65,8 +73,8 @@ def with_measured_state(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
 
 
 def measured_reads(plant: Plant, blocks: Sequence[Block]) -> tuple[Signal, ...]:
-    """Return the signals of the measured state and its time, as far as some blocks read them."""
-    every = measured_state(plant), replace(plant.time, name=MEASURED_TIME)
+    """Return the signals of the measured state and outputs and of their time, as far as some blocks read them."""
+    every = measured_state(plant), measured_output(plant), replace(plant.time, name=MEASURED_TIME)
     return tuple(signal for signal in every if any(signal.name in block.reads for block in blocks))
 
 

@@ -16,6 +16,7 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal, scalar
 from fpirhc.task.problem import Problem
 
+MEASURED_OUTPUT = "_measured_output"  # the outputs of the same instant
 MEASURED = "_measured_state"  # the state that the response belongs to, where a controller may act on a predicted one
 MEASURED_TIME = "_measured_time"  # the time at which it is given, where a controller may act on a predicted one
 NONE = 1e-9  # a fraction of a cycle below this counts as zero
@@ -24,6 +25,11 @@ NONE = 1e-9  # a fraction of a cycle below this counts as zero
 def measured_state(plant: Plant) -> Signal:
     """Return the signal of the measured state."""
     return Signal(MEASURED, plant.state.elements, plant.state.units)
+
+
+def measured_output(plant: Plant) -> Signal:
+    """Return the signal of the measured outputs."""
+    return Signal(MEASURED_OUTPUT, plant.output.elements, plant.output.units)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,7 @@ import numpy as np
 
 from fpirhc.horizon.nominal import known_on_reference
 from fpirhc.horizon.regular_gain import nominal_run
-from fpirhc.symbolic.live import nominal
-from fpirhc.task.problem import Problem
+from fpirhc.task.problem import Problem, nominal_start
 
 
 def reference_states(problem: Problem, count: int) -> np.ndarray:
@@ -16,10 +15,6 @@ def reference_states(problem: Problem, count: int) -> np.ndarray:
     if known_on_reference(plant):
         referenced = np.asarray(problem.reference.function(plant).map(count)(times[None, :])[0].full())
         return referenced[list(plant.known_by_outputs)]
-    lower, upper = nominal(problem.limits).input_bounds(plant)
-    bounds = tuple(map(float, lower)), tuple(map(float, upper))
-    start = tuple(map(float, problem.start_state))
-    run = problem.period, problem.cycles
-    states, _ = nominal_run(plant, problem.reference, problem.integrator, start, bounds, run)
+    states, _ = nominal_run(plant, problem.reference, *nominal_start(problem))
     places = np.minimum(np.round(times / problem.period).astype(int), states.shape[1] - 1)
     return states[:, places]

@@ -15,7 +15,7 @@ from functools import cached_property
 
 import casadi as ca
 
-from fpirhc.controllers.mirror_path import MEASURED, measured_state
+from fpirhc.controllers.mirror_path import MEASURED, measured_output, measured_state
 from fpirhc.deformation.queue import Queue
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal
@@ -49,6 +49,11 @@ class ResponsePairs:
     def state(self) -> Signal:
         """The signal of the measured state; behind dead time a controller may act on a predicted one."""
         return measured_state(self.problem.plant) if self.waiting else self.problem.plant.state
+
+    @property
+    def seen(self) -> Signal:
+        """The signal of the measured outputs; behind dead time a controller may act on predicted ones."""
+        return measured_output(self.problem.plant) if self.waiting else self.problem.plant.output
 
     @property
     def cycles(self) -> int:
@@ -87,7 +92,9 @@ class ResponsePairs:
 
     def output(self, s: Signals) -> tuple[Expression | None, dict[str, Expression]]:
         """Return the measured outputs of that instant, and what is remembered; None where they do not belong to a pair."""
-        return _queued(s, _OUTPUTS, self._states, s.output) if self.outputs else (None, {})
+        if not self.outputs:
+            return None, {}
+        return _queued(s, _OUTPUTS, self._states, getattr(s, self.seen.name))
 
     @cached_property
     def _delay(self) -> float:

@@ -121,6 +121,8 @@ class Instance(Expected):
             ca.DM,
         ):  # every kind of expression passes for every other: see symbolic.expression
             return isinstance(value, ca.SX | ca.MX | ca.DM | int | float)
+        if self.one is np.ndarray:
+            return isinstance(value, np.ndarray | ca.DM) or _is_array(value)
         return isinstance(value, np.bool_ if isinstance(value, np.bool_) and self.one is bool else self.one)
 
     def contract(self) -> type | None:
@@ -279,5 +281,22 @@ def _container(origin: type, arguments: tuple[typing.Any, ...]) -> Expected:
     return Instance(origin)
 
 
+def _is_array(value: object) -> bool:
+    """Whether numpy makes an array of numbers of a list."""
+    if not isinstance(value, list | tuple):
+        return False
+    try:
+        return not np.isnan(np.asarray(value, dtype=float)).any()
+    except (TypeError, ValueError):
+        return False
+
+
 _OFTEN = (float, int)
-_WORDS = {str: "a text", bool: "True or False", type(None): "None", dict: "a dict", ca.SX: "an expression"}
+_WORDS = {
+    str: "a text",
+    bool: "True or False",
+    type(None): "None",
+    dict: "a dict",
+    ca.SX: "an expression",
+    np.ndarray: "an array",
+}

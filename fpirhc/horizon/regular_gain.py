@@ -57,25 +57,21 @@ def nominal_run(
     return nominal_motion(plant, reference, step, np.array(start), ends, period * np.arange(cycles), rate)
 
 
-def singular_gain(
-    plant: Plant,
-    reference: Reference,
-    integrator: Integrator,
-    start: tuple[float, ...],
-    bounds: Bounds,
-    times: tuple[float, int],
-) -> str:
+def singular_gain(plant: Plant, states: np.ndarray, inputs: np.ndarray, period: float) -> str:
     """Return a sentence that says where the gain vanishes or changes its sign, and its values; empty where it does not.
 
-    The arguments are those of `nominal_run`.
+    Args:
+        plant: the model.
+        states: of its nominal run, cycle by cycle, shape (nx, m).
+        inputs: of the same run, shape (nu, m).
+        period: length of a cycle.
     """
-    states, inputs = nominal_run(plant, reference, integrator, start, bounds, times)
     x, u, p = plant.symbols()
     response, count = plant.controlled_response_function(x, u, p), states.shape[1]
     gain = ca.Function("fpirhc_output_gain", [x, u, p], [ca.densify(ca.det(ca.jacobian(response, u)))])
     believed = np.repeat(plant.approximate[:, None], count, axis=1)
     gains = np.asarray(gain.map(count)(states, inputs, believed).full()).ravel()
-    return _judged(plant, gains, states, times[0])
+    return _judged(plant, gains, states, period)
 
 
 def _judged(plant: Plant, gains: np.ndarray, states: np.ndarray, period: float) -> str:

@@ -38,11 +38,13 @@ def stiffness(
         return ""
     fastest = modes[wrong][int(np.argmax(np.abs(modes[wrong])))]
     substeps = math.ceil(float(np.abs(modes).max()) * period / _INSIDE)
-    remedy = f"RungeKutta4(substeps={substeps})" if substeps <= _MOST else "Cvodes()"
+    few = substeps <= _MOST
+    remedy = f"RungeKutta4(substeps={substeps})" if few else "Cvodes()"
+    needed = "" if few else f"; RungeKutta4 would need {substeps} sub-steps"
     rate = f"1/{plant.time_unit}"
     return (
         f"a mode decays with the pole {_text(fastest)} {rate}, which times the period of {period:g} {plant.time_unit} is "
-        f"{abs(fastest) * period:.3g}, and {integrator!r} makes it grow by {float(growth[wrong].max()):.3g} per cycle; use "
+        f"{abs(fastest) * period:.3g}, and {integrator!r} makes it grow by {float(growth[wrong].max()):.3g} per cycle{needed}; use "
         f"integrator={remedy}"
     )
 

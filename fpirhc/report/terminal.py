@@ -62,6 +62,9 @@ def show(comparison: Comparison, report: Path) -> None:
     _table(comparison).show(console)
     if sum(e.optimality is not None for e in comparison.entries) > 1:
         _plans(comparison).show(console)
+    for entry in comparison.entries:
+        if entry.run.stop:
+            say(console, f"{entry.name} ended early: {entry.run.stop}")
     for line in comparison.information:
         say(console, line)
     for entry in comparison.entries:

@@ -13,7 +13,8 @@ from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.linear import response_slopes
-from fpirhc.review.plan_feedback import PlanGain, longer, plan_gains
+from fpirhc.review.plan_feedback import PlanGain, longer
+from fpirhc.review.plan_of_outputs import gains_at
 from fpirhc.review.state_matrix import state_matrices
 
 QUESTION = "Is the horizon long enough?"
@@ -28,8 +29,8 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
         return None
     reach, unit = problem.horizon.stages * problem.horizon.step, problem.time_unit
     try:
-        [first] = plan_gains(problem, problem.horizon, problem.cost, [0.0], plant.approximate, grid.states_at)
-        [second] = plan_gains(problem, longer(problem.horizon), problem.cost, [0.0], plant.approximate, grid.states_at)
+        [first] = gains_at(problem, problem.horizon, problem.cost, [0.0], plant.approximate, grid.states_at)
+        [second] = gains_at(problem, longer(problem.horizon), problem.cost, [0.0], plant.approximate, grid.states_at)
     except (FpirhcError, np.linalg.LinAlgError) as error:
         return Answer(QUESTION, Verdict.UNKNOWN, f"{reach:g} {unit}; the plan's feedback is not known: {error}")
     size = float(np.linalg.norm(second.entries))

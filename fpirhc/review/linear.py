@@ -206,6 +206,8 @@ def loop_matrices(problem: Problem, controller: Controller) -> LoopMatrices:
         raise NotSupported(
             "the linear loop of a map is not covered for orders above 1, whose next outputs are predicted"
         )
+    if problem.plant.outputs and "output" in controller.feeds:
+        raise NotSupported("the linear loop of predicted outputs is not covered: a wrong model predicts other outputs")
     elements = straightened(problem).plant.state.elements
     judged = tuple(elements.index(c) for c in problem.judged_names if c in elements)
     return matrices_of(linear_problem(problem, controller), controller, judged)

@@ -12,8 +12,9 @@ from fpirhc.controllers.contract import Planner, without_deformation
 from fpirhc.errors import FpirhcError, InvalidName, NotSupported
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.late import is_late, scaled
-from fpirhc.review.linear import LinearLoop, controlled_gain, linear_parameters, loop_matrices, response_slopes
-from fpirhc.review.plan_feedback import PlanGain, no_gain, plan_gains
+from fpirhc.review.linear import LinearLoop, controlled_gain, linear_parameters, loop_matrices
+from fpirhc.review.plan_feedback import PlanGain, no_gain
+from fpirhc.review.plan_of_outputs import gains_at
 from fpirhc.review.stand_in import linear_stand_in
 from fpirhc.review.straight import straightened
 
@@ -78,11 +79,13 @@ def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
     def at(place: int, draw: int) -> LinearLoop:
         here = (grid.drawn_states[draw, place], grid.commands[draw, place])
         slopes = straight.slopes_on(here[0], grid.draws[draw])
-        own, model = (linear_parameters(slopes, *here, p, gains[place]) for p in (grid.draws[draw], believed))
+        feedback = straight.feedback_on(gains[place], here[0], grid.draws[draw], believed)
+        own, model = (linear_parameters(slopes, *here, p, feedback) for p in (grid.draws[draw], believed))
         return matrices.at(own, model)
 
     first = (grid.states[places[0]], grid.commands[0, places[0]])
-    model = linear_parameters(straight.slopes_on(first[0], believed), *first, believed, gains[places[0]])
+    feedback = straight.feedback_on(gains[places[0]], first[0], believed, believed)
+    model = linear_parameters(straight.slopes_on(first[0], believed), *first, believed, feedback)
     ideal = loop_matrices(problem, without_deformation(stand_in)).at(model, model)
     drawn = [at(k, d) for k, d in _pairs(grid, places) if np.isfinite(grid.commands[d, k]).all()]
     late = [loop for edge in _late(grid) for loop in loops_at(edge, controller, places[:: max(1, len(places) // 2)])]
@@ -102,9 +105,10 @@ def loops_at(grid: ReviewGrid, controller: Controller, places: Sequence[int]) ->
     feedbacks = plan_gains_at(grid, plan, [float(grid.times[k]) for k in places], believed)
     matrices, straight = loop_matrices(problem, stand_in), straightened(problem)
     loops = []
-    for k, feedback in zip(places, feedbacks, strict=True):
+    for k, gain in zip(places, feedbacks, strict=True):
         here = (grid.states[k], grid.commands[0, k])
         slopes = straight.slopes_on(here[0], grid.draws[0])
+        feedback = straight.feedback_on(gain, here[0], grid.draws[0], believed)
         loops.append(matrices.at(*(linear_parameters(slopes, *here, p, feedback) for p in (grid.draws[0], believed))))
     return loops
 
@@ -129,12 +133,14 @@ def ideal_loops(grid: ReviewGrid, controller: Controller, count: int) -> list[tu
     places = _thinned(usable, count)
     feedbacks = plan_gains_at(grid, plan, [float(grid.times[k]) for k in places], believed)
     matrices = loop_matrices(problem, without_deformation(stand_in))
-    slopes = response_slopes(plant)
+    straight = straightened(problem)
     loops = []
-    for k, feedback in zip(places, feedbacks, strict=True):
+    for k, gain in zip(places, feedbacks, strict=True):
+        slopes = straight.slopes_on(grid.states[k], believed)
+        feedback = straight.feedback_on(gain, grid.states[k], believed, believed)
         model = linear_parameters(slopes, grid.states[k], needed[k], believed, feedback)
-        gain = controlled_gain(plant, slopes, grid.states[k], needed[k], believed)
-        loops.append((matrices.at(model, model), gain))
+        effect = controlled_gain(straight.plant, straight.slopes, grid.states[k], needed[k], believed)
+        loops.append((matrices.at(model, model), effect))
     return loops
 
 
@@ -164,9 +170,7 @@ def plan_gains_at(grid: ReviewGrid, plan: Planner | None, times: list[float], be
     problem = grid.problem
     if plan is None:
         return [no_gain(problem.plant)] * len(times)
-    if problem.plant.outputs:
-        raise NotSupported("the linear loop of a plan is not covered for outputs")
     cost = plan.cost or problem.cost
     assert problem.horizon is not None
     assert cost is not None
-    return plan_gains(problem, problem.horizon, cost, times, believed, grid.states_at)
+    return gains_at(problem, problem.horizon, cost, times, believed, grid.states_at)

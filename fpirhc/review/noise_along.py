@@ -6,13 +6,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.contraction import noise_spread, response_jacobians
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import InvalidName, InvalidValue, NotContractive, NotSupported, nearest
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.linear import response_slopes
 from fpirhc.sensing.base import response_names
 from fpirhc.task.problem import Problem
 
@@ -93,8 +93,8 @@ def _deviations(problem: Problem, noise: Mapping[str, float] | None) -> np.ndarr
 def _of_sensors(problem: Problem) -> dict[str, float]:
     """Deviation of the noise of the sensors that measure responses."""
     plant, sensing = problem.plant, problem.sensing
-    measured = dict(zip(response_names(plant), plant.controlled_names, strict=True))
-    if sensing.sensors and not set(measured) & set(sensing.measures(plant)):
+    measured = dict(zip(response_names(plant.face), plant.controlled_names, strict=True))
+    if sensing.sensors and not set(measured) & set(sensing.measures(plant.face)):
         raise NotSupported(
             f"suggest: the response is estimated by {type(sensing.estimator).__name__}, whose noise is not white; give "
             "noise={coordinate: standard deviation of the estimated response}"
@@ -111,8 +111,9 @@ def _along_the_reference(grid: ReviewGrid, believed: np.ndarray) -> tuple[np.nda
     places = np.unique(np.linspace(0, len(grid.times) - 1, _POINTS).astype(int))
     exact = np.tile(grid.draws[0], (len(places), 1))
     jacobians = response_jacobians(plant, grid.states[places], grid.requests(believed)[places], exact, believed)
-    slopes, controlled = response_slopes(plant), list(plant.controlled_indices)
-    gains = [np.asarray(slopes(grid.states[k], grid.commands[0, k], believed)[1].full())[controlled] for k in places]
+    x, u, p = plant.symbols()
+    slope = ca.Function("fpirhc_gain", [x, u, p], [ca.jacobian(plant.controlled_response_function(x, u, p), u)])
+    gains = [np.asarray(slope(grid.states[k], grid.commands[0, k], believed).full()) for k in places]
     usable = [k for k in range(len(places)) if np.isfinite(jacobians[k]).all() and np.isfinite(gains[k]).all()]
     if not usable:
         raise NotContractive(

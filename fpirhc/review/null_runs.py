@@ -13,6 +13,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved, without_deformation
+from fpirhc.review.grid import each
 from fpirhc.review.nominal_runs import CYCLES, shortened
 from fpirhc.review.prediction import NominalRun, exactly
 from fpirhc.simulation.simulate import simulate
@@ -119,7 +120,7 @@ def null_problem(problem: Problem, controller: Controller) -> Problem:
 
 def _errors_along(problem: Problem, states: np.ndarray) -> dict[str, float]:
     first = round(problem.measure_from / problem.period)
-    places = _places(problem)
+    places, states = _places(problem), _followed(problem, states)
     with np.errstate(over="ignore", invalid="ignore"):
         errors = states[first:, places] - _reference(problem, len(states))[first:, places]
         sizes = np.sqrt(np.mean(errors**2, axis=0))
@@ -128,7 +129,7 @@ def _errors_along(problem: Problem, states: np.ndarray) -> dict[str, float]:
 
 def _ranges(problem: Problem, states: np.ndarray) -> dict[str, float]:
     """Range of the reference or the largest error, whichever is larger; the reference's size where both are rounding."""
-    places = _places(problem)
+    places, states = _places(problem), _followed(problem, states)
     reference = _reference(problem, len(states))[:, places]
     sizes = np.maximum(np.ptp(reference, axis=0), np.abs(states[:, places] - reference).max(axis=0))
     largest = np.abs(reference).max(axis=0)
@@ -137,7 +138,17 @@ def _ranges(problem: Problem, states: np.ndarray) -> dict[str, float]:
 
 
 def _places(problem: Problem) -> list[int]:
-    return [problem.plant.state.elements.index(n) for n in problem.judged_names]
+    return [problem.plant.output.elements.index(n) for n in problem.judged_names]
+
+
+def _followed(problem: Problem, states: np.ndarray) -> np.ndarray:
+    """What follows the reference: the states, or the outputs and their derivatives, shape (m, ny)."""
+    plant = problem.plant
+    if not plant.outputs:
+        return states
+    count = len(states)
+    held = (np.zeros((count, plant.input.size)), np.tile(plant.exact, (count, 1)), np.zeros((count, len(plant.names))))
+    return each(plant.output_function, states, *held)
 
 
 def _reference(problem: Problem, count: int) -> np.ndarray:

@@ -43,10 +43,12 @@ class PlanGain:
     Args:
         state: K, shape (nu, nx).
         before: L, shape (nu, nu); zero unless the plan weighs the change of its inputs.
+        outputs: K_d, shape (nu, ny), of the distance of measured outputs from the model's; None without outputs.
     """
 
     state: np.ndarray
     before: np.ndarray
+    outputs: np.ndarray | None = None
 
     @property
     def entries(self) -> np.ndarray:

@@ -1,8 +1,9 @@
 """The effect of adaptation on the response, predicted before a run of the plant.
 
 The model is run once as its own plant, with the controller but without its deformation: the nominal run, with states
-x_k and desired responses d_k. Along it the deformation alone is iterated with the plant's response, by the library's own
-blocks from the deformation to the limits,
+x_k and desired responses d_k. Where outputs follow the reference, the states at which a wrong model would have them are not
+those of the plant, so there the run is that of the plant under the controller with the exact model. Along it the deformation
+alone is iterated with the plant's response, by the library's own blocks from the deformation to the limits,
 
     f_k = response(x_k, u_{k-1}; exact),    r_k = G(r_{k-1}, f_k, d_k),    u_k = inverse(x_k, r_k; approximate),
     e_k = response(x_k, u_k; exact) - d_k,
@@ -87,7 +88,8 @@ def nominal_run(problem: Problem, controller: Controller, *, compiled: bool = Tr
     ready = resolved(problem, controller)
     ready.check(problem)
     believed = ready.parameters(problem.plant)
-    model = replace(problem, plant=exactly(problem.plant, believed), disturbances={}, sensing=Sensing())
+    own = known_exactly(problem.plant) if problem.plant.outputs else exactly(problem.plant, believed)
+    model = replace(problem, plant=own, disturbances={}, sensing=Sensing())
     run = simulate(model, without_deformation(ready), seed=0, compiled=compiled)
     if run.stop is not None or run.cycles < 2:
         raise NotSupported(f"no prediction: the model's own run ended early: {run.stop}")
@@ -171,6 +173,12 @@ def _judge_block(plant: Plant) -> Block:
     return Block("judge_response", Layout(reads), Layout(writes), step, opaque=plant.inverse_opaque)
 
 
+def known_exactly(plant: Plant) -> Plant:
+    """Return the plant whose approximate parameters are the exact ones."""
+    named = {n: replace(p, approximate=p.exact, spread=None) for n, p in plant.parameters.items()}
+    return replace(plant, parameters=named)
+
+
 def exactly(plant: Plant, values: np.ndarray) -> Plant:
     """Return the plant with these exact parameters."""
     pairs = zip(plant.parameters.items(), values, strict=True)
@@ -193,6 +201,6 @@ def _check(problem: Problem, controller: Controller) -> None:
     if problem.signals:
         raise NotSupported("no prediction with signals from outside, which change along the run; simulate it")
     late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
-    if late or problem.sensing.delay(problem.plant, problem.period):
+    if late or problem.sensing.delay(problem.plant.face, problem.period):
         what = "dead time" if late else "an estimated response"
         raise NotSupported(f"no prediction with {what}: the response must belong to the last request")

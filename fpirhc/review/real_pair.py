@@ -95,6 +95,8 @@ def real_loops(grid: ReviewGrid, controller: Controller, points: Sequence[RealPo
     """
     assert grid.real is not None
     problem, model, reality = grid.real, grid.problem.plant, _reality(grid.real)
+    if model.outputs:
+        raise NotSupported("a reality beside outputs has other inner states than the model; simulate it")
     if controller.model_plant(problem) is not model:
         raise NotSupported("its model is the reality")
     believed = controller.parameters(model)
@@ -135,8 +137,9 @@ def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Ext
     modes = _beyond(np.linalg.eigvals(a), np.linalg.eigvals(reduced))
     slow = 1j * _SLOW * float(np.abs(modes).min(initial=np.inf))
     gain = d + c @ np.linalg.solve(slow * np.eye(len(a)) - a, b) if modes.size else d
-    of_model = response_slopes(model)(grid.states[point.place], point.command, believed)[1]
-    assumed = np.asarray(of_model.full())[list(model.controlled_indices)]
+    x, u, p = model.symbols()
+    by_input = ca.Function("fpirhc_gain", [x, u, p], [ca.jacobian(model.controlled_response_function(x, u, p), u)])
+    assumed = np.asarray(by_input(grid.states[point.place], point.command, believed).full())
     return Extra(modes, np.linalg.eigvals(gain @ np.linalg.inv(assumed)))
 
 

@@ -24,7 +24,7 @@ from fpirhc.review.maps import largest_product
 from fpirhc.review.margins import margins_enough
 from fpirhc.review.neighbourhood import spectrum_near
 from fpirhc.review.nominal_runs import NominalRuns
-from fpirhc.review.of_outputs import review_of_outputs, verdict_of_outputs
+from fpirhc.review.of_order_zero import controls_order_zero, review_of_order_zero
 from fpirhc.review.orders import relative_orders
 from fpirhc.review.pays import pays
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, known_questions
@@ -58,8 +58,8 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
         NotInvertible: the inputs and the controlled coordinates differ in number.
     """
     grid = review_grid(problem, mismatch, seed)
-    if problem.plant.outputs:
-        return review_of_outputs(grid, controllers)
+    if controls_order_zero(grid):
+        return review_of_order_zero(grid, controllers)
     general = [well_posed(grid), relative_orders(grid), inverse_exists(grid), commands_inside(grid)]
     reach = horizon_long_enough(grid)
     more = (question.ask(grid) for question in known_questions(ProblemQuestion))
@@ -78,8 +78,6 @@ def predict(problem: Problem, controller: Controller) -> Answer:
     """
     grid = review_grid(problem, 0.0, 0)
     own = replace(grid, draws=grid.draws[:1])  # the box does not matter
-    if problem.plant.outputs:
-        return verdict_of_outputs(own, controller)
     ready = resolved(own.problem, controller)
     general = [well_posed(own), inverse_exists(own), commands_inside(own)]
     loops = loops_along(own, ready)
@@ -92,8 +90,8 @@ def predict(problem: Problem, controller: Controller) -> Answer:
 
 def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: NominalRuns) -> tuple[Answer, ...]:
     try:
-        if grid.real is not None:
-            checked(grid.real, controller)
+        if grid.real is not None or grid.problem.plant.outputs:
+            checked(grid.real or grid.problem, controller)
         ready = resolved(grid.problem, controller)
         ready.check(grid.problem)
     except FpirhcError as error:

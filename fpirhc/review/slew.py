@@ -11,9 +11,12 @@ import math
 import numpy as np
 
 from fpirhc.deformation.base import Deformation
+from fpirhc.plant.chain import derivatives_function
+from fpirhc.plant.plant import Plant
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.linear import LinearLoop, controlled_gain, response_slopes
+from fpirhc.review.linear import LinearLoop, controlled_gain
+from fpirhc.review.straight import straightened
 
 QUESTION = "Is the map fast enough for reference and disturbances?"
 _SPARE = 2.0  # how many times faster than the reference the map should be
@@ -59,7 +62,7 @@ def _speed(grid: ReviewGrid, believed: np.ndarray) -> float:
     states = grid.states_at(times).T
     responses = np.asarray(problem.reference.function(plant).map(_POINTS)(times[None, :])[1].full())
     exact, model = (np.repeat(p[:, None], _POINTS, axis=1) for p in (plant.exact, believed))
-    commands = plant.inverse_function.map(_POINTS)(states, responses[list(plant.controlled_indices)], exact)
+    commands = plant.inverse_function.map(_POINTS)(states, responses[list(plant.face.controlled_indices)], exact)
     requests = np.asarray(plant.controlled_response_function.map(_POINTS)(states, commands, model).full())
     speeds = np.linalg.norm(np.diff(requests, axis=1), axis=0) / (times[1] - times[0])
     return float(speeds[np.isfinite(speeds)].max(initial=0.0))
@@ -69,24 +72,51 @@ def _speed_after_start(grid: ReviewGrid, believed: np.ndarray, ideal: LinearLoop
     """Largest |d r/dt| of the plan's feedback from the problem's start."""
     plant = grid.problem.plant
     z = np.zeros(len(ideal.dynamics))
-    z[ideal.state] = grid.problem.start_state - grid.states[0]
+    straight = straightened(grid.problem)
+    z[ideal.state] = _start_deviation(grid, straight.plant)
     commands = np.empty((_CYCLES, len(plant.inputs)))
     for k in range(_CYCLES):
         commands[k] = ideal.arriving @ z
         z = ideal.dynamics @ z
     command = np.nan_to_num(grid.commands[0, 0])
-    gain = controlled_gain(plant, response_slopes(plant), grid.states[0], command, believed)
+    gain = controlled_gain(straight.plant, straight.slopes, grid.states[0], command, believed)
     changes = np.linalg.norm(np.diff(commands, axis=0) @ gain.T, axis=1)
     return float(changes.max() / grid.problem.period)
 
 
+def _start_deviation(grid: ReviewGrid, straight: Plant) -> np.ndarray:
+    """Deviation of the start from the reference, in the coordinates of the linear loop; inner states of outputs have none."""
+    problem = grid.problem
+    if not problem.plant.outputs:
+        return problem.start_state - grid.states[0]
+    reference = np.asarray(problem.reference.function(problem.plant)(0.0)[0].full()).ravel()
+    errors = dict(zip(problem.plant.output.elements, problem.start_output - reference, strict=True))
+    return np.array([errors.get(e, 0.0) for e in straight.state.elements])
+
+
 def effect(grid: ReviewGrid, name: str) -> float:
-    """Return the change of the responses by one unit of a disturbance: 1 on a coordinate, the exact gain on an input."""
+    """Return the change of the responses by one unit of a disturbance: 1 on a coordinate, the exact gain on an input.
+
+    One that adds to a state of a plant with outputs changes their responses by its slope. One that adds to an output changes the
+    response by its own derivative, which is zero for a jump.
+    """
     plant = grid.problem.plant
+    if plant.outputs and name in plant.coordinates:
+        return _effect_of_state(grid, name)
     if name not in plant.inputs:
-        return 1.0
+        return 0.0 if name in plant.outputs else 1.0
     unit = np.array([1.0 if i == name else 0.0 for i in plant.inputs])
     command = np.nan_to_num(grid.commands[0, 0])
     respond = plant.controlled_response_function
     change = respond(grid.states[0], command + unit, plant.exact) - respond(grid.states[0], command, plant.exact)
     return float(np.linalg.norm(change.full()))
+
+
+def _effect_of_state(grid: ReviewGrid, name: str) -> float:
+    """Change of the outputs' responses by one unit that adds to the rate of a state, at the start of the reference."""
+    plant, face = grid.problem.plant, grid.problem.plant.face
+    orders = dict(zip(face.names, face.orders, strict=True))
+    function = derivatives_function(plant, [(n, orders[n]) for n in plant.controlled_names])
+    at = grid.states[0], np.nan_to_num(grid.commands[0, 0]), plant.exact
+    unit = np.array([1.0 if n == name else 0.0 for n in plant.names])
+    return float(np.linalg.norm((function(*at, unit) - function(*at, 0 * unit)).full()))

@@ -59,7 +59,7 @@ def bears_lag(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answer
 
 def law_of(grid: ReviewGrid, controller: Controller) -> tuple[float, int] | None:
     """Return rate and number of poles of the tracking law for the most demanding coordinate; None where there is no such law."""
-    law, plant = controller.law, grid.problem.plant
+    law, plant = controller.law, grid.problem.plant.face
     laws = [law.feedback(plant.orders[k]) for k in plant.controlled_indices] if law else []
     known = [(one.rate, len(one.gains)) for one in laws if one is not None and one.rate is not None]
     return max(known, key=lambda pair: pair[1]) if known else None

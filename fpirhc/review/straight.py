@@ -21,6 +21,7 @@ from scipy.linalg import null_space, qr
 
 from fpirhc.plant.outputs import light_plant
 from fpirhc.plant.plant import Plant
+from fpirhc.review.plan_feedback import PlanGain
 from fpirhc.task.problem import Problem
 
 Slopes: TypeAlias = ca.Function | Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[ca.DM, ca.DM]]
@@ -34,11 +35,30 @@ class Straight:
         plant: its coordinates, orders and inputs; without outputs the plant itself. Of a plant with outputs it has no equations.
         slopes: Function (state, input, parameters) -> slopes of its responses by the state x and the input.
         change: Function (state, parameters) -> T (nx, nx); None without outputs.
+        shown: Function (state, parameters) -> slopes C (ny, nx) of all outputs y, y', ...; None without outputs.
     """
 
     plant: Plant
     slopes: ca.Function
     change: ca.Function | None = None
+    shown: ca.Function | None = None
+
+    def feedback_on(self, gain: PlanGain, state: np.ndarray, exact: np.ndarray, believed: np.ndarray) -> PlanGain:
+        """Return a plan's feedback in the coordinates of the plant that moves; without outputs the gain itself.
+
+        Args:
+            gain: in the states x, and of d = (C - C^) x.
+            state: of the point, shape (nx,).
+            exact: parameters of the plant that moves, shape (np,).
+            believed: those of the model.
+        """
+        if self.change is None or gain.outputs is None:
+            return gain
+        assert self.shown is not None
+        real, model = (np.asarray(self.shown(state, p).full()) for p in (exact, believed))
+        whole = gain.state + gain.outputs @ (real - model)
+        change = np.asarray(self.change(state, exact).full())
+        return PlanGain(np.linalg.solve(change.T, whole.T).T, gain.before)
 
     def slopes_on(self, state: np.ndarray, exact: np.ndarray) -> Slopes:
         """Return the function (state, input, parameters) -> A (n, nx), B (n, nu) in the coordinates of the plant that moves.
@@ -94,4 +114,6 @@ def _straightened(plant: Plant, start: tuple[float, ...]) -> Straight:
     responses = ca.vertcat(plant.controlled_response_function(x, u, p), rates)
     slopes = [ca.densify(ca.jacobian(responses, v)) for v in (x, u)]
     change = ca.Function("fpirhc_change", [x, p], [ca.densify(ca.jacobian(z, x))])
-    return Straight(light, ca.Function("fpirhc_slopes", [x, u, p], slopes), change)
+    everything = ca.vertcat(*chain.values())
+    seen = ca.Function("fpirhc_all_shown", [x, p], [ca.densify(ca.jacobian(everything, x))])
+    return Straight(light, ca.Function("fpirhc_slopes", [x, u, p], slopes), change, seen)

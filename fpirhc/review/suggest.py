@@ -26,6 +26,7 @@ from fpirhc.review.grid import review_grid
 from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import loops_along
 from fpirhc.review.noise_along import Noisy, noisy_points
+from fpirhc.review.straight import straightened
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
 
@@ -173,5 +174,6 @@ def _floor(ideal: LinearLoop | None, noisy: Noisy, problem: Problem) -> dict[str
         return dict.fromkeys(plant.controlled_names, math.nan)
     entry = ideal.entry @ noisy.inverses[0]
     spread = scipy.linalg.solve_discrete_lyapunov(ideal.dynamics, entry @ noisy.covariance @ entry.T)
-    places = [ideal.state[plant.state.elements.index(c)] for c in plant.controlled_names]
+    elements = straightened(problem).plant.state.elements
+    places = [ideal.state[elements.index(c)] for c in plant.controlled_names]
     return {c: float(np.sqrt(spread[k, k])) for c, k in zip(plant.controlled_names, places, strict=True)}

@@ -45,6 +45,8 @@ def tube(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np.nda
             right model.
     """
     plant = nominal.problem.plant
+    if plant.outputs:
+        raise NotSupported("no tube: the nominal run of outputs is that of the plant, and a tube is around the model's")
     if len(plant.controlled_names) < len(plant.names):
         raise NotSupported("no tube: a coordinate that is not controlled moves by itself")
     force = majorant(nominal, errors, gain, exact) + np.abs(errors.force - errors.error)

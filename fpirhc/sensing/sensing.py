@@ -195,7 +195,10 @@ class Sensing(Checked):
                 if sensor.noise is not None:
                     seen[name] = seen[name] + s.sensing[columns.index(f"{name} noise")]
                 if sensor.quantum is not None:
-                    seen[name] = sensor.quantum * ca.floor(seen[name] / sensor.quantum + 0.5)
+                    quantum = float(
+                        sensor.quantum
+                    )  # not live: a division by a symbol rounds otherwise than one by a number
+                    seen[name] = quantum * ca.floor(seen[name] / quantum + 0.5)
                 if sensor.dropout:
                     lost = s.sensing[columns.index(f"{name} lost")] > 0.5
                     seen[name] = ca.if_else(lost, s.sensor_last[lossy.index(name)], seen[name])

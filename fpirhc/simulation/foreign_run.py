@@ -66,7 +66,7 @@ def run_foreign(
         reading = foreign.read(k * problem.period, sent.copy())
         bridged = 0 if reading.values is not None else bridged + 1
         if bridged > foreign.holds and k + 1 < cycles:
-            return log[: k + 1], stopped(problem, k + 1, reading.mistake)
+            return log[: k + 1], stopped(problem, k + 1, reading.mistake) + foreign.remedy
         held[0] = float(reading.values is None)
         if reading.values is not None:
             answer[:] = reading.values

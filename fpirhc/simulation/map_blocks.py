@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import casadi as ca
 
+from fpirhc.plant.instant import response_orders
 from fpirhc.sensing.base import backward_difference, combine
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, Value, expression
@@ -31,7 +32,9 @@ def with_true_response(problem: Problem, sense: Block, motion: Signal, response:
         response: signal of the response.
     """
     face, period = problem.plant.face, problem.period
-    orders = {c: face.orders[face.names.index(c)] for c in problem.plant.controlled_names}
+    orders = response_orders(problem.plant)
+    if not any(orders.values()):
+        return sense  # a response of order 0 is the output, and no difference
     places = {c: face.state.elements.index(c) for c in orders}
     entries = [(c, j) for c, order in orders.items() for j in range(1, order + 1)]
     past = Signal(_PAST, tuple(f"{c}@{j}" for c, j in entries))

@@ -22,6 +22,8 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero
 from fpirhc.plant.plant import Plant
 
+_LONGEST = 60  # characters of an answer that are shown
+
 
 class Body(Protocol):
     """What a foreign reality must be able to do."""
@@ -76,6 +78,13 @@ class Foreign(Checked):
                 )
 
     @property
+    def remedy(self) -> str:
+        """What bridges bad answers."""
+        if not self.holds:
+            return "; Foreign(holds=1) bridges a bad answer with the last good one"
+        return f", after {self.holds} in a row that were held; Foreign(holds={self.holds + 1}) bridges one more"
+
+    @property
     def symbolic(self) -> None:
         """No plant: nothing is known of it but its answers."""
 
@@ -126,19 +135,38 @@ class Foreign(Checked):
     def _answer(self, ask: Callable[[], npt.ArrayLike], method: str, *, timed: bool) -> Reading:
         who, begin = f"{method} of {type(self.body).__name__}", self.clock()
         try:
-            answer = np.asarray(ask(), dtype=float)
-        except Exception as error:  # noqa: BLE001  # whatever a stranger's object raises is a bad answer, which has a policy
-            return Reading(None, f"{who} raised {type(error).__name__}: {error}")
+            given = ask()
+        except (Exception, SystemExit) as error:  # noqa: BLE001  # whatever a stranger's object raises is a bad answer
+            return Reading(None, f"{who} raised {type(error).__name__}: {' '.join(str(error).split())}")
         elapsed = self.clock() - begin
+        answer = _real_numbers(given)
+        expected = f"{len(self.measures)} numbers: {', '.join(self.measures)}"
+        if answer is None:
+            return Reading(None, f"{who} returned {_short(given)}, expected {expected}")
         if answer.shape != (len(self.measures),):
-            expected = f"({len(self.measures)},) for {', '.join(self.measures)}"
             return Reading(None, f"{who} returned the shape {answer.shape}, expected {expected}")
         if not np.isfinite(answer).all():
             place = int(np.argmin(np.isfinite(answer)))
-            return Reading(None, f"{who} returned {list(self.measures)[place]} = {answer[place]}")
+            return Reading(
+                None, f"{who} returned {list(self.measures)[place]} = {answer[place]}, expected a finite number"
+            )
         if timed and self.deadline is not None and elapsed > self.deadline:
             return Reading(None, f"{who} took {elapsed:.3g} s, and its deadline is {self.deadline:.3g} s")
         return Reading(answer)
+
+
+def _real_numbers(answer: object) -> np.ndarray | None:
+    """The answer as real numbers; None where it is none."""
+    try:
+        column = np.asarray(answer)
+        return column.astype(float) if column.dtype.kind in "biuf" else None
+    except (TypeError, ValueError):  # rows of different lengths, or an object that refuses to become an array
+        return None
+
+
+def _short(answer: object) -> str:
+    text = " ".join(repr(answer).split())
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
 def quantities(model: Plant) -> dict[str, str]:

@@ -48,15 +48,16 @@ def settle_maps(problem: Problem, mistakes: Mistakes) -> None:
 def check_map_task(problem: Problem, mistakes: Mistakes) -> None:
     """Add what is not covered beside a map to `mistakes`."""
     model, reality = problem.plant, problem.symbolic_reality
-    if reality is not None and reality.plant.step is not None and model.step is None:
+    instant = _instant(model)
+    at_once = bool(instant) and set(instant) == set(model.controlled or model.outputs)  # no derivative is looked for
+    if reality is not None and reality.plant.step is not None and model.step is None and not at_once:
         mistakes.add(
             "reality: it is a map, and the model has differential equations, whose derivatives a map does not have; write the "
             "model as a map with the same step"
         )
     if model.step is None:
         return
-    instant = _instant(model)
-    if instant and set(instant) < set(model.controlled or model.outputs):
+    if instant and not at_once:
         mistakes.add(
             f"outputs: {', '.join(instant)} of order 0 beside outputs that steps move: their responses belong to other "
             "cycles, which is not covered; control them by two problems"

@@ -23,26 +23,24 @@ from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import kind
-from fpirhc.task.samples import Course, course_function, is_opaque, span_of
+from fpirhc.task.samples import Course, course_function, is_held, is_opaque, span_of
 
 
 class External(Checked, ABC):
-    """Contract: what a signal really is, and what the model is told of it."""
+    """Contract: what a signal really is, and what the model is told of it.
 
-    @property
-    @abstractmethod
-    def real(self) -> Course:
-        """Values that act on the plant."""
+    Attributes:
+        values: what acts on the plant.
+        preview: whether a horizon has the model's values of the future; else those of the cycle are held along it.
+    """
+
+    values: Course
+    preview: bool = False
 
     @property
     @abstractmethod
     def told(self) -> Course | None:
         """Values that the model has; None: the nominal one."""
-
-    @property
-    def previewed(self) -> bool:
-        """Whether a horizon has the values of the future; else those of the cycle are held along it."""
-        return self.told is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,19 +57,9 @@ class Known(External):
     preview: bool = True
 
     @property
-    def real(self) -> Course:
-        """The values."""
-        return self.values
-
-    @property
     def told(self) -> Course:
         """The values."""
         return self.values
-
-    @property
-    def previewed(self) -> bool:
-        """As stated."""
-        return self.preview
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +71,6 @@ class Unknown(External):
     """
 
     values: Course
-
-    @property
-    def real(self) -> Course:
-        """The values."""
-        return self.values
 
     @property
     def told(self) -> None:
@@ -109,24 +92,14 @@ class Believed(External):
     preview: bool = True
 
     @property
-    def real(self) -> Course:
-        """What acts on the plant."""
-        return self.values
-
-    @property
     def told(self) -> Course:
         """What the model is told."""
         return self.model
 
-    @property
-    def previewed(self) -> bool:
-        """As stated."""
-        return self.preview
-
 
 def real_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function | None:
     """Function (time, parameters) -> parameters with the real values of the signals; None where the plant has none."""
-    return _filled(plant, {n: signals[n].real for n in plant.signal_names if n in signals})
+    return _filled(plant, {n: signals[n].values for n in plant.signal_names if n in signals})
 
 
 def model_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function | None:
@@ -137,7 +110,7 @@ def model_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function |
 
 def previewed_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function | None:
     """Function (time, parameters) -> parameters with what the model is told of a later time; None where it is told nothing."""
-    ahead = {n: one for n, one in signals.items() if one.previewed}
+    ahead = {n: one for n, one in signals.items() if one.preview}
     return model_values(plant, ahead)
 
 
@@ -154,7 +127,7 @@ def signals_of(plant: Plant, signals: Mapping[str, External]) -> dict[str, Exter
 
 def really_known(signals: Mapping[str, External]) -> Mapping[str, External]:
     """Return the same signals, told to the model as they are: what an exact model knows."""
-    return {name: Known(one.real) for name, one in signals.items()}
+    return {name: Known(one.values) for name, one in signals.items()}
 
 
 def as_told(plant: Plant, signals: Mapping[str, External]) -> dict[str, External]:
@@ -163,8 +136,14 @@ def as_told(plant: Plant, signals: Mapping[str, External]) -> dict[str, External
     made: dict[str, External] = {}
     for name, one in signals_of(plant, signals).items():
         course = one.told
-        made[name] = Known(nominal[name] if course is None else course, preview=one.previewed or course is None)
+        made[name] = Known(nominal[name] if course is None else course, preview=one.preview or course is None)
     return made
+
+
+def not_held(signals: Mapping[str, External], names: Sequence[str]) -> tuple[str, ...]:
+    """Return those of some signals that change between jumps, really or as the model is told."""
+    courses = {name: (signals[name].values, signals[name].told) for name in names if name in signals}
+    return tuple(n for n, both in courses.items() if not all(c is None or is_held(c) for c in both))
 
 
 def rows_of(function: ca.Function | None, times: np.ndarray, parameters: np.ndarray) -> np.ndarray:
@@ -203,8 +182,8 @@ def check_signals(
         mistakes.add(f"signals: '{name}' is a parameter; declare it as outside(nominal=..., unit=...) in the plant")
     mistakes.unknown("signals: name", signals.keys() - ordinary, units)
     for name, one in signals.items():
-        for what, course in (("values", one.real), ("values of the model", one.told)):
-            if course is not None:
+        for what, course in (("values", one.values), ("values of the model", one.told)):
+            if course is not None and (what == "values" or course is not one.values):
                 _check_course(f"signals: {what} of '{name}'", course, times, mistakes)
 
 

@@ -16,7 +16,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Duration
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.horizon.regular_gain import Bounds, singular_gain
+from fpirhc.horizon.regular_gain import Bounds, nominal_run, singular_gain
 from fpirhc.horizon.stage_check import check_stage
 from fpirhc.plant.algebraic import unsolved
 from fpirhc.plant.integrators import USUAL, Integrator
@@ -32,7 +32,7 @@ from fpirhc.task.foreign import Foreign
 from fpirhc.task.limits import Limits
 from fpirhc.task.map_task import check_map_task, settle_maps
 from fpirhc.task.needed import needed_measurements, needed_names
-from fpirhc.task.outside import External, check_signals, real_values, rows_of, signals_of
+from fpirhc.task.outside import External, check_signals, not_held, real_values, rows_of, signals_of
 from fpirhc.task.problem_view import problem_facts, problem_table
 from fpirhc.task.reality import Reality
 from fpirhc.task.reference import Reference
@@ -360,14 +360,15 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
     plant = problem.plant
     if not plant.outputs:
         return
-    late = differentiated_signals(plant)
-    if late:
+    smooth = not_held(problem.signals, differentiated_signals(plant))
+    if smooth:
         mistakes.add(
-            f"signals: {', '.join(late)} from outside have derivatives of their own in those of outputs, which is not covered; "
-            "choose an output that depends on the state alone, or write it as a coordinate"
+            f"signals: the derivatives of outputs depend on {', '.join(smooth)}, whose own derivatives nobody states; state it in "
+            "steps, Samples(times, values), which hold between their times, or choose another output"
         )
     if len(plant.inputs) == len(plant.controlled or plant.outputs):
-        singular = singular_gain(plant, problem.reference, *nominal_start(problem))
+        states, inputs = nominal_run(plant, problem.reference, *nominal_start(problem))
+        singular = singular_gain(plant, states, inputs, problem.period)
         if singular:
             mistakes.add(f"outputs: {singular}")
 

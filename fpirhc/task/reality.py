@@ -197,7 +197,8 @@ class Reality(Checked):
             raise InvalidProblem(f"reality: the rate of its state '{wrong}' is not finite at the start")
         stiff = stiffness(plant, integrator, period, start, command, plant.exact)
         if stiff:
-            raise InvalidProblem(f"reality: {stiff}")
+            what, _, remedy = stiff.partition("; use ")
+            raise InvalidProblem(f"reality: {what}; use Reality(..., {remedy})")
 
     def check_as_model(self, model: Plant) -> None:
         """Raise if a controller of the model cannot have this reality as its model: both need the same coordinates and orders.
@@ -254,10 +255,11 @@ def _check_output(reality: Reality, model: Plant, name: str, unit: str, mistakes
     plant, own = reality.plant, reality.seen.get(name, name)
     if own not in plant.coordinates:
         if name not in reality.seen:
+            followed = not model.outputs and name in (model.controlled or model.names)
+            believed = "" if followed else ", or have it believed: Sensing(measured=..., belief=ModelStates())"
             mistakes.add(
                 f"it has no coordinate '{name}', which the model has and the controller is given; add it, or name the one that is "
-                f"measured in its place: Reality(seen={{'{name}': ...}}), or have it believed: Sensing(measured=..., "
-                f"belief=ModelStates()). Its coordinates: {', '.join(plant.coordinates)}"
+                f"measured in its place: Reality(seen={{'{name}': ...}}){believed}. Its coordinates: {', '.join(plant.coordinates)}"
             )
         return
     for one in sorted({own, name} & set(plant.coordinates)):

@@ -61,6 +61,11 @@ class Samples(Checked):
         return True
 
     @property
+    def held(self) -> bool:
+        """Whether the values are constant between jumps."""
+        return self.hold == "zero"
+
+    @property
     def span(self) -> tuple[float, float]:
         """First and last time with a stated value; a last sample that is held goes on for ever."""
         times = np.asarray(self.times, dtype=float)
@@ -86,6 +91,11 @@ Course: TypeAlias = Samples | Callable[[Expression], Expression] | float
 def is_opaque(course: Course) -> bool:
     """Whether a course needs operations that scalar expressions cannot."""
     return bool(getattr(course, "opaque", False))
+
+
+def is_held(course: Course) -> bool:
+    """Whether a course is constant between jumps, as a number and samples that are held are."""
+    return not callable(course) or bool(getattr(course, "held", False))
 
 
 def span_of(course: Course) -> tuple[float, float]:

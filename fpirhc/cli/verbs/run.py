@@ -138,7 +138,7 @@ VERB = Verb(
     run=_run,
     codes={
         ExitCode.NOT_WRITABLE: ExitCode.NOT_WRITABLE.meaning,
-        ExitCode.ENDED_EARLY: "the run ended early because a signal was not finite",
+        ExitCode.ENDED_EARLY: "the run ended early; its reason is named, and the cycles before it are saved",
     },
     examples=(
         ('fpirhc run two_mass "RHC+FPI"', "one run, saved as .npz and .png"),

@@ -171,7 +171,7 @@ def _estimate_block(
             **others,
         }
 
-    outputs = (plant.output,) if pairs.outputs else ()
+    outputs = (pairs.seen,) if pairs.outputs else ()
     reads = Layout((pairs.state, *outputs, plant.response_signal("realised"), plant.parameter, acted))
     block = Block("estimate", reads, Layout((believed, estimate)), step, own, opaque=True)
     return block if followed is None else replace(block, reads=reads + followed.reads, derived=followed.derived)

@@ -28,7 +28,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, compose_controller, embedded, like
-from fpirhc.controllers.mirror import MEASURED, MEASURED_TIME
+from fpirhc.controllers.mirror import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
+from fpirhc.controllers.output_ahead import output_ahead
 from fpirhc.controllers.own_reference import own_signals
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
@@ -53,6 +54,11 @@ class Predictor(Checked, ABC):
     def residual_time(self) -> float | None:
         """Time constant of the low-passed model residual that `advance` is given, s; None: the residual is zero."""
         return None
+
+    @property
+    def predicts_state(self) -> bool:
+        """Whether the whole state follows from what is queued, also where outputs are controlled; True by default."""
+        return True
 
     @abstractmethod
     def check(self, plant: Plant) -> None:
@@ -117,6 +123,11 @@ class ByModel(Predictor):
 @dataclass(frozen=True)
 class ByDesired(Predictor):
     """Integrate the queued desired responses."""
+
+    @property
+    def predicts_state(self) -> bool:
+        """False: desired responses of outputs say nothing of inner states."""
+        return False
 
     def check(self, plant: Plant) -> None:
         """Raise if some coordinate is not controlled.
@@ -194,8 +205,17 @@ class Predicted(Controller):
 
     @property
     def feeds(self) -> Mapping[str, str]:
-        """Time and state ahead in place of time and state."""
-        return {"time": "time_ahead", "state": "state_ahead", **self.controller.feeds}
+        """Time, state and outputs ahead in place of those of now."""
+        ahead = {"time": "time_ahead", "state": "state_ahead", "output": "output_ahead"}
+        return {**ahead, **self.controller.feeds}
+
+    def outputs_unusable(self, problem: Problem) -> str:
+        """Return why the predictor or the wrapped controller does not cover outputs; empty where both do."""
+        if not self.by.predicts_state:
+            return (
+                f"{self.by} predicts what is desired of the outputs, and the inverse needs the state; use by=ByModel()"
+            )
+        return self.controller.outputs_unusable(problem)
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
         """Return the notes of the wrapped controller; with set-points, that they are followed late by the dead time."""
@@ -238,7 +258,9 @@ class Predicted(Controller):
             return self.controller.blocks(problem)
         inner = compose_controller(problem, self.controller, ahead=True)
         ahead = {"time": like(plant.time, "time_ahead"), "state": like(plant.state, "state_ahead")}
-        feeds = {**ahead, MEASURED: plant.state, MEASURED_TIME: plant.time}
+        if plant.outputs:
+            ahead["output"] = like(plant.output, "output_ahead")
+        feeds = {**ahead, MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: plant.time}
         sent = self.by.sent(plant)
         before = Signal("_sent_before", sent.elements, sent.units, self.by.sent_at_start(problem))
         ahead_by = _Lead(self._cycles(problem), self._length(problem), self.inputs)
@@ -274,6 +296,10 @@ class _Lead:
     cycles: float
     longest: int
     time: float
+
+    def cycles_of(self, like_this: Expression) -> Expression:
+        """Return the cycles as an expression of the same kind."""
+        return expressed(self.cycles, like_this) if is_live(self.cycles) else expression(float(self.cycles))
 
     def oldest(self, queued: Expression, size: int) -> Expression:
         """Return the value that acted while the response was realised."""
@@ -312,8 +338,10 @@ def _predict_block(problem: Problem, by: Predictor, lead: _Lead, before: Signal,
     advance = by.advance(plant, problem.period)
     corrected = _residual(plant, by.residual_time, problem.period) if by.residual_time else None
     responses = (plant.response_signal("realised"),) if corrected else ()
-    reads = (plant.time, plant.state, *responses, plant.parameter, before)
+    outputs = (plant.output,) if plant.outputs else ()
+    reads = (plant.time, plant.state, *outputs, *responses, plant.parameter, before)
     own = (queue, residual) if corrected else (queue,)
+    moved = output_ahead(plant) if plant.outputs else None
 
     def step(s: Signals) -> dict[str, Expression]:
         queued = ca.vertcat(s._sent_before, s.sent[: size * cycles])
@@ -324,6 +352,9 @@ def _predict_block(problem: Problem, by: Predictor, lead: _Lead, before: Signal,
             memory_next["residual_next"] = error
         on_their_way = [queued[size * k : size * (k + 1)] for k in range(cycles)]
         state = lead.integrated(advance, s.state, on_their_way, [s.parameters, error])
+        if moved is not None:
+            time = lead.cycles_of(s.state) * problem.period
+            memory_next["output_ahead"] = moved(s.output, s.state, state, s.parameters, time)
         return {"time_ahead": s.time + lead.time, "state_ahead": state, **memory_next}
 
     return Block("predict", Layout(reads), Layout(writes), step, Layout(own), opaque=True)

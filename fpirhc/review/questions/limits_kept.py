@@ -29,7 +29,8 @@ def reference_keeps_limits(grid: ReviewGrid) -> Answer | None:
         return None
     horizon = replace(problem.horizon, terminal=())
     try:
-        ocp = transcribe(problem.plant, problem.reference, horizon, problem.cost, replace(limits, soft={}, prices={}))
+        all_hard, start = replace(limits, soft={}, prices={}), problem.start_state
+        ocp = transcribe(problem.plant, problem.reference, horizon, problem.cost, all_hard, start=start)
     except FpirhcError as error:
         return Answer(TEXT, Verdict.UNKNOWN, str(error))
     values = _values(grid, ocp)
@@ -88,7 +89,9 @@ def _commands_before(grid: ReviewGrid) -> np.ndarray:
     earlier = np.maximum(grid.times - problem.horizon.step, 0.0)
     responses = np.asarray(problem.reference.function(plant).map(len(earlier))(earlier[None, :])[1].full())
     exact = np.tile(plant.exact, (len(earlier), 1))
-    return each(plant.inverse_function, grid.states_at(earlier), responses[list(plant.controlled_indices)].T, exact)
+    return each(
+        plant.inverse_function, grid.states_at(earlier), responses[list(plant.face.controlled_indices)].T, exact
+    )
 
 
 QUESTION = ProblemQuestion(ask=reference_keeps_limits, order=30)

@@ -42,7 +42,8 @@ def leaves_right_model_alone(case: Case) -> Answer:
         text += "the loop with the right model does not converge without adaptation"
         return Answer(QUESTION_TEXT, Verdict.UNKNOWN, text, "See the rates.", numbers)
     try:
-        runs = null_runs(case.problem, case.controller, nominal)
+        # The nominal run of a plant with outputs has the states of the plant, and not those of the model.
+        runs = null_runs(case.problem, case.controller, None if case.problem.plant.outputs else nominal)
     except FpirhcError as error:
         return Answer(QUESTION_TEXT, Verdict.UNKNOWN, f"{text}no run of the model: {error}", "", numbers)
     worst = runs.worst

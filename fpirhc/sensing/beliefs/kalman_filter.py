@@ -22,15 +22,16 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.kinds import Positive
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import quantities, values_of
+from fpirhc.sensing.base import values_of
 from fpirhc.sensing.belief import Belief, Correct, Evidence, Model, Predict, Remembered
+from fpirhc.sensing.noises import covariance_entries, first_covariance, name_mistakes, require_named
 from fpirhc.sensing.observability import unobservable
 from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.live import expressed, is_live, nominal
 
-_STATE, _COVARIANCE = "belief_state", "belief_covariance"
+_STATE, _COVARIANCE, _VARIANCES = "belief_state", "belief_covariance", "belief_variances"
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +54,7 @@ class KalmanFilter(Belief):
     start: Mapping[str, Positive] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("measured", "noise"):
-            if not getattr(self, name):
-                raise InvalidValue(f"KalmanFilter({name}={{}}): name at least one")
+        require_named("KalmanFilter", measured=self.measured, noise=self.noise)
 
     def check(self, plant: Plant, measured: tuple[str, ...]) -> None:
         """Raise if a name is unknown or not measured.
@@ -63,17 +62,7 @@ class KalmanFilter(Belief):
         Raises:
             InvalidProblem: all mistakes together.
         """
-        mistakes = Mistakes("KalmanFilter")
-        every = quantities(plant)
-        mistakes.unknown("measured: quantity", self.measured, every)
-        for name in self.measured:
-            if name in every and name not in measured:
-                mistakes.add(
-                    f"measured: no sensor shows '{name}'; those of Sensing(measured=...) are {', '.join(measured)}"
-                )
-        mistakes.unknown("noise: coordinate", self.noise, plant.coordinates)
-        mistakes.unknown("start: state", self.start, plant.state.elements)
-        mistakes.raise_if_any()
+        name_mistakes("KalmanFilter", plant, measured, self.measured, self.noise, self.start).raise_if_any()
 
     def believes(self, plant: Plant, known: tuple[str, ...]) -> tuple[str, ...]:
         """The whole state: measured states come filtered."""
@@ -86,14 +75,20 @@ class KalmanFilter(Belief):
         return tuple(self.measured)
 
     def memory(self, model: Model) -> Layout:
-        """The believed state, and its covariance column by column."""
-        state = model.plant.state
-        first = np.diag([self.start.get(e, 0.0) ** 2 for e in state.elements])
-        entries = tuple(f"{i},{j}" for j in state.elements for i in state.elements)
+        """The believed state, its covariance column by column, and the variances of the noises.
+
+        The variances are constants of a run. As data they enter the same operations whether they are live or not.
+        """
+        state, first = model.plant.state, first_covariance(model.plant, self.start)
         return Layout(
             (
                 Signal(_STATE, state.elements, state.units, tuple(map(float, model.start))),
-                Signal(_COVARIANCE, entries, start=tuple(map(float, first.ravel()))),
+                Signal(_COVARIANCE, covariance_entries(model.plant), start=tuple(map(float, first.ravel()))),
+                Signal(
+                    _VARIANCES,
+                    (*self.noise, *self.measured),
+                    start=tuple(float(nominal(d) ** 2) for d in self._deviations),
+                ),
             )
         )
 
@@ -114,11 +109,13 @@ class KalmanFilter(Belief):
             evidence: Evidence, memory: Remembered, predicted: Expression
         ) -> tuple[Expression, dict[str, Expression]]:
             u, p, before = evidence.command, evidence.parameters, memory[_COVARIANCE]
-            covariance_predicted = spread(memory[_STATE], before, u, p, evidence.moves)
+            white, noise = self._variances(memory[_VARIANCES])
+            covariance_predicted = spread(memory[_STATE], before, u, p, evidence.moves, white)
             shown = ca.vertcat(*(evidence.measured[n] for n in self.measured))
-            state, covariance = gain(predicted, covariance_predicted, u, p, shown)
+            state, covariance = gain(predicted, covariance_predicted, u, p, shown, noise)
             state = ca.if_else(evidence.counts, state, predicted)
-            return state, {_STATE: state, _COVARIANCE: ca.if_else(evidence.counts, covariance, covariance_predicted)}
+            covariance = ca.if_else(evidence.counts, covariance, covariance_predicted)
+            return state, {_STATE: state, _COVARIANCE: covariance, _VARIANCES: memory[_VARIANCES]}
 
         return corrected
 
@@ -132,8 +129,17 @@ class KalmanFilter(Belief):
         """True: the covariance of an error that neither decays nor is observed would stay or grow for ever."""
         return True
 
+    @property
+    def _deviations(self) -> list[float]:
+        return [*self.noise.values(), *self.measured.values()]
+
+    def _variances(self, remembered: Expression) -> tuple[Expression, Expression]:
+        """Variances of the noises and of the sensors; those of live settings, else the remembered ones."""
+        every = [expressed(d * d, remembered) if is_live(d) else remembered[k] for k, d in enumerate(self._deviations)]
+        return ca.vertcat(*every[: len(self.noise)]), ca.vertcat(*every[len(self.noise) :])
+
     def _spread_function(self, model: Model) -> ca.Function:
-        """Function (state, covariance, input, parameters, share) -> covariance of the prediction after that share of a cycle."""
+        """Function (state, covariance, input, parameters, share, variances of w) -> covariance of the prediction."""
         plant, size = model.plant, model.plant.state.size
         x, u, p = plant.symbols()
         w, before = ca.SX.sym("w", len(plant.names)), ca.SX.sym("P", size * size)
@@ -141,12 +147,12 @@ class KalmanFilter(Belief):
         after, at = model.move(x, u, p, w, share), [x, u, p, w, share]
         jacobians = ca.Function("fpirhc_slopes", at, [ca.jacobian(after, x), ca.jacobian(after, w)])
         slope, effect = (ca.densify(m) for m in jacobians(x, u, p, ca.SX.zeros(w.numel()), share))
-        white = ca.diag(ca.DM([self.noise.get(n, 0.0) ** 2 for n in plant.names]))
-        spread = slope @ ca.reshape(before, size, size) @ slope.T + effect @ white @ effect.T
-        return ca.Function("fpirhc_spread", [x, before, u, p, share], [ca.densify(ca.vec(spread))])
+        white, effect = ca.SX.sym("white", len(self.noise)), effect[:, [plant.names.index(n) for n in self.noise]]
+        spread = slope @ ca.reshape(before, size, size) @ slope.T + effect @ ca.diag(white) @ effect.T
+        return ca.Function("fpirhc_spread", [x, before, u, p, share, white], [ca.densify(ca.vec(spread))])
 
     def _gain_function(self, model: Model) -> ca.Function:
-        """Function (prediction, its covariance, input, parameters, measured) -> (state, covariance)."""
+        """Function (prediction, its covariance, input, parameters, measured, variances of these) -> (state, covariance)."""
         plant, size = model.plant, model.plant.state.size
         x, u, p = plant.symbols()
         y, column = ca.SX.sym("y", len(self.measured)), ca.SX.sym("P", size * size)
@@ -154,13 +160,14 @@ class KalmanFilter(Belief):
         values = values_of(plant, x, u, p)
         expected = ca.vertcat(*(values[n] for n in self.measured))
         slope = ca.densify(ca.jacobian(expected, x))
-        noise = ca.diag(ca.DM([d**2 for d in self.measured.values()]))
+        variances = ca.SX.sym("R", len(self.measured))
+        noise = ca.diag(variances)
         innovation = slope @ covariance @ slope.T + noise
         gain = ca.solve(ca.densify(innovation), slope @ covariance).T
         rest = ca.SX.eye(size) - gain @ slope
         joseph = rest @ covariance @ rest.T + gain @ noise @ gain.T
         results = [x + gain @ (y - expected), ca.vec(joseph)]
-        return ca.Function("fpirhc_kalman", [x, column, u, p, y], [ca.densify(r) for r in results])
+        return ca.Function("fpirhc_kalman", [x, column, u, p, y, variances], [ca.densify(r) for r in results])
 
 
 EXAMPLES = (KalmanFilter(measured={"a": 1e-3, "b": 1e-3}, noise={"a": 1.0, "b": 1.0}),)

@@ -80,13 +80,14 @@ def measure_optimality(
     rows = plans[np.unique(np.linspace(0, plans.size - 1, SAMPLES).astype(int))] if plans.size else plans
     times = np.ravel(times)
     parameters = rows_of(model_values(model, known), times + problem.period / 2, ready.parameters(model))
+    seen = run[feeds["output"] if feeds.get("output") in run.layout.names else "output"] if of_measured else states
     excess = []
     for row in rows:
         shift = run["command_shift"][row - 1]
         first = ocp.start(states[row], run["command"][row - 1] - shift).full().ravel()
         data = np.asarray(data_of(times[row], parameters[row]).full())
         if of_measured is not None:
-            data = np.asarray(of_measured(data, states[row], run["output"][row], parameters[row]).full())
+            data = np.asarray(of_measured(data, states[row], seen[row], parameters[row]).full())
         best = solve(first, data, ocp.input_lower - shift, ocp.input_upper - shift)
         cost_of_plan = run["solve.cost"][row]
         if best is not None and run["status"][row] <= Status.NOT_CONVERGED:

@@ -126,6 +126,9 @@ def _step_of(stepper: Stepper) -> Callable[[float, np.ndarray, np.ndarray, np.nd
         return lambda now, seen, realised, memory: stepper.step(
             now, seen[:-size], realised, memory, output=seen[-size:]
         )
+    if stepper.beside:  # by itself: `step_measured` would have to split the sample in every cycle
+        size = stepper.beside
+        return lambda now, seen, realised, memory: stepper.step(now, seen[size:], realised, memory, output=seen[:size])
     return lambda now, measured, _, memory: stepper.step_measured(now, measured, memory)
 
 

@@ -1,0 +1,95 @@
+"""What the gate of bad samples costs on two_mass: with it and without it, side by side in one run.
+
+    python benchmarks/gate.py            prints a table; --write puts it into docs/performance.md
+
+Process time of the compiled loop over 10 s of 1 kHz, and of 10 000 steps by hand, with and without the gate, in turns that change
+places. The difference is the median of the quotients of pairs that ran one after the other, with their quartiles; times are the
+best. Without the gate the same composed controller stands in the same loop, and nothing is checked, held or counted.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+
+import fpirhc as fp
+from fpirhc.controllers.gate import Gate
+from fpirhc.simulation.simulate import simulator
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.layout import Expression, Layout
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from in_turns import Work, compared, loop_time
+from table import write_table
+
+TASK = fp.load_problem("two_mass")
+CONTROLLERS = ("CTC", "CTC+FPI (eq 6)", "RHC", "RHC+FPI")
+REPEATS = 41
+STEPS = 10_000  # by hand
+
+
+class Open(Gate):
+    """No gate: every sample is given to the controller."""
+
+    @property
+    def memory(self) -> Layout:
+        """The controller's memory alone."""
+        return self.controller_memory
+
+    def block(self) -> Block:
+        """The controller's step as one block."""
+        own, trace = self.controller_memory, self.inner.trace
+
+        def step(s: Signals) -> dict[str, Expression]:
+            memory = own.join({m: getattr(s, m) for m in own.names})
+            sample = [getattr(s, r) for r in self.inner.reads.names]
+            memory_next, shown, command = self.inner.function(memory, *sample)
+            following = {f"{m}_next": v for m, v in own.split(memory_next).items()}
+            return {**trace.split(shown), "command": command, **following}
+
+        return Block("open", self.reads, trace, step, own, opaque=self.inner.opaque, inside=self.inner)
+
+
+def cycles(name: str) -> Work:
+    """Process time of the compiled loop alone."""
+    return loop_time(simulator(TASK.problem, TASK.controllers[name]))
+
+
+def steps(name: str) -> Work:
+    """Process time of steps by hand with the first sample, the memory handed on."""
+    stepper = fp.Stepper(TASK.problem, TASK.controllers[name])
+    state, realised = TASK.problem.start_state, np.zeros(len(TASK.problem.plant.inputs))
+
+    def work() -> float:
+        memory = stepper.start()
+        begin = time.process_time()
+        for _ in range(STEPS):
+            _, memory = stepper.step(0.0, state, realised, memory)
+        return time.process_time() - begin
+
+    return work
+
+
+def price(name: str, what: str, make: Callable[[str], Work], count: int) -> list[str]:
+    """Row: microseconds without and with the gate, and the ratio."""
+    with patch("fpirhc.simulation.loop.Gate", Open), patch("fpirhc.simulation.step_composition.Gate", Open):
+        works = [make(name)]
+    works.append(make(name))
+    return [f"{name}, {what}", *compared(works, count, REPEATS)]
+
+
+def main() -> None:
+    """Measure and print."""
+    rows = [price(name, "loop", cycles, TASK.problem.cycles) for name in CONTROLLERS]
+    rows += [price(name, "step by hand", steps, STEPS) for name in CONTROLLERS]
+    write_table("gate", ("", "without the gate", "with it", "difference"), rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,138 @@
+"""A plan on outputs near the reference: feedback of the state, of the measured outputs, and of the input before.
+
+A plan follows the reference less d, the distance of the measured outputs from the model's, extrapolated over the horizon (see
+`shifted_reference`). In deviations,
+
+    u = u* + K x + K_d d + L (u_before - u*),        d = (C - C^) x,
+
+with the slopes C and C^ of y, y', ... by the state, of the plant that moves and of the model. K_d is the feedforward of the Riccati
+recursion for a reference that is shifted by each entry of d,
+
+    v_k = q_k + A' v_{k+1} + (S + B' P A)' g_k,      g_k = -(R + B' P B)^-1 (r_k + B' v_{k+1}),      K_d = g_0,
+
+where q and r are the second derivatives of the cost by state or input and reference, times that shift.
+
+The model is linearised along its own motion from the state of the plant, on which its outputs keep their distance d: the one that a
+plan approaches where its cost lets it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.horizon.cost import Cost
+from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stage, linear_stage, stage_symbols
+from fpirhc.horizon.horizon import Horizon
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.stage_data import shifted_reference, stage_data
+from fpirhc.horizon.transcription import transcribe
+from fpirhc.review.plan_feedback import PlanGain, plan_gains
+from fpirhc.task.limits import Limits
+from fpirhc.task.problem import Problem
+
+Sweep = tuple[ca.Function, ca.Function, ca.Function, ca.Function, ca.Function]
+
+
+def gains_at(
+    problem: Problem,
+    horizon: Horizon,
+    cost: Cost,
+    times: Sequence[float],
+    believed: np.ndarray,
+    states_at: Callable[[np.ndarray], np.ndarray],
+) -> list[PlanGain]:
+    """Return the gains of plans on outputs, or on coordinates; arguments as in `plan_gains`."""
+    if not problem.plant.outputs:
+        return plan_gains(problem, horizon, cost, times, believed, states_at)
+    return output_plan_gains(problem, horizon, cost, times, states_at(np.array(times)), believed)
+
+
+def output_plan_gains(
+    problem: Problem, horizon: Horizon, cost: Cost, times: Sequence[float], states: np.ndarray, believed: np.ndarray
+) -> list[PlanGain]:
+    """Return the gains of the plans that start on the reference at these times.
+
+    Args:
+        problem: the problem, whose plant has outputs.
+        horizon: of the plans.
+        cost: of the plans.
+        times: at which the plans start.
+        states: of the plant that moves at these times, shape (m, nx).
+        believed: parameters of the model, shape (np,).
+    """
+    plant = problem.plant
+    horizon = replace(horizon, margins={})
+    ocp = transcribe(plant, problem.reference, horizon, cost, Limits(), start=problem.start_state)
+    data_of, shifted = (
+        stage_data(plant, problem.reference, horizon, cost),
+        shifted_reference(plant, ocp.data, ocp.stages + 1),
+    )
+    sweep = (linear_stage(ocp), hessian_stage(ocp, GaussNewton()), hessian_end(ocp), *_slopes_by_data(ocp))
+    reference, controlled = problem.reference.function(plant), list(plant.face.controlled_indices)
+    gains = []
+    for time, state in zip(times, states, strict=True):
+        clock = time + horizon.step * np.arange(ocp.stages)
+        seen, responses = (np.asarray(v.full()) for v in reference.map(ocp.stages)(clock[None, :]))
+        table, y = data_of(time, believed), seen[:, 0]
+        data = np.asarray(shifted(table, state, y, believed).full())
+        moves = [np.asarray(shifted(table, state, y + e, believed).full()) - data for e in np.eye(len(y))]
+        motion = _motion(ocp, plant.inverse_function, state, responses[controlled], data, believed)
+        gains.append(_gains(sweep, *motion, data, moves, plant.state.size))
+    return gains
+
+
+def _motion(
+    ocp: OptimalControl, inverse: ca.Function, state: np.ndarray, responses: np.ndarray, data: np.ndarray, p: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """States (ns, N + 1) and inputs (nu, N) of the model with the responses of the reference."""
+    inputs = [np.asarray(inverse(state, responses[:, 0], p).full()).ravel()]
+    columns = [np.asarray(ocp.start(state, inputs[0]).full()).ravel()]
+    for k in range(ocp.stages):
+        if k:
+            inputs.append(np.asarray(inverse(columns[k][: len(state)], responses[:, k], p).full()).ravel())
+        columns.append(np.asarray(ocp.dynamics(columns[k], inputs[k], data[:, k]).full()).ravel())
+    return np.column_stack(columns), np.column_stack(inputs)
+
+
+def _gains(
+    sweep: Sweep, states: np.ndarray, inputs: np.ndarray, data: np.ndarray, moves: Sequence[np.ndarray], nx: int
+) -> PlanGain:
+    """First gains of the recursion; `moves` are the changes of the data by each entry of d."""
+    linear, curved, end, by_data, end_by_data = sweep
+    last = states[:, -1], data[:, -1]
+    value = np.asarray(end(*last)[2].full())
+    slope = np.column_stack([np.asarray(end_by_data(*last, m[:, -1]).full()) for m in moves])
+    gain = np.zeros((len(inputs), len(states)))
+    feed = np.zeros((len(inputs), len(moves)))
+    for k in reversed(range(inputs.shape[1])):
+        at = (states[:, k], inputs[:, k], data[:, k])
+        a, b = (np.asarray(m.full()) for m in linear(*at)[2:4])
+        q, s, r = (np.asarray(m.full()) for m in curved(*at, np.zeros(len(states))))
+        on_state, on_input = (
+            np.column_stack(columns)
+            for columns in zip(*([np.asarray(v.full()) for v in by_data(*at, m[:, k])] for m in moves), strict=True)
+        )
+        coupled, curvature = s + b.T @ value @ a, r + b.T @ value @ b
+        gain = -np.linalg.solve(curvature, coupled)
+        feed = -np.linalg.solve(curvature, on_input + b.T @ slope)
+        slope = on_state + a.T @ slope + coupled.T @ feed
+        value = q + a.T @ value @ a + coupled.T @ gain
+    nu = len(inputs)
+    return PlanGain(gain[:, :nx], gain[:, nx:] if gain.shape[1] > nx else np.zeros((nu, nu)), feed)
+
+
+def _slopes_by_data(ocp: OptimalControl) -> tuple[ca.Function, ca.Function]:
+    """Functions (s, u, theta, move) -> changes of l_s and l_u; (s, theta, move) -> change of T_s: by a move of theta."""
+    s, u, theta = stage_symbols(ocp)
+    move = ca.SX.sym("move", theta.numel())
+    cost, final = ocp.stage_cost(s, u, theta)[0], ocp.terminal_cost(s, theta)
+    changes = [ca.jtimes(ca.gradient(cost, v), theta, move) for v in (s, u)]
+    at_end = ca.jtimes(ca.gradient(final, s), theta, move)
+    return (
+        ca.Function("fpirhc_by_data", [s, u, theta, move], [ca.densify(c) for c in changes]),
+        ca.Function("fpirhc_end_by_data", [s, theta, move], [ca.densify(at_end)]),
+    )

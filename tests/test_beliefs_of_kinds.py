@@ -1,0 +1,260 @@
+"""Beliefs of other kinds of plants - maps, algebraic states, outputs that the command moves at once - and their live settings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from plants import linear
+
+import fpirhc as fp
+from fpirhc.conformance.live import check_live
+from fpirhc.errors import NotSupported
+from fpirhc.sensing.belief import Belief
+from fpirhc.simulation.sample import raw_measurements
+
+TRACK = fp.ComputedTorque(fp.Exponential(rate=0.2))
+T = 2.0  # s, one step of the map
+NOISES: dict[str, Any] = {
+    "measured": {"adult": 0.02},
+    "noise": {"young": 0.02, "adult": 0.01},
+    "start": {"young": 0.1, "adult": 0.1},
+}
+FILTER = fp.KalmanFilter(**NOISES)
+HORIZON = fp.MovingHorizonStates(**NOISES, window=4)
+
+
+def run(problem: fp.Problem, controller: Any = TRACK, seed: int = 0) -> fp.Run:
+    return fp.simulate(problem, controller, seed=seed, compiled=False)
+
+
+# Maps
+
+
+def fishery(belief: Belief, birth: float = 2.5, noise: float = 0.0, **changes: Any) -> fp.Problem:
+    """Ricker's stock in two ages: the adults are counted, the young are not."""
+    plant = fp.Plant.of_map(
+        states={"young": "1", "adult": "1"},
+        inputs={"catch": "1"},
+        parameters={"birth": fp.Parameter(approximate=birth, exact=2.5, unit="1")},
+        next=lambda x, u, p: {
+            "young": p.birth * x.adult * ca.exp(-x.adult),
+            "adult": 0.5 * x.adult + 0.4 * x.young - u.catch,
+        },
+        outputs={"adult": fp.Output("1", lambda x, p: x.adult)},
+        step=T,
+    )
+    sensors = {"adult": fp.Sensor(noise=fp.Noise(noise))} if noise else {}
+    settings: dict[str, Any] = {"sensing": fp.Sensing(sensors, fp.Measured(), measured=["adult"], belief=belief)}
+    return fp.Problem(
+        plant=plant, reference=fp.Trajectory(lambda t: {"adult": 0.8 + 0.1 * ca.sin(0.15 * t)}),
+        start={"young": 0.9, "adult": 0.7}, period=T, duration=60.0, **(settings | changes),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("belief", [fp.ModelStates(), FILTER, HORIZON], ids=lambda b: type(b).__name__)
+def test_the_right_map_believes_what_is(belief: Belief) -> None:
+    result = run(fishery(belief))
+    np.testing.assert_allclose(result["state"], result["plant_state"], atol=1e-12)
+    assert np.ptp(result["plant_state"], axis=0).min() > 0.02
+
+
+def test_a_filter_of_a_map_is_that_of_the_books() -> None:
+    """Against a recursion in numpy with a wrong birth rate; noise adds T w to the next state, as a disturbance does."""
+    result = run(fishery(FILTER, birth=3.0, noise=0.02))
+    x, p, c = np.array([0.9, 0.7]), np.diag([0.01, 0.01]), np.array([[0.0, 1.0]])
+    w = T**2 * np.diag([0.02, 0.01]) ** 2
+    for k, measured in enumerate(raw_measurements(result)):
+        if k:
+            y, a = x
+            slope = np.array([[0.0, 3.0 * (1 - a) * np.exp(-a)], [0.4, 0.5]])
+            x = np.array([3.0 * a * np.exp(-a), 0.5 * a + 0.4 * y - result["command"][k - 1, 0]])
+            p = slope @ p @ slope.T + w
+        gain = p @ c.T / (c @ p @ c.T + 0.02**2)
+        x, p = x + gain @ (measured - c @ x), p - gain @ c @ p
+        np.testing.assert_allclose(result["state"][k], x, atol=1e-12)
+
+
+# Algebraic states
+
+
+def drained(algebraic: bool, belief: Belief) -> fp.Problem:
+    """Two tanks in a row; the flow between them solves q |q| + q = h1 - h2, by Newton's method or by hand."""
+
+    def by_hand(difference: Any) -> Any:
+        return ca.sign(difference) * (ca.sqrt(0.25 + ca.fabs(difference)) - 0.5)
+
+    def rates(q: Any, u: Any, p: Any, z: Any = None) -> dict[str, Any]:
+        flow = z.flow if algebraic else by_hand(q.h1 - q.h2)
+        return {"h1": u.u - flow, "h2": p.pipe * flow - 0.3 * q.h2}
+
+    solved = fp.Algebraic(
+        units={"flow": "m^2/s"},
+        equations=lambda q, u, p, z: {"flow": z.flow * ca.fabs(z.flow) + z.flow - (q.h1 - q.h2)},
+        guess=lambda q, u, p: {"flow": q.h1 - q.h2},
+        steps=12,
+    )
+    if algebraic:
+        response: Any = lambda q, u, p, z: rates(q, u, p, z)  # noqa: E731
+    else:
+        response = lambda q, u, p: rates(q, u, p)  # noqa: E731
+    plant = fp.Plant(
+        coordinates={"h1": "m", "h2": "m"}, inputs={"u": "m/s"}, controlled=("h1",), order=1, response=response,
+        parameters={"pipe": fp.Parameter(approximate=1.2, exact=1.0, unit="1")}, algebraic=solved if algebraic else None,
+    )  # fmt: skip
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"h1": 1.2 + 0.3 * ca.sin(t), "h2": 0.6 + 0 * t}),
+        start={"h1": 1.0, "h2": 0.5},
+        period=0.05,
+        duration=4.0,
+        sensing=fp.Sensing(
+            {"h1": fp.Sensor(noise=fp.Noise(1e-3))}, fp.VelocityDifference(), measured=["h1"], belief=belief
+        ),
+    )
+
+
+LEVELS: dict[str, Any] = {"measured": {"h1": 1e-3}, "noise": {"h1": 0.02, "h2": 0.05}}
+
+
+@pytest.mark.parametrize(
+    "belief",
+    [fp.ModelStates(), fp.KalmanFilter(**LEVELS), fp.MovingHorizonStates(**LEVELS, window=4)],
+    ids=lambda b: type(b).__name__,
+)
+def test_algebraic_states_are_believed_as_those_that_are_solved_by_hand(belief: Belief) -> None:
+    """Newton's flow and its derivatives are those of the root: the wrong pipe is corrected alike."""
+    one, other = (
+        run(drained(algebraic, belief), fp.ComputedTorque(fp.Exponential(1.0))) for algebraic in (True, False)
+    )
+    np.testing.assert_allclose(one["state"], other["state"], atol=1e-9)
+    assert np.abs(one["state.h2"] - one["plant_state.h2"]).max() > 1e-3
+
+
+# Outputs that the command moves at once
+
+
+def test_an_output_of_order_zero_shows_what_is_believed() -> None:
+    """The power of a heating element is measured; its temperature, started 20 K too low, follows from the resistance."""
+
+    def resistance(x: Any) -> Any:
+        return 14.0 * (1 + 4e-3 * x.theta)
+
+    plant = fp.Plant.of_states(
+        states={"theta": "K"},
+        inputs={"u": "V"},
+        parameters={},
+        rates=lambda x, u, p: {"theta": (u.u**2 / resistance(x) - 2.0 * x.theta) / 50.0},
+        outputs={"power": fp.Output("W", lambda x, u, p: u.u**2 / resistance(x))},
+        inverse=lambda x, r, p: {"u": ca.sqrt(r.power * resistance(x))},
+    )
+    belief = fp.KalmanFilter(measured={"power": 1.0}, noise={"theta": 0.1}, start={"theta": 20.0})
+    problem = fp.Problem(
+        plant=plant,
+        reality=fp.Reality(plant, start={"theta": 30.0}),
+        reference=fp.Trajectory(lambda t: {"power": 200 + 60 * ca.sin(t / 5)}),
+        start={"theta": 10.0},
+        input_before={"u": 60.0},
+        period=0.1,
+        duration=10.0,
+        sensing=fp.Sensing({"power": fp.Sensor(noise=fp.Noise(1.0))}, fp.Measured(), measured=["power"], belief=belief),
+    )
+    errors = {}
+    for name, one in (("filter", belief), ("model", fp.ModelStates())):
+        result = run(replace(problem, sensing=replace(problem.sensing, belief=one)), fp.FeedforwardOnly())
+        errors[name] = np.abs(result["state.theta"] - result["plant_state.theta"])[50:].max()
+    assert errors["filter"] < 1.5
+    assert errors["model"] > 10
+
+
+# Signals from outside
+
+
+def room(belief: Belief) -> fp.Problem:
+    """A heated room in known weather: its air is an output that is measured, late by two cycles; its walls are believed."""
+    plant = fp.Plant.of_states(
+        states={"air": "K", "walls": "K"},
+        inputs={"heat": "kW"},
+        parameters={"loss": fp.Parameter(0.3, 0.3, "kW/K"), "ambient": fp.outside(nominal=280.0, unit="K")},
+        rates=lambda x, u, p: {
+            "air": p.loss * (p.ambient - x.air) + 0.5 * (x.walls - x.air) + u.heat,
+            "walls": 0.1 * (x.air - x.walls) + 0.05 * (p.ambient - x.walls),
+        },
+        outputs={"felt": fp.Output("K", lambda x, p: 0.7 * x.air + 0.3 * x.walls)},
+        time_unit="h",
+    )
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"felt": 291.0 + ca.sin(0.3 * t)}),
+        start={"air": 292.0, "walls": 289.0},
+        period=0.25,
+        duration=10.0,
+        signals={"ambient": fp.Known(lambda t: 280.0 + 5.0 * ca.sin(0.4 * t))},
+        dead_time=fp.DeadTime(measurement=0.5),
+        sensing=fp.Sensing({}, fp.PositionDifference(), measured=["felt"], belief=belief),
+    )
+
+
+ROOM: dict[str, Any] = {"measured": {"felt": 0.1}, "noise": {"air": 0.1, "walls": 0.1}}
+
+
+@pytest.mark.parametrize(
+    "belief",
+    [fp.ModelStates(), fp.KalmanFilter(**ROOM), fp.MovingHorizonStates(**ROOM, window=5)],
+    ids=lambda b: type(b).__name__,
+)
+def test_states_behind_an_output_are_believed_in_known_weather(belief: Belief) -> None:
+    """The model moves in the weather of the time of the samples, in every cycle of a window too."""
+    result = run(room(belief), fp.ComputedTorque(fp.Exponential(rate=0.5)))
+    true = result["plant_state"]
+    assert np.ptp(true[:, 1]) > 0.5
+    np.testing.assert_allclose(result["state"][2:], true[:-2], atol=1e-9)
+
+
+# Live settings
+
+
+def double(belief: Belief, **changes: Any) -> fp.Problem:
+    sensing = fp.Sensing(
+        {"y": fp.Sensor(noise=fp.Noise(1e-3), quantum=1e-4)}, fp.PositionDifference(), measured=["y"], belief=belief
+    )
+    settings: dict[str, Any] = {"sensing": sensing, "period": 0.01, "duration": 0.2, "start": {"y": 0.0}}
+    reference = fp.Trajectory(lambda t: {"y": 0.3 * ca.sin(t)})
+    return fp.Problem(plant=linear(1.0, 1.0), reference=reference, **(settings | changes))
+
+
+HALF: dict[str, Any] = {"measured": {"y": 1e-3}, "noise": {"y": 0.5}, "start": {"y": 1.0}}
+
+
+def test_noises_of_a_filter_are_live_bit_by_bit() -> None:
+    paths = [
+        "sensing.belief.measured.y",
+        "sensing.belief.noise.y",
+        "sensing.belief.start.y",
+        "sensing.sensors.y.quantum",
+    ]
+    problem = double(fp.KalmanFilter(**HALF))
+    live = {one.path: one.refused for one in check_live(problem, TRACK, paths=paths, cycles=12)}
+    assert [path for path in paths if not live[path]] == paths[:2]
+
+
+NOT_LIVE = ("measured.y", "noise.y", "start.y", "bounds.y.0", "window", "iterations", "barrier")
+
+
+@pytest.mark.parametrize("name", NOT_LIVE)
+def test_settings_of_a_moving_horizon_are_not_live(name: str) -> None:
+    belief = fp.MovingHorizonStates(**HALF, window=3, bounds={"y": (-1.0, 1.0)})
+    with pytest.raises(NotSupported, match=f"'sensing.belief.{name}'.* cannot be live"):
+        fp.simulator(double(belief), TRACK, compiled=False, live=[f"sensing.belief.{name.removesuffix('.0')}"])
+
+
+def test_a_late_measurement_is_not_live_beside_a_belief() -> None:
+    late = fp.DeadTime(inputs={"u": 0.02}, measurement=0.01, longest={"u": 0.04, "measurement": 0.02})
+    problem = double(fp.KalmanFilter(**HALF), dead_time=late)
+    with pytest.raises(NotSupported, match=r"'dead_time.measurement' cannot be live here"):
+        fp.simulator(problem, TRACK, compiled=False, live=["dead_time.measurement"])
+    [tried] = check_live(problem, TRACK, paths=["dead_time.inputs.u"], cycles=12)
+    assert not tried.refused

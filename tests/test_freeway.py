@@ -1,0 +1,213 @@
+"""The freeway: METANET against a published run, its ramp, and the emission that an iteration on targets holds.
+
+The reference is a run of 900 steps of FilippoAiraldi/sym-metanet (MIT licence, tests/data/freeway/LICENSE), every twentieth row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.problem_files.problem_file import Task
+
+DATA = Path(__file__).parent / "data" / "freeway" / "reference.csv"
+T = 10 / 3600  # h
+TOTAL_TIME_SPENT = 1433.7876921  # veh h
+
+
+@cache
+def task(name: str) -> Task:
+    return fp.load_problem(name)
+
+
+@cache
+def run_of(name: str, controller: str) -> fp.Run:
+    """One run of a shipped task."""
+    return fp.simulate(task(name).problem, task(name).controllers[controller], seed=0, compiled=False)
+
+
+def error(name: str, controller: str) -> float:
+    [value] = fp.measure(task(name).problem, run_of(name, controller)).rms_error.values()
+    return float(value)
+
+
+def open_loop() -> np.ndarray:
+    """900 steps of 10 s with an open ramp and the demands of the source, shape (900, 14)."""
+    problem = task("freeway_metering").problem
+    plant = problem.plant.over(T)  # one step, and not the six of a minute
+    hours = T * np.arange(900)
+    demands = {
+        "demand": np.interp(hours, [2, 2.25], [3500, 1000]),
+        "ramp_demand": np.interp(hours, [0, 0.15, 0.35, 0.5], [500, 1500, 1500, 500]),
+    }
+    values = np.tile(plant.exact, (900, 1))
+    for name, column in demands.items():
+        values[:, plant.parameter.elements.index(name)] = column
+    x, u, p = plant.symbols()
+    step = ca.Function("step", [x, u, p], [plant.next_function(x, u, p, ca.SX.zeros(len(plant.names)))])
+    function = step.mapaccum(900)
+    return np.asarray(function(problem.start_state, np.ones((1, 900)), values.T).full()).T
+
+
+def test_metanet_is_the_published_run() -> None:
+    """Densities, speeds and queues to rounding, and the total time spent to every printed digit."""
+    states, rows = open_loop(), np.loadtxt(DATA, delimiter=",", skiprows=1)
+    at, published = rows[:, 0].astype(int), rows[:, 1:]
+    assert len(at) == 45
+    np.testing.assert_allclose(states[at], published, rtol=1e-14, atol=2e-13)
+    cars = 2 * states[:, :6].sum(axis=1) + states[:, 12:].sum(axis=1)
+    assert T * cars.sum() == pytest.approx(TOTAL_TIME_SPENT, abs=1e-7)
+
+
+def test_cars_are_conserved() -> None:
+    """What has come is on the road, waits, or has left at the end, whatever the speeds are."""
+    states, hours = open_loop(), T * np.arange(900)
+    come = np.interp(hours, [2, 2.25], [3500, 1000]) + np.interp(hours, [0, 0.15, 0.35, 0.5], [500, 1500, 1500, 500])
+    first = task("freeway_metering").problem.start_state[None, :]
+    before = np.vstack([first, states[:-1]])
+    left = 2 * before[:, 5] * before[:, 11]
+    cars = [2 * s[:, :6].sum(axis=1) + s[:, 12:].sum(axis=1) for s in (before, states)]
+    assert cars[1] - cars[0] == pytest.approx(T * (come - left), abs=1e-10)
+
+
+# Metering
+
+
+def test_the_density_at_the_merge_has_order_one() -> None:
+    plant = task("freeway_metering").problem.plant
+    assert plant.face.orders == (1,)
+    assert plant.instant_names == ()
+
+
+@pytest.mark.parametrize(("controller", "expected"), [("CTC", 0.79), ("CTC+FPI", 0.158)])
+def test_adaptation_holds_the_density(controller: str, expected: float) -> None:
+    """The figures of the description."""
+    assert error("freeway_metering", controller) == pytest.approx(expected, rel=0.02)
+
+
+def test_an_exact_map_of_a_minute_has_no_error() -> None:
+    """Six steps with the rate held are one map, whose inverse the controller has."""
+    assert error("freeway_metering", "CTC exact model") < 1e-12
+
+
+def test_the_run_is_a_loop_by_hand() -> None:
+    """The rates of a run through METANET in numpy, six steps per minute, with the demands in the middle of every minute."""
+    problem, run = task("freeway_metering").problem, run_of("freeway_metering", "CTC+FPI")
+    state = np.array(problem.start_state)
+    for k in range(run.cycles):
+        assert run["state"][k] == pytest.approx(state, rel=1e-13, abs=1e-12)
+        middle = (k + 0.5) * problem.period
+        demands = (
+            np.interp(middle, [2, 2.25], [3500, 1000]),
+            np.interp(middle, [0, 0.15, 0.35, 0.5], [500, 1500, 1500, 500]),
+        )
+        for _ in range(6):
+            state = by_hand(state, float(run["command.r"][k]), demands)
+
+
+def by_hand(state: np.ndarray, rate: float, demands: tuple[float, float]) -> np.ndarray:
+    """One step of METANET in numpy, with the published numbers."""
+    rho, v, w = state[:6], state[6:12], state[12:]
+    room = np.minimum(1, (180 - rho[[0, 4]]) / (180 - 33.5))
+    main, ramp = np.array([1, rate]) * np.minimum(np.array(demands) + w / T, np.array([4000, 2000]) * room)
+    flow, merging = 2 * rho * v, np.array([0, 0, 0, 0, ramp, 0])
+    ahead, settling = np.append(rho[1:], min(rho[5], 33.5)), 102 * np.exp(-((rho / 33.5) ** 1.867) / 1.867)
+    later = v + T / (18 / 3600) * (settling - v) + T * v * (np.append(v[0], v[:-1]) - v)
+    later = later - 60 * T / (18 / 3600) * (ahead - rho) / (rho + 40) - 0.0122 * T / 2 * merging * v / (rho + 40)
+    dense = rho + T / 2 * (np.append(main, flow[:-1]) - flow + merging)
+    return np.concatenate([dense, later, w + T * (np.array(demands) - [main, ramp])])
+
+
+def test_a_metered_ramp_saves_time() -> None:
+    """An open ramp lets the density rise to 71, where traffic is slow; metered, all together spend less time, queue included."""
+    metered, start = run_of("freeway_metering", "CTC+FPI")["state"], task("freeway_metering").problem.start_state
+    free = np.vstack([start, open_loop()[:359]])
+    spent = [hours * (2 * s[:, :6].sum() + s[:, 12:].sum()) for hours, s in ((T, free), (6 * T, metered))]
+    assert spent == pytest.approx([570.8, 553.5], abs=0.2)
+    assert free[:, 4].max() == pytest.approx(71, abs=0.5)
+    assert metered[:, 4].max() < 33
+
+
+# Emission
+
+
+def settled_emission(flow: float, rate: float, p: dict[str, float]) -> float:
+    """The model's map by bisection: LANES rho V(rho) = flow on the free branch."""
+
+    def emitted(q: float) -> float:
+        low, high = 0.0, p["rho_crit"]
+        for _ in range(100):
+            rho = (low + high) / 2
+            speed = p["v_free"] * np.exp(-((rho / p["rho_crit"]) ** p["a"]) / p["a"])
+            low, high = (rho, high) if 2 * rho * speed < q else (low, rho)
+        return float(q * (1374 / speed + 47.5 + 0.00867 * speed**2) / 1000)
+
+    return 4 * emitted(flow) + 2 * emitted(flow + 2000 * rate)
+
+
+@pytest.mark.parametrize("which", ["approximate", "exact"])
+def test_the_static_map_is_that_of_settled_traffic(which: str) -> None:
+    """Eight steps of Newton's method inside the map against bisection, for all rates."""
+    plant = task("freeway").problem.plant
+    values = getattr(plant, which)
+    p = dict(zip(plant.parameters, values, strict=True))
+    for rate in np.linspace(0.0, 0.6, 13):
+        mapped = float(plant.controlled_response_function([50.0], rate, values))
+        assert mapped == pytest.approx(settled_emission(2500.0, rate, p), rel=1e-9)
+
+
+def test_every_target_has_a_rate() -> None:
+    """Beyond the largest rate the map goes on as a line, and its inverse with it."""
+    plant = task("freeway").problem.plant
+    for target in (1900.0, 2000.0, 2140.0):
+        rate = float(plant.inverse_function([50.0], target, plant.approximate))
+        assert float(plant.controlled_response_function([50.0], rate, plant.approximate)) == pytest.approx(
+            target, rel=1e-7
+        )
+    assert rate > 0.6
+
+
+def test_the_iteration_holds_the_emission() -> None:
+    """The figures of the description; the map alone stays at its largest rate."""
+    assert error("freeway", "static map") == pytest.approx(71.8, rel=0.02)
+    assert error("freeway", "static map+FPI") == pytest.approx(5.0, rel=0.02)
+    assert run_of("freeway", "static map")["clipped"].all()
+    assert run_of("freeway", "static map+FPI")["clipped"][30:].sum() == 0
+    assert run_of("freeway", "static map+FPI")["reality_state.w2"].min() > 6  # so the ramp is never short of cars
+    assert run_of("freeway", "static map+FPI")["reality_state.w2"].max() < 1710
+
+
+def test_even_the_exact_map_is_worse_than_the_iteration() -> None:
+    """Traffic takes its time, and nobody knows the mainstream: figures of the description."""
+    problem = task("freeway").problem
+    exact = {n: replace(one, approximate=one.exact) for n, one in problem.plant.parameters.items()}
+    known = {n: fp.Known(one.values) for n, one in problem.signals.items()}
+    informed = replace(problem, plant=replace(problem.plant, parameters=exact))
+    for one, expected in ((informed, 33.5), (replace(informed, signals=known), 7.3)):
+        run = fp.simulate(one, fp.FeedforwardOnly(), seed=0, compiled=False)
+        assert fp.measure(one, run).rms_error["emission"] == pytest.approx(expected, rel=0.02)
+    last = fp.Cascade(fp.FeedforwardOnly(), fp.Affine(gain=-1.0), paired=None)
+    plain = fp.simulate(problem, last, seed=0, compiled=False)
+    assert fp.measure(problem, plain).rms_error["emission"] == pytest.approx(5.1, rel=0.02)
+
+
+def test_the_shift_of_the_target_is_that_of_a_loop_by_hand() -> None:
+    """The cascade and METANET in numpy: map by bisection, pairing through the lag, ten seconds per step."""
+    run, problem = run_of("freeway", "static map+FPI"), task("freeway").problem
+    lag, period, gain = 1 / 60, problem.period, 0.5
+    emission, shift, under_way = run["output.emission"], 0.0, float(run["output.emission"][0] - 2140.0)
+    decay = np.exp(-period / lag)
+    free = run["clipped"] == 0
+    for k in range(1, 120):
+        under_way = decay * under_way + (1 - decay) * shift
+        reference = 2140 + 25 * np.sin(2 * np.pi * k * period)
+        wanted = shift - gain * (emission[k] - reference - under_way + shift)
+        shift = float(run["shift.emission"][k])
+        if free[k - 1] or abs(wanted) < abs(shift):
+            assert shift == pytest.approx(wanted, abs=1e-8)

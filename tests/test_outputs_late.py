@@ -1,0 +1,121 @@
+"""Plants with outputs behind dead time: outputs are predicted with the state, and keep their distance from the model's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_outputs import OPTIMISER, SHORT, TWO_MASS, arm, circle, hill, on_outputs, planned, sedated, simulated
+
+import fpirhc as fp
+from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.output_ahead import output_ahead
+from fpirhc.errors import NotSupported
+from fpirhc.review.grid import review_grid
+from fpirhc.review.loops import loops_along
+from fpirhc.simulation.simulate import simulator
+
+LAW = fp.Exponential(rate=1.0)
+LATE = 0.2  # min, of the pump
+
+
+def late(problem: fp.Problem, time: float = LATE) -> fp.Problem:
+    return replace(problem, dead_time=fp.DeadTime(inputs={"u": time}))
+
+
+@pytest.mark.parametrize("name", ["CTC+FPI (eq 6)", "RHC"])
+def test_outputs_that_are_coordinates_change_no_prediction(name: str) -> None:
+    dead_time = fp.DeadTime(inputs={"Q1": 3e-3, "Q2": 3e-3}, measurement=2e-3)
+    short = replace(SHORT, duration=0.06, measure_from=0.0, dead_time=dead_time)
+    controller = fp.Predicted(TWO_MASS.controllers[name], inputs=3e-3, measurement=2e-3)
+    if controller.deformation.adapts:
+        controller = controller.with_deformation(fp.Paired(controller.deformation, cycles=5))
+    plain, run = (simulated(p, controller) for p in (short, on_outputs(short)))
+    for signal in ("state", "command", "state_ahead"):
+        assert np.array_equal(plain[signal], run[signal])
+    assert np.array_equal(run["output_ahead"], run["state_ahead"])
+
+
+def test_outputs_ahead_of_a_right_model_are_those_that_come() -> None:
+    """With the exact model, ahead is what is measured later, to the error of the integrator."""
+    problem = late(sedated(hill(4.0)))
+    run = simulated(problem, fp.Predicted(fp.ComputedTorque(LAW), inputs=LATE))
+    cycles = round(LATE / problem.period)
+    assert np.allclose(run["output_ahead"][:-cycles], run["output"][cycles:], atol=1e-6)
+    assert np.abs(run["output_ahead"] - run["output"]).max() > 0.5
+
+
+def test_the_distance_of_a_wrong_model_moves_as_a_polynomial() -> None:
+    """Y + d' tau of a plant whose outputs differ from the model's by d and d'; d'' of the model is zero."""
+    plant = hill(5.5)
+    shift = np.array([2.0, -0.3])
+    x, later, tau = np.array([3.0, 2.0]), np.array([3.1, 2.1]), 0.25
+    own, ahead = (plant.output_function(s, 0.0, 5.5, np.zeros(2)).full().ravel() for s in (x, later))
+    y = output_ahead(plant)(own + shift, x, later, 5.5, tau).full().ravel()
+    assert np.allclose(y, ahead + np.array([2.0 - 0.3 * tau, -0.3]))
+
+
+def test_a_prediction_helps_behind_dead_time_and_leaves_no_error_at_rest() -> None:
+    """A law that is too fast for the dead time; the prediction keeps it, with the wrong curve too."""
+    problem, fast = late(sedated(hill(5.5)), 0.5), fp.ComputedTorque(fp.Exponential(rate=1.5))
+    bare, ahead = (simulated(problem, c) for c in (fast, fp.Predicted(fast, inputs=0.5)))
+    errors = [fp.measure(problem, r).rms_error["depth"] for r in (bare, ahead)]
+    assert errors[1] < 0.3 * errors[0]
+    plan = fp.Predicted(fp.RecedingHorizon(OPTIMISER), inputs=LATE)
+    run = simulated(late(planned()), plan)
+    assert abs(run["true_error.depth"][-1]) < 0.05
+
+
+def test_adaptation_behind_dead_time_helps() -> None:
+    """The form that compares with the model's response; it takes no drift of the response within the dead time for an error."""
+    problem = replace(late(sedated(hill(5.5)), 0.05), input_before={"u": 1.5}, measure_from=8.0)
+    plain = fp.Predicted(fp.ComputedTorque(LAW), inputs=0.05)
+    adaptive = plain.with_deformation(fp.ModelReferenced(fp.Affine(-0.4), cycles=3))
+    errors = [fp.measure(problem, simulated(problem, c)).rms_error["depth"] for c in (plain, adaptive)]
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_an_estimator_inside_a_prediction_has_the_measured_outputs() -> None:
+    """The filter compares what was measured with what it expected then, and not what is predicted."""
+    problem, law = late(sedated(hill(4.0))), fp.ComputedTorque(LAW)
+    noise = {"C": 1e-3, "E": 1e-3}
+    shift = fp.DisturbanceKalman({"depth": 1.0}, {"depth": 0.01, "C": 0.01, "E": 0.01}, noise=noise)
+    inside = simulated(problem, fp.Predicted(fp.Estimating(law, shift), inputs=LATE))
+    assert np.abs(inside["estimate"]).max() < 1e-3  # a right model has nothing to learn
+    assert np.abs(inside["output_ahead.depth"] - inside["output.depth"]).max() > 0.5
+
+
+REFUSED: dict[str, tuple[Callable[[], Controller], str]] = {
+    "desired": (
+        lambda: fp.Predicted(fp.ComputedTorque(LAW), inputs=LATE, by=fp.ByDesired()),
+        r"the inverse needs the state; use by=ByModel\(\)",
+    ),
+    "inside": (
+        lambda: fp.Predicted(fp.RecedingHorizon(OPTIMISER, replanning=fp.FromPlan(LAW)), inputs=LATE),
+        "FromPlan tracks",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_not_covered_says_so(name: str) -> None:
+    make, words = REFUSED[name]
+    with pytest.raises(NotSupported, match=words):
+        simulated(late(planned()), make())
+
+
+def test_the_linear_loop_of_a_prediction_says_why_there_is_none() -> None:
+    controller = fp.Predicted(fp.ComputedTorque(LAW, fp.Paired(fp.Affine(-0.4), cycles=12)), inputs=LATE)
+    assert "predicted outputs" in loops_along(review_grid(late(sedated(hill(5.5))), 0.0, 0), controller).reason
+
+
+def test_live_dead_times_of_outputs_are_those_that_are_built() -> None:
+    times = fp.DeadTime(inputs={"A": 4e-3, "B": 4e-3})
+    problem = replace(circle(arm(), dead_time=times), duration=0.2, measure_from=0.0)
+    law = fp.ComputedTorque(fp.Exponential(6.0))
+    built = simulated(problem, fp.Predicted(law, inputs=4e-3))
+    ready = simulator(problem, fp.Predicted(law, inputs=2e-3, longest=8e-3), compiled=False, live=["inputs"])
+    opened = ready.run(seed=0, settings={"inputs": 4e-3})
+    assert np.allclose(built["output"], opened["output"], atol=1e-12)
