@@ -1,7 +1,15 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
 from .baselines.check import accept, bless, check_baseline
-from .conformance import check_controller, check_deformation, check_live, check_optimiser, check_plant, check_tracking
+from .conformance import (
+    check_belief,
+    check_controller,
+    check_deformation,
+    check_live,
+    check_optimiser,
+    check_plant,
+    check_tracking,
+)
 from .contraction import assess_gain, check_gain, delayed_limit, response_jacobian, spectrum_over_box, spectrum_over_run
 from .controllers.computed_torque import ComputedTorque
 from .controllers.feedforward_only import FeedforwardOnly
@@ -273,6 +281,7 @@ __all__ = [
     "bless",
     "certify",
     "check_baseline",
+    "check_belief",
     "check_controller",
     "check_deformation",
     "check_gain",

@@ -24,6 +24,7 @@ PAGES = {
         'CHOICES = {"projected-gradient": ("projected gradient", lambda t: ProjectedGradient(30, t))}',
     ),
     "gradient": ("estimator", 'EXAMPLES = (Gradient("m", gain=0.02, largest=0.6),)'),
+    "observer": ("belief", 'EXAMPLES = (Observer({"a": {"a": 0.3}, "b": {"b": 0.3}}),)'),
     "saturated": ("controller", "EXAMPLES = (Saturated(6.0, 20.0),)"),
 }
 MEMBERS = {
@@ -32,6 +33,7 @@ MEMBERS = {
     "optimisers": "ProjectedGradient",
     "estimators": "Gradient",
     "controllers": "Saturated",
+    "beliefs": "Observer",
 }
 # Two wrappers in each other, neither of them known to fpirhc: a controller whose user wants to name it.
 NAMED = '''

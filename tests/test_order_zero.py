@@ -160,6 +160,48 @@ def test_a_review_says_what_it_covers() -> None:
     assert "not covered for outputs of order 0" in answers.problem[-1].evidence
 
 
+@pytest.mark.parametrize(("gain", "verdict"), [(0.5, "yes"), (3.5, "no")])
+def test_a_review_judges_the_gain_by_the_settled_map(gain: float, verdict: str) -> None:
+    """P = R^ r / R for a request r: the slope is R^ / R along the way, and a run does what the verdict says."""
+    problem, controller = heated(element(), duration=20.0), fp.Cascade(STATIC, affine(gain))
+    by_question = {
+        a.question: a for a in fp.review(problem, {"one": controller}, mismatch=0.0, seed=0).controllers["one"]
+    }
+    run = simulated(problem, controller)
+    slopes = 14.0 / (COLD * (1 + WARMER * run["state.theta"]))
+    signs = by_question["Do the eigenvalues of the response Jacobian have one sign?"].numbers
+    assert signs["largest"] == pytest.approx(slopes.max(), rel=0.02)
+    assert str(by_question["Is the map's gain admissible?"].verdict) == verdict
+    assert (np.abs(run["error.power"][-20:]).max() > 100) == (verdict == "no")
+
+
+def test_a_static_map_has_no_error_once_it_is_right() -> None:
+    """Y = u + k u^3 + .3 v and z = v + k v^3, by Newton's method: exact at every sample but the first."""
+    plant = fp.Plant.of_states(
+        states={"still": "1"},
+        inputs={"u": "1", "v": "1"},
+        parameters={"k": fp.Parameter(approximate=0.3, exact=0.2, unit="1")},
+        rates=lambda x, u, p: {"still": 0 * x.still},
+        outputs={
+            "y": fp.Output("1", lambda x, u, p: u.u + p.k * u.u**3 + 0.3 * u.v),
+            "z": fp.Output("1", lambda x, u, p: u.v + p.k * u.v**3),
+        },
+    )
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"y": ca.sin(t), "z": 0.5 + 0.2 * ca.cos(t)}),
+        start={"still": 0.0},
+        period=0.1,
+        duration=10.0,
+        measure_from=5.0,
+    )
+    exact = simulated(problem, fp.ExactModel(STATIC))
+    assert np.abs(exact["error"][1:]).max() < 1e-8  # Newton's tolerance
+    iterated = simulated(problem, fp.Cascade(STATIC, affine(0.8)))
+    wrong = simulated(problem, STATIC)
+    assert np.abs(iterated["error"][50:]).max() < 0.2 * np.abs(wrong["error"][50:]).max()
+
+
 def test_a_comparison_says_that_the_output_is_measured() -> None:
     """And judges the iteration beside its inner controller, with the null test of the pair."""
     problem = heated(element(), duration=10.0)
@@ -229,6 +271,17 @@ def test_feedforward_alone_is_refused_where_errors_would_add_up() -> None:
     problem = heated(plant, reference=fp.Trajectory(lambda t: {"hot": 100.0 + 0 * t}))
     with pytest.raises(NotSupported, match="the error of hot would add up"):
         simulated(problem, STATIC)
+
+
+def test_a_static_map_needs_a_state_that_stands_still() -> None:
+    with pytest.raises(InvalidProblem, match="a static map y = h\\(u\\) may have one that stands still"):
+        fp.Plant.of_states(
+            states={},
+            inputs={"u": "1"},
+            parameters={},
+            rates=lambda x, u, p: {},
+            outputs={"y": fp.Output("1", lambda x, u, p: u.u)},
+        )
 
 
 def test_an_expression_with_other_arguments_is_named() -> None:

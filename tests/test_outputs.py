@@ -423,7 +423,6 @@ NOT_COVERED: dict[str, tuple[Callable[[], Controller], str]] = {
         "FromMeasurementTracked",
     ),
     "feedforward": (lambda: fp.RecedingHorizon(OPTIMISER, on_failure=fp.Feedforward()), "Feedforward needs references"),
-    "sliding": (lambda: fp.SlidingMode(rate=1.0, gain=1.0, width=1.0), "SlidingMode does not cover outputs"),
 }
 
 

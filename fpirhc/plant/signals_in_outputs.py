@@ -1,8 +1,8 @@
 """Outputs and signals from outside: which signals have derivatives of their own in those of the outputs.
 
-With y' = dh/dx x' + dh/dw w' an output that depends on a signal w needs w' in its derivative, which nobody states. It is zero
-where the signal is held between jumps. A signal that first appears in the last derivative, as an input does, needs none; nor do
-outputs of order 0.
+With y' = dh/dx x' + dh/dw w' an output that depends on a signal w needs w' in its derivative, which nobody states. It is zero where
+the signal is held between jumps. A signal that first appears in the last derivative, as an input does, needs none; nor do outputs
+of order 0.
 """
 
 from __future__ import annotations

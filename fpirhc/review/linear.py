@@ -202,12 +202,12 @@ def loop_matrices(problem: Problem, controller: Controller) -> LoopMatrices:
     steps = problem.sensing.estimator.of_steps and not problem.sensing.sensors and problem.sensing.belief is None
     if problem.plant.outputs and not problem.sensing.ideal and not steps:
         raise NotSupported("the linear loop behind sensors or estimators is not covered for outputs")
+    if problem.plant.outputs and "output" in controller.feeds:
+        raise NotSupported("the linear loop of predicted outputs is not covered: a wrong model predicts other outputs")
     if steps and max(problem.plant.face.orders) > 1:
         raise NotSupported(
             "the linear loop of a map is not covered for orders above 1, whose next outputs are predicted"
         )
-    if problem.plant.outputs and "output" in controller.feeds:
-        raise NotSupported("the linear loop of predicted outputs is not covered: a wrong model predicts other outputs")
     elements = straightened(problem).plant.state.elements
     judged = tuple(elements.index(c) for c in problem.judged_names if c in elements)
     return matrices_of(linear_problem(problem, controller), controller, judged)

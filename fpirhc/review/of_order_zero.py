@@ -1,4 +1,8 @@
-"""A review of a problem whose controlled outputs have the order 0: what is known before a run, and what is not."""
+"""A review of a problem whose controlled outputs have the order 0: what is known before a run, and what is not.
+
+The iteration is on settled values. Its Jacobian J is that of the plant's static map times the inverse of the model's, and a settled
+error is multiplied by I - a J in every cycle. Behind a lag, through which the target is paired, more gain is admissible, not less.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +10,22 @@ from collections.abc import Mapping
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
-from fpirhc.errors import FpirhcError
+from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.review.answer import Answer, Review, Verdict
 from fpirhc.review.commands import commands_inside
+from fpirhc.review.gain import gain_admissible
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.inverse import inverse_exists
+from fpirhc.review.neighbourhood import spectrum_near
 from fpirhc.review.orders import relative_orders
+from fpirhc.review.signs import one_sign
 from fpirhc.review.well_posed import well_posed
 
 _NOT_COVERED = (
-    "not covered for outputs of order 0: the linear loop, in which an output is a state, and with it convergence, gains and "
-    "zero dynamics"
+    "not covered for outputs of order 0: the linear loop, in which an output is a state, and with it lags, dead times and zero "
+    "dynamics"
 )
+_LIMIT = 2.0  # of effective gain times eigenvalue, once everything has settled
 
 
 def controls_order_zero(grid: ReviewGrid) -> bool:
@@ -40,7 +48,14 @@ def review_of_order_zero(grid: ReviewGrid, controllers: Mapping[str, Controller]
 
 def _of(grid: ReviewGrid, controller: Controller) -> tuple[Answer, ...]:
     try:
-        checked(grid.real or grid.problem, controller)
+        ready = checked(grid.real or grid.problem, controller)
     except FpirhcError as error:
         return (Answer("Does the controller fit the problem?", Verdict.NO, str(error), "See the message."),)
-    return ()
+    if not ready.deformation.adapts:
+        return ()
+    believed = ready.parameters(grid.problem.plant)
+    try:
+        own, boxed = (spectrum_near(grid, believed, draws, near=False) for draws in (grid.draws[:1], grid.draws))
+    except InvalidValue as error:
+        return (Answer("Do the eigenvalues of the response Jacobian have one sign?", Verdict.UNKNOWN, str(error)),)
+    return (one_sign(own, boxed), gain_admissible(ready.deformation, own, boxed, _LIMIT))

@@ -22,9 +22,11 @@ from scipy.optimize import linear_sum_assignment
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import NotSupported
 from fpirhc.plant.plant import Parameter, Plant
+from fpirhc.review.carried import carrying
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.linear import LinearLoop, cycle_of, linear_parameters, linear_problem, matrices_of, response_slopes
 from fpirhc.review.loops import plan_gains_at
+from fpirhc.review.reduced import outer_slopes, reduced
 from fpirhc.review.stand_in import linear_stand_in
 from fpirhc.symbolic.layout import Expression, Named
 from fpirhc.task.problem import Problem
@@ -68,10 +70,11 @@ class Extra:
 
 @lru_cache(maxsize=4)  # several questions of a review need them
 def real_points(grid: ReviewGrid) -> tuple[RealPoint, ...]:
-    """Return some points of the reference at which the reality settles; none where it nowhere does."""
+    """Return some points of the reference at which the reality settles, or moves along; none where it nowhere does."""
     assert grid.real is not None
-    reality = _reality(grid.real)
-    known = reality.shared(grid.problem.plant)
+    reality, model = _reality(grid.real), grid.problem.plant
+    known = reality.shared(model)
+    carried = carrying(reality, model) if len(known) < model.state.size else None
     solve = _settling(grid.real, [k for k in range(reality.plant.state.size) if k not in known.values()])
     places = np.unique(np.linspace(0, len(grid.times) - 1, _POINTS).astype(int))
     points, guess = [], (grid.real.real_start, grid.real.inputs_before)
@@ -79,7 +82,9 @@ def real_points(grid: ReviewGrid) -> tuple[RealPoint, ...]:
         start = guess[0].copy()
         for own, there in known.items():
             start[there] = grid.states[place, own]
-        at = solve(start, guess[1], grid.responses[place])
+        at = solve(start, guess[1], grid.responses[place]) if carried is None else None
+        if carried is not None:
+            at = carried(start, guess[1], np.append(grid.states[place], grid.responses[place]))
         if at is not None:
             points.append(RealPoint(int(place), *at))
             guess = at
@@ -122,9 +127,7 @@ def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Ext
     """Return the poles of the reality that it has beyond the settled one, and its response Jacobian below them, at a point."""
     assert grid.real is not None
     reality, model = _reality(grid.real), grid.problem.plant
-    plant, known = reality.plant, reality.shared(model)
-    outer = sorted(known.values())
-    free = [k for k in range(plant.state.size) if k not in outer]
+    plant = reality.plant
     x, u, p = plant.symbols()
     calm = ca.SX.zeros(len(plant.names))
     rate = plant.derivative_function(x, u, p)
@@ -132,9 +135,9 @@ def extra_modes(grid: ReviewGrid, point: RealPoint, believed: np.ndarray) -> Ext
     slopes = [ca.densify(ca.jacobian(v, w)) for v in (rate, response) for w in (x, u)]
     values = ca.Function("fpirhc_modes", [x, u, p], slopes)(point.real, point.command, plant.exact)
     a, b, c, d = (np.asarray(m.full()) for m in values)
-    settle = np.linalg.pinv(a[np.ix_(free, free)])
-    reduced = a[np.ix_(outer, outer)] - a[np.ix_(outer, free)] @ settle @ a[np.ix_(free, outer)]
-    modes = _beyond(np.linalg.eigvals(a), np.linalg.eigvals(reduced))
+    modes = _beyond(
+        np.linalg.eigvals(a), np.linalg.eigvals(reduced(a, outer_slopes(reality, model, point.real, point.command)))
+    )
     slow = 1j * _SLOW * float(np.abs(modes).min(initial=np.inf))
     gain = d + c @ np.linalg.solve(slow * np.eye(len(a)) - a, b) if modes.size else d
     x, u, p = model.symbols()

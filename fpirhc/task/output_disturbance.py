@@ -2,7 +2,8 @@
 
 They move no state. What is measured, judged and followed is y, so a controller is to hold y and not h. Derivatives of y have those
 of d between its jumps, y^(k) = L^k h + d^(k): the response that a deformation sees has d^(r). At a jump of d the output jumps, and
-its derivatives do not show it; an estimator that differentiates samples does. An error of a sensor, which is measured and not
+its derivatives do not show it; an estimator that differentiates samples does. The response of a map of order 1 is a difference,
+and so is what d adds to it. An error of a sensor, which is measured and not
 judged, is `Sensor(noise=...)`.
 """
 
@@ -49,7 +50,12 @@ def disturbance_values(problem: Problem, times: np.ndarray, seed: int) -> np.nda
         one.values(times, np.random.default_rng(stream))
         for one, stream in zip(problem.disturbances.values(), streams, strict=True)
     ]
-    values += [problem.disturbances[name].derivative(times, k) for name, k in disturbance_columns(problem) if k]
+    by_name = dict(zip(problem.disturbances, values, strict=True))
+    for name, k in disturbance_columns(problem):
+        if k and problem.plant.step is not None:
+            values.append(np.diff(by_name[name], prepend=by_name[name][:1]) / problem.period)
+        elif k:
+            values.append(problem.disturbances[name].derivative(times, k))
     return np.column_stack(values) if values else np.zeros((len(times), 0))
 
 

@@ -32,6 +32,7 @@ from fpirhc.task.foreign import Foreign
 from fpirhc.task.limits import Limits
 from fpirhc.task.map_task import check_map_task, settle_maps
 from fpirhc.task.needed import needed_measurements, needed_names
+from fpirhc.task.output_disturbance import disturbed_outputs
 from fpirhc.task.outside import External, check_signals, not_held, real_values, rows_of, signals_of
 from fpirhc.task.problem_view import problem_facts, problem_table
 from fpirhc.task.reality import Reality
@@ -224,10 +225,14 @@ class Problem(Checked):
         return rows_of(real_values(plant, self.signals), np.array([self.period / 2]), plant.exact)[0]
 
     def _check_derivatives(self, instants: np.ndarray) -> None:
-        """Raise if the disturbance of an output has no derivatives, which its own derivatives need."""
-        for name in self.plant.outputs:
-            if name in self.disturbances:
-                self.disturbances[name].derivative(instants, 1)
+        """Raise if the disturbance of an output does not have the derivatives that are needed."""
+        for name, order in disturbed_outputs(self).items():
+            if self.plant.step is not None and order > 1:
+                raise InvalidValue(
+                    f"disturbances: the output '{name}' of a map has relative order {order}, and its differences look ahead to "
+                    "disturbances that nobody knows yet; disturb a state or an input, or an output of order 1"
+                )
+            self.disturbances[name].derivative(instants, 1)
 
     @property
     def _needed(self) -> frozenset[str]:
@@ -364,7 +369,7 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
     if smooth:
         mistakes.add(
             f"signals: the derivatives of outputs depend on {', '.join(smooth)}, whose own derivatives nobody states; state it in "
-            "steps, Samples(times, values), which hold between their times, or choose another output"
+            "steps, Samples(times, values), which hold between their times, or choose an output whose derivatives it is not in"
         )
     if len(plant.inputs) == len(plant.controlled or plant.outputs):
         states, inputs = nominal_run(plant, problem.reference, *nominal_start(problem))

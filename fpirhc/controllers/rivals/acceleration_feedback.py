@@ -25,6 +25,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, invert_block
+from fpirhc.controllers.face import on_face
 from fpirhc.controllers.tracked import bounded, desired_blocks
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
@@ -77,6 +78,11 @@ class AccelerationFeedback(Controller):
         """Return the stability limit (1 + p) / (1 - p) of kappa lambda_max(J) for control cycles of that period, s."""
         return (1 + self.pole(period)) / (1 - self.pole(period))
 
+    def outputs_unusable(self, problem: Problem) -> str:
+        """Return nothing: law and measured response are those of the outputs."""
+        del problem
+        return ""
+
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, tracking, feedback, invert, limit, judge, running, tracking update."""
         plant = problem.plant
@@ -86,9 +92,9 @@ class AccelerationFeedback(Controller):
             self._feedback_block(problem),
             invert_block(plant),
             *closing,
-            bounded(problem, self.tracking).update(plant, problem.period),
+            on_face(plant, bounded(problem, self.tracking).update(plant.face, problem.period)),
         ]
-        return blocks, [*delays, *self.tracking.delays(plant)]
+        return blocks, [*delays, *self.tracking.delays(plant.face)]
 
     def _feedback_block(self, problem: Problem) -> Block:
         """Block (desired, realised) -> request; before the first response the request is the desired response."""

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
+from fpirhc.controllers.face import on_face
 from fpirhc.controllers.rivals.reference_model import model_block
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, Mistakes
@@ -58,13 +59,18 @@ class BacksteppingMRAC(Controller):
                 f"BacksteppingMRAC(model_rate={self.model_rate!r}, rates={self.rates!r}): expected positive numbers, 1/s"
             )
 
+    def outputs_unusable(self, problem: Problem) -> str:
+        """Return nothing: the reference model and the nested errors are those of the outputs."""
+        del problem
+        return ""
+
     def check(self, problem: Problem) -> None:
         """Raise if the rates do not fit the relative orders.
 
         Raises:
             InvalidProblem: all mistakes together.
         """
-        plant, mistakes = problem.plant, Mistakes("BacksteppingMRAC")
+        plant, mistakes = problem.plant.face, Mistakes("BacksteppingMRAC")
         for k in plant.controlled_indices:
             if plant.orders[k] != len(self.rates):
                 mistakes.add(
@@ -85,8 +91,8 @@ class BacksteppingMRAC(Controller):
         """Return the blocks reference, reference model, nested errors, deform, invert, limit, judge, running."""
         plant = problem.plant
         closing, delays = closing_blocks(problem, self.deformation)
-        model = model_block(plant, self.model_rate, problem.period)
-        return [reference_block(problem), model, self._nested_block(plant), *closing], delays
+        own = model_block(plant.face, self.model_rate, problem.period), self._nested_block(plant.face)
+        return [reference_block(problem), *(on_face(plant, block) for block in own), *closing], delays
 
     def _nested_block(self, plant: Plant) -> Block:
         """Block (state, model, response of the model) -> (nested errors, desired)."""

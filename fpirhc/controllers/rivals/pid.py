@@ -90,8 +90,9 @@ class PID(Controller):
         x, u, p = plant.symbols()
         effect = ca.Function("fpirhc_effect", [x, u, p], [ca.jacobian(plant.controlled_response_function(x, u, p), u)])
         at_start = effect(problem.start_state, [0] * len(plant.inputs), plant.approximate)
-        for k, (name, index) in enumerate(zip(names, plant.controlled_indices, strict=True)):
-            gains, order = self.gains(name, plant.orders[index]), plant.orders[index]
+        face = plant.face
+        for k, (name, index) in enumerate(zip(names, face.controlled_indices, strict=True)):
+            gains, order = self.gains(name, face.orders[index]), face.orders[index]
             if len(gains) > order + 1:
                 mistakes.add(
                     f"derivative: '{name}' of relative order {order} has at most {order - 1} gains of e', e'', ..."
@@ -105,6 +106,11 @@ class PID(Controller):
                 )
         mistakes.raise_if_any()
 
+    def outputs_unusable(self, problem: Problem) -> str:
+        """Return nothing: the error is that of the outputs."""
+        del problem
+        return ""
+
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, pid, limit, judge, running, integral."""
         plant = problem.plant
@@ -116,9 +122,9 @@ class PID(Controller):
             rename("desired", response, plant.response_signal("desired")),
             self._law(problem),
             *closing,
-            integral_update(plant, problem.period, self._useful(problem)),
+            integral_update(plant.face, problem.period, self._useful(problem)),
         ]
-        return blocks, [*delays, *integral_delay(plant)]
+        return blocks, [*delays, *integral_delay(plant.face)]
 
     def _useful(self, problem: Problem) -> list[Useful]:
         """What the integrals may ask for: commands inside the limits of their inputs, by those of the build."""
@@ -131,13 +137,13 @@ class PID(Controller):
 
     def _law(self, problem: Problem) -> Block:
         """Block (state, reference, integral, warm_up) -> command, and the model's response to it (for readers of a log)."""
-        plant = problem.plant
-        orders = [plant.orders[k] for k in plant.controlled_indices]
+        plant, face, seen = problem.plant, problem.plant.face, problem.plant.output
+        orders = [face.orders[k] for k in face.controlled_indices]
         gains = [self.gains(n, order) for n, order in zip(plant.controlled_names, orders, strict=True)]
         integral_gains = [k[0] for k in gains]
 
         def step(s: Signals) -> dict[str, Expression]:
-            errors = error_chains(plant, s.reference - s.state)
+            errors = error_chains(face, s.reference - getattr(s, seen.name))
             direct = [
                 total(g * e for g, e in zip(k[1:], chain, strict=True)) for k, chain in zip(gains, errors, strict=True)
             ]
@@ -153,15 +159,16 @@ class PID(Controller):
                 **remembered,
             }
 
-        before, in_use = integral_signal(plant, "_integral_before"), integral_signal(plant, "_integral_used")
-        reads = (plant.state, like(plant.state, "reference"), plant.parameter, scalar("warm_up"), before)
+        before, in_use = integral_signal(face, "_integral_before"), integral_signal(face, "_integral_used")
+        outputs = (seen,) if plant.outputs else ()
+        reads = (plant.state, *outputs, like(seen, "reference"), plant.parameter, scalar("warm_up"), before)
         writes = (
-            error_signal(plant),
+            error_signal(face),
             in_use,
             like(plant.input, "command_unclipped"),
             plant.response_signal("_deformed_unclipped"),
         )
-        return Block("pid", Layout(reads), Layout(writes), step, gains_before(plant, integral_gains))
+        return Block("pid", Layout(reads), Layout(writes), step, gains_before(face, integral_gains))
 
 
 def _first_integral(gain: float, direct: Expression) -> Expression:

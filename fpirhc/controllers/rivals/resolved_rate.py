@@ -33,6 +33,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, invert_block, like, reference_block
+from fpirhc.controllers.face import on_face
 from fpirhc.controllers.own_reference import motion_of, own_signals, own_values
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.deformation.base import Deformation
@@ -74,6 +75,11 @@ class ResolvedAccelerationRate(Controller):
         """Return the coefficients of (d/dt + rate)^degree below the highest, lowest derivative first."""
         return decay_gains(self.rate, degree)
 
+    def outputs_unusable(self, problem: Problem) -> str:
+        """Return nothing: the error is that of the outputs, and increments of their response give the command's."""
+        del problem
+        return ""
+
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, rate, increment, invert, limit, judge, running."""
         plant = problem.plant
@@ -81,7 +87,7 @@ class ResolvedAccelerationRate(Controller):
         blocks = [
             reference_block(problem),
             _nominal_block(problem),
-            self._rate_block(problem),
+            on_face(plant, self._rate_block(problem)),
             _increment_block(problem),
             invert_block(plant),
             *closing,
@@ -89,8 +95,8 @@ class ResolvedAccelerationRate(Controller):
         return blocks, delays
 
     def _rate_block(self, problem: Problem) -> Block:
-        """Block (state, realised, reference now and one cycle later) -> (desired, its change in this cycle)."""
-        plant, period, warm_up_cycles = problem.plant, problem.period, problem.warm_up_cycles
+        """Block (state, realised, reference now and one cycle later) -> (desired, its change in this cycle), of the face."""
+        plant, period, warm_up_cycles = problem.plant.face, problem.period, problem.warm_up_cycles
 
         def step(s: Signals) -> dict[str, Expression]:
             errors = error_chains(plant, s.reference - s.state)
@@ -114,7 +120,7 @@ class ResolvedAccelerationRate(Controller):
 def _nominal_block(problem: Problem) -> Block:
     """Block time -> nominal response now and one cycle later."""
     plant, function = problem.plant, motion_of(problem, ahead=problem.period)
-    controlled = list(plant.controlled_indices)
+    controlled = list(plant.face.controlled_indices)
 
     def step(s: Signals) -> dict[str, Expression]:
         later = function(s.time, *own_values(problem, s))[1][controlled]
@@ -132,8 +138,8 @@ def _increment_block(problem: Problem) -> Block:
     measured = ca.SX.sym("f", len(plant.controlled_names))
     response = plant.controlled_response_function(x, u, p)
     highest = plant.response_function(x, u, p)
-    # The measured responses move the state; the model's response does where nothing is measured.
-    for k, index in enumerate(plant.controlled_indices):
+    # The measured responses move the state; the model's response does where nothing is measured, and where outputs are.
+    for k, index in enumerate(() if plant.outputs else plant.controlled_indices):
         highest[index] = measured[k]
     rates = []
     for element in plant.state.elements:

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block, rename
+from fpirhc.controllers.face import on_face
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import InvalidValue, Mistakes
@@ -79,6 +80,11 @@ class SlidingMode(Controller):
             )
         mistakes.raise_if_any()
 
+    def outputs_unusable(self, problem: Problem) -> str:
+        """Return nothing: the surface is that of the outputs' errors."""
+        del problem
+        return ""
+
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, surface, deform, invert, limit, judge, running."""
         response = problem.plant.response_signal("_reference_response")
@@ -86,7 +92,7 @@ class SlidingMode(Controller):
         blocks = [
             reference_block(problem),
             rename("nominal", response, problem.plant.response_signal("nominal")),
-            self._surface_block(problem.plant),
+            on_face(problem.plant, self._surface_block(problem.plant.face)),
             *closing,
         ]
         return blocks, delays

@@ -80,6 +80,7 @@ class Entry:
         price: its time per cycle beside that of its pair.
         no_bound: why it is no bound, for an exact model that an adapted controller beats.
         information: what it measures and when it acts; None: not asked.
+        automatic: settings of its deformation that were chosen automatically.
     """
 
     name: str
@@ -100,6 +101,7 @@ class Entry:
     price: Price | None = None
     no_bound: tuple[str, ...] = ()
     information: Information | None = None
+    automatic: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,6 +347,7 @@ def _entry(
         learns=ready.learns,
         plan_every=every,
         information=information(problem, ready, loops[name].loop, every),
+        automatic=tuple(controller.deformation.automatic),
     )
 
 

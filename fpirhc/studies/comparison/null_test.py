@@ -162,6 +162,7 @@ def _sentence(
             f"({costs})."
         )
     return (
-        f"{head}failed, {adaptive} is worse than {plain} although there is nothing to adapt ({numbers}). It takes something else "
-        "for an error of the model: the drift of the response within a long cycle, an unpaired delay, or noise."
+        f"{head}failed, {adaptive} is worse than {plain} although there is nothing to adapt ({numbers}). Its gain is too small for "
+        "its law or its plan, or it takes something else for an error of the model: the drift of the response within a long cycle, "
+        "an unpaired delay, or noise. fpirhc review says more."
     )

@@ -1,7 +1,7 @@
 """The verdict: the effect of adaptation in sentences, with the reasons where there is none.
 
-Every claim is computed from the entries, and every sentence about a pair carries its outcome. Known reasons are the response
-Jacobian's eigenvalues, a step limit below the slew of the desired response, and a cost that weighs absolute effort.
+Every claim is computed from the entries, and every sentence about a pair carries its outcome. Known reasons are those of
+`fpirhc.studies.comparison.causes`.
 """
 
 from __future__ import annotations
@@ -10,16 +10,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
+from fpirhc.studies.comparison.causes import causes
 from fpirhc.studies.comparison.changes import Change, major, outcome_of, times
 from fpirhc.studies.comparison.other_rows import remarks
 from fpirhc.studies.comparison.outcome import Finding, Outcome
 
 if TYPE_CHECKING:
     from fpirhc.studies.comparison.compare import Entry
-
-MANY_CYCLES = 3  # of a run from which the slew of its desired response is judged
 
 
 def findings(
@@ -53,7 +50,7 @@ def judge(plain: Entry, adaptive: Entry, scales: Mapping[str, float]) -> Finding
     pair = (plain.name, adaptive.name)
     if adaptive.run.stop is not None:
         also = f", nor does {plain.name} ({plain.run.stop})" if plain.run.stop is not None else ""
-        text = f"{adaptive.name} does not finish: {adaptive.run.stop}{also}.{_causes(plain, adaptive)}"
+        text = f"{adaptive.name} does not finish: {adaptive.run.stop}{also}.{causes(plain, adaptive)}"
         return Finding(text, Outcome.NOT_COMPARABLE if also else Outcome.WORSE, pair)
     if plain.run.stop is not None:
         return Finding(
@@ -71,7 +68,7 @@ def judge(plain: Entry, adaptive: Entry, scales: Mapping[str, float]) -> Finding
     beside += _not_weighed(adaptive, [c for n, c in changes.items() if n not in weighed])
     text = _SENTENCES[outcome](plain, adaptive, list(counted.values())) + beside
     if outcome is not Outcome.BETTER:
-        text += _causes(plain, adaptive)
+        text += causes(plain, adaptive)
     return Finding(text, outcome, pair, {n: c.ratio for n, c in counted.items()})
 
 
@@ -173,37 +170,3 @@ def _price(plain: Entry, adaptive: Entry) -> str:
     if abs(price.difference) <= price.noise:
         return f"; the time per cycle differs by less than can be measured here ({price.noise:.2g} microseconds)"
     return f" at {abs(price.difference):.2g} {'more' if price.difference > 0 else 'fewer'} microseconds per cycle"
-
-
-def _causes(plain: Entry, adaptive: Entry) -> str:
-    causes = [c for c in (_gain_cause(adaptive), _slew_cause(plain, adaptive), _effort_cause(adaptive)) if c]
-    return " " + " ".join(causes) if causes else ""
-
-
-def _gain_cause(entry: Entry) -> str:
-    if entry.contraction is None or entry.contraction.predicted < 1:
-        return ""
-    return f"Its iteration is no contraction (predicted factor {entry.contraction.predicted:.3g}): {entry.contraction.report.text}"
-
-
-def _slew_cause(plain: Entry, adaptive: Entry) -> str:
-    """The step limit is compared with the desired response of the same controller without adaptation, which does not diverge."""
-    limit = adaptive.run.settings["step_limit"]
-    if not isinstance(limit, float) or plain.run.cycles < MANY_CYCLES:
-        return ""
-    largest = float(np.linalg.norm(np.diff(plain.run["desired"], axis=0), axis=1).max())
-    if largest < limit:
-        return ""
-    return (
-        f"The desired response changes by up to {largest:.3g} in one cycle, more than the map's largest step of {limit:.3g}: "
-        f"raise its scale S at least {1.25 * largest / limit:.2g} times, or leave S out to have it chosen."
-    )
-
-
-def _effort_cause(entry: Entry) -> str:
-    if not entry.run.settings.get("weighs_effort"):
-        return ""
-    return (
-        "Its cost weighs the absolute effort, so the optimum of the wrong model trades tracking against a wrong effort and "
-        "adaptation realises that plan faithfully: weigh the deviation from the model's feedforward, or the input's rate."
-    )

@@ -1,0 +1,151 @@
+"""Laws that every belief keeps, tried in short closed loops."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fpirhc.conformance.controller import two_masses
+from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
+from fpirhc.controllers.computed_torque import ComputedTorque
+from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.wrappers.exact_model import ExactModel
+from fpirhc.sensing.belief import Belief
+from fpirhc.sensing.measured import Measured
+from fpirhc.sensing.sensing import Sensing
+from fpirhc.sensing.sensor import Sensor
+from fpirhc.simulation.run import Run
+from fpirhc.simulation.sample import raw_measurements
+from fpirhc.simulation.simulate import simulate
+from fpirhc.simulation.stepper import Stepper
+from fpirhc.task.dead_time import DeadTime
+from fpirhc.task.disturbance import Noise
+from fpirhc.task.problem import Problem
+from fpirhc.tracking.exponential import Exponential
+
+Array = npt.NDArray[Any]
+
+_CYCLES = 20
+_SAME = 1e-9  # of the largest state
+_NOISE = 1e-3  # of the first measured values' size
+
+
+def check_belief(
+    belief: Belief, *, seed: int, problem: Problem | None = None, controller: Controller | None = None
+) -> None:
+    """Check every law on a belief.
+
+    Args:
+        belief: the belief.
+        seed: of noise and of all draws.
+        problem: whose states are believed, with `Sensing(measured=...)`; its response must be linear in states and inputs.
+            None: two masses whose positions a and b are measured.
+        controller: of the problem; None: computed torque with the rate 4.
+
+    Raises:
+        AssertionError: the first law that does not hold, in one sentence.
+        FpirhcError: the belief cannot serve the problem.
+    """
+    task = two_masses() if problem is None else problem
+    sensing = Sensing({}, Measured(), measured=["a", "b"]) if problem is None else task.sensing
+    believed = Sensing(sensing.sensors, sensing.estimator, measured=sensing.measured, belief=belief)
+    short = replace(task, duration=_CYCLES * task.period, measure_from=0.0, sensing=believed)
+    keep(belief, _Trial(belief, short, controller or ComputedTorque(Exponential(rate=4.0)), seed), LAWS, seed)
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A belief in short runs of a problem."""
+
+    belief: Belief
+    problem: Problem
+    controller: Controller
+    seed: int
+
+    @cached_property
+    def noisy(self) -> Problem:
+        """The problem with noise on all that is measured."""
+        sensing, plant = self.problem.sensing, self.problem.plant
+        sensors = {name: Sensor(noise=Noise(_NOISE)) for name in sensing.measures(plant)}
+        return replace(self.problem, sensing=replace(sensing, sensors=sensors))
+
+    @cached_property
+    def noisy_run(self) -> Run:
+        """With a wrong model, in the virtual machine."""
+        return simulate(self.noisy, self.controller, seed=self.seed, compiled=False)
+
+    def exact_run(self, problem: Problem) -> Run:
+        """With the exact model."""
+        return simulate(problem, ExactModel(self.controller), seed=self.seed, compiled=False)
+
+
+def frozen_value(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """A belief is a frozen value that can be hashed, copied and described."""
+    is_a_frozen_value(trial.belief)
+
+
+def facts_hold(trial: _Trial, generator: np.random.Generator) -> None:
+    """It believes states of the plant, uses what is measured, and its free errors are directions of the state."""
+    plant, sensing = trial.problem.plant, trial.problem.sensing
+    measured, size = sensing.measures(plant), plant.state.size
+    foreign = [n for n in trial.belief.believes(plant, sensing.known(plant)) if n not in plant.state.elements]
+    hold(not foreign, f"it believes {foreign}, which are no states of the plant")
+    unseen = [n for n in trial.belief.uses(measured) if n not in measured]
+    hold(not unseen, f"it uses {unseen}, which no sensor shows")
+    slopes, shown = [generator.normal(size=(size, size))], [generator.normal(size=(1, size))]
+    basis = np.asarray(trial.belief.free(slopes, shown, [0]))
+    hold(basis.ndim == 2 and len(basis) == size, f"free() has the shape {basis.shape}, expected ({size}, number)")
+
+
+def right_model_believes_what_is(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """With the exact model, the right start and no noise the believed state is the plant's."""
+    run = trial.exact_run(trial.problem)
+    error, size = np.abs(run["state"] - run["plant_state"]).max(), np.abs(run["plant_state"]).max()
+    hold(within(error, _SAME * size), f"the believed state is off by {error:.3g}, states are as large as {size:.3g}")
+
+
+def lives_in_the_time_of_the_samples(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """Behind a measurement that is late by 2.25 cycles it is the state of that time, interpolated as samples are."""
+    late = replace(trial.problem, dead_time=DeadTime(measurement=2.25 * trial.problem.period))
+    run = trial.exact_run(late)
+    true, believed = run["plant_state"], run["state"]
+    hold(np.array_equal(believed[:3], true[[0, 0, 0]]), "before the first late sample it is not the start")
+    error = np.abs(believed[3:] - 0.75 * true[1:-2] - 0.25 * true[:-3]).max()
+    hold(within(error, _SAME * np.abs(true).max()), f"behind a late measurement it is off by {error:.3g}")
+
+
+def finite_under_noise(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """With a wrong model and noise on all that is measured every believed state is a number."""
+    run = trial.noisy_run
+    hold(run.stop is None and bool(np.isfinite(run["state"]).all()), "under noise a believed state is not finite")
+
+
+def one_step_with_the_controller(trial: _Trial, generator: np.random.Generator) -> None:
+    """Raw measurements of a run give its states bit by bit; a bad sample leaves the memory as it was."""
+    run = trial.noisy_run
+    measured, names = raw_measurements(run), trial.problem.sensing.measures(trial.problem.plant)
+    anything = dict.fromkeys(names, (-np.inf, np.inf))
+    stepper = Stepper(trial.noisy, trial.controller, compiled=False, plausible=anything, bounded=False)
+    memory, bad = stepper.start(), int(generator.integers(1, run.cycles))
+    for k in range(run.cycles):
+        if k == bad:
+            _, after = stepper.step_measured(float(run.time[k]), np.full(measured.shape[1], np.nan), memory)
+            changed = [stepper.memory.columns[i] for i in np.flatnonzero(after != memory)]
+            hold(changed == ["skipped_before"], f"a sample of NaN changes {changed} in the memory")
+        _, memory = stepper.step_measured(float(run.time[k]), measured[k], memory)
+        same = np.array_equal(stepper.trace()["state"], run["state"][k])
+        hold(same, f"in cycle {k} a stepper believes another state than the run")
+
+
+LAWS = (
+    frozen_value,
+    facts_hold,
+    right_model_believes_what_is,
+    lives_in_the_time_of_the_samples,
+    finite_under_noise,
+    one_step_with_the_controller,
+)

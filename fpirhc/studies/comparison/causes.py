@@ -1,0 +1,91 @@
+"""Known reasons why adaptation does not help in a run, in sentences.
+
+They are the response Jacobian's eigenvalues, a step limit below the slew of the desired response, a cost that weighs absolute
+effort, plans that did not converge, and commands that stand at their limits. The last two are facts of the runs, where the share of
+the cycles is no start or single event.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fpirhc.simulation.metrics.base import percent
+from fpirhc.status import Status
+
+if TYPE_CHECKING:
+    from fpirhc.studies.comparison.compare import Entry
+
+MANY_CYCLES = 3  # of a run from which the slew of its desired response is judged
+_MANY_PLANS = 0.05  # share of the cycles from which plans that did not converge are a reason
+_OFTEN = 0.2  # share of the cycles from which commands at their limits are a reason
+
+
+def causes(plain: Entry, adaptive: Entry) -> str:
+    """Return the known reasons, each a sentence after a space; empty where none is known."""
+    sentences = (
+        _gain_cause(adaptive),
+        _slew_cause(plain, adaptive),
+        _effort_cause(adaptive),
+        _plan_cause(plain, adaptive),
+        _limit_cause(plain, adaptive),
+    )
+    return "".join(f" {sentence}" for sentence in sentences if sentence)
+
+
+def _gain_cause(entry: Entry) -> str:
+    if entry.contraction is None or entry.contraction.predicted < 1:
+        return ""
+    return f"Its iteration is no contraction (predicted factor {entry.contraction.predicted:.3g}): {entry.contraction.report.text}"
+
+
+def _slew_cause(plain: Entry, adaptive: Entry) -> str:
+    """The step limit is compared with the desired response of the same controller without adaptation, which does not diverge."""
+    limit = adaptive.run.settings["step_limit"]
+    if not isinstance(limit, float) or plain.run.cycles < MANY_CYCLES:
+        return ""
+    largest = float(np.linalg.norm(np.diff(plain.run["desired"], axis=0), axis=1).max())
+    if largest < limit:
+        return ""
+    more = f"at least {1.25 * largest / limit:.2g} times"
+    change = f"raise its scale S {more}, or leave S out to have it chosen"
+    if "scale" in adaptive.automatic:
+        change = f"the scale S that was chosen automatically did not foresee this, so state one that is {more} as large"
+    fact = f"The desired response changes by up to {largest:.3g} in one cycle, more than the map's largest step of {limit:.3g}"
+    return f"{fact}: {change}."
+
+
+def _effort_cause(entry: Entry) -> str:
+    if not entry.run.settings.get("weighs_effort"):
+        return ""
+    return (
+        "Its cost weighs the absolute effort, so the optimum of the wrong model trades tracking against a wrong effort and "
+        "adaptation realises that plan faithfully: weigh the deviation from the model's feedforward, or the input's rate."
+    )
+
+
+def _plan_cause(plain: Entry, adaptive: Entry) -> str:
+    before, after = (_share(e, "status", Status.NOT_CONVERGED.name) / max(1, e.run.cycles) for e in (plain, adaptive))
+    if after < _MANY_PLANS:
+        return ""
+    return (
+        f"Its plans did not converge in {percent(after)} of the cycles (those of {plain.name} in {percent(before)}), so this is "
+        "not the optimum of its cost: give the optimiser more iterations, then compare."
+    )
+
+
+def _limit_cause(plain: Entry, adaptive: Entry) -> str:
+    before, after = (_share(e, "clipped_share", "") for e in (plain, adaptive))
+    if after < _OFTEN:
+        return ""
+    fact = (
+        f"Its command stands at a limit in {percent(after)} of the cycles (that of {plain.name} in {percent(before)})"
+    )
+    if before >= _OFTEN:
+        return f"{fact}, where no adaptation can act: widen the limits, or slow the reference down."
+    return f"{fact}, where no adaptation can act: it asks for too much, or oscillates; the command in the report shows which."
+
+
+def _share(entry: Entry, metric: str, by: str) -> float:
+    return float(entry.metrics.values.get(metric, {}).get(by, 0.0))

@@ -1,0 +1,90 @@
+"""Rivals on plants with outputs: those whose idea is about errors follow outputs; the others say why they do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_outputs import SHORT, arm, circle, hill, on_outputs, sedated, simulated
+
+import fpirhc as fp
+from fpirhc.controllers.contract import Controller
+from fpirhc.errors import InvalidProblem, NotSupported
+
+RIVALS: dict[str, Controller] = {
+    "PID": fp.PID({"q1": 80.0, "q2": 60.0}, {"q1": 30.0, "q2": 20.0}, {"q1": 20.0, "q2": 15.0}),
+    "sliding": fp.SlidingMode(rate=6.0, gain=20.0, width=2.0),
+    "rate": fp.ResolvedAccelerationRate(rate=6.0),
+    "feedback": fp.AccelerationFeedback(fp.Exponential(rate=6.0), gain=0.5, time_constant=0.01),
+    "backstepping": fp.BacksteppingMRAC(6.0, (5.0, 5.0), fp.Affine(-0.5)),
+}
+
+
+@pytest.mark.parametrize("name", RIVALS)
+def test_outputs_that_are_coordinates_change_no_signal(name: str) -> None:
+    """`ResolvedAccelerationRate` moves states by its model where outputs are measured, so its model is exact here."""
+    short = replace(SHORT, duration=0.1, measure_from=0.0)
+    if name == "rate":
+        plant = short.plant.with_exact(short.plant.approximate)
+        short = replace(short, plant=plant)
+    plain, run = (simulated(p, RIVALS[name]) for p in (short, on_outputs(short)))
+    for signal in ("state", "command", "desired"):
+        same = np.array_equal if name != "rate" else np.allclose
+        assert same(plain[signal], run[signal]), signal
+
+
+ON_DEPTH: dict[str, tuple[Controller, float]] = {
+    "PID": (fp.PID({"depth": -2.0}, {"depth": -0.6}, {"depth": -2.0}), 1.0),
+    "sliding": (fp.SlidingMode(rate=1.0, gain=2.0, width=0.5), 0.3),
+    "rate": (fp.ResolvedAccelerationRate(rate=1.0), 0.1),
+    "feedback": (fp.AccelerationFeedback(fp.Exponential(rate=1.0), gain=2.0, time_constant=0.2), 0.1),
+    "backstepping": (fp.BacksteppingMRAC(1.0, (1.0, 1.0), fp.Affine(-1.5)), 0.1),
+}
+
+
+@pytest.mark.parametrize("name", ON_DEPTH)
+def test_a_rival_follows_an_output_of_a_wrong_curve(name: str) -> None:
+    """The depth falls from 74 to 40; the errors are those of tuned rivals, rms from 3 min on."""
+    controller, largest = ON_DEPTH[name]
+    problem = sedated(hill(5.5), input_before={"u": 1.5})
+    run = simulated(problem, controller)
+    assert run.stop is None
+    assert fp.measure(problem, run).rms_error["depth"] < largest
+
+
+def test_an_increment_by_hand_on_the_hand_of_an_arm() -> None:
+    """The first request after a step of the model: its response to the last command plus the change, less its own drift."""
+    problem = replace(circle(arm()), duration=0.1, measure_from=0.0)
+    run = simulated(problem, fp.ResolvedAccelerationRate(rate=6.0))
+    plant, k, p, size = problem.plant, 20, [1.4], 1e-6
+    respond, x, u = plant.controlled_response_function, run["state"][k], run["command"][k - 1]
+    moved = plant.derivative_function(x, u, p).full().ravel()
+    ends = [respond(x + s * size * moved, u, p).full().ravel() for s in (1, -1)]
+    drift = (ends[0] - ends[1]) / (2 * size)
+    change = run["desired"][k] - run["realised"][k]
+    request = respond(x, u, p).full().ravel() + change - problem.period * drift
+    assert np.allclose(run["command"][k], plant.inverse_function(x, request, p).full().ravel(), atol=1e-6)
+
+
+REFUSED = ("AdaptiveInverseDynamics", "SlotineLi", "ForceMRAC", "LyapunovMRAC", "Slotted")
+
+
+@pytest.fixture(scope="module")
+def members() -> dict[str, Controller]:
+    """One controller of every class among some shipped problems."""
+    tasks = (fp.load_problem(name) for name in ("mrac_pendulum", "crane_slots", "planar_arm"))
+    return {type(one).__name__: one for task in tasks for one in task.controllers.values()}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_rival_that_needs_coordinates_says_so(name: str, members: dict[str, Controller]) -> None:
+    with pytest.raises(NotSupported, match=rf"{name} does not cover outputs .*\(depth\): "):
+        simulated(sedated(hill(5.5)), members[name])
+
+
+def test_gains_are_named_by_outputs() -> None:
+    with pytest.raises(InvalidProblem, match="controlled coordinate 'deep' is unknown"):
+        simulated(sedated(hill(5.5)), fp.PID({"deep": -1.0}))
+    with pytest.raises(InvalidProblem, match="has relative order 2, but rates has 1"):
+        simulated(sedated(hill(5.5)), fp.BacksteppingMRAC(1.0, (1.0,), fp.Affine(-1.0)))
