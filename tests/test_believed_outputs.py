@@ -133,6 +133,16 @@ def test_a_measured_state_beside_the_output_corrects_what_is_believed() -> None:
     assert errors[0] < 0.05 * errors[1]
 
 
+def test_a_late_measured_state_begins_where_the_reality_does() -> None:
+    """A blood sample that is late by three cycles shows the real start until it shows the motion; the belief began elsewhere."""
+    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["depth", "C"], belief=fp.ModelStates())
+    real, late = fp.Reality(drug(), start={"C": 2.5, "R": 0.5, "E": 2.5}), fp.DeadTime(measurement=3 / 12)
+    result = run(sedated(None, sensing=sensing, reality=real, dead_time=late, duration=4.0), PLAIN)
+    assert np.array_equal(result["state.C"][:4], np.full(4, 2.5))
+    assert np.array_equal(result["state.C"][4:], result["plant_state.C"][1:-3])
+    assert result["state.R"][0] == 1.5
+
+
 TWO_MASS = fp.load_problem("two_mass")
 
 
@@ -202,6 +212,9 @@ def test_an_exact_model_referenced_form_changes_nothing() -> None:
     sensing = fp.Sensing({}, fp.Measured(), belief=fp.ModelStates())
     problem, form = sedated(None, sensing=sensing, duration=5.0), fp.ModelReferenced(fp.Affine(-0.5))
     plain, referenced = (run(problem, fp.ExactModel(fp.ComputedTorque(LAW, d))) for d in (fp.Identity(), form))
+    np.testing.assert_allclose(referenced["command"], plain["command"], atol=1e-9)
+    behind = sedated(FILTER, duration=2.0, measure_from=0.0)  # behind differences, with a twin that the filter moves
+    plain, referenced = (run(behind, fp.ExactModel(fp.ComputedTorque(LAW, d))) for d in (fp.Identity(), form))
     np.testing.assert_allclose(referenced["command"], plain["command"], atol=1e-9)
     wrong = sedated(None, believed=5.0, sensing=sensing)
     errors = [
@@ -355,11 +368,6 @@ WRONG: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
         lambda: run(integrating("y"), PLAIN),
         NotSupported,
         "KalmanFilter: z cannot be observed along the reference from y",
-    ),
-    "twin": (
-        lambda: run(sedated(FILTER), fp.ComputedTorque(LAW, fp.ModelReferenced(fp.Affine(-0.5)))),
-        NotSupported,
-        "it compares with a twin of the plant behind the estimator",
     ),
 }  # fmt: skip
 

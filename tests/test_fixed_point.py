@@ -80,6 +80,15 @@ def test_same_optimum_as_ipopt(cost, high):
     np.testing.assert_allclose(plan.inputs, other.inputs, atol=1e-5)
 
 
+def test_a_horizon_knows_the_optimisers_that_are_gone():
+    """A new optimiser may have the address of one that is gone; it is solved by its own iteration all the same."""
+    ocp, data = pendulum_problem()
+    for tolerance in (1.0, 1e-3, 1e-9, 1e-2, 1e-8):
+        plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=tolerance), np.array([1.0, -1.0]), data)
+        assert plan.stationarity is not None
+        assert plan.stationarity <= tolerance
+
+
 def test_a_fixed_point_stays_fixed():
     """A converged plan is not moved by more iterations."""
     ocp, data = pendulum_problem(limits=fp.Limits(inputs={"torque": (-1.0, 1.0)}))

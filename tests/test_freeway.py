@@ -211,3 +211,39 @@ def test_the_shift_of_the_target_is_that_of_a_loop_by_hand() -> None:
         shift = float(run["shift.emission"][k])
         if free[k - 1] or abs(wanted) < abs(shift):
             assert shift == pytest.approx(wanted, abs=1e-8)
+
+
+class Road:
+    """METANET in numpy as a body outside: it measures the queue and the emission."""
+
+    def __init__(self, problem: fp.Problem) -> None:
+        self.problem = problem
+
+    def reset(self, seed: int) -> list[float]:  # noqa: ARG002 -- nothing is random
+        """Go to the start."""
+        self.state = np.array(self.problem.real_start)
+        return self.measured()
+
+    def step(self, time: float, command: np.ndarray) -> list[float]:
+        """Hold the rate for a minute."""
+        middle = time + self.problem.period / 2
+        for _ in range(6):
+            demands = 2500 + 80 * np.sin(2 * np.pi * middle / 1.7), 1100.0
+            self.state = by_hand(self.state, float(command[0]), demands)
+        return self.measured()
+
+    def measured(self) -> list[float]:
+        """Queue and emission."""
+        density, speed = self.state[:6], self.state[6:12]
+        emitted = 2 * density * speed * (1374 / speed + 47.5 + 0.00867 * speed**2)
+        return [float(self.state[13]), float(emitted.sum() / 1000)]
+
+
+def test_a_body_outside_is_the_same_freeway() -> None:
+    """Reset and step in place of the symbolic reality: the same commands. Without a lag nothing depends on the start before it."""
+    problem = replace(task("freeway").problem, duration=1.0)
+    outside = replace(problem, reality=fp.Foreign(Road(problem), measures={"w2": "veh", "emission": "kg/h"}))
+    cascade = fp.Cascade(fp.FeedforwardOnly(), fp.Affine(gain=-1.0), fp.ThroughModel(lag=0.0))
+    one, other = (fp.simulate(p, cascade, seed=0, compiled=False) for p in (problem, outside))
+    for name in ("command.r", "output.emission", "shift.emission", "realised.emission"):
+        assert other[name] == pytest.approx(one[name], rel=1e-9), name

@@ -284,3 +284,23 @@ def test_controllers_that_do_not_cover_maps_are_refused(what: str) -> None:
     make, message = REFUSED[what]
     with pytest.raises(FpirhcError, match=message):
         simulated(replace(stock(), horizon=None, cost=None), make())
+
+
+def test_a_receding_horizon_with_the_iteration_is_the_loop_by_hand() -> None:
+    """From the planned inputs on: nominal response, deformation, command and stock, in numpy."""
+    problem = stock()
+    run = simulated(problem, fp.RecedingHorizon(OPTIMISER, fp.ModelReferenced(fp.Affine(gain=-1.6))))
+
+    def response(x: float, u: float, growth: float) -> float:
+        return growth * x * (1 - x) - u
+
+    x, last, before, delta = 0.3, 0.0, 0.0, 0.0
+    for k, planned in enumerate(run["planned"][:, 0]):
+        if k:
+            modelled, realised = response(last, before, 0.8), (x - last) / 0.1
+            delta = delta - 0.8 * (realised - (modelled - delta))
+        request = response(x, planned, 0.8) + delta
+        command = 0.8 * x * (1 - x) - request
+        assert run["plant_state"][k, 0] == pytest.approx(x, abs=1e-13)
+        assert run["command"][k, 0] == pytest.approx(command, abs=1e-12)
+        last, before, x = x, command, x + 0.1 * response(x, command, 1.1)

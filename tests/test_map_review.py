@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
+from scipy.signal import cont2discrete, ss2tf
 
 import fpirhc as fp
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
+from fpirhc.review.zero_dynamics import zero_dynamics_rate
 
 T = 10.0  # s, one step
 ITERATION = fp.ModelReferenced(fp.Affine(gain=-1.0))
@@ -92,3 +95,43 @@ def test_questions_about_time_are_not_asked() -> None:
     assert [a.question for a in answers if a.verdict.name == "NO"] == []
     [null] = [a for a in answers if "right model alone" in a.question]
     assert "predicted rms response error on a right model 0," in null.evidence or "e-1" in null.evidence, null.evidence
+
+
+def test_zero_dynamics_have_the_zeros_of_the_sampled_plant() -> None:
+    """A double integrator with friction, its command held: the zero near -1 is that of scipy's transfer function."""
+    period = 0.1
+    matrices = (np.array(m) for m in ([[0.0, 1.0], [0.0, -2.0]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.0]]))
+    a, b, c, d, _ = cont2discrete(tuple(matrices), period)
+
+    def later(x: Any, u: Any, p: Any) -> dict[str, Any]:
+        after = ca.DM(a) @ ca.vertcat(x.y, x.v) + ca.DM(b) * p.effect * u.force
+        return {"y": after[0], "v": after[1]}
+
+    plant = fp.Plant.of_map(
+        states={"y": "m", "v": "m/s"},
+        inputs={"force": "N"},
+        parameters={"effect": fp.Parameter(1.0, 1.0, "1")},
+        next=later,
+        step=period,
+        outputs={"y": fp.Output("m", lambda x, _: x.y)},
+    )
+    problem = fp.Problem(plant, fp.Trajectory(lambda t: {"y": 0 * t}), {"y": 0.0, "v": 0.0}, period, 5.0)
+    numerator = ss2tf(a, b, c, d)[0][0]
+    zero = -numerator[2] / numerator[1]
+    rate = zero_dynamics_rate(review_grid(problem, mismatch=0.0, seed=0))
+    assert rate == pytest.approx(np.log(abs(zero)) / period, rel=1e-9)
+    assert -1 < zero < -0.9
+
+
+def test_an_order_above_one_has_no_linear_loop() -> None:
+    plant = fp.Plant.of_map(
+        states={"y": "1", "v": "1"},
+        inputs={"u": "1"},
+        parameters={},
+        next=lambda x, u, p: {"y": x.v, "v": 0.5 * x.y + u.u},
+        step=T,
+        outputs={"y": fp.Output("1", lambda x, _: x.y)},
+    )
+    problem = fp.Problem(plant, fp.Trajectory(lambda t: {"y": 0 * t}), {"y": 0.0, "v": 0.0}, T, 200.0)
+    loops = loops_along(review_grid(problem, mismatch=0.0, seed=0), fp.ComputedTorque(LAW, ITERATION))
+    assert "not covered for orders above 1" in loops.reason

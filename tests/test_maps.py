@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.errors import FpirhcError, InvalidProblem
+from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
+from fpirhc.report.series import chart_data
 
 T = 10.0  # s, one step
 RATE = 0.04  # 1/s
@@ -207,6 +208,20 @@ def test_what_does_not_fit_a_map_is_refused(what: str) -> None:
         build()
 
 
+def test_derivatives_of_a_map_are_refused() -> None:
+    with pytest.raises(
+        NotSupported, match="output_chain differentiates with respect to time, which a map does not have"
+    ):
+        fp.output_chain(fishery(), "stock")
+
+
+def test_a_page_draws_steps() -> None:
+    """Between two cycles a map has no motion that a line could show."""
+    made = fp.compare(fp.load_problem("fishery"), controllers=["CTC"], seed=0, compiled=False)
+    assert made.steps
+    assert chart_data(made, ["#000000"])["steps"] is True
+
+
 def test_a_map_as_reality_needs_a_map_as_model() -> None:
     rates = fp.Plant.of_states(
         states={"stock": "1"},
@@ -231,16 +246,15 @@ def test_disturbances_and_signals_act_as_in_the_loop_by_hand() -> None:
         plant,
         duration=70.0,
         signals={"rain": fp.Unknown(fp.Samples(T * np.arange(8), rain, "zero"))},
-        disturbances={"stock": fp.Step(at=25.0, size=2e-3)},
+        disturbances={"stock": fp.Step(at=30.0, size=2e-3)},
     )
     run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=RATE)))
     growth, caught = (p.exact for p in FISH.values())
     x = 0.3
     for k in range(7):
         assert run["plant_state"][k, 0] == pytest.approx(x, abs=1e-15)
-        pushed = T * 2e-3 if run["disturbance"][k, 0] else 0.0
+        pushed = T * 2e-3 if k >= 3 else 0.0
         x = x + T * (growth * x * (1 - x) - caught * run["command"][k, 0]) + rain[k] + pushed
-    assert 0 < np.count_nonzero(run["disturbance"]) < 7
 
 
 # A fishery, year by year
@@ -261,3 +275,68 @@ def test_the_shipped_fishery_is_the_recursion_of_its_source() -> None:
     for k, effort in enumerate(run["command"][:, 0]):
         assert run["plant_state"][k] == pytest.approx([adults, recruits], abs=1e-11)
         adults, recruits = (0.6 - 0.3 * effort) * adults + recruits, 2.0 * adults * np.exp(-adults / 100.0)
+
+
+# Other ways to the controller
+
+
+class Pond:
+    """The stock as an object outside."""
+
+    def reset(self, seed: int) -> np.ndarray:
+        """The first measurement."""
+        del seed
+        self.stock = 0.3
+        return np.array([self.stock])
+
+    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+        """One step of the map, in Python."""
+        del time
+        growth, caught = (p.exact for p in FISH.values())
+        self.stock += T * (growth * self.stock * (1 - self.stock) - caught * float(command[0]))
+        return np.array([self.stock])
+
+
+def test_a_map_outside_is_the_map() -> None:
+    """What is measured is the stock; the difference of the last cycle is the controller's own."""
+    controller = fp.ComputedTorque(fp.Exponential(rate=RATE), fp.ModelReferenced(fp.Affine(gain=-1.0)))
+    outside = simulated(task(reality=fp.Foreign(Pond(), measures={"stock": "1"})), controller)
+    assert np.abs(outside["command"] - simulated(task(), controller)["command"]).max() < 1e-12
+
+
+def test_a_state_of_a_map_that_nobody_measures_is_believed() -> None:
+    """With an exact model the belief is the state; a filter's covariance is that of the map's own matrices."""
+    plant = fp.Plant.of_map(
+        states={"a": "1", "b": "1"},
+        inputs={"u": "1"},
+        parameters={},
+        next=lambda x, u, p: {"a": 0.8 * x.a + 0.1 * x.b + u.u, "b": 0.6 * x.b + 0.1 * x.a},
+        step=1.0,
+        controlled=("a",),
+    )
+    beliefs = fp.ModelStates(), fp.KalmanFilter(measured={"a": 1e-3}, noise={"a": 1e-3, "b": 1e-3})
+    for belief in beliefs:
+        problem = fp.Problem(
+            plant,
+            fp.Trajectory(lambda t: {"a": ca.sin(0.05 * t), "b": 0 * t}),
+            {"a": 0.0, "b": 0.3},
+            1.0,
+            60.0,
+            sensing=fp.Sensing(measured=["a"], belief=belief),
+        )
+        run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=0.3)))
+        assert np.abs(run["state.b"] - run["plant_state.b"]).max() < 1e-14
+
+
+def test_a_cascade_on_a_map_iterates_on_its_target() -> None:
+    """The pairing's lag is stated; one that is not stated is that of the map's slowest mode z, -T / log|z|."""
+    settling = fishery(next=lambda x, u, p: {"stock": 0.8 * x.stock - u.catch})
+    assert fp.ThroughModel().stated(task(settling)).lag == pytest.approx(-T / np.log(0.8))
+    law = fp.Exponential(rate=0.04, integral=False)
+    cascade = fp.Cascade(fp.ComputedTorque(law), fp.Affine(gain=-0.6), fp.ThroughModel(lag=2 * T))
+    problem = task(duration=1500.0, measure_from=500.0)
+    plain, deformed = (
+        float(np.sqrt((simulated(problem, c)["true_error"][50:] ** 2).mean()))
+        for c in (fp.ComputedTorque(law), cascade)
+    )
+    assert deformed < 0.1 * plain

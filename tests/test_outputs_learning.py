@@ -183,6 +183,15 @@ def test_a_disturbance_reaches_a_model_with_algebraic_states() -> None:
     assert np.allclose(one, other)
 
 
+def test_a_disturbance_of_a_map_adds_to_its_difference() -> None:
+    plant = fp.Plant.of_map(
+        states={"a": "m", "b": "m"}, inputs={"u": "N"}, parameters={}, step=0.1,
+        next=lambda x, u, p: {"a": x.a + 0.2 * x.b, "b": 0.5 * x.b + u.u}, outputs={"y": fp.Output("m", lambda x, p: x.a)},
+    )  # fmt: skip
+    after = disturbed(plant, ("b",)).next_function([1.0, 2.0], 3.0, [0.7], [0.0, 0.0]).full().ravel()
+    assert np.allclose(after, [1.4, 4.0 + 0.1 * 0.7])
+
+
 def test_an_inverse_of_the_user_has_the_disturbance_of_the_response() -> None:
     plant = hill(5.5)
     by_user = replace(plant, inverse=lambda x, r, p: {"u": plant.inverse_function(x.vector, r.depth, p.half)[0]})

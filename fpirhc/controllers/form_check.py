@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from fpirhc.controllers.mirror_path import NONE
 from fpirhc.deformation.base import Deformation, Mirror
 from fpirhc.deformation.model_referenced import form_inside
 from fpirhc.deformation.queue import every
@@ -41,10 +42,13 @@ def check_outputs(problem: Problem, controller: _Controller) -> None:
     _check_order_zero(problem, controller)
     name, mirror = type(controller).__name__, controller.deformation.mirror
     reason = controller.outputs_unusable(problem)
-    estimated = not (problem.sensing.estimator.shows_response or problem.plant.step)
-    if not reason and mirror is not None and (estimated or mirror.measurement):
+    fraction = mirror is not None and mirror.measurement % 1 > NONE
+    if not reason and mirror is not None and (fraction or (problem.plant.step and mirror.measurement)):
         name = type(controller.deformation).__name__
-        reason = "it compares with a twin of the plant behind the estimator or the late measurement, which has coordinates only"
+        reason = (
+            f"its twin moves from the state that is given with the samples, and these are late by {mirror.measurement:g} cycles; "
+            "believe in whole cycles, and for a map in none"
+        )
     if reason:
         what = ", ".join(problem.plant.outputs)
         raise NotSupported(f"{name} does not cover outputs that are expressions of the state ({what}): {reason}")

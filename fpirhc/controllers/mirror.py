@@ -24,6 +24,7 @@ from fpirhc.controllers.mirror_path import (
     measured_state,
 )
 from fpirhc.controllers.twin import BEFORE, twin_block
+from fpirhc.controllers.twin_of_outputs import twin_of_outputs
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.queue import every
 from fpirhc.plant.plant import Plant
@@ -51,6 +52,8 @@ def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Bloc
         return [map_mirror(path)], []
     if not estimated:
         return [_instant_block(path)], []
+    if problem.plant.outputs:
+        return [twin_of_outputs(path)], []
     return [twin_block(path)], [Delay(problem.plant.response_signal(BEFORE), "_deformation")]
 
 

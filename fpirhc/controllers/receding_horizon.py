@@ -21,6 +21,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
 from fpirhc.controllers.contract import Planner
+from fpirhc.controllers.first_plan import built_first_memory, first_memory
 from fpirhc.controllers.on_failure import HoldPlan, OnFailure
 from fpirhc.controllers.own_reference import motion_of, own_signals, own_values, preview_of
 from fpirhc.controllers.planned_model import as_planned, held_model
@@ -182,7 +183,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     preview = preview_of(problem)
     running_data = data_of if preview is None else _stage_data(problem, count, previewed=True)
     start = nominal(problem)
-    memory = optimiser.memory(ocp).starting_at(_first_memory(start, optimiser, ocp, data_of))
+    memory = optimiser.memory(ocp).starting_at(built_first_memory(start, optimiser, ocp, data_of))
     solve = optimiser.step(ocp.opened())
     feedforward_of = _feedforward(problem)
     low, high = problem.limits.input_ends(plant)
@@ -221,7 +222,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         ahead = replace(ocp.at(values), input_lower=lower, input_upper=upper)
         settled(optimiser, values).check(ahead)
         signals = _derived_numbers(ahead) if ocp.settings else {}
-        first = lambda: optimiser.memory(ocp).unpack(_first_memory(start, optimiser, ahead, data_of))  # noqa: E731
+        first = lambda: optimiser.memory(ocp).unpack(first_memory(start, optimiser, ahead, data_of))  # noqa: E731
         return Derived(signals, first, {name: _STALE[name] for name in signals})
 
     own = memory + Layout((scalar("plan_begun"),))
@@ -259,16 +260,6 @@ def _plan_reads(problem: Problem, ocp: OptimalControl) -> Layout:
     own, outputs = own_signals(problem), (plant.output,) if plant.outputs else ()
     start = like(plant.state, "_plan_state")
     return Layout((plant.time, start, *outputs, plant.parameter, *last, *_derived_signals(ocp), *own))
-
-
-def _first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> np.ndarray:
-    """The optimiser's memory before the run: the plan for the first horizon at the problem's start."""
-    first = np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel()
-    live = ocp.nodes[2][ocp.data.slice("settings").start :, 0] if ocp.settings else None
-    arguments = (0.0, problem.plant.approximate)
-    table = data_of(*arguments) if live is None else data_of(*arguments, live)
-    data = np.asarray(table.full())
-    return optimiser.first_memory(ocp, first, data)
 
 
 def _derived_signals(ocp: OptimalControl) -> tuple[Signal, ...]:

@@ -91,13 +91,8 @@ def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     if reality is None:
         return problem.start_output, plant.controlled_response_function(*at).full().ravel()
     calm = np.zeros(len(problem.real_plant.names))
-    if plant.outputs:
-        return problem.start_output, reality.response_function(plant, seen=True)(*at, calm).full().ravel()
-    shown = dict(
-        zip(reality.shown(plant), reality.state_function(plant, seen=True)(*at, calm).full().ravel(), strict=True)
-    )
-    state = [shown.get(e, first) for e, first in zip(plant.state.elements, problem.start_state, strict=True)]
-    return np.array(state), reality.response_function(plant, seen=True)(*at, calm).full().ravel()
+    motion = problem.start_output if plant.outputs else np.array(list(_first_states(problem).values()))
+    return motion, reality.response_function(plant, seen=True)(*at, calm).full().ravel()
 
 
 def first_shown(problem: Problem) -> dict[str, float]:
@@ -105,7 +100,18 @@ def first_shown(problem: Problem) -> dict[str, float]:
     plant, (motion, response) = problem.plant, first_estimates(problem)
     names = (*plant.output.elements, *response_names(plant.face))
     shown = dict(zip(names, map(float, np.concatenate([motion, response])), strict=True))
-    return dict(zip(plant.state.elements, map(float, problem.start_state), strict=True)) | shown
+    return _first_states(problem) | shown
+
+
+def _first_states(problem: Problem) -> dict[str, float]:
+    """First states of the plant that moves, by name in the model; the model's where it does not have them."""
+    plant, reality = problem.plant, problem.symbolic_reality
+    states = dict(zip(plant.state.elements, map(float, problem.start_state), strict=True))
+    if reality is None:
+        return states
+    at = problem.real_start, problem.inputs_before, problem.real_parameters, np.zeros(len(problem.real_plant.names))
+    values = reality.state_function(plant, seen=True)(*at).full().ravel()
+    return states | dict(zip(reality.shown(plant), map(float, values), strict=True))
 
 
 def _believing(problem: Problem) -> Believing | None:

@@ -123,28 +123,36 @@ class _Moves:
 
     def __init__(self, problem: Problem, names: Sequence[str], path: Path) -> None:
         plant, period = problem.plant, problem.period
-        self.state = ca.DM(_drift(plant, path.fraction * period))
+        self.state = ca.DM(drift(plant, path.fraction * period))
         places = {e: k for k, e in enumerate(plant.state.elements)}
         rows = [np.asarray(self.state)[places[n]] if n in places else np.zeros(plant.state.size) for n in names]
         self.sample = ca.DM(np.array(rows))
-        ahead = _drift(plant, period)
-        # What is remembered at a start is linear in the start; a cycle later the start would have been on the same path.
-        columns = [
-            _remembered(problem, names, unit) for unit in (np.zeros(plant.state.size), *np.eye(plant.state.size))
-        ]
-        self.memory = [
-            ca.DM(np.column_stack([c[k] - columns[0][k] for c in columns[1:]]) @ ahead) for k in range(len(columns[0]))
-        ]
+        self.memory = memory_moves(problem, names)
+
+
+def memory_moves(problem: Problem, names: Sequence[str]) -> list[ca.DM]:
+    """Return the matrices that turn a move of the estimated state, or outputs, into moves of what the estimator remembers.
+
+    What is remembered at a start is linear in the start; a cycle later the start would have been on the same path.
+
+    Args:
+        problem: with the estimator.
+        names: of what it measures.
+    """
+    face = problem.plant.face
+    ahead, size = drift(face, problem.period), face.state.size
+    columns = [_remembered(problem, names, unit) for unit in (np.zeros(size), *np.eye(size))]
+    return [ca.DM(np.column_stack([c[k] - columns[0][k] for c in columns[1:]]) @ ahead) for k in range(len(columns[0]))]
 
 
 def _remembered(problem: Problem, names: Sequence[str], start: np.ndarray) -> list[np.ndarray]:
     """What the estimator remembers at a start, signal by signal."""
-    block = problem.sensing.estimator.block(problem.plant, problem.period, start, Signal("_seen", tuple(names)))
+    block = problem.sensing.estimator.block(problem.plant.face, problem.period, start, Signal("_seen", tuple(names)))
     return [m.start_vector() for m in block.memory.signals]
 
 
-def _drift(plant: Plant, time: float) -> np.ndarray:
-    """Matrix by which a state moves in that time while all highest derivatives are zero: Taylor's formula."""
+def drift(plant: Plant, time: float) -> np.ndarray:
+    """Return the matrix by which a state moves in that time while all highest derivatives are zero: Taylor's formula."""
     elements = plant.state.elements
     drift = np.zeros((len(elements), len(elements)))
     for k, element in enumerate(elements):

@@ -55,7 +55,7 @@ def of_map(
         coordinates=states,
         inputs=inputs,
         parameters=parameters,
-        response=Differences(next, tuple(states), step),  # type: ignore[arg-type]  # what is no mapping is refused by name
+        response=Differences(next, tuple(states), step),
         order=1,
         controlled=controlled,
         ranges=ranges or {},

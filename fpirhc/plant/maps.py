@@ -24,7 +24,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import casadi as ca
 import numpy as np
@@ -58,11 +58,11 @@ class Differences:
         """The signature of the map, so that a wrong number of arguments is named as that of the map."""
         return inspect.signature(self.next)
 
-    def __call__(self, x: Named, *others: Named) -> object:
+    def __call__(self, x: Named, *others: Named) -> Mapping[str, Expression]:
         """Return the differences; what is not a mapping, or not the value of a state, stays as it is and is refused as such."""
         values = self.next(x, *others)
         if not isinstance(values, Mapping):
-            return values
+            return cast(Mapping[str, Expression], values)
         scalars = ca.SX | ca.MX | ca.DM | int | float
         return {
             name: (value - x[name]) / self.step if name in self.states and isinstance(value, scalars) else value

@@ -130,21 +130,27 @@ def face_of(plant: Plant) -> Plant:
 
 
 def light_plant(
-    plant: Plant, coordinates: Mapping[str, str], order: Mapping[str, int], controlled: Sequence[str]
+    plant: Plant,
+    coordinates: Mapping[str, str],
+    order: Mapping[str, int],
+    controlled: Sequence[str],
+    inputs: Mapping[str, str] | None = None,
 ) -> Plant:
     """Return the plant y^(r) = u of some quantities, each controlled one with an input of its own.
 
     Args:
-        plant: of which they are; its inputs stay, in their order.
+        plant: of which they are.
         coordinates: name -> unit.
         order: name -> relative order.
         controlled: as many names as there are inputs.
+        inputs: name -> unit of those that act; None: all inputs of the plant, in their order.
     """
-    inputs = dict(zip(controlled, plant.inputs, strict=True))
+    acting = dict(plant.inputs if inputs is None else inputs)
+    by_name = dict(zip(controlled, acting, strict=True))
 
     def response(*arguments: Named) -> dict[str, Expression]:
         u = arguments[-2]
-        return {name: u[inputs[name]] if name in inputs else ca.SX(0) for name in coordinates}
+        return {name: u[by_name[name]] if name in by_name else ca.SX(0) for name in coordinates}
 
     names = [f"d{k}" for k in range(max(order.values()))] + ["u", "p"]
     kind = inspect.Parameter.POSITIONAL_ONLY
@@ -152,6 +158,7 @@ def light_plant(
     return replace(
         plant,
         coordinates=dict(coordinates),
+        inputs=acting,
         parameters={},
         response=response,
         order=dict(order),

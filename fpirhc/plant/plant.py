@@ -90,7 +90,7 @@ class Plant(Checked):
     next: Callable[..., Mapping[str, Expression]] | None = field(
         default=None, kw_only=True, metadata={"setting": "where given"}
     )
-    steps: Few = field(default=1, kw_only=True, metadata={"setting": "where given"})
+    steps: Few = field(default=1, kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("plant")

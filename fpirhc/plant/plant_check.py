@@ -28,7 +28,11 @@ def check_names(plant: Plant, mistakes: Mistakes) -> None:
     quantities = "states" if plant.next is not None or (plant.outputs and plant.order == 1) else "coordinates"
     for what, group in ((quantities, plant.coordinates), ("inputs", plant.inputs), ("outputs", outputs)):
         if not group and what != "outputs":
-            still = " (a static map y = h(u) may have one that stands still)" if plant.outputs and what == quantities else ""
+            still = (
+                " (a static map y = h(u) may have one that stands still)"
+                if plant.outputs and what == quantities
+                else ""
+            )
             mistakes.add(f"{what} are empty; name at least one, with its unit{still}")
         for name, unit in group.items():
             if not isinstance(unit, str) or not unit:

@@ -15,7 +15,7 @@ from functools import cached_property
 
 import casadi as ca
 
-from fpirhc.errors import InvalidName, NotInvertible, nearest
+from fpirhc.errors import InvalidName, NotInvertible, NotSupported, nearest
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.structural_order import structural_order
 
@@ -57,8 +57,14 @@ def output_chain(plant: Plant, coordinate: str, input_name: str | None = None) -
     Raises:
         InvalidName: an unknown coordinate or input, or no name although there are several inputs.
         NotInvertible: the input reaches no derivative of the coordinate, or another input reaches an earlier one.
+        NotSupported: a map.
     """
     name = _input(plant, coordinate, input_name)
+    if plant.step is not None:
+        raise NotSupported(
+            "output_chain differentiates with respect to time, which a map does not have; write an output, whose differences and "
+            "order are those of `Plant.face` and `Plant.output_function`"
+        )
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
     rate = plant.forced_derivative_function(x, u, p, w)

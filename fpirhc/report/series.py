@@ -53,6 +53,7 @@ def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]
             for k, e in enumerate(entries)
         ],
         "timeUnit": comparison.time_unit,
+        "steps": comparison.steps,
         "time": _round(np.repeat(longest.time[edges[:-1]], 2) + _halves(longest, edges)),
         "charts": charts,
     }

@@ -1,7 +1,7 @@
 """A review of a problem whose controlled outputs have the order 0: what is known before a run, and what is not.
 
 The iteration is on settled values. Its Jacobian J is that of the plant's static map times the inverse of the model's, and a settled
-error is multiplied by I - a J in every cycle. Behind a lag through which the target is paired more gain is admissible, and not less.
+error is multiplied by I - a J in every cycle. Behind a lag, through which the target is paired, more gain is admissible, not less.
 """
 
 from __future__ import annotations

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero
+from fpirhc.plant.instant import response_orders
 from fpirhc.plant.plant import Plant
 
 _LONGEST = 60  # characters of an answer that are shown
@@ -171,7 +172,8 @@ def _short(answer: object) -> str:
 
 def quantities(model: Plant) -> dict[str, str]:
     """Return the unit of every quantity of a model that can be measured: state elements, outputs, and controlled responses."""
-    face, signals = model.face, (model.state, model.output)
+    signals, orders = (model.state, model.output), response_orders(model)
     shown = {name: unit for s in signals for name, unit in zip(s.elements, s.entry_units, strict=True)}
-    responses = {face.names[k] + "'" * face.orders[k]: face.response_units[k] for k in face.controlled_indices}
+    units = model.response_signal("realised").entry_units
+    responses = {name + "'" * order: unit for (name, order), unit in zip(orders.items(), units, strict=True)}
     return {**shown, **responses}

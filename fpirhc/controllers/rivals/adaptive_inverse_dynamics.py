@@ -43,8 +43,9 @@ class AdaptiveInverseDynamics(Controller):
     Lyapunov rule learns slowly, because it learns from these errors; a Projection learns as fast as without a deformation.
 
     Behind dead time the rule pairs the errors with the response of the same instant: state and reference are those at which the
-    response was realised, and the command is the one that acted then. The estimate reaches the plant late, so the gains of a
-    Lyapunov rule must fall as the dead time grows. A deformation needs its own pairing, `Paired`.
+    response was realised, and the command is the one that acted then. Behind an estimator alone, whose response is late by a cycle
+    or two, the newest error is better (`three_link_arm`: half the rms error). The estimate reaches the plant late, so the gains of
+    a Lyapunov rule must fall as the dead time grows. A deformation needs its own pairing, `Paired`.
 
     Args:
         tracking: the law that gives the desired response.
@@ -78,11 +79,10 @@ class AdaptiveInverseDynamics(Controller):
             NotSupported: errors of an earlier instant, to set-points.
         """
         self._learning.check(problem, inverts=True)
-        late = ResponsePairs(problem, problem.dead_time).waiting
-        if late and own_signals(problem) and not self.rule.reads_response:
+        if _late(problem) and own_signals(problem) and not self.rule.reads_response:
             raise NotSupported(
-                f"{type(self.rule).__name__} pairs a response with the error of the same instant, and behind dead time or an "
-                "estimator set-points are not remembered for it; use Projection, or a Trajectory"
+                f"{type(self.rule).__name__} pairs a response with the error of the same instant, and behind dead time set-points "
+                "are not remembered for it; use Projection, or a Trajectory"
             )
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
@@ -111,8 +111,10 @@ class AdaptiveInverseDynamics(Controller):
         fixed = self.lyapunov_row() if rows is None else np.zeros(0)
 
         target, reads = self._target(problem)
+        paired = _late(problem)
 
-        def gradient(s: Signals, state: Expression, estimate: Expression) -> Pair:
+        def gradient(s: Signals, then: Expression, estimate: Expression) -> Pair:
+            state = then if paired else s.state
             matrix, _ = equation(state, s.realised, s._command_before, estimate, s.parameters)
             chains = error_chains(plant, target(s) - state)
             if self.tracking.integral:
@@ -129,7 +131,7 @@ class AdaptiveInverseDynamics(Controller):
     def _target(self, problem: Problem) -> tuple[Callable[[Signals], Expression], tuple[Signal, ...]]:
         """The reference when the response was realised, and what it reads; no sample is older than the start."""
         plant, pairs = problem.plant, ResponsePairs(problem, problem.dead_time)
-        if not pairs.waiting or own_signals(problem):
+        if not _late(problem) or own_signals(problem):
             return lambda s: s._target, (like(plant.state, "_target"),)
         reference = problem.reference.function(plant)
 
@@ -144,6 +146,11 @@ class AdaptiveInverseDynamics(Controller):
         size = len(gains)
         weights = np.diag([self.tracking.rate ** (2.0 * (size - 1 - k)) for k in range(size)])
         return np.asarray(solve_continuous_lyapunov(companion(gains).T, -weights)[-1])
+
+
+def _late(problem: Problem) -> bool:
+    """Whether there is dead time, behind which state, reference and response are of other instants."""
+    return bool(problem.dead_time.queued)
 
 
 EXAMPLES = (

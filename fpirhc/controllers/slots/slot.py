@@ -1,12 +1,11 @@
 """A time slot: one coordinate, controlled alone with its own relative order, tracking law and deformation.
 
-On a plant a slot becomes a `Channel`: the coordinate's chain of derivatives, and a light plant that consists of this chain alone,
-y^(r) = u. So tracking laws and deformations work in a slot as they do on a whole plant.
+On a plant a slot becomes a `Channel`: the coordinate's chain of derivatives, and its face, the light plant y^(r) = u. So tracking
+laws and deformations work in a slot as they do on a whole plant, or on the outputs of one.
 """
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, field
 
@@ -18,11 +17,12 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.deformation.model_referenced import form_inside
 from fpirhc.errors import InvalidProblem, NotInvertible, NotSupported
 from fpirhc.fields.checked import Checked
+from fpirhc.plant.outputs import light_plant
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.relative_order import OutputChain, output_chain
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Layout, Named, Signal
+from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import PREFIX
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
@@ -62,7 +62,7 @@ class Channel:
         slot: that is on the plant.
         chain: the derivatives of its coordinate.
         number: place among the slots.
-        plant: the light plant y^(r) = u.
+        plant: its face, y^(r) = u.
         start_gain: d y^(r)/du of the model at the problem's start.
     """
 
@@ -106,7 +106,9 @@ def channel(problem: Problem, slot: Slot, number: int) -> Channel:
     gain = float(chain.gain(problem.start_state, rest, plant.approximate))
     if not (np.isfinite(gain) and gain != 0):
         raise NotInvertible(f"'{chain.input}' has no effect on '{slot.coordinate}' at the start (gain {gain:g})")
-    return Channel(slot, chain, number, _light_plant(plant, chain), gain)
+    name, acting = chain.coordinate, {chain.input: plant.inputs[chain.input]}
+    light = light_plant(plant, {name: chain.unit}, {name: chain.order}, (name,), acting)
+    return Channel(slot, chain, number, light, gain)
 
 
 def _check_deformation(deformation: Deformation) -> None:
@@ -128,19 +130,6 @@ def _check_deformation(deformation: Deformation) -> None:
         raise NotSupported(
             f"{type(outer).__name__} around a model-referenced form: put it inside, ModelReferenced({type(outer).__name__}(map))"
         )
-
-
-def _light_plant(plant: Plant, chain: OutputChain) -> Plant:
-    """The plant y^(r) = u with the chain as its state; only its signals are used."""
-
-    def response(*arguments: Named) -> dict[str, Expression]:
-        return {chain.coordinate: arguments[-2].vector}
-
-    names = [f"d{k}" for k in range(chain.order)] + ["u", "p"]
-    kind = inspect.Parameter.POSITIONAL_ONLY
-    vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(n, kind) for n in names])
-    inputs = {chain.input: plant.inputs[chain.input]}
-    return Plant({chain.coordinate: chain.unit}, inputs, {}, response, chain.order, time_unit=plant.time_unit)
 
 
 def for_channel(

@@ -14,6 +14,7 @@ from dataclasses import replace
 import casadi as ca
 
 from fpirhc.errors import Mistakes, NotSupported
+from fpirhc.plant.maps import Differences
 from fpirhc.plant.outputs import Output
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.sensing.base import response_names
@@ -52,10 +53,13 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
     if responses:
         units |= dict(zip(responses, plant.response_signal("_").units, strict=True))
     added = {disturbance_name(n): Parameter(0.0, 0.0, units[n]) for n in names}
+    following = None if plant.next is None else _next(plant, coordinates)
+    response = _response(plant, coordinates)
     return replace(
         plant,
         parameters={**plant.parameters, **added},
-        response=_response(plant, coordinates),
+        response=response if following is None else Differences(following, plant.names, float(plant.step or 1.0)),
+        next=following,
         inverse=None if plant.inverse is None else _inverse(plant, plant.inverse, names),
         outputs={n: _output(plant, n, one, names) for n, one in plant.outputs.items()},
     )
@@ -76,6 +80,20 @@ def _response(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping
 
     vars(response)["__signature__"] = inspect.signature(plant.response)
     return response
+
+
+def _next(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping[str, Expression]]:
+    """The map with its disturbances, whose response is the difference per step."""
+    assert plant.next is not None
+    original, step = plant.next, float(plant.step or 1.0)
+
+    def following(*arguments: Named) -> Mapping[str, Expression]:
+        *others, p = arguments
+        values = original(*others, _own(plant, p))
+        return {c: v + step * p[disturbance_name(c)] if c in coordinates else v for c, v in values.items()}
+
+    vars(following)["__signature__"] = inspect.signature(original)
+    return following
 
 
 def _output(plant: Plant, name: str, one: Output, names: Sequence[str]) -> Output:

@@ -124,6 +124,7 @@ class Comparison:
         pictures: pictures of the problem for the report.
         null: what adaptation does where there is nothing to adapt, for the first pair; None without one.
         time_unit: unit of time of the problem.
+        steps: whether the plant is a map, which has no motion between two cycles.
         information: what the controllers are given, what each uses, and when each acts, in sentences.
     """
 
@@ -142,6 +143,7 @@ class Comparison:
     pictures: tuple[Picture, ...] = ()
     null: NullTest | None = None
     time_unit: str = "s"
+    steps: bool = False
     information: tuple[str, ...] = ()
 
     @property
@@ -251,6 +253,7 @@ def compare(
         pictures=task.pictures,
         null=null_of_pair(task.problem, judged[0].pair, entries, loops, sizes, seed=seed),
         time_unit=task.problem.time_unit,
+        steps=task.problem.real_plant.step is not None,
         information=sentences(task.problem, {e.name: e.information for e in entries if e.information}),
     )
 
