@@ -213,6 +213,9 @@ def test_an_exact_model_referenced_form_changes_nothing() -> None:
     problem, form = sedated(None, sensing=sensing, duration=5.0), fp.ModelReferenced(fp.Affine(-0.5))
     plain, referenced = (run(problem, fp.ExactModel(fp.ComputedTorque(LAW, d))) for d in (fp.Identity(), form))
     np.testing.assert_allclose(referenced["command"], plain["command"], atol=1e-9)
+    behind = sedated(FILTER, duration=2.0, measure_from=0.0)  # behind differences, with a twin that the filter moves
+    plain, referenced = (run(behind, fp.ExactModel(fp.ComputedTorque(LAW, d))) for d in (fp.Identity(), form))
+    np.testing.assert_allclose(referenced["command"], plain["command"], atol=1e-9)
     wrong = sedated(None, believed=5.0, sensing=sensing)
     errors = [
         fp.measure(wrong, run(wrong, fp.ComputedTorque(LAW, d))).rms_error["depth"] for d in (fp.Identity(), form)

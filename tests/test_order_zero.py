@@ -140,6 +140,19 @@ def test_set_points_noise_and_dead_time() -> None:
     assert np.abs(run["true_error.power"][settled]).max() < 3.0  # W; the element is still warming up
 
 
+def test_a_disturbance_of_the_output_is_a_part_of_its_response() -> None:
+    """A lamp of 20 W on the same meter: measured, judged, and made up for by the target."""
+    problem = heated(element(COLD, WARMER), disturbances={"power": fp.Step(at=20.0, size=20.0)})
+    run = simulated(problem, fp.Cascade(STATIC, affine(0.5)))
+    lamp = np.where(run.time >= 20.0 - 1e-9, 20.0, 0.0)
+    ohms = COLD * (1 + WARMER * run["state.theta"])
+    drawn = run["command.u"][:-1] ** 2 / ohms[1:] + lamp[1:]
+    assert run["output.power"][1:] == pytest.approx(drawn, rel=1e-12)
+    assert np.array_equal(run["realised"], run["output"])
+    assert np.abs(run["error.power"][run.time > 23]).max() < 2.0
+    assert np.abs(run["error.power"]).max() > 19
+
+
 def test_a_stepper_does_what_the_loop_does() -> None:
     problem, controller = heated(element(), duration=2.0, measure_from=0.0), fp.Cascade(STATIC, affine(0.4))
     run = simulated(problem, controller)

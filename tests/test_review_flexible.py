@@ -104,3 +104,10 @@ def test_a_gain_that_only_the_rigid_model_bears_is_refused_by_the_review() -> No
     by_question = {a.question: a for a in answers}
     assert str(by_question[LOOP].verdict) == "no"
     assert str(by_question[RESONANCE].verdict) == "no"
+
+
+def test_a_law_that_excites_the_shaft_is_refused_without_adaptation_too() -> None:
+    """The rigid model's loop has wide margins; the growth of the real pair is that of the runs above."""
+    answers = {a.question: a for a in fp.review(servo(), {"it": law(0.0)}, mismatch=0.0, seed=0).controllers["it"]}
+    assert str(answers[LOOP].verdict) == "no"
+    assert answers[LOOP].numbers["radius"] == pytest.approx(1.00526, abs=1e-4)

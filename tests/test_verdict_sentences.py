@@ -255,6 +255,8 @@ def test_plans_that_did_not_converge_are_a_cause_from_a_twentieth_of_the_cycles_
         " Its plans did not converge in 42 % of the cycles (those of RHC in 34 %), so this is not the optimum of its cost: give "
         "the optimiser more iterations, then compare."
     )
+    swinging = {"status": {"NOT_CONVERGED": 0.41 * CYCLES}, "clipped_share": {"": 0.4}}
+    assert no_difference(measured=swinging).startswith(" Its command stands at a limit in 40 % of the cycles")
 
 
 def test_commands_at_their_limits_are_a_cause_from_a_fifth_of_the_cycles_on():

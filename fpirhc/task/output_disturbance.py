@@ -26,8 +26,9 @@ LOGGED = "output_disturbance"
 
 def disturbed_outputs(problem: Problem) -> dict[str, int]:
     """Return the disturbed outputs by name with their relative orders; a name of a coordinate of the moving plant is none."""
-    face, moved = problem.plant.face, problem.real_plant.coordinates
-    orders = dict(zip(face.names, face.orders, strict=True)) if problem.plant.outputs else {}
+    plant, moved = problem.plant, problem.real_plant.coordinates
+    orders = dict(zip(plant.face.names, plant.face.orders, strict=True)) if plant.outputs else {}
+    orders |= dict.fromkeys(plant.instant_names, 0)
     return {n: orders[n] for n in problem.disturbances if n in orders and n not in moved}
 
 

@@ -67,7 +67,10 @@ def _effort_cause(entry: Entry) -> str:
 
 def _plan_cause(plain: Entry, adaptive: Entry) -> str:
     before, after = (_share(e, "status", Status.NOT_CONVERGED.name) / max(1, e.run.cycles) for e in (plain, adaptive))
-    if after < _MANY_PLANS:
+    swings = (
+        before < 0.5 * after and _share(adaptive, "clipped_share", "") >= _OFTEN
+    )  # plans of a run that swings are hard
+    if after < _MANY_PLANS or swings:
         return ""
     return (
         f"Its plans did not converge in {percent(after)} of the cycles (those of {plain.name} in {percent(before)}), so this is "
