@@ -21,13 +21,13 @@ import numpy as np
 from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.algebraic import unsolved
-from fpirhc.plant.chain import derivatives_function, input_reaches_at
+from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.instant import response_orders
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.settling import settled
 from fpirhc.plant.stiffness import stiffness
-from fpirhc.plant.structural_order import structural_order
+from fpirhc.task.reality_check import check_coordinate, check_expression, check_inputs, other_unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ class Reality(Checked):
             InvalidProblem: all mistakes together.
         """
         mistakes = Mistakes("reality")
-        _check_inputs(self.plant, model, mistakes)
+        check_inputs(self.plant, model, mistakes)
         mistakes.unknown("seen: coordinate of the model", self.seen, model.coordinates)
         mistakes.unknown("seen: coordinate of the reality", self.seen.values(), self.plant.coordinates)
         mistakes.unknown("start: state", self.start, self.plant.state.elements)
@@ -95,15 +95,15 @@ class Reality(Checked):
             )
         for name, unit in model.coordinates.items():
             if needed is None or name in needed:
-                _check_output(self, model, name, unit, mistakes)
+                check_coordinate(self, model, name, unit, mistakes)
             elif self.plant.coordinates.get(name, unit) != unit:
-                mistakes.add(_other_unit(self.plant, name, name, unit))
+                mistakes.add(other_unit(self.plant, name, name, unit))
         if model.outputs and self.seen:
             mistakes.add(
                 "seen: what is measured of a model with outputs are the outputs of the same names; write the sensor there"
             )
         for name in model.outputs:
-            _check_expression(self, model, name, mistakes)
+            check_expression(self, model, name, mistakes)
         mistakes.raise_if_any()
 
     def shown(self, model: Plant) -> tuple[str, ...]:
@@ -237,68 +237,3 @@ class Reality(Checked):
         if seen:
             return tuple(self.seen.get(c, c) for c in model.names)
         return tuple(self.true_name(c) for c in model.names)
-
-
-def _check_inputs(plant: Plant, model: Plant, mistakes: Mistakes) -> None:
-    own, expected = ", ".join(plant.inputs), ", ".join(model.inputs)
-    if own != expected:
-        mistakes.add(
-            f"its inputs are {own}, the model's are {expected}; both take the same commands, so name them alike, in order"
-        )
-    for name, unit in plant.inputs.items():
-        other = model.inputs.get(name, unit)
-        if unit != other:
-            mistakes.add(f"its input '{name}' is in {unit}, the model's in {other}; write both in one unit")
-
-
-def _check_output(reality: Reality, model: Plant, name: str, unit: str, mistakes: Mistakes) -> None:
-    plant, own = reality.plant, reality.seen.get(name, name)
-    if own not in plant.coordinates:
-        if name not in reality.seen:
-            followed = not model.outputs and name in (model.controlled or model.names)
-            believed = "" if followed else ", or have it believed: Sensing(measured=..., belief=ModelStates())"
-            mistakes.add(
-                f"it has no coordinate '{name}', which the model has and the controller is given; add it, or name the one that is "
-                f"measured in its place: Reality(seen={{'{name}': ...}}){believed}. Its coordinates: {', '.join(plant.coordinates)}"
-            )
-        return
-    for one in sorted({own, name} & set(plant.coordinates)):
-        if plant.coordinates[one] != unit:
-            mistakes.add(_other_unit(plant, one, name, unit))
-    order = model.orders[model.names.index(name)]
-    at_once = input_reaches_at(plant, own, order - 1)
-    if at_once is not None:
-        mistakes.add(
-            f"its derivative {own}{chr(39) * at_once} jumps with the command, but it is a state of the model, where '{name}' has "
-            f"the order {order}; give the model this order, or the reality a coordinate of its own"
-        )
-    elif not model.outputs and name in (model.controlled or model.names) and structural_order(plant, own) is None:
-        mistakes.add(f"no input reaches its coordinate '{own}', however often it is differentiated")
-
-
-def _other_unit(plant: Plant, own: str, name: str, unit: str) -> str:
-    units = f"in {plant.coordinates[own]}, the model's '{name}' in {unit}"
-    return f"its coordinate '{own}' is {units}; write both in one unit"
-
-
-def _check_expression(reality: Reality, model: Plant, name: str, mistakes: Mistakes) -> None:
-    """Add what is wrong with the reality's output, or coordinate, of the name of an output of the model."""
-    plant, unit = reality.plant, model.outputs[name].unit
-    units = {**plant.coordinates, **{n: one.unit for n, one in plant.outputs.items()}}
-    if name not in units:
-        mistakes.add(
-            f"it has no output '{name}', which the model has and which is judged; give its plant this output too. Its coordinates "
-            f"and outputs: {', '.join(units)}"
-        )
-        return
-    if units[name] != unit:
-        mistakes.add(f"its '{name}' is in {units[name]}, the model's in {unit}; write both in one unit")
-    if name in model.instant_names:
-        return
-    order = model.face.orders[model.face.names.index(name)]
-    at_once = input_reaches_at(plant, name, order - 1)
-    if at_once is not None:
-        mistakes.add(
-            f"its derivative {name}{chr(39) * at_once} jumps with the command, but '{name}' has the relative order {order} in the "
-            "model; give the model this order, or the reality an actuator"
-        )
