@@ -86,7 +86,7 @@ def _response(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping
 
 def _differences(plant: Plant, following: Map) -> Map:
     """The response of a map: the difference of its steps."""
-    return Differences(following, plant.names, float(plant.step or 1.0))  # type: ignore[return-value]  # see `Plant.of_map`
+    return Differences(following, plant.names, float(plant.step or 1.0))
 
 
 def _next(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping[str, Expression]]:
