@@ -20,6 +20,8 @@ from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.layout import Expression, Named
 
+Map = Callable[..., Mapping[str, Expression]]
+
 
 def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
     """Return the plant with disturbances as parameters of value 0, see `disturbance_name`.
@@ -54,11 +56,11 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
         units |= dict(zip(responses, plant.response_signal("_").units, strict=True))
     added = {disturbance_name(n): Parameter(0.0, 0.0, units[n]) for n in names}
     following = None if plant.next is None else _next(plant, coordinates)
-    response = _response(plant, coordinates)
+    response = _response(plant, coordinates) if following is None else _differences(plant, following)
     return replace(
         plant,
         parameters={**plant.parameters, **added},
-        response=response if following is None else Differences(following, plant.names, float(plant.step or 1.0)),
+        response=response,
         next=following,
         inverse=None if plant.inverse is None else _inverse(plant, plant.inverse, names),
         outputs={n: _output(plant, n, one, names) for n, one in plant.outputs.items()},
@@ -80,6 +82,11 @@ def _response(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping
 
     vars(response)["__signature__"] = inspect.signature(plant.response)
     return response
+
+
+def _differences(plant: Plant, following: Map) -> Map:
+    """The response of a map: the difference of its steps."""
+    return Differences(following, plant.names, float(plant.step or 1.0))
 
 
 def _next(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping[str, Expression]]:
