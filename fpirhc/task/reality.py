@@ -24,6 +24,7 @@ from fpirhc.plant.algebraic import unsolved
 from fpirhc.plant.chain import derivatives_function, input_reaches_at
 from fpirhc.plant.instant import response_orders
 from fpirhc.plant.integrators import Integrator
+from fpirhc.plant.outputs import output_order
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.settling import settled
 from fpirhc.plant.stiffness import stiffness
@@ -109,7 +110,7 @@ class Reality(Checked):
     def shown(self, model: Plant) -> tuple[str, ...]:
         """Return the names of the model's states that it has, in the model's order."""
         own = dict(zip(model.names, self._names(model, seen=True), strict=True))
-        return tuple(e for e in model.state.elements if own[e.rstrip("'")] in self.plant.coordinates)
+        return tuple(e for e in model.state.elements if own[e.rstrip("'")] in quantities_of(self.plant))
 
     def state_function(self, model: Plant, *, seen: bool) -> ca.Function:
         """Function (state, input, parameters, forcing) of the reality -> the model's states that it has, in the order of `shown`.
@@ -160,7 +161,25 @@ class Reality(Checked):
                 f"reality: its states {missing} have no equilibrium at the start of the model; give their first values: "
                 f"Reality(start={{'{elements[free[0]]}': ...}})"
             )
+        self._check_shown_start(model, start, at_rest, command)
         return at_rest
+
+    def _check_shown_start(self, model: Plant, start: np.ndarray, first: np.ndarray, command: np.ndarray) -> None:
+        """Raise if outputs stand for the model's coordinates, no start is stated, and they start elsewhere than the model."""
+        hidden = [e for e in self.shown(model) if self.true_name(e.rstrip("'")) not in self.plant.coordinates]
+        if model.outputs or self.start or not hidden:
+            return
+        values = self.state_function(model, seen=False)(
+            first, command, self.plant.exact, np.zeros(len(self.plant.names))
+        )
+        own = dict(zip(self.shown(model), np.asarray(values.full()).ravel(), strict=True))
+        for name in hidden:
+            wanted = start[model.state.elements.index(name)]
+            if not abs(own[name] - wanted) <= 1e-6 * (1 + abs(wanted)):
+                raise InvalidProblem(
+                    f"reality: its output '{name}' starts at {own[name]:.4g}, that of the model at {wanted:.4g}; give first values "
+                    f"of its states: Reality(start={{'{self.plant.state.elements[0]}': ...}})"
+                )
 
     def shared(self, model: Plant) -> dict[int, int]:
         """Return the places of the states that both have: place in the model's state -> place in its own."""
@@ -173,7 +192,7 @@ class Reality(Checked):
 
     def true_name(self, coordinate: str) -> str:
         """Return its coordinate at which a coordinate of the model is judged."""
-        return coordinate if coordinate in self.plant.coordinates else self.seen.get(coordinate, coordinate)
+        return coordinate if coordinate in quantities_of(self.plant) else self.seen.get(coordinate, coordinate)
 
     def check_motion(self, start: np.ndarray, command: np.ndarray, integrator: Integrator, period: float) -> None:
         """Raise if the reality cannot move from its start, or the integrator cannot follow it there.
@@ -239,6 +258,16 @@ class Reality(Checked):
         return tuple(self.true_name(c) for c in model.names)
 
 
+def quantities_of(plant: Plant) -> dict[str, str]:
+    """Return the units of what a reality can show: its coordinates and its outputs."""
+    return {**plant.coordinates, **{name: one.unit for name, one in plant.outputs.items()}}
+
+
+def _order(plant: Plant, name: str) -> int | None:
+    """The relative order of a coordinate or an output; None where no input reaches it."""
+    return structural_order(plant, name) if name in plant.coordinates else output_order(plant, name)
+
+
 def _check_inputs(plant: Plant, model: Plant, mistakes: Mistakes) -> None:
     own, expected = ", ".join(plant.inputs), ", ".join(model.inputs)
     if own != expected:
@@ -253,7 +282,8 @@ def _check_inputs(plant: Plant, model: Plant, mistakes: Mistakes) -> None:
 
 def _check_output(reality: Reality, model: Plant, name: str, unit: str, mistakes: Mistakes) -> None:
     plant, own = reality.plant, reality.seen.get(name, name)
-    if own not in plant.coordinates:
+    units = quantities_of(plant)
+    if own not in units:
         if name not in reality.seen:
             followed = not model.outputs and name in (model.controlled or model.names)
             believed = "" if followed else ", or have it believed: Sensing(measured=..., belief=ModelStates())"
@@ -262,8 +292,8 @@ def _check_output(reality: Reality, model: Plant, name: str, unit: str, mistakes
                 f"measured in its place: Reality(seen={{'{name}': ...}}){believed}. Its coordinates: {', '.join(plant.coordinates)}"
             )
         return
-    for one in sorted({own, name} & set(plant.coordinates)):
-        if plant.coordinates[one] != unit:
+    for one in sorted({own, name} & set(units)):
+        if units[one] != unit:
             mistakes.add(_other_unit(plant, one, name, unit))
     order = model.orders[model.names.index(name)]
     at_once = input_reaches_at(plant, own, order - 1)
@@ -272,19 +302,19 @@ def _check_output(reality: Reality, model: Plant, name: str, unit: str, mistakes
             f"its derivative {own}{chr(39) * at_once} jumps with the command, but it is a state of the model, where '{name}' has "
             f"the order {order}; give the model this order, or the reality a coordinate of its own"
         )
-    elif not model.outputs and name in (model.controlled or model.names) and structural_order(plant, own) is None:
+    elif not model.outputs and name in (model.controlled or model.names) and _order(plant, own) is None:
         mistakes.add(f"no input reaches its coordinate '{own}', however often it is differentiated")
 
 
 def _other_unit(plant: Plant, own: str, name: str, unit: str) -> str:
-    units = f"in {plant.coordinates[own]}, the model's '{name}' in {unit}"
+    units = f"in {quantities_of(plant)[own]}, the model's '{name}' in {unit}"
     return f"its coordinate '{own}' is {units}; write both in one unit"
 
 
 def _check_expression(reality: Reality, model: Plant, name: str, mistakes: Mistakes) -> None:
     """Add what is wrong with the reality's output, or coordinate, of the name of an output of the model."""
     plant, unit = reality.plant, model.outputs[name].unit
-    units = {**plant.coordinates, **{n: one.unit for n, one in plant.outputs.items()}}
+    units = quantities_of(plant)
     if name not in units:
         mistakes.add(
             f"it has no output '{name}', which the model has and which is judged; give its plant this output too. Its coordinates "

@@ -1,4 +1,4 @@
-"""Does the loop with the reality converge where nothing adapts? The margins of the model's loop do not show what the model lacks."""
+"""Does the loop with the reality converge where nothing adapts? The margins of the model's loop do not show what it lacks."""
 
 from __future__ import annotations
 
