@@ -6,3 +6,8 @@ def derivative_unit(unit: str, derivative: int, time: str = "s") -> str:
     if derivative == 0:
         return unit
     return f"{unit}/{time}" if derivative == 1 else f"{unit}/{time}^{derivative}"
+
+
+def with_space(unit: str) -> str:
+    """Return a unit as it stands behind a number: ' kg', and nothing for '1'."""
+    return "" if unit == "1" else f" {unit}"

@@ -1,4 +1,4 @@
-"""Does the loop with the reality converge where nothing adapts? The margins of the model's loop do not show what it lacks."""
+"""Does the loop with the reality converge where nothing adapts? Margins of the model's loop do not show what the model lacks."""
 
 from __future__ import annotations
 

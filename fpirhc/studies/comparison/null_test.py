@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from fpirhc.plant.units import with_space
 from fpirhc.simulation.common_columns import judged_motion
 from fpirhc.simulation.metrics.window import by_name
 from fpirhc.simulation.simulate import Simulator, simulator
@@ -149,14 +150,13 @@ def _sentence(
     if any(math.isnan(c.after) for c in changes.values()):
         return f"{head}failed, {adaptive} does not finish where {plain} does, with nothing to adapt."
     shown = sorted(changes.values(), key=lambda c: -c.ratio if c.ratio == c.ratio else 0.0)
-    numbers = ", ".join(
-        f"{c.name} {c.before:.3g} -> {c.after:.3g} {null.plant.face.coordinates[c.name]}" for c in shown
-    )
+    units = {name: with_space(unit) for name, unit in null.plant.face.coordinates.items()}
+    numbers = ", ".join(f"{c.name} {c.before:.3g} -> {c.after:.3g}{units[c.name]}" for c in shown)
     if outcome in (Outcome.BETTER, Outcome.NO_DIFFERENCE):
         tiny = all(c.size < ROUNDING for c in changes.values())
         return f"{head}passed, {adaptive} is not worse than {plain} ({'rounding only' if tiny else numbers})."
     if cured is not None:
-        costs = ", ".join(f"{n} {cured[n]:.3g} {null.plant.face.coordinates[n]}" for n in changes)
+        costs = ", ".join(f"{n} {cured[n]:.3g}{units[n]}" for n in changes)
         return (
             f"{head}{adaptive} makes a small error of its own ({numbers}); it is smaller than that of {plain} with the wrong model "
             f"({costs})."

@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from fpirhc.plant.units import with_space
 from fpirhc.studies.comparison.causes import causes
 from fpirhc.studies.comparison.changes import Change, major, outcome_of, times
 from fpirhc.studies.comparison.other_rows import remarks
@@ -116,7 +117,7 @@ _SENTENCES = {
 
 def _listed(entry: Entry, changes: Sequence[Change], *, factors: bool = True) -> str:
     return ", ".join(
-        f"{c.name} from {c.before:.3g} to {c.after:.3g} {entry.run.unit(f'error.{c.name}')}"
+        f"{c.name} from {c.before:.3g} to {c.after:.3g}{with_space(entry.run.unit(f'error.{c.name}'))}"
         + (_factor(c) if factors else "")
         for c in changes
     )
