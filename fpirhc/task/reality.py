@@ -27,7 +27,7 @@ from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.settling import settled
 from fpirhc.plant.stiffness import stiffness
-from fpirhc.task.reality_check import check_coordinate, check_expression, check_inputs, other_unit
+from fpirhc.task.reality_check import check_coordinate, check_expression, check_inputs, other_unit, quantities_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ class Reality(Checked):
     def shown(self, model: Plant) -> tuple[str, ...]:
         """Return the names of the model's states that it has, in the model's order."""
         own = dict(zip(model.names, self._names(model, seen=True), strict=True))
-        return tuple(e for e in model.state.elements if own[e.rstrip("'")] in self.plant.coordinates)
+        return tuple(e for e in model.state.elements if own[e.rstrip("'")] in quantities_of(self.plant))
 
     def state_function(self, model: Plant, *, seen: bool) -> ca.Function:
         """Function (state, input, parameters, forcing) of the reality -> the model's states that it has, in the order of `shown`.
@@ -160,7 +160,25 @@ class Reality(Checked):
                 f"reality: its states {missing} have no equilibrium at the start of the model; give their first values: "
                 f"Reality(start={{'{elements[free[0]]}': ...}})"
             )
+        self._check_shown_start(model, start, at_rest, command)
         return at_rest
+
+    def _check_shown_start(self, model: Plant, start: np.ndarray, first: np.ndarray, command: np.ndarray) -> None:
+        """Raise if outputs stand for the model's coordinates, no start is stated, and they start elsewhere than the model."""
+        hidden = [e for e in self.shown(model) if self.true_name(e.rstrip("'")) not in self.plant.coordinates]
+        if model.outputs or self.start or not hidden:
+            return
+        values = self.state_function(model, seen=False)(
+            first, command, self.plant.exact, np.zeros(len(self.plant.names))
+        )
+        own = dict(zip(self.shown(model), np.asarray(values.full()).ravel(), strict=True))
+        for name in hidden:
+            wanted = start[model.state.elements.index(name)]
+            if not abs(own[name] - wanted) <= 1e-6 * (1 + abs(wanted)):
+                raise InvalidProblem(
+                    f"reality: its output '{name}' starts at {own[name]:.4g}, that of the model at {wanted:.4g}; give first values "
+                    f"of its states: Reality(start={{'{self.plant.state.elements[0]}': ...}})"
+                )
 
     def shared(self, model: Plant) -> dict[int, int]:
         """Return the places of the states that both have: place in the model's state -> place in its own."""
@@ -173,7 +191,7 @@ class Reality(Checked):
 
     def true_name(self, coordinate: str) -> str:
         """Return its coordinate at which a coordinate of the model is judged."""
-        return coordinate if coordinate in self.plant.coordinates else self.seen.get(coordinate, coordinate)
+        return coordinate if coordinate in quantities_of(self.plant) else self.seen.get(coordinate, coordinate)
 
     def check_motion(self, start: np.ndarray, command: np.ndarray, integrator: Integrator, period: float) -> None:
         """Raise if the reality cannot move from its start, or the integrator cannot follow it there.

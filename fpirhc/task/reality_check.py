@@ -6,11 +6,17 @@ from typing import TYPE_CHECKING
 
 from fpirhc.errors import Mistakes
 from fpirhc.plant.chain import input_reaches_at
+from fpirhc.plant.outputs import output_order
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.structural_order import structural_order
 
 if TYPE_CHECKING:
     from fpirhc.task.reality import Reality
+
+
+def quantities_of(plant: Plant) -> dict[str, str]:
+    """Return the units of what a reality can show: its coordinates and its outputs."""
+    return {**plant.coordinates, **{name: one.unit for name, one in plant.outputs.items()}}
 
 
 def check_inputs(plant: Plant, model: Plant, mistakes: Mistakes) -> None:
@@ -29,7 +35,8 @@ def check_inputs(plant: Plant, model: Plant, mistakes: Mistakes) -> None:
 def check_coordinate(reality: Reality, model: Plant, name: str, unit: str, mistakes: Mistakes) -> None:
     """Add what is wrong with the reality's coordinate of the name of a coordinate of the model that it needs."""
     plant, own = reality.plant, reality.seen.get(name, name)
-    if own not in plant.coordinates:
+    units = quantities_of(plant)
+    if own not in units:
         if name not in reality.seen:
             followed = not model.outputs and name in (model.controlled or model.names)
             believed = "" if followed else ", or have it believed: Sensing(measured=..., belief=ModelStates())"
@@ -38,8 +45,8 @@ def check_coordinate(reality: Reality, model: Plant, name: str, unit: str, mista
                 f"measured in its place: Reality(seen={{'{name}': ...}}){believed}. Its coordinates: {', '.join(plant.coordinates)}"
             )
         return
-    for one in sorted({own, name} & set(plant.coordinates)):
-        if plant.coordinates[one] != unit:
+    for one in sorted({own, name} & set(units)):
+        if units[one] != unit:
             mistakes.add(other_unit(plant, one, name, unit))
     order = model.orders[model.names.index(name)]
     at_once = input_reaches_at(plant, own, order - 1)
@@ -48,20 +55,20 @@ def check_coordinate(reality: Reality, model: Plant, name: str, unit: str, mista
             f"its derivative {own}{chr(39) * at_once} jumps with the command, but it is a state of the model, where '{name}' has "
             f"the order {order}; give the model this order, or the reality a coordinate of its own"
         )
-    elif not model.outputs and name in (model.controlled or model.names) and structural_order(plant, own) is None:
+    elif not model.outputs and name in (model.controlled or model.names) and _order(plant, own) is None:
         mistakes.add(f"no input reaches its coordinate '{own}', however often it is differentiated")
 
 
 def other_unit(plant: Plant, own: str, name: str, unit: str) -> str:
     """Return the sentence about a coordinate in another unit."""
-    units = f"in {plant.coordinates[own]}, the model's '{name}' in {unit}"
+    units = f"in {quantities_of(plant)[own]}, the model's '{name}' in {unit}"
     return f"its coordinate '{own}' is {units}; write both in one unit"
 
 
 def check_expression(reality: Reality, model: Plant, name: str, mistakes: Mistakes) -> None:
     """Add what is wrong with the reality's output, or coordinate, of the name of an output of the model."""
     plant, unit = reality.plant, model.outputs[name].unit
-    units = {**plant.coordinates, **{n: one.unit for n, one in plant.outputs.items()}}
+    units = quantities_of(plant)
     if name not in units:
         mistakes.add(
             f"it has no output '{name}', which the model has and which is judged; give its plant this output too. Its coordinates "
@@ -79,3 +86,8 @@ def check_expression(reality: Reality, model: Plant, name: str, mistakes: Mistak
             f"its derivative {name}{chr(39) * at_once} jumps with the command, but '{name}' has the relative order {order} in the "
             "model; give the model this order, or the reality an actuator"
         )
+
+
+def _order(plant: Plant, name: str) -> int | None:
+    """The relative order of a coordinate or an output; None where no input reaches it."""
+    return structural_order(plant, name) if name in plant.coordinates else output_order(plant, name)
