@@ -7,6 +7,7 @@ from typing import Any
 
 import fpirhc as fp
 from fpirhc.deformation import Deformation
+from fpirhc.task.outside import really_known
 
 
 def exchanged(value: Any, deformation: Deformation) -> Any:
@@ -23,7 +24,8 @@ def with_exact_model(problem: fp.Problem) -> fp.Problem:
     known = {n: replace(p, approximate=p.exact) for n, p in problem.plant.parameters.items()}
     sensors = {n: replace(s, noise=None, dropout=0.0) for n, s in problem.sensing.sensors.items()}
     plant, sensing = replace(problem.plant, parameters=known), replace(problem.sensing, sensors=sensors)
-    return replace(problem, plant=plant, disturbances={}, sensing=sensing)
+    signals = really_known(problem.signals)
+    return replace(problem, plant=plant, disturbances={}, sensing=sensing, signals=signals)
 
 
 def told(problem: fp.Problem) -> dict[str, Any]:

@@ -99,7 +99,8 @@ def test_all_forms_have_the_same_edge(form):
 def null_change(name: str) -> float:
     """Largest change of the state by the form where the model is exact, relative to its largest value."""
     module: Any = fp.load_problem(name)
-    problem = short(with_exact_model(module.problem), 400)
+    problem = with_exact_model(module.problem)
+    problem = short(problem, min(400, problem.cycles))
     controller = module.controllers[module.headline[1]]
     sign = -1.0 if resolved(problem, controller).deformation.effective_gain() < 0 else 1.0
     map = fp.Sigmoid(gain=-0.5 * sign, shift=0.3 * sign, scale=50.0)
