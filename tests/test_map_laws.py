@@ -117,13 +117,13 @@ def error_of(problem: fp.Problem, controller: Controller) -> np.ndarray:
 def test_for_short_steps_the_map_is_the_differential_equation(form: str, pair: str) -> None:
     """The same law, with derivatives and with differences: halving the step halves what is between the errors."""
     between = []
-    for period in (0.02, 0.01, 0.005):
+    for period in (0.04, 0.02, 0.01):
         controller = fp.ComputedTorque(LAW, FORMS[form])
         of_map, of_rates = (error_of(task(make(period), period), controller) for make in PAIRS[pair])
         between.append(float(np.abs(of_map - of_rates).max()))
-    assert between[0] < 0.02
+    assert between[0] < 0.04
     ratios = np.array(between[:-1]) / between[1:]
-    assert np.all((ratios > 1.7) & (ratios < 2.3)), (between, ratios)
+    assert np.all((ratios > 1.6) & (ratios < 2.4)), (between, ratios)
 
 
 # Plans
@@ -190,13 +190,13 @@ def test_a_plan_is_the_minimum_by_hand(steps: int) -> None:
 
 
 def test_a_plan_on_a_wrong_model_is_cured_by_the_iteration() -> None:
-    """Shares of the error that are left, beside the exact model as the bound."""
+    """Shares of the error that are left, with plans from the measured stock and with the model's own motion tracked."""
     iteration = fp.ModelReferenced(fp.Affine(gain=-1.6))
+    few = fp.FixedPoint(iterations=4, tolerance=1e-6)
     controllers = {
-        "RHC": fp.RecedingHorizon(OPTIMISER),
-        "RHC+FPI": fp.RecedingHorizon(OPTIMISER, iteration),
-        "exact": fp.ExactModel(fp.RecedingHorizon(OPTIMISER)),
-        "tracked": fp.RecedingHorizon(OPTIMISER, iteration, replanning=fp.FromPlan(fp.Exponential(rate=2.0))),
+        "RHC": fp.RecedingHorizon(few),
+        "RHC+FPI": fp.RecedingHorizon(few, iteration),
+        "tracked": fp.RecedingHorizon(few, iteration, replanning=fp.FromPlan(fp.Exponential(rate=2.0))),
     }
     rms = {}
     for name, controller in controllers.items():
@@ -204,7 +204,6 @@ def test_a_plan_on_a_wrong_model_is_cured_by_the_iteration() -> None:
         rms[name] = float(np.sqrt((run["true_error"][20:] ** 2).mean()))
     assert rms["RHC+FPI"] < 0.2 * rms["RHC"]
     assert rms["tracked"] < 0.2 * rms["RHC"]
-    assert rms["exact"] < rms["RHC"]
 
 
 # Ways of running
@@ -289,7 +288,8 @@ def test_controllers_that_do_not_cover_maps_are_refused(what: str) -> None:
 def test_a_receding_horizon_with_the_iteration_is_the_loop_by_hand() -> None:
     """From the planned inputs on: nominal response, deformation, command and stock, in numpy."""
     problem = stock()
-    run = simulated(problem, fp.RecedingHorizon(OPTIMISER, fp.ModelReferenced(fp.Affine(gain=-1.6))))
+    few = fp.FixedPoint(iterations=4, tolerance=1e-6)
+    run = simulated(problem, fp.RecedingHorizon(few, fp.ModelReferenced(fp.Affine(gain=-1.6))))
 
     def response(x: float, u: float, growth: float) -> float:
         return growth * x * (1 - x) - u

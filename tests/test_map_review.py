@@ -17,7 +17,7 @@ from fpirhc.review.zero_dynamics import zero_dynamics_rate
 
 T = 10.0  # s, one step
 ITERATION = fp.ModelReferenced(fp.Affine(gain=-1.0))
-OPTIMISER = fp.FixedPoint(iterations=4, tolerance=1e-9)
+OPTIMISER = fp.FixedPoint(iterations=2, tolerance=1e-6)
 LAW = fp.Exponential(rate=0.04)
 
 
@@ -41,8 +41,8 @@ def task(**changes: Any) -> fp.Problem:
         "reference": fp.Trajectory(lambda t: {"a": 0.5 + 0 * t, "b": 1 / 3 + 0 * t}),
         "start": {"a": 0.5, "b": 1 / 3},
         "period": T,
-        "duration": 2000.0,
-        "horizon": fp.Horizon(stages=3, step=T),
+        "duration": 800.0,
+        "horizon": fp.Horizon(stages=2, step=T),
         "cost": fp.Quadratic(states={"a": 1.0}, rate={"catch": 1.0}),
     }
     return fp.Problem(**{**arguments, **changes})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -56,6 +58,10 @@ def test_a_review_refuses_what_scenarios_refuse(problem):
     assert fp.review(problem, controllers, mismatch=39.0, seed=0).mismatch == 39.0
     with pytest.raises(InvalidProblem, match=r"parameter 'c'.*at most 40 % stay inside"):
         fp.review(problem, controllers, mismatch=41.0, seed=0)
-    for wrong in (100.0, -1.0, float("nan")):
-        with pytest.raises(InvalidValue, match="at least 0 and below 100"):
+    for wrong, words in (
+        (100.0, "at least 0 and below 100"),
+        (-1.0, "at least 0 and below 100"),
+        (math.nan, "a number, got nan"),
+    ):
+        with pytest.raises(InvalidValue, match=words):
             fp.review(problem, controllers, mismatch=wrong, seed=0)

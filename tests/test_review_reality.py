@@ -199,3 +199,14 @@ def test_null_runs_are_those_of_the_model():
     assert null_problem(problem, controller).reality is None
     runs = null_runs(problem, controller)
     assert runs.adapted["y"] == pytest.approx(runs.without["y"], rel=1e-9)
+
+
+def test_a_right_parameter_is_no_right_model():
+    """Beside a reality the exact parameters of the model move nothing: no advice to leave a deformation out follows from them."""
+    controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5, scale=50.0))
+    real = quick(resonant(0.8))
+    for question in ("Does adaptation lower the response error?", "Does the deformation reach the wrong parameters?"):
+        beside, alone = (answer(one, controller, question) for one in (real, replace(real, reality=None)))
+        assert str(beside.verdict) == "unknown"
+        assert str(alone.verdict) != "unknown"
+        assert "right enough" not in beside.change

@@ -213,7 +213,7 @@ def edited(old: str, new: str) -> None:
 
 def receding() -> None:
     """The problem with a horizon and two planners."""
-    edited("    measure_from=0.1,\n", HORIZON.replace("1.0,", "0.1,", 1))
+    edited("measure_from=0.1,\n", HORIZON.replace("1.0,", "0.1,", 1))
     edited("controllers = {\n", PLANNERS)
 
 
@@ -232,7 +232,7 @@ def diverging() -> None:
 
 
 def too_weak() -> None:
-    edited("    measure_from", '    limits=fp.Limits(inputs={"u": (-0.01, 0.01)}),\n    measure_from')
+    edited("measure_from", 'limits=fp.Limits(inputs={"u": (-0.01, 0.01)}), measure_from')
 
 
 def taken() -> None:

@@ -121,6 +121,8 @@ def derivative_is_the_chain(trial: _Trial, generator: np.random.Generator) -> No
     elements = plant.state.elements
     for x, u in trial.points(generator):
         forcing = generator.normal(size=len(plant.names))
+        if plant.steps > 1:  # a forcing of a map acts in each of its steps, and moves the state of the later ones
+            forcing[:] = 0
         forced = _numbers(plant.response_function, x, u, plant.exact) + forcing
         rate = _numbers(plant.forced_derivative_function, x, u, plant.exact, forcing)
         for k, name in enumerate(elements):

@@ -47,6 +47,7 @@ class ReviewGrid:
         inner: places of the simulated states.
         mismatch: range of the exact parameters and of the dead times, percent.
         real: the problem with its reality, where it has one that is a plant; `problem` is then that of the model alone.
+        elsewhere: whether a run moves something else than the model's plant, so that its exact parameters move nothing.
     """
 
     problem: Problem
@@ -57,6 +58,7 @@ class ReviewGrid:
     inner: tuple[int, ...] = ()
     mismatch: float = 0.0
     real: Problem | None = None
+    elsewhere: bool = False
 
     @cached_property
     def drawn_states(self) -> np.ndarray:
@@ -121,7 +123,8 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
     Raises:
         NotInvertible: the inputs and the controlled coordinates differ in number.
     """
-    real, problem = problem if problem.symbolic_reality else None, problem.of_model
+    elsewhere, real = problem.reality is not None, problem if problem.symbolic_reality else None
+    problem = problem.of_model
     plant = problem.plant
     times = np.linspace(0.0, problem.duration, _POINTS)
     nominal = _nominal(problem).map(_POINTS)(times[None, :])
@@ -137,7 +140,7 @@ def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:
         inner = ()
     else:
         states[:, list(inner)] = own
-    return ReviewGrid(problem, times, states, responses, rows, inner, mismatch, real)
+    return ReviewGrid(problem, times, states, responses, rows, inner, mismatch, real, elsewhere)
 
 
 def _nominal(problem: Problem) -> ca.Function:

@@ -30,12 +30,20 @@ def pays(case: Case) -> Answer:
     if max(without, adapted) <= ROUNDING * nominal_size(nominal):
         return Answer(QUESTION, Verdict.UNKNOWN, f"{text}: there is no error to lower", "", numbers)
     if not adapted < without:
-        change = "Raise the gain, shorten the period, or leave the deformation out: the model is right enough."
-        return Answer(QUESTION, Verdict.NO, text, change, numbers)
+        return _no_gain(text, numbers, elsewhere=case.grid.elsewhere)
     if null > _HARM * without:
         change = "Adaptation would do harm with a slightly better model: raise the gain or shorten the period."
         return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
     return Answer(QUESTION, Verdict.YES, text, "", numbers)
+
+
+def _no_gain(text: str, numbers: dict[str, float], *, elsewhere: bool) -> Answer:
+    """The answer where adaptation does not lower the predicted error."""
+    if elsewhere:
+        text += ", for the exact values of the model's own parameters, which move nothing beside a reality"
+        return Answer(QUESTION, Verdict.UNKNOWN, text, "Run it and compare.", numbers)
+    change = "Raise the gain, shorten the period, or leave the deformation out: the model is right enough."
+    return Answer(QUESTION, Verdict.NO, text, change, numbers)
 
 
 def rms(nominal: NominalRun, errors: ResponseErrors) -> float:

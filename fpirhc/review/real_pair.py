@@ -104,6 +104,9 @@ def real_loops(grid: ReviewGrid, controller: Controller, points: Sequence[RealPo
         raise NotSupported("a reality beside outputs has other inner states than the model; simulate it")
     if controller.model_plant(problem) is not model:
         raise NotSupported("its model is the reality")
+    hidden = [c for c in problem.judged_names if reality.true_name(c) not in reality.plant.coordinates]
+    if hidden:
+        raise NotSupported(f"{', '.join(hidden)} of the reality are outputs and no coordinates; simulate it")
     believed = controller.parameters(model)
     stand_in, plan = linear_stand_in(grid.problem, controller)
     linear = linear_problem(grid.problem, stand_in)

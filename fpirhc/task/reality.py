@@ -21,13 +21,13 @@ import numpy as np
 from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.algebraic import unsolved
-from fpirhc.plant.chain import derivatives_function, input_reaches_at
+from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.instant import response_orders
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.settling import settled
 from fpirhc.plant.stiffness import stiffness
-from fpirhc.plant.structural_order import structural_order
+from fpirhc.task.reality_check import check_coordinate, check_expression, check_inputs, other_unit, quantities_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ class Reality(Checked):
             InvalidProblem: all mistakes together.
         """
         mistakes = Mistakes("reality")
-        _check_inputs(self.plant, model, mistakes)
+        check_inputs(self.plant, model, mistakes)
         mistakes.unknown("seen: coordinate of the model", self.seen, model.coordinates)
         mistakes.unknown("seen: coordinate of the reality", self.seen.values(), self.plant.coordinates)
         mistakes.unknown("start: state", self.start, self.plant.state.elements)
@@ -95,21 +95,21 @@ class Reality(Checked):
             )
         for name, unit in model.coordinates.items():
             if needed is None or name in needed:
-                _check_output(self, model, name, unit, mistakes)
+                check_coordinate(self, model, name, unit, mistakes)
             elif self.plant.coordinates.get(name, unit) != unit:
-                mistakes.add(_other_unit(self.plant, name, name, unit))
+                mistakes.add(other_unit(self.plant, name, name, unit))
         if model.outputs and self.seen:
             mistakes.add(
                 "seen: what is measured of a model with outputs are the outputs of the same names; write the sensor there"
             )
         for name in model.outputs:
-            _check_expression(self, model, name, mistakes)
+            check_expression(self, model, name, mistakes)
         mistakes.raise_if_any()
 
     def shown(self, model: Plant) -> tuple[str, ...]:
         """Return the names of the model's states that it has, in the model's order."""
         own = dict(zip(model.names, self._names(model, seen=True), strict=True))
-        return tuple(e for e in model.state.elements if own[e.rstrip("'")] in self.plant.coordinates)
+        return tuple(e for e in model.state.elements if own[e.rstrip("'")] in quantities_of(self.plant))
 
     def state_function(self, model: Plant, *, seen: bool) -> ca.Function:
         """Function (state, input, parameters, forcing) of the reality -> the model's states that it has, in the order of `shown`.
@@ -160,7 +160,25 @@ class Reality(Checked):
                 f"reality: its states {missing} have no equilibrium at the start of the model; give their first values: "
                 f"Reality(start={{'{elements[free[0]]}': ...}})"
             )
+        self._check_shown_start(model, start, at_rest, command)
         return at_rest
+
+    def _check_shown_start(self, model: Plant, start: np.ndarray, first: np.ndarray, command: np.ndarray) -> None:
+        """Raise if outputs stand for the model's coordinates, no start is stated, and they start elsewhere than the model."""
+        hidden = [e for e in self.shown(model) if self.true_name(e.rstrip("'")) not in self.plant.coordinates]
+        if model.outputs or self.start or not hidden:
+            return
+        values = self.state_function(model, seen=False)(
+            first, command, self.plant.exact, np.zeros(len(self.plant.names))
+        )
+        own = dict(zip(self.shown(model), np.asarray(values.full()).ravel(), strict=True))
+        for name in hidden:
+            wanted = start[model.state.elements.index(name)]
+            if not abs(own[name] - wanted) <= 1e-6 * (1 + abs(wanted)):
+                raise InvalidProblem(
+                    f"reality: its output '{name}' starts at {own[name]:.4g}, that of the model at {wanted:.4g}; give first values "
+                    f"of its states: Reality(start={{'{self.plant.state.elements[0]}': ...}})"
+                )
 
     def shared(self, model: Plant) -> dict[int, int]:
         """Return the places of the states that both have: place in the model's state -> place in its own."""
@@ -173,7 +191,7 @@ class Reality(Checked):
 
     def true_name(self, coordinate: str) -> str:
         """Return its coordinate at which a coordinate of the model is judged."""
-        return coordinate if coordinate in self.plant.coordinates else self.seen.get(coordinate, coordinate)
+        return coordinate if coordinate in quantities_of(self.plant) else self.seen.get(coordinate, coordinate)
 
     def check_motion(self, start: np.ndarray, command: np.ndarray, integrator: Integrator, period: float) -> None:
         """Raise if the reality cannot move from its start, or the integrator cannot follow it there.
@@ -237,68 +255,3 @@ class Reality(Checked):
         if seen:
             return tuple(self.seen.get(c, c) for c in model.names)
         return tuple(self.true_name(c) for c in model.names)
-
-
-def _check_inputs(plant: Plant, model: Plant, mistakes: Mistakes) -> None:
-    own, expected = ", ".join(plant.inputs), ", ".join(model.inputs)
-    if own != expected:
-        mistakes.add(
-            f"its inputs are {own}, the model's are {expected}; both take the same commands, so name them alike, in order"
-        )
-    for name, unit in plant.inputs.items():
-        other = model.inputs.get(name, unit)
-        if unit != other:
-            mistakes.add(f"its input '{name}' is in {unit}, the model's in {other}; write both in one unit")
-
-
-def _check_output(reality: Reality, model: Plant, name: str, unit: str, mistakes: Mistakes) -> None:
-    plant, own = reality.plant, reality.seen.get(name, name)
-    if own not in plant.coordinates:
-        if name not in reality.seen:
-            followed = not model.outputs and name in (model.controlled or model.names)
-            believed = "" if followed else ", or have it believed: Sensing(measured=..., belief=ModelStates())"
-            mistakes.add(
-                f"it has no coordinate '{name}', which the model has and the controller is given; add it, or name the one that is "
-                f"measured in its place: Reality(seen={{'{name}': ...}}){believed}. Its coordinates: {', '.join(plant.coordinates)}"
-            )
-        return
-    for one in sorted({own, name} & set(plant.coordinates)):
-        if plant.coordinates[one] != unit:
-            mistakes.add(_other_unit(plant, one, name, unit))
-    order = model.orders[model.names.index(name)]
-    at_once = input_reaches_at(plant, own, order - 1)
-    if at_once is not None:
-        mistakes.add(
-            f"its derivative {own}{chr(39) * at_once} jumps with the command, but it is a state of the model, where '{name}' has "
-            f"the order {order}; give the model this order, or the reality a coordinate of its own"
-        )
-    elif not model.outputs and name in (model.controlled or model.names) and structural_order(plant, own) is None:
-        mistakes.add(f"no input reaches its coordinate '{own}', however often it is differentiated")
-
-
-def _other_unit(plant: Plant, own: str, name: str, unit: str) -> str:
-    units = f"in {plant.coordinates[own]}, the model's '{name}' in {unit}"
-    return f"its coordinate '{own}' is {units}; write both in one unit"
-
-
-def _check_expression(reality: Reality, model: Plant, name: str, mistakes: Mistakes) -> None:
-    """Add what is wrong with the reality's output, or coordinate, of the name of an output of the model."""
-    plant, unit = reality.plant, model.outputs[name].unit
-    units = {**plant.coordinates, **{n: one.unit for n, one in plant.outputs.items()}}
-    if name not in units:
-        mistakes.add(
-            f"it has no output '{name}', which the model has and which is judged; give its plant this output too. Its coordinates "
-            f"and outputs: {', '.join(units)}"
-        )
-        return
-    if units[name] != unit:
-        mistakes.add(f"its '{name}' is in {units[name]}, the model's in {unit}; write both in one unit")
-    if name in model.instant_names:
-        return
-    order = model.face.orders[model.face.names.index(name)]
-    at_once = input_reaches_at(plant, name, order - 1)
-    if at_once is not None:
-        mistakes.add(
-            f"its derivative {name}{chr(39) * at_once} jumps with the command, but '{name}' has the relative order {order} in the "
-            "model; give the model this order, or the reality an actuator"
-        )

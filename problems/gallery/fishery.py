@@ -73,3 +73,4 @@ controllers = {
     "RHC+FPI": fp.RecedingHorizon(optimiser, iteration),
     "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }
+headline = ("RHC", "RHC+FPI")

@@ -25,6 +25,8 @@ def reaches_parameters(case: Case) -> Answer:
     plant = case.problem.plant
     names = plant.parameter.elements
     wrong = [k for k, (believed, exact) in enumerate(zip(case.believed, plant.exact, strict=True)) if believed != exact]
+    if not wrong and case.grid.elsewhere:
+        return Answer(TEXT, Verdict.UNKNOWN, "what differs is the reality, and no parameter of the model's own plant")
     if not wrong:
         return Answer(TEXT, Verdict.YES, "every parameter of the model is right", "", {"wrong": 0.0, "reached": 0.0})
     present = _present(plant)
