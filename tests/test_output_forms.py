@@ -180,7 +180,8 @@ def test_every_form_lowers_the_error_of_a_wrong_model(name: str, kind: str) -> N
 
     bare = error(controller)
     errors = {form: error(controller.with_deformation(map_)) for form, map_ in FORMS.items()}
-    assert max(errors.values()) < 0.6 * bare, (bare, errors)
+    assert errors["plain"] < 0.75 * bare  # it takes the plant's drift within a cycle for an error of the model
+    assert max(errors["increment"], errors["model-referenced"]) < 0.2 * bare
 
 
 @pytest.mark.parametrize("kind", ["CTC", "RHC"])

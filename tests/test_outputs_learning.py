@@ -28,7 +28,7 @@ SHIFT = fp.DisturbanceKalman({"depth": 1.0}, {"depth": 0.01, **STATES}, noise=SL
 PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-2))
 
 
-@pytest.mark.parametrize("name", ["CTC", "RHC"])
+@pytest.mark.parametrize("name", ["RHC"])
 def test_outputs_that_are_coordinates_change_no_estimate(name: str) -> None:
     """The filter that measures the response too: positions and velocities are states and outputs at once."""
     short = replace(SHORT, duration=0.1, measure_from=0.0)
