@@ -177,7 +177,7 @@ def test_a_reality_shows_its_output_and_starts_elsewhere_than_the_belief() -> No
     assert errors[0] < 0.1 * errors[1]
 
 
-ANAESTHESIA = fp.load_problem(str(Path(__file__).resolve().parents[1] / "problems/gallery/anaesthesia.py"))
+ANAESTHESIA = fp.load_problem(str(Path(__file__).resolve().parents[2] / "problems/gallery/anaesthesia.py"))
 COMPARTMENTS = fp.KalmanFilter(
     measured={"bis": 0.5},
     noise={"C1": 0.3, "C2": 0.02, "C3": 0.02, "Ce": 0.1},

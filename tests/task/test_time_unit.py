@@ -22,7 +22,7 @@ from fpirhc.studies.comparison.compare import Comparison, compare
 from fpirhc.studies.open_loop import solve_first
 from fpirhc.studies.scenarios.scenario_study import compare_scenarios
 
-GALLERY = Path(__file__).parents[1] / "problems" / "gallery"
+GALLERY = Path(__file__).parents[2] / "problems" / "gallery"
 # A short form of each task: (file, unit, changes, unit of the first coordinate's first derivative)
 CASES = (
     ("hodgkin_huxley", "ms", {"duration": 2.0, "measure_from": 1.0}, "mV/ms"),

@@ -12,7 +12,7 @@ import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.members import FAMILIES, member_classes
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGES = sorted(p for p in DOCS.rglob("*.md") if "_build" not in p.parts)
 
 

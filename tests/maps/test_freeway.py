@@ -16,7 +16,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.problem_files.problem_file import Task
 
-DATA = Path(__file__).parent / "data" / "freeway" / "reference.csv"
+DATA = Path(__file__).parents[1] / "data" / "freeway" / "reference.csv"
 T = 10 / 3600  # h
 TOTAL_TIME_SPENT = 1433.7876921  # veh h
 

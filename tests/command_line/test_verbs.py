@@ -23,7 +23,7 @@ from fpirhc.cli.main import main
 from fpirhc.problem_files.problem_file import shipped_problems
 from fpirhc.studies.comparison.optimiser_choices import optimiser_choices
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 VERBS = tuple(shipped().values())
 THEIRS = """
 import argparse

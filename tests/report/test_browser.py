@@ -26,7 +26,7 @@ from fpirhc.studies.scenarios.scenario_study import compare_scenarios
 pytestmark = pytest.mark.browser
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-BOXES = Path(__file__).with_name("browser_boxes.js").read_text(encoding="utf-8")
+BOXES = Path(__file__).parents[1].joinpath("browser_boxes.js").read_text(encoding="utf-8")
 SCREENS = ((1280, "light"), (1280, "dark"), (390, "light"), (390, "dark"))
 
 

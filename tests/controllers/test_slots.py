@@ -706,7 +706,7 @@ def test_a_saved_run_keeps_its_slots(tmp_path):
 def test_compare_says_the_radius_and_draws_the_slots(tmp_path, capsys):
     """The Floquet radius in the text; in the report the bands, their legend, and the times of the slots."""
     arguments = [
-        str(Path(__file__).parents[1] / "problems" / "crane_slots.py"),
+        str(Path(__file__).parents[2] / "problems" / "crane_slots.py"),
         "--controllers",
         "slots",
         "slots+FPI",

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 LANES = (ROOT / "tests" / "lanes.txt").read_text(encoding="utf-8").splitlines()
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-SCRIPT = Path(__file__).parents[1] / "scripts" / "sbom.py"
+SCRIPT = Path(__file__).parents[2] / "scripts" / "sbom.py"
 
 
 def bill() -> Any:
@@ -39,7 +39,7 @@ def test_bill_of_materials_names_what_is_needed():
     assert json.dumps(bill()) == json.dumps(document)
 
 
-AUDIT = Path(__file__).parents[1] / "scripts" / "audit_answer.py"
+AUDIT = Path(__file__).parents[2] / "scripts" / "audit_answer.py"
 UNKNOWN = {"name": "casadi", "skip_reason": "Dependency not found on PyPI"}
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PAGES = {
     "clipped": ("map", "EXAMPLES = (Clipped(gain=0.3, limit=5.0),)"),
     "poles": ("tracking", "EXAMPLES = (Poles(rate=2.0),)"),
