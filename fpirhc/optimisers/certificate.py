@@ -23,18 +23,21 @@ References: S. Banach, Fund. Math. 3, 1922; J. M. Ortega, W. C. Rheinboldt, Iter
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.fields.checked_call import checked_call
 from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stage, linear_stage
+from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.optimisers.active import active_limits, directions, largest_return
 from fpirhc.optimisers.plan import Plan
 from fpirhc.summary import line, number, table
 
 _ROUNDING = 1e-14  # relative to the trace, added to the model before it is factorised
+_REMEMBERED = 4  # horizons whose Functions are kept
 _AT_BOUND = 1e-9  # relative distance within which an input counts as at its bound
 
 
@@ -146,16 +149,34 @@ def _relative_eigenvalues(root: np.ndarray, hessian: np.ndarray) -> np.ndarray:
 
 def _second_order(plan: Plan, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Gradient (N nu) and exact Hessian (N nu, N nu) of the Lagrangian at these inputs, by Hessian-vector products."""
-    ocp = plan.problem
+    slope, product = _derivatives(plan.problem)
+    n, nu = plan.problem.stages, plan.problem.input.size
+    point = plan.states[:, 0], at, plan.data, plan.state_multipliers
+    directions_in_turn = np.eye(nu * n).reshape(-1, n, nu).transpose(2, 0, 1).reshape(nu, -1)
+    columns = product(*point, directions_in_turn)
+    return np.asarray(slope(*point).full()).ravel(), np.asarray(columns.full())
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _derivatives(ocp: OptimalControl) -> tuple[ca.Function, ca.Function]:
+    """Functions of (first state, U, data, multipliers): the gradient (N nu), and, for N nu directions, columns of the Hessian."""
+    gradient = reduced_gradient(ocp)
     nu, n = ocp.input.size, ocp.stages
-    inputs, direction = ca.MX.sym("U", nu, n), ca.MX.sym("d", nu, n)
-    slope = reduced_gradient(ocp)(plan.states[:, 0], inputs, plan.data, plan.state_multipliers)[1]
-    product = ca.Function("fpirhc_hessian_times", [inputs, direction], [ca.vec(ca.jtimes(slope, inputs, direction))])
-    first = np.asarray(ca.Function("fpirhc_slope", [inputs], [ca.vec(slope)])(at).full()).ravel()
-    columns = product.map(nu * n)(
-        np.tile(at, nu * n), np.eye(nu * n).reshape(-1, n, nu).transpose(2, 0, 1).reshape(nu, -1)
+    point = [ca.MX.sym(gradient.name_in(k), gradient.sparsity_in(k)) for k in range(4)]
+    direction = ca.MX.sym("d", nu, n)
+    slope = gradient(*point)[1]
+    along = ca.jtimes(slope, point[1], direction)
+    product = ca.Function("fpirhc_hessian_times", [*point, direction], [ca.vec(along)])
+    return (
+        ca.Function("fpirhc_slope", point, [ca.vec(slope)]),
+        product.map("fpirhc_hessian_columns", "serial", nu * n, [0, 1, 2, 3], []),
     )
-    return first, np.asarray(columns.full())
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _stages(ocp: OptimalControl) -> tuple[ca.Function, ca.Function, ca.Function]:
+    """Functions of a stage's linear model and Hessian, and of the end's."""
+    return linear_stage(ocp), hessian_stage(ocp, GaussNewton()), hessian_end(ocp)
 
 
 def _free(plan: Plan, inputs: np.ndarray, slope: np.ndarray) -> np.ndarray:
@@ -171,7 +192,7 @@ def _model(plan: Plan) -> np.ndarray:
     """M (N nu, N nu) at the plan, by propagating the linearised model."""
     ocp, data = plan.problem, plan.data
     n, nu = ocp.stages, ocp.input.size
-    linear, hessians = linear_stage(ocp), hessian_stage(ocp, GaussNewton())
+    linear, hessians, end = _stages(ocp)
     sensitivity, total = np.zeros((ocp.state.size, n * nu)), np.zeros((n * nu, n * nu))
     for i in range(n):
         s, u, theta = plan.states[:, i], plan.inputs[:, i], data[:, i]
@@ -184,5 +205,5 @@ def _model(plan: Plan) -> np.ndarray:
         total[own, own] += r
         sensitivity = a @ sensitivity
         sensitivity[:, own] += b
-    final = np.asarray(hessian_end(ocp)(plan.states[:, n], data[:, n])[2].full())
+    final = np.asarray(end(plan.states[:, n], data[:, n])[2].full())
     return np.asarray(total + sensitivity.T @ final @ sensitivity)
