@@ -50,10 +50,10 @@ def twin_of_outputs(path: Path) -> Block:
         motion, response, *memories = estimate.function(sample, *(getattr(s, m.name) for m in own))
         away = getattr(s, MEASURED_OUTPUT) - motion
         move = ca.if_else(is_finite(away), away, 0)  # what is not finite must not be remembered
-        given = getattr(s, MEASURED)
-        given = ca.if_else(is_finite(given), given, at)
-        turn = chain(at, end, parameters) - chain(given, end, parameters)
-        remembered |= {f"{_STATE}_next": given, f"{_OFFSET}_next": offset + move + turn, **signals}
+        measured = getattr(s, MEASURED)
+        measured = ca.if_else(is_finite(measured), measured, at)
+        turn = chain(at, end, parameters) - chain(measured, end, parameters)
+        remembered |= {f"{_STATE}_next": measured, f"{_OFFSET}_next": offset + move + turn, **signals}
         for signal, value, matrix in zip(own, memories, moves, strict=True):
             remembered[f"{signal.name}_next"] = value + matrix @ move
         return {"_modelled": response, **remembered}

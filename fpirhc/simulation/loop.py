@@ -192,8 +192,8 @@ def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
     plant, late, sensing = problem.plant, problem.dead_time.measurement_wait(problem.period), problem.sensing
     first, resting = first_estimates(problem)
     starts = (problem.start_state, first) if plant.outputs else (first,)
-    given = sensing.belief is None  # a believed state is the controller's own
-    states = [*zip(shown[0], measured_signals(plant), starts, strict=True)] if given else []
+    states_pass = sensing.belief is None  # a believed state is the controller's own
+    states = [*zip(shown[0], measured_signals(plant), starts, strict=True)] if states_pass else []
     if not sensing.ideal:
         others = states[:-1]
         all_shown = first_shown(problem)

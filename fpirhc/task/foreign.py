@@ -136,14 +136,14 @@ class Foreign(Checked):
     def _answer(self, ask: Callable[[], npt.ArrayLike], method: str, *, timed: bool) -> Reading:
         who, begin = f"{method} of {type(self.body).__name__}", self.clock()
         try:
-            given = ask()
+            returned = ask()
         except (Exception, SystemExit) as error:  # noqa: BLE001  # whatever a stranger's object raises is a bad answer
             return Reading(None, f"{who} raised {type(error).__name__}: {' '.join(str(error).split())}")
         elapsed = self.clock() - begin
-        answer = _real_numbers(given)
+        answer = _real_numbers(returned)
         expected = f"{len(self.measures)} numbers: {', '.join(self.measures)}"
         if answer is None:
-            return Reading(None, f"{who} returned {_short(given)}, expected {expected}")
+            return Reading(None, f"{who} returned {_short(returned)}, expected {expected}")
         if answer.shape != (len(self.measures),):
             return Reading(None, f"{who} returned the shape {answer.shape}, expected {expected}")
         if not np.isfinite(answer).all():

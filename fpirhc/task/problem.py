@@ -204,8 +204,8 @@ class Problem(Checked):
     @property
     def real_integrator(self) -> Integrator:
         """Integrator of the plant that a run moves."""
-        chosen = (self.symbolic_reality.integrator if self.symbolic_reality else None) or self.integrator
-        return motion_of(self.real_plant, chosen, USUAL)
+        integrator = (self.symbolic_reality.integrator if self.symbolic_reality else None) or self.integrator
+        return motion_of(self.real_plant, integrator, USUAL)
 
     @cached_property
     def real_start(self) -> np.ndarray:

@@ -341,7 +341,7 @@ def _predict_block(problem: Problem, by: Predictor, lead: _Lead, before: Signal,
     outputs = (plant.output,) if plant.outputs else ()
     reads = (plant.time, plant.state, *outputs, *responses, plant.parameter, before)
     own = (queue, residual) if corrected else (queue,)
-    moved = output_ahead(plant) if plant.outputs else None
+    outputs_ahead = output_ahead(plant) if plant.outputs else None
 
     def step(s: Signals) -> dict[str, Expression]:
         queued = ca.vertcat(s._sent_before, s.sent[: size * cycles])
@@ -352,9 +352,9 @@ def _predict_block(problem: Problem, by: Predictor, lead: _Lead, before: Signal,
             memory_next["residual_next"] = error
         on_their_way = [queued[size * k : size * (k + 1)] for k in range(cycles)]
         state = lead.integrated(advance, s.state, on_their_way, [s.parameters, error])
-        if moved is not None:
+        if outputs_ahead is not None:
             time = lead.cycles_of(s.state) * problem.period
-            memory_next["output_ahead"] = moved(s.output, s.state, state, s.parameters, time)
+            memory_next["output_ahead"] = outputs_ahead(s.output, s.state, state, s.parameters, time)
         return {"time_ahead": s.time + lead.time, "state_ahead": state, **memory_next}
 
     return Block("predict", Layout(reads), Layout(writes), step, Layout(own), opaque=True)

@@ -55,13 +55,13 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
     if responses:
         units |= dict(zip(responses, plant.response_signal("_").units, strict=True))
     added = {disturbance_name(n): Parameter(0.0, 0.0, units[n]) for n in names}
-    following = None if plant.next is None else _next(plant, coordinates)
-    response = _response(plant, coordinates) if following is None else _differences(plant, following)
+    next_states = None if plant.next is None else _next(plant, coordinates)
+    response = _response(plant, coordinates) if next_states is None else _differences(plant, next_states)
     return replace(
         plant,
         parameters={**plant.parameters, **added},
         response=response,
-        next=following,
+        next=next_states,
         inverse=None if plant.inverse is None else _inverse(plant, plant.inverse, names),
         outputs={n: _output(plant, n, one, names) for n, one in plant.outputs.items()},
     )
@@ -84,9 +84,9 @@ def _response(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping
     return response
 
 
-def _differences(plant: Plant, following: Map) -> Map:
+def _differences(plant: Plant, next_states: Map) -> Map:
     """The response of a map: the difference of its steps."""
-    return Differences(following, plant.names, float(plant.step or 1.0))
+    return Differences(next_states, plant.names, float(plant.step or 1.0))
 
 
 def _next(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping[str, Expression]]:
@@ -94,13 +94,13 @@ def _next(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping[str
     assert plant.next is not None
     original, step = plant.next, float(plant.step or 1.0)
 
-    def following(*arguments: Named) -> Mapping[str, Expression]:
+    def next_states(*arguments: Named) -> Mapping[str, Expression]:
         *others, p = arguments
         values = original(*others, _own(plant, p))
         return {c: v + step * p[disturbance_name(c)] if c in coordinates else v for c, v in values.items()}
 
-    vars(following)["__signature__"] = inspect.signature(original)
-    return following
+    vars(next_states)["__signature__"] = inspect.signature(original)
+    return next_states
 
 
 def _output(plant: Plant, name: str, one: Output, names: Sequence[str]) -> Output:
