@@ -138,12 +138,14 @@ class DisturbanceKalman(Estimator):
         noise = np.array([self.noise.get(n, 0.0) for n in model.names])
         walk = problem.period * np.array(list(self.drift.values())) ** 2
         q = scipy.linalg.block_diag((noise_input * noise**2) @ noise_input.T, np.diag(walk))
-        r = np.diag(np.array(list(self.measured.values())) ** 2)
+        deviation = np.array(list(self.measured.values()))
         gain = np.zeros((model.state.size + size, len(self.measured)))
         a, c, q = a[np.ix_(used, used)], c[:, used], q[np.ix_(used, used)]
+        # In units of their deviations: variances 1e17 apart leave the Riccati solver without a digit.
+        scaled, one = c / deviation[:, None], np.eye(len(deviation))
         try:
-            p = scipy.linalg.solve_discrete_are(a.T, c.T, q, r)
-            own = np.linalg.solve(c @ p @ c.T + r, c @ p).T
+            p = scipy.linalg.solve_discrete_are(a.T, scaled.T, q, one)
+            own = np.linalg.solve(scaled @ p @ scaled.T + one, scaled @ p).T / deviation
         except np.linalg.LinAlgError:
             own = np.full((len(a), len(self.measured)), np.nan)
         gain[used] = own
