@@ -57,7 +57,7 @@ def _set_completion(action: argparse.Action) -> None:
 
 def _problems() -> dict[str, object]:
     """Names of shipped problems, and problem files."""
-    from fpirhc.problem_files.problem_file import shipped_problems
+    from fpirhc.problem_files.shipped import shipped_problems
 
     names = " ".join(shipped_problems())
     bash = f'_fpirhc_problems() {{\n  compgen -W "{names}" -- "$1"\n  compgen -f -X "!*.py" -- "$1"\n  compgen -d -- "$1"\n}}'

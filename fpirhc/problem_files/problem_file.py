@@ -10,7 +10,6 @@ It may also define
 
 from __future__ import annotations
 
-import ast
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,11 +17,12 @@ from types import ModuleType
 from typing import ClassVar
 
 from fpirhc.controllers.base import Controller
-from fpirhc.errors import FpirhcError, Mistakes, ProblemFileError, nearest
+from fpirhc.errors import FpirhcError, Mistakes, ProblemFileError
 from fpirhc.fields.checked_call import checked_call
 from fpirhc.fields.given import call_of, described
 from fpirhc.problem_files.importing import imported
 from fpirhc.problem_files.importing import line_of as _at
+from fpirhc.problem_files.shipped import find_problem
 from fpirhc.problem_files.tuning_spans import TuningSpans, check_tuning
 from fpirhc.simulation.metrics import Metric, known_metrics, with_own_metrics
 from fpirhc.simulation.pictures.base import Picture
@@ -80,51 +80,6 @@ class Task:
         ]
         notes = [*self.description.split("\n\n")[:1], f"Problem: {', '.join(problem_facts(self.problem))}."]
         return table(f"{self.name}: {self.title}", ("controller", "kind", "deformation", "headline"), rows, notes)
-
-
-def shipped_folders() -> list[Path]:
-    """Folders of shipped problems, inside the installed package or beside it in a checkout, each with its gallery."""
-    package = Path(__file__).resolve().parents[1]
-    places = (package / "_problems", package.parent / "problems")
-    return [f for place in places for f in (place, place / "gallery") if f.is_dir()]
-
-
-def shipped_problems() -> dict[str, Path]:
-    """Return the shipped problems: name -> path."""
-    paths: dict[str, Path] = {}
-    for folder in shipped_folders():
-        for path in sorted(folder.glob("*.py")):
-            if not path.name.startswith("_"):
-                paths.setdefault(path.stem, path)
-    return paths
-
-
-def title_of(path: Path) -> str:
-    """First line of a problem file's docstring, without running the file."""
-    try:
-        text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
-    except (OSError, SyntaxError, ValueError):
-        return ""
-    return (text or "").strip().partition("\n")[0]
-
-
-def find_problem(name_or_path: str) -> Path:
-    """Return the path of a shipped problem or of a user's file.
-
-    Raises:
-        ProblemFileError: there is no such file or problem; the nearest shipped name is offered.
-    """
-    path = Path(name_or_path)
-    if path.suffix == ".py" or path.parent != Path():
-        if path.is_file():
-            return path
-        raise ProblemFileError(
-            f"no file at '{name_or_path}'; give the path of a problem file, or a name from 'fpirhc list'"
-        )
-    shipped = shipped_problems()
-    if name_or_path in shipped:
-        return shipped[name_or_path]
-    raise ProblemFileError(f"problem '{name_or_path}' is unknown.{nearest(name_or_path, shipped)}")
 
 
 @checked_call

@@ -12,7 +12,8 @@ from pathlib import Path
 from fpirhc.baselines.check import accept
 from fpirhc.baselines.places import baseline_path
 from fpirhc.errors import InvalidName, OutputError
-from fpirhc.problem_files.problem_file import load_problem, shipped_problems
+from fpirhc.problem_files.problem_file import load_problem
+from fpirhc.problem_files.shipped import shipped_problems
 
 _LONGEST = 60  # characters of a name
 _FALLBACK = "my_plant"

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from scipy.special import comb
 
 from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import Plant
@@ -66,6 +65,8 @@ class StateVariableFilter(DerivativeEstimator):
 
     def weights(self, order: int, period: float) -> Array:
         """The B-spline of an n-th difference through n low-passes (1 - p) / (1 - p / z), without the negligible tail."""
+        from scipy.special import comb  # it takes longer to import than all the rest of a problem
+
         pole, _ = self._coefficients(period)
         count = math.ceil(math.log(_TAIL) / math.log(abs(pole))) + 10 * order if pole else 1
         after = np.arange(count)

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from scipy.signal import lfilter
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
@@ -172,6 +171,8 @@ class ColouredNoise(Disturbance):
 
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:
         """Return the noise's values."""
+        from scipy.signal import lfilter  # it takes longer to import than all the rest of a problem
+
         white = random.normal(0.0, self.deviation, times.shape)
         if times.size < 2:
             return white

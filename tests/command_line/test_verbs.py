@@ -20,7 +20,7 @@ from fpirhc.cli import verbs as package
 from fpirhc.cli.discovery import shipped
 from fpirhc.cli.exit_codes import OF_EVERY_VERB, ExitCode
 from fpirhc.cli.main import main
-from fpirhc.problem_files.problem_file import shipped_problems
+from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.studies.comparison.optimiser_choices import optimiser_choices
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -178,10 +178,20 @@ def test_help_names_every_optimiser(name, capsys):
     assert f"{', '.join(optimiser_choices())}, or all" in words
 
 
-def test_help_is_light():
-    """The list of commands is printed without any of the heavy libraries."""
-    heavy = ("casadi", "numpy", "scipy", "rich", "matplotlib", "control", "pandas", "osqp")
-    code = f"import sys; from fpirhc.cli.main import main; main([]); print([m for m in {heavy} if m in sys.modules])"
+HEAVY = ("casadi", "numpy", "scipy", "rich", "matplotlib", "control", "pandas", "osqp")
+
+
+@pytest.mark.parametrize(
+    ("first", "absent"),
+    [
+        ("from fpirhc.cli.main import main; main([])", HEAVY),
+        ("from fpirhc.cli.main import main; main(['list'])", HEAVY),
+        ("import fpirhc as fp; fp.Problem", HEAVY[2:]),
+    ],
+)
+def test_what_comes_first_is_light(first, absent):
+    """The lists of commands and of problems need no heavy library, and a problem none but CasADi and numpy."""
+    code = f"import sys; {first}; print([m for m in {absent} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout.splitlines()[-1] == "[]"
 

@@ -17,7 +17,7 @@ from test_dead_time import affine
 import fpirhc as fp
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import NotSupported
-from fpirhc.problem_files.problem_file import shipped_problems
+from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.review.form import recommended_form, right_form
 from fpirhc.symbolic.block import Block
 

@@ -26,7 +26,7 @@ from fpirhc.controllers.contract import Planner
 from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.members import FAMILIES, Example, examples, member_classes
 from fpirhc.optimisers.base import Optimiser
-from fpirhc.problem_files.problem_file import shipped_problems
+from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.tracking.base import Tracking

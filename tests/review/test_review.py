@@ -16,7 +16,7 @@ from reviewed import PERIOD, about, answers, mass, torque
 import fpirhc as fp
 from fpirhc.cli.main import main
 from fpirhc.controllers import contract
-from fpirhc.problem_files.problem_file import shipped_problems
+from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.review.forms import forms_of
 from fpirhc.review.grid import parameter_box, review_grid
 from fpirhc.review.loops import loops_along

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.problem_files.problem_file import shipped_problems
+from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.review.grid import review_grid
 from fpirhc.review.questions.jumps import jumps, reference_free_of_jumps
 

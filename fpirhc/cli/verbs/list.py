@@ -13,7 +13,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> ExitCode:  # noqa: ARG001
-    from fpirhc.problem_files.problem_file import shipped_problems, title_of
+    from fpirhc.problem_files.shipped import shipped_problems, title_of
     from fpirhc.summary import printable
 
     for name, path in shipped_problems().items():
