@@ -41,7 +41,7 @@ def check_live(
     cycles: int = 40,
     compiled: bool = False,
 ) -> tuple[Tried, ...]:
-    """Ask every number of a controller, and of the problem's cost and limits, to be live, and return what became of it.
+    """Try each number of a controller, and of the problem's cost and limits, as a live setting; return which are supported.
 
     Every number either is refused by name, or a loop with another number in it runs as the loop that is built with that number,
     bit by bit, and the number of the build as the loop without live settings.

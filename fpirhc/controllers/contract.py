@@ -139,7 +139,7 @@ class Controller(Checked, ABC):
         return plant.approximate if self.inner is None else self.inner.parameters(plant)
 
     def told(self, problem: Problem) -> Mapping[str, External]:
-        """Return the signals from outside with what the controller's model is told of them: those of the problem."""
+        """Return the measured disturbances that this controller's model has, with their preview: those of the problem."""
         return problem.signals if self.inner is None else self.inner.told(problem)
 
     def model_plant(self, problem: Problem) -> Plant:

@@ -1,4 +1,4 @@
-"""The largest response that the limits of the inputs allow: the scale beyond which a demand is no demand but a fault.
+"""The largest response that the limits of the inputs allow; larger requests are treated as sensor faults.
 
     L_i = max over the reference and the start of   |f_i(x, c)| + sum_k max |f_i(x, c with u_k at a limit) - f_i(x, c)|
 

@@ -240,7 +240,7 @@ def takes(function: Callable[..., object], arguments: int | None) -> bool:
 
 
 def expected_by(annotation: object) -> Expected:  # noqa: PLR0911 -- one line per kind of annotation
-    """Return what an annotation expects; what is not understood expects nothing."""
+    """Return what an annotation expects; unsupported annotations are not checked."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
         return _annotated(arguments)

@@ -59,7 +59,7 @@ class Differences:
         return inspect.signature(self.next)
 
     def __call__(self, x: Named, *others: Named) -> Mapping[str, Expression]:
-        """Return the differences; what is not a mapping, or not the value of a state, stays as it is and is refused as such."""
+        """Return the differences; invalid results are returned unchanged, and validation reports them."""
         values = self.next(x, *others)
         if not isinstance(values, Mapping):
             return cast(Mapping[str, Expression], values)

@@ -28,6 +28,7 @@ from fpirhc.review.maps import largest_product
 from fpirhc.review.neighbourhood import eigenvalues_near
 from fpirhc.review.stages import stiff_advice
 from fpirhc.review.stand_in import is_planned
+from fpirhc.review.wording import per_cycle
 from fpirhc.review.zero_dynamics import zero_dynamics_modes
 
 QUESTION = "Does the deformation converge?"
@@ -49,7 +50,7 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
     radii, left_out = _own_radii(grid, loops)
     growth = np.log(np.maximum(radii, 1e-300)) * grid.problem.cycles
     worst = float(radii.max())
-    text = f"the slowest mode of the linear loop changes by {worst:.6g} per cycle"
+    text = f"the slowest mode of the linear loop {per_cycle(worst, grid.problem)}"
     if left_out:
         text += f", beside those of the states that decay by themselves, {float(loops.radii.max()):.6g}"
     numbers = {"radius": worst, "smallest_radius": float(radii.min())}
@@ -85,7 +86,7 @@ def box_converges(loops: Loops) -> Answer:
     # Without draws the box is a point: approximate and exact parameters are the same.
     radii = np.array([one.radius for one in loops.drawn or loops.loops])
     share, worst = float((radii < 1).mean()), float(radii.max())
-    text = f"in {100 * share:.3g} % of {len(radii)} draws; the worst mode changes by {worst:.6g} per cycle"
+    text = f"in {100 * share:.3g} % of {len(radii)} draws; the worst mode is multiplied by {worst:.6g} per cycle"
     numbers = {"share": share, "radius": worst}
     if share == 1:
         return Answer(question, Verdict.YES, text, "", numbers)

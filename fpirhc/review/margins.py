@@ -20,6 +20,7 @@ from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import Loops
 from fpirhc.review.neutral import NEUTRAL
+from fpirhc.review.wording import duration
 from fpirhc.task.problem import Problem
 
 QUESTION = "Has the linear loop enough margin?"
@@ -42,23 +43,21 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool) -> Answer:
         return Answer(QUESTION, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
     if len(loops.loops[0].dynamics) > _LARGEST:
         radius = float(loops.radii.max())
-        text = f"largest |pole| {radius:.6g}; no margins of a loop of {len(loops.loops[0].dynamics)} states"
+        text = f"largest closed-loop pole magnitude {radius:.6g}; no margins of a loop of {len(loops.loops[0].dynamics)} states"
         return Answer(QUESTION, Verdict.UNKNOWN, text, "", {"radius": radius})
+    radius = float(loops.radii.max())
+    text = f"largest closed-loop pole magnitude {radius:.6g}"
+    if radius >= 1:  # there is no margin to lose
+        return _outside(loops, text, {"radius": radius})
     places = {0, int(np.argmax(loops.radii))}
     all_margins = [margins(loops.loops[k], i) for k in sorted(places) for i in range(len(problem.plant.inputs))]
     gain, phase, delay = (min(column) for column in zip(*all_margins, strict=True))
-    radius = float(loops.radii.max())
     numbers = {"radius": radius, "gain_margin": gain, "phase_margin": phase, "delay_margin": delay}
-    text = (
-        f"largest |pole| {radius:.6g}; gain may change {gain:.3g} times, phase by {phase:.3g} deg, "
-        f"delay by {delay:.3g} {problem.time_unit} ({delay / problem.period:.3g} cycles)"
-    )
+    text += f"; {_sizes(gain, phase, delay, problem)}"
     if loops.learns:
         text += ", before the controller has learned anything"
     if any(one.hidden.any() for one in loops.loops):
         text += "; neutral modes that no judged coordinate shows are left out"
-    if radius >= 1:
-        return _outside(loops, text, numbers)
     good = gain >= LEAST_GAIN and phase >= LEAST_PHASE
     change = (
         "" if good else "Lower the map's gain or the rate." if adapts else "Lower the rate, or weigh the inputs more."
@@ -76,6 +75,13 @@ def _outside(loops: Loops, text: str, numbers: dict[str, float]) -> Answer:
     return Answer(
         QUESTION, verdict, text, "See the rates, the zero dynamics, and the convergence of a deformation.", numbers
     )
+
+
+def _sizes(gain: float, phase: float, delay: float, problem: Problem) -> str:
+    """The margins in the units of the field."""
+    factor = f"{gain:.3g} ({20 * math.log10(gain):.3g} dB)" if math.isfinite(gain) else "infinite"
+    late = f"{duration(delay, problem)} ({delay / problem.period:.3g} cycles)" if math.isfinite(delay) else "infinite"
+    return f"gain margin {factor}, phase margin {f'{phase:.3g} deg' if math.isfinite(phase) else 'infinite'}, delay margin {late}"
 
 
 def margins(loop: LinearLoop, place: int) -> tuple[float, float, float]:

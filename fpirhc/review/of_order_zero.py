@@ -21,10 +21,7 @@ from fpirhc.review.orders import relative_orders
 from fpirhc.review.signs import one_sign
 from fpirhc.review.well_posed import well_posed
 
-_NOT_COVERED = (
-    "not covered for outputs of order 0: the linear loop, in which an output is a state, and with it lags, dead times and zero "
-    "dynamics"
-)
+_NOT_COVERED = "pole, delay and zero-dynamics checks are not available for outputs of relative order 0"
 _LIMIT = 2.0  # of effective gain times eigenvalue, once everything has settled
 
 

@@ -1,4 +1,4 @@
-"""Are rate x period and rate x dead time inside their limits? They are, where the loop converges with the right model."""
+"""Is the sampling fast enough for the tracking law? It is, where the nominal loop converges: that of plant = model."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fpirhc.review.neutral import NEUTRAL
 from fpirhc.review.stages import stiff_advice
 from fpirhc.review.stand_in import is_planned
 
-QUESTION = "Are rate x period and rate x dead time small enough?"
+QUESTION = "Is the sampling fast enough for the tracking law?"
 
 
 def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answer:
@@ -26,7 +26,7 @@ def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answ
         return Answer(QUESTION, Verdict.UNKNOWN, f"{text}; no linear loop: {loops.reason}", "", numbers)
     radius = loops.ideal.radius
     numbers["ideal_radius"] = radius
-    text += f"; with the right model the slowest mode changes by {radius:.6g} per cycle"
+    text += f"; in the nominal loop, plant = model, the slowest mode is multiplied by {radius:.6g} per cycle"
     if radius < 1:
         return Answer(QUESTION, Verdict.YES, text, "", numbers)
     change = stiff_advice(grid, controller.parameters(grid.problem.plant), planned=is_planned(controller)) or (

@@ -76,7 +76,7 @@ def zero_dynamics(problem: Problem, rate: float | None, planned: bool, loops: Lo
     if ((planned and rate > 0) or neutral) and loops.loops:
         radius = float(loops.radii.max())
         numbers["radius"] = radius
-        text += f"; the linear loop changes by {radius:.6g} per cycle"
+        text += f"; the slowest mode of the linear loop is multiplied by {radius:.6g} per cycle"
         if radius < 1:
             return Answer(QUESTION, Verdict.YES, text, "", numbers)
         verdict = Verdict.UNKNOWN if loops.learns or neutral or radius < 1 + NEUTRAL else Verdict.NO

@@ -76,7 +76,7 @@ class Sensing(Checked):
         return tuple(n for n in quantities(plant) if n in self.measured)
 
     def known(self, plant: Plant) -> tuple[str, ...]:
-        """State elements that follow from what is measured; a measured output is known as itself alone."""
+        """State elements that follow from what is measured; a measured output determines no state by itself."""
         measures, elements = self.measures(plant), plant.state.elements
         shown = self.estimator.known(plant.face, measures)
         if not plant.outputs:

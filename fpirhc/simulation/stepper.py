@@ -260,7 +260,7 @@ class Stepper(Checked):
         return self._now.why_refused
 
     def stale(self) -> dict[str, str]:
-        """Return what follows from live settings by way of Python, and what becomes of a device that goes on with the old number.
+        """Return what follows from live settings by way of Python, and the effect of a deployed build with the outdated value.
 
         Gains, scales, limits, weights and dead times themselves are data, and may be written at any time. An empty text
         says that the number must not stay as it was: change the settings that it follows from only where Python computes it.

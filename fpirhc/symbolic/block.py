@@ -40,8 +40,8 @@ class Derived:
         signals: values of signals 'setting.derived.NAME', by their names.
         memory: function that returns values of remembered signals at the start of a run, by their names; a change during a run
             does not need them.
-        stale: what becomes of a loop that goes on with the old number of a signal, by name, for a device without Python; '' where
-            it must not.
+        stale: the effect of running a deployed build with the outdated value of a signal, by name, for a device without Python;
+            '' where it must not.
     """
 
     signals: Mapping[str, np.ndarray] = field(default_factory=dict)

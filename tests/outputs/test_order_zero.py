@@ -170,7 +170,7 @@ def test_a_review_says_what_it_covers() -> None:
     by_question = {a.question: a for a in answers.problem}
     assert by_question["Are the relative orders those of the plant?"].evidence.startswith("power 0")
     assert str(by_question["Does the inverse exist along the reference?"].verdict) == "yes"
-    assert "not covered for outputs of order 0" in answers.problem[-1].evidence
+    assert "not available for outputs of relative order 0" in answers.problem[-1].evidence
 
 
 @pytest.mark.parametrize(("gain", "verdict"), [(0.5, "yes"), (3.5, "no")])

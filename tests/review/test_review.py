@@ -193,9 +193,9 @@ def test_a_good_problem_is_ready():
         ("Does the deformation converge", torque(gain=-4.0), {}),
         ("gain admissible", torque(gain=-4.0), {}),
         ("gain admissible", torque(), {"dead_time": fp.DeadTime(inputs={"u": 0.06})}),
-        ("fast enough", torque(scale=1e-4), {}),
-        ("rate x dead time", torque(rate=8.0), {"dead_time": fp.DeadTime(inputs={"u": 0.06})}),
-        ("rate x period", torque(rate=900.0), {}),
+        ("map fast enough", torque(scale=1e-4), {}),
+        ("sampling fast enough", torque(rate=8.0), {"dead_time": fp.DeadTime(inputs={"u": 0.06})}),
+        ("sampling fast enough", torque(rate=900.0), {}),
         ("range large enough", fp.ComputedTorque(fp.Exponential(6.0), fp.Rotation(fraction=0.3, radius=1.0)), {}),
         ("commands", torque(), {"limits": fp.Limits(inputs={"u": (-0.3, 0.3)})}),
         ("margin", torque(gain=-4.0), {}),
@@ -281,7 +281,7 @@ def test_a_plan_that_is_too_stiff_for_its_map_is_found():
     task = fp.load_problem("two_mass")
     name = "RHC+FPI, stiff, small S"
     answers_by_question = fp.review(task.problem, {name: task.controllers[name]}, mismatch=0.0, seed=0)
-    slew = about({a.question: a for a in answers_by_question.answers}, "fast enough")
+    slew = about({a.question: a for a in answers_by_question.answers}, "map fast enough")
     assert slew.verdict == "no"
     assert not answers_by_question.ready
 

@@ -19,7 +19,9 @@ from fpirhc.review.gain import gain_admissible
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import Loops
+from fpirhc.review.margins import margins_enough
 from fpirhc.review.slew import slew_enough
+from fpirhc.review.wording import duration, per_cycle
 
 PERIOD, CYCLES = 0.1, 100
 EDGE = math.log(100) / CYCLES  # of the logarithm of a factor per cycle
@@ -84,9 +86,36 @@ def test_convergence_is_a_hundredfold_change_over_the_run(grid, logarithms, verd
     radii = np.exp(logarithms)
     one = convergence(grid, loops(*radii))
     assert one.verdict == verdict
-    assert one.evidence.startswith(f"the slowest mode of the linear loop changes by {max(radii):.6g} per cycle")
+    assert one.evidence.startswith(f"the slowest mode of the linear loop is multiplied by {max(radii):.6g} per cycle")
     assert one.numbers == {"radius": max(radii), "smallest_radius": min(radii)}
     assert bool(one.change) == (verdict != "yes")
+
+
+def test_poles_and_times_are_in_the_units_of_the_field():
+    """0.1 s per cycle: -0.1 / ln 0.976 = 4.12 s; ms and us below a second; a mode that does not decay has no time constant."""
+    problem = mass()
+    assert per_cycle(0.976, problem) == "is multiplied by 0.976 per cycle (time constant 4.12 s)"
+    assert per_cycle(0.5, problem) == "is multiplied by 0.5 per cycle (time constant 144 ms)"
+    assert per_cycle(1.02, problem) == "is multiplied by 1.02 per cycle"
+    assert [duration(t, problem) for t in (2.5, 0.0591, 2.1e-5)] == ["2.5 s", "59.1 ms", "21 us"]
+    hours = replace(problem.plant, time_unit="h")
+    assert duration(0.25, replace(problem, plant=hours)) == "0.25 h"
+
+
+def test_margins_of_an_integrator_by_hand(grid):
+    """x+ = x + w, w = -0.1 x: L(-1) = -1/20; |z - 1| = 0.1 at 0.10004 rad a cycle, where the phase is -90 - 2.87 deg."""
+    one = np.eye(1)
+    integrator = LinearLoop(0.9 * one, one, -0.1 * one, np.array([0]), PERIOD)
+    answer = margins_enough(grid.problem, Loops((0,), (integrator,), integrator), adapts=True)
+    assert answer.evidence == (
+        "largest closed-loop pole magnitude 0.9; gain margin 20 (26 dB), phase margin 87.1 deg, delay margin 1.52 s (15.2 cycles)"
+    )
+    unstable = LinearLoop(1.1 * one, one, 0.1 * one, np.array([0]), PERIOD)
+    lost = margins_enough(grid.problem, Loops((0,), (unstable,), unstable), adapts=True)
+    assert (lost.verdict, lost.numbers) == ("no", {"radius": 1.1})
+    assert lost.evidence == (
+        "largest closed-loop pole magnitude 1.1; a pole is outside the unit circle all along the reference"
+    )
 
 
 def test_the_range_along_the_reference_is_told(grid):
@@ -129,10 +158,10 @@ def test_doubts_and_steep_maps_speak_against_convergence(grid):
 @pytest.mark.parametrize(
     ("drawn", "verdict", "text"),
     [
-        ((0.5, 0.9), "yes", "in 100 % of 2 draws; the worst mode changes by 0.9 per cycle"),
-        ((0.5, 1.0), "unknown", "in 50 % of 2 draws; the worst mode changes by 1 per cycle"),
-        ((0.5, 0.9, 1.25), "unknown", "in 66.7 % of 3 draws; the worst mode changes by 1.25 per cycle"),
-        ((), "yes", "in 100 % of 1 draws; the worst mode changes by 0.25 per cycle"),
+        ((0.5, 0.9), "yes", "in 100 % of 2 draws; the worst mode is multiplied by 0.9 per cycle"),
+        ((0.5, 1.0), "unknown", "in 50 % of 2 draws; the worst mode is multiplied by 1 per cycle"),
+        ((0.5, 0.9, 1.25), "unknown", "in 66.7 % of 3 draws; the worst mode is multiplied by 1.25 per cycle"),
+        ((), "yes", "in 100 % of 1 draws; the worst mode is multiplied by 0.25 per cycle"),
     ],
 )
 def test_share_of_the_box_that_converges(drawn, verdict, text):

@@ -73,7 +73,7 @@ def test_a_plan_without_a_linear_loop_has_the_sign_too(rate):
 
 
 @pytest.mark.parametrize("controller", [LAW, PLAN])
-@pytest.mark.parametrize("words", ["rate x period", "margin"])
+@pytest.mark.parametrize("words", ["sampling fast enough", "margin"])
 def test_an_integral_that_nobody_judges_is_no_fault(controller, words):
     """It stays where it is put, and no judged coordinate shows it; the horizon is not said to diverge either."""
     one = answer(companion(0.0), controller, words)

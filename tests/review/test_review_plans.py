@@ -103,7 +103,14 @@ def test_nothing_is_unknown_about_a_rate_weighted_plan():
     """Horizon, rates, zero dynamics, margins, convergence and box have answers of their own."""
     adaptive = replace(PLAIN, deformation=fp.ModelReferenced(fp.Sigmoid(gain=-0.5, scale=20.0)))
     every = answers(oscillator(), adaptive)
-    for words in ("horizon long", "rate x period", "zero dynamics", "margin", "deformation converge", "box of par"):
+    for words in (
+        "horizon long",
+        "sampling fast enough",
+        "zero dynamics",
+        "margin",
+        "deformation converge",
+        "box of par",
+    ):
         assert about(every, words).verdict == "yes", about(every, words)
     assert "radius" in about(every, "margin").numbers
 

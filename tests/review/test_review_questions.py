@@ -124,7 +124,7 @@ def test_limits_inside_leave_the_linear_loop_known():
         "paths": {"power": replace(POWER, lower=-9.0, upper=9.0)},
     }
     plain = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3))
-    for words in ("rate x period", "margin", "horizon long", KEEPS):
+    for words in ("sampling fast enough", "margin", "horizon long", KEEPS):
         one = answer(mass(**limits), {"it": plain}, words)
         assert one is not None
         assert "known" not in one.evidence

@@ -33,20 +33,22 @@ def bears_wrong_dead_time(case: Case) -> Answer | None:
         return Answer(TEXT, Verdict.UNKNOWN, f"no linear loop: {case.loops.reason}")
     radius = float(case.loops.radii.max())
     if radius >= 1:
-        text = f"with the dead time as it is the slowest mode changes by {radius:.6g} per cycle"
+        text = f"with the dead time as it is the slowest mode is multiplied by {radius:.6g} per cycle"
         return Answer(TEXT, Verdict.UNKNOWN, text, "See the convergence.", {"radius": radius})
     try:
         borne, beyond = _borne(case)
     except FpirhcError as error:
         return Answer(TEXT, Verdict.UNKNOWN, str(error))
     if borne:
-        more = "or more" if beyond is None else f"at {beyond[0]} the slowest mode changes by {beyond[1]:.6g} per cycle"
+        more = (
+            "or more"
+            if beyond is None
+            else f"at {beyond[0]} the slowest mode is multiplied by {beyond[1]:.6g} per cycle"
+        )
         return Answer(TEXT, Verdict.YES, f"it bears {borne} cycles, {more}", "", {"borne": float(borne)})
     assert beyond is not None
     margin = _margin_below_one(case)
-    text = (
-        f"delay margin {margin:.3g} cycles; wrong by one cycle, the slowest mode changes by {beyond[1]:.6g} per cycle"
-    )
+    text = f"delay margin {margin:.3g} cycles; wrong by one cycle, the slowest mode is multiplied by {beyond[1]:.6g} per cycle"
     verdict = Verdict.UNKNOWN if case.loops.learns or not case.controller.deformation.constant else Verdict.NO
     numbers = {"borne": 0.0, "radius_one_cycle": beyond[1]} | ({"delay_margin": margin} if margin < 1 else {})
     return Answer(TEXT, verdict, text, _CHANGE, numbers)

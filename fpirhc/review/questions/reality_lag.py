@@ -35,8 +35,8 @@ def leaves_room(case: Case) -> Answer | None:
     product = gain * max(float(np.abs(one.eigenvalues).max()) for one in extras)
     room, most = poles * rate * lag, damped_product(period, lag, rate, poles, damping=_DAMPING)
     text = (
-        f"a lag of {lag:.3g} {unit} unknown to the model; {poles} poles at {rate:g} {case.problem.rate_unit} times this lag "
-        f"are {room:.3g}, and a fast iteration is stable below 1; gain x eigenvalue is {product:.3g}"
+        f"a lag of {lag:.3g} {unit} that the model lacks; {poles} x {rate:g} {case.problem.rate_unit} x lag = {room:.3g}, "
+        f"which must stay below 1 for a fast iteration; gain x eigenvalue is {product:.3g}"
     )
     numbers = {"lag": lag, "room": room, "product": product, "damped_product": most}
     if room >= 1:

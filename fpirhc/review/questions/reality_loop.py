@@ -30,7 +30,7 @@ def real_pair_converges(case: Case) -> Answer | None:
         bare = max(one.radius for one in real_loops(case.grid, without_deformation(case.controller), points))
     except (FpirhcError, np.linalg.LinAlgError) as error:
         return Answer(TEXT, Verdict.UNKNOWN, f"no linear loop of the real pair: {error}")
-    text = f"the slowest or fastest growing mode changes by {adapted:.6g} per cycle, without adaptation by {bare:.6g}"
+    text = f"the slowest or fastest growing mode is multiplied by {adapted:.6g} per cycle, without adaptation by {bare:.6g}"
     numbers = {"radius": adapted, "bare_radius": bare}
     if adapted < 1:
         return Answer(TEXT, Verdict.YES, text, "", numbers)

@@ -23,7 +23,7 @@ def plain_pair_converges(case: Case) -> Answer | None:
         radius = max(one.radius for one in real_loops(case.grid, case.controller, points))
     except (FpirhcError, np.linalg.LinAlgError):
         return None
-    text, numbers = f"the slowest or fastest growing mode changes by {radius:.6g} per cycle", {"radius": radius}
+    text, numbers = f"the slowest or fastest growing mode is multiplied by {radius:.6g} per cycle", {"radius": radius}
     if radius < 1:
         return Answer(TEXT, Verdict.YES, text, "", numbers)
     change = "Lower the rate of the tracking law, or the weights of the plan."
