@@ -8,6 +8,8 @@ from __future__ import annotations
 import html
 from collections.abc import Iterable, Sequence
 
+_LEAST_SHARE = 1e-5
+
 
 def line(value: object, *facts: str) -> str:
     """Return 'Class(fact, fact)' on one line."""
@@ -33,6 +35,16 @@ def printable(text: str) -> str:
 def number(value: float) -> str:
     """Return a number in four digits."""
     return f"{value:.4g}"
+
+
+def in_percent(share: float) -> str:
+    """Return a share in percent, in three digits; what is below a thousandth of a percent is said to be so."""
+    return "below 0.001 %" if 0 < abs(share) < _LEAST_SHARE else f"{100 * share:.3g} %"
+
+
+def written_out(value: float, digits: int) -> str:
+    """Return a number in so many digits and without a power of ten, its thousands apart: 245 000."""
+    return f"{float(f'{value:.{digits}g}'):,.15g}".replace(",", " ") if abs(value) >= 1 else f"{value:.{digits}g}"
 
 
 def _escaped(text: str) -> str:

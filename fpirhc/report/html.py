@@ -18,6 +18,7 @@ from fpirhc.report.series import chart_data
 from fpirhc.report.wanted import wanted_pictures
 from fpirhc.simulation.drawing import BANDS, PALETTE
 from fpirhc.simulation.metrics.columns import Column, columns
+from fpirhc.studies.comparison.optimality import gap
 
 if TYPE_CHECKING:
     from fpirhc.studies.comparison.compare import Comparison, Entry
@@ -72,12 +73,12 @@ def _verdict(comparison: Comparison) -> str:
     return f"<section id='verdict'><p class='headline {css_class(outcome)}'>{_text(first)}</p><ul>{rest}</ul>{about}</section>"
 
 
-def _number(value: float | None, digits: int = 3) -> str:
+def _number(value: float | None) -> str:
     if value is None:
         return _MISSING
     if math.isnan(value):
         return _NONE
-    return f"{value:.{digits}g}"
+    return f"{value:.3g}"
 
 
 def _table(comparison: Comparison) -> str:
@@ -129,8 +130,8 @@ def _studied(entry: Entry) -> list[str]:
     cycle, excess = entry.cycle, entry.optimality
     times = (cycle.median, cycle.p99, cycle.maximum, cycle.first) if cycle else (None,) * 4
     planning = cycle.planning if cycle and entry.metrics.solve else None
-    gaps = (excess.median, excess.worst) if excess else (None, None)
-    return [*(_number(v) for v in (*times, planning)), *(_number(v, 2) for v in gaps)]
+    gaps = [gap(v, 2) for v in (excess.median, excess.worst)] if excess else [_MISSING] * 2
+    return [*(_number(v) for v in (*times, planning)), *gaps]
 
 
 def _charts(comparison: Comparison) -> str:

@@ -18,7 +18,8 @@ from fpirhc.simulation.metrics.columns import Column as Metric
 from fpirhc.simulation.metrics.columns import columns
 from fpirhc.simulation.simulate import SWITCHED_OFF
 from fpirhc.status import Status
-from fpirhc.summary import printable
+from fpirhc.studies.comparison.optimality import gap
+from fpirhc.summary import in_percent, printable
 
 if TYPE_CHECKING:
     from fpirhc.simulation.metrics import Metrics
@@ -169,7 +170,7 @@ def status_shares(statuses: Mapping[str, int]) -> str:
     """The shares of cycles whose status is not ok, such as 'not converged 1.67 %'; 'ok' where there are none."""
     cycles = sum(statuses.values())
     other = {name: count for name, count in statuses.items() if count and name != "OK"}
-    return ", ".join(f"{k.lower().replace('_', ' ')} {100 * v / cycles:.3g} %" for k, v in other.items()) or "ok"
+    return ", ".join(f"{k.lower().replace('_', ' ')} {in_percent(v / cycles)}" for k, v in other.items()) or "ok"
 
 
 def _plans(comparison: Comparison) -> Folding:
@@ -183,7 +184,7 @@ def _plans(comparison: Comparison) -> Folding:
             continue
         times = [_micro(v) for v in (cycle.planning, cycle.p99, cycle.maximum, cycle.first)] if cycle else [""] * 4
         solves = [metrics.text(f"solve.{name}") for name in ("median_iterations", "median_stationarity")]
-        table.add([entry.name, *solves, f"{excess.median:.0e}" if excess else "-", *times])
+        table.add([entry.name, *solves, gap(excess.median, 1) if excess else "-", *times])
     return table
 
 

@@ -16,6 +16,7 @@ from fpirhc.review.linear import response_slopes
 from fpirhc.review.plan_feedback import PlanGain, longer
 from fpirhc.review.plan_of_outputs import gains_at
 from fpirhc.review.state_matrix import state_matrices
+from fpirhc.summary import in_percent
 
 QUESTION = "Is the horizon long enough?"
 _SAME = 0.1  # relative change of the plan's feedback
@@ -38,7 +39,7 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
     grows = _growth(grid, first)
     slowest = _slowest(grid)
     text = (
-        f"{reach:g} {unit}; twice as long changes the plan's feedback by {100 * change:.3g} %; slowest time constant "
+        f"{reach:g} {unit}; twice as long changes the plan's feedback by {in_percent(change)}; slowest time constant "
     )
     text += f"{slowest:.3g} {unit}" if math.isfinite(slowest) else "infinite"
     numbers = {"reach": reach, "change": change, "slowest_time_constant": slowest, "growth": grows}

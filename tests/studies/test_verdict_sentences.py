@@ -126,6 +126,21 @@ def test_an_error_that_was_zero():
     assert "(10 times less)" in said(*tiny)[0]
 
 
+def test_factors_are_written_as_people_write_them():
+    """No powers of ten, no inf: what is left of an error may be rounding, and beyond a million the digits say nothing."""
+    before = entry("RHC", errors={"y": 0.0537})
+    for after, words in (
+        (1e-12, "(to rounding)"),
+        (1e-320, "(to rounding)"),
+        (0.0, "(to rounding)"),
+        (0.0537 / 2.4e6, "(more than a million times less)"),
+        (0.0537 / 245_120, "(245 000 times less)"),
+        (0.0537 / 1234, "(1 230 times less)"),
+        (0.0537 / 12.34, "(12.3 times less)"),
+    ):
+        assert said(before, entry("FPI", "RHC", errors={"y": after}))[0].endswith(f"{words}.")
+
+
 def test_an_error_that_is_no_number_is_not_compared():
     """NaN is neither better nor worse."""
     lost = first(entry("RHC"), entry("FPI", "RHC", errors={"y": float("nan")}))
@@ -139,12 +154,17 @@ def test_an_error_that_is_no_number_is_not_compared():
         (Price("RHC", 2.5, 0.1), " at 2.5 more microseconds per cycle."),
         (Price("RHC", -0.4, 0.1), " at 0.4 fewer microseconds per cycle."),
         (Price("RHC", 0.4, 0.5), "; the time per cycle differs by less than can be measured here (0.5 microseconds)."),
+        (Price("RHC", 9.94, 0.1), " at 9.9 more microseconds per cycle."),
+        (Price("RHC", -1.6e3, 0.1), "."),
         (Price("another", 2.5, 0.1), "."),
         (None, "."),
     ],
 )
 def test_price(price, words):
-    """Only a difference beyond the noise has a sign; nothing where both were not timed in turn."""
+    """Only a difference beyond the noise has a sign; nothing where both were not timed in turn.
+
+    Both cycles take 5 microseconds, so a difference of more than 10 was not theirs.
+    """
     plain, adaptive = entry("RHC"), entry("FPI", "RHC", errors={"y": 0.5}, facts={"price": price})
     assert said(plain, adaptive) == (f"FPI lowers the rms error of y from 1 to 0.5 m (2 times less){words}",)
 

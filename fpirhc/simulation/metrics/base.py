@@ -25,11 +25,6 @@ def digits(value: float) -> str:
     return f"{value:.3g}"
 
 
-def percent(value: float) -> str:
-    """Return a share in percent."""
-    return f"{100 * value:.3g} %"
-
-
 @dataclass(frozen=True, eq=False)
 class Metric(Checked):
     """A number that sums up a run, or one number for every coordinate, input or term.

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fpirhc.simulation.metrics.base import percent
 from fpirhc.status import Status
+from fpirhc.summary import in_percent
 
 if TYPE_CHECKING:
     from fpirhc.studies.comparison.compare import Entry
@@ -73,8 +73,8 @@ def _plan_cause(plain: Entry, adaptive: Entry) -> str:
     if after < _MANY_PLANS or swings:
         return ""
     return (
-        f"Its plans did not converge in {percent(after)} of the cycles (those of {plain.name} in {percent(before)}), so this is "
-        "not the optimum of its cost: give the optimiser more iterations, then compare."
+        f"Its plans did not converge in {in_percent(after)} of the cycles (those of {plain.name} in {in_percent(before)}), so this "
+        "is not the optimum of its cost: give the optimiser more iterations, then compare."
     )
 
 
@@ -82,9 +82,7 @@ def _limit_cause(plain: Entry, adaptive: Entry) -> str:
     before, after = (_share(e, "clipped_share", "") for e in (plain, adaptive))
     if after < _OFTEN:
         return ""
-    fact = (
-        f"Its command stands at a limit in {percent(after)} of the cycles (that of {plain.name} in {percent(before)})"
-    )
+    fact = f"Its command stands at a limit in {in_percent(after)} of the cycles (that of {plain.name} in {in_percent(before)})"
     if before >= _OFTEN:
         return f"{fact}, where no adaptation can act: widen the limits, or slow the reference down."
     return f"{fact}, where no adaptation can act: it asks for too much, or oscillates; the command in the report shows which."

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.summary import written_out
 from fpirhc.task.problem import Problem
 
 HELPS = 0.9  # an rms error below this share of the pair's counts as lower
@@ -23,6 +24,7 @@ HURTS = 1.1
 MINOR = 0.01  # of the largest relative error
 ROUNDING = 1e-9  # relative errors
 _SAMPLES = 2000
+_MANY = 1e6
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,11 @@ class Change:
         return max(self.before, self.after) / self.scale
 
     @property
+    def vanishes(self) -> bool:
+        """Whether what is left of an error is rounding, in a floating-point number of the size of the scale."""
+        return self.after < ROUNDING * self.scale <= self.before
+
+    @property
     def outcome(self) -> Outcome:
         """Better below 0.9, worse above 1.1."""
         if not self.size >= ROUNDING:
@@ -62,10 +69,8 @@ class Change:
 
 
 def times(factor: float) -> str:
-    """Return a factor in three digits, and never as a power of ten below a million: 245 000 times."""
-    if not 1e3 <= factor < 1e7:
-        return f"{factor:.3g} times"
-    return f"{float(f'{factor:.3g}'):,.0f} times".replace(",", " ")
+    """Return a factor in three digits and without a power of ten: 245 000 times; beyond a million its digits say nothing."""
+    return f"{written_out(factor, 3)} times" if factor < _MANY else "more than a million times"
 
 
 def outcome_of(changes: Mapping[str, Change]) -> Outcome:

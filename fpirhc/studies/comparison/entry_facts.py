@@ -12,6 +12,7 @@ from fpirhc.review.grid import review_grid
 from fpirhc.simulation.metrics import Metrics
 from fpirhc.status import Status
 from fpirhc.studies.comparison.optimality import Optimality
+from fpirhc.summary import in_percent
 from fpirhc.task.problem import Problem, cycles_per_stage
 
 _MUCH = 1e-2  # relative cost above the optimum
@@ -70,7 +71,7 @@ def _plans_of(problem: Problem, controller: Controller, metrics: Metrics, optima
         reasons.append(f"it plans every {every} cycles, while a deformation acts in each of them")
     missed = 1 - metrics.statuses.get(Status.OK.name, 0) / max(sum(metrics.statuses.values()), 1)
     if missed > 0:
-        reasons.append(f"its optimiser did not converge in {100 * missed:.3g} % of the cycles")
+        reasons.append(f"its optimiser did not converge in {in_percent(missed)} of the cycles")
     if optimality is not None and optimality.median > _MUCH:
         reasons.append(f"the cost of its plans is {100 * optimality.median:.2g} % above the converged optimum")
     return reasons + _discretisation(problem, controller)

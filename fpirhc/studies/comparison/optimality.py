@@ -22,6 +22,7 @@ from fpirhc.task.outside import model_values, previewed_values, rows_of, signals
 from fpirhc.task.problem import Problem, cycles_per_stage
 
 SAMPLES = 25  # plans of a run that are solved again
+_OTHER = 1e-6  # relative; closer to the optimum a negative excess is the accuracy of the solves
 _ACCURATE = 1e-8  # of the input's range
 
 
@@ -93,6 +94,11 @@ def measure_optimality(
         if best is not None and run["status"][row] <= Status.NOT_CONVERGED:
             excess.append((cost_of_plan - best) / max(abs(best), 1e-12))
     return Optimality(float(np.median(excess)), float(np.max(excess)), len(excess)) if excess else None
+
+
+def gap(excess: float, digits: int) -> str:
+    """Return an excess as text; a plan that is clearly cheaper than the solve from rest has found another optimum."""
+    return "other optimum" if excess < -_OTHER else f"{max(excess, 0.0):.{digits}g}"
 
 
 class _Solver:

@@ -15,6 +15,7 @@ from fpirhc.studies.comparison.causes import causes
 from fpirhc.studies.comparison.changes import Change, major, outcome_of, times
 from fpirhc.studies.comparison.other_rows import remarks
 from fpirhc.studies.comparison.outcome import Finding, Outcome
+from fpirhc.summary import written_out
 
 if TYPE_CHECKING:
     from fpirhc.studies.comparison.compare import Entry
@@ -124,6 +125,8 @@ def _listed(entry: Entry, changes: Sequence[Change], *, factors: bool = True) ->
 
 
 def _factor(change: Change) -> str:
+    if change.vanishes:
+        return " (to rounding)"
     if not 0 < change.ratio < math.inf:
         return ""
     more = change.ratio > 1
@@ -168,6 +171,9 @@ def _price(plain: Entry, adaptive: Entry) -> str:
     price = adaptive.price
     if price is None or plain.cycle is None or price.beside != plain.name:
         return ""
-    if abs(price.difference) <= price.noise:
-        return f"; the time per cycle differs by less than can be measured here ({price.noise:.2g} microseconds)"
-    return f" at {abs(price.difference):.2g} {'more' if price.difference > 0 else 'fewer'} microseconds per cycle"
+    if abs(price.difference) <= price.noise or adaptive.cycle is None:
+        return f"; the time per cycle differs by less than can be measured here ({written_out(price.noise, 2)} microseconds)"
+    if abs(price.difference) > plain.cycle.median + adaptive.cycle.median:  # something else kept the machine busy
+        return ""
+    more = "more" if price.difference > 0 else "fewer"
+    return f" at {written_out(abs(price.difference), 2)} {more} microseconds per cycle"

@@ -12,6 +12,7 @@ import numpy as np
 from fpirhc.simulation.metrics import Metric, known_metrics
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.studies.scenarios.bootstrap import ConfidenceInterval, median_interval, middle
+from fpirhc.summary import in_percent
 
 Record = Mapping[str, Any]
 
@@ -175,7 +176,7 @@ def _failed(one: Summary) -> str:
 
 def percent(share: float) -> str:
     """Return a share as text."""
-    return f"{100 * share:.3g} %" if np.isfinite(share) else "none (failed)"
+    return in_percent(share) if np.isfinite(share) else "none (failed)"
 
 
 def signed(share: float) -> str:

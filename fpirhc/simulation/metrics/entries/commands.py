@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from fpirhc.simulation.metrics.base import Metric, percent
+from fpirhc.simulation.metrics.base import Metric
 from fpirhc.simulation.metrics.window import by_name, input_unit, measured_cycles
 from fpirhc.simulation.run import Run
+from fpirhc.summary import in_percent
 from fpirhc.task.problem import Problem
 
 
@@ -29,7 +30,7 @@ METRICS = (
         clipped_share,
         better="neither",
         title="clipped",
-        text=percent,
+        text=in_percent,
         headline=True,
         finite=True,
         step=lambda _, cycles: 1.0 / cycles,

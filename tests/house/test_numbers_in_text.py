@@ -1,0 +1,47 @@
+"""Numbers in sentences are written as people write them."""
+
+from __future__ import annotations
+
+import pytest
+
+from fpirhc.studies.comparison.optimality import gap
+from fpirhc.summary import in_percent, written_out
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [
+        (0.0, "0 %"),
+        (2.31e-37, "below 0.001 %"),
+        (1e-5, "0.001 %"),
+        (0.0167, "1.67 %"),
+        (0.986, "98.6 %"),
+        (1.0, "100 %"),
+    ],
+)
+def test_shares(share, text):
+    """A share that is not zero is not told as zero, and not with a power of ten."""
+    assert in_percent(share) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [
+        (1600.0, 2, "1 600"),
+        (245_120.0, 3, "245 000"),
+        (12.34, 3, "12.3"),
+        (0.0042, 2, "0.0042"),
+        (-1600.0, 2, "-1 600"),
+    ],
+)
+def test_numbers_without_powers_of_ten(value, digits, text):
+    """Thousands stand apart."""
+    assert written_out(value, digits) == text
+
+
+@pytest.mark.parametrize(
+    ("excess", "text"), [(-0.6, "other optimum"), (-3e-9, "0"), (0.0, "0"), (0.0123, "0.012"), (2e-7, "2e-07")]
+)
+def test_a_plan_is_not_better_than_the_optimum(excess, text):
+    """A negative gap is another optimum, or the accuracy of the solves."""
+    assert gap(excess, 2) == text
