@@ -62,7 +62,7 @@ def rows_of(name: str, count: int) -> list[tuple[str, ...]]:
     ocp = problem_of(CASES[name])
     horizons = cold_set(CASES[name], ocp, count)
     fixed = fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp))
-    limited = native(limited_step(ocp, fixed._limited(MOST, realtime=False))).function
+    limited = native(limited_step(ocp, fixed._limited(MOST))).function
     solvers = {"FixedPoint": whole(fixed, ocp), "interior": from_nothing(limited, ocp, np.zeros(limited.size1_in(4)))}
     if "--alone" not in sys.argv:
         solvers["IPOPT"] = rival(fp.Ipopt(accuracy=1e-9), ocp, {})

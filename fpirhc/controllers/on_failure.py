@@ -40,12 +40,16 @@ class OnFailure(Checked, ABC):
 
 @dataclass(frozen=True)
 class HoldPlan(OnFailure):
-    """Keep using the last good plan, shifted."""
+    """Use the plan that the optimiser returns where it fails, with the status HELD.
+
+    Where a horizon cannot be kept, `FixedPoint` returns a plan of least violation; where nothing is finite, every optimiser returns
+    its remembered plan, shifted.
+    """
 
     def choose(
         self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
     ) -> tuple[Expression, Expression]:
-        """Return the plan: an optimiser that fails returns its last good plan."""
+        """Return the plan that the optimiser returns."""
         del feedforward
         return planned, ca.if_else(failed, int(Status.HELD), status)
 

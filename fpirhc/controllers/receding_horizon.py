@@ -8,7 +8,7 @@ response that the model gives to the plan's first input is the nominal one; it i
 
 so the optimiser is given input bounds shifted by -delta of the last cycle, and its plan stays feasible for the actuator.
 
-The first plan is computed before the run, for the problem's start, so that one iteration per cycle only has to follow the changes.
+The first plan is computed before the run, for the problem's start, so that a call of the loop only has to follow the changes.
 """
 
 from __future__ import annotations

@@ -139,6 +139,11 @@ class Limited:
         t, z = ca.if_else(none, 1, t), ca.if_else(none, 0, ca.if_else(self.of_states, held, z))
         return Interior(t, ca.if_else(none, 0, e), z)
 
+    def priced(self, p: Expansion) -> ca.MX:
+        """Return the cost of a plan with the price of its violations."""
+        counted = ca.logic_and(self.present, self.of_states)
+        return p.value + ca.sum1(ca.vec(ca.if_else(counted, self.rho * ca.fmax(-self.distance(p), 0), 0)))
+
     def path(self, p: Expansion, mu: ca.MX) -> tuple[ca.MX, ca.MX]:
         """Return slacks and elastics that belong to the distances: t - e = d and mu / t + mu / e = rho."""
         d = self.distance(p)

@@ -26,7 +26,8 @@ state. An iteration finds a direction by one Riccati sweep and evaluates the pla
 adjoint sweep. Every plan that is returned has therefore been evaluated.
 
 With limits of states the iteration is that of `fpirhc.optimisers.limited`: the same step with the active limits as equalities, and
-interior steps where it does not contract. An open-loop solve without limits of states uses that iteration where its own one does
+interior steps where it does not contract. It ends where the plan is solved, in a loop as in open loop; a loop bounds its
+iterations. An open-loop solve without limits of states uses that iteration where its own one does
 not converge.
 
 References: H. Khan, J. K. Tar, I. J. Rudas on fixed-point iteration in place of the reduced gradient (2017-2018); H. Issa,
@@ -59,7 +60,7 @@ from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.live import settled
 
 _DIGITS = 1e-15  # relative rounding of a number
-_MOST_LIMITED = 1000  # iterations of one converging call with limits of states
+_MOST_LIMITED = 1000  # iterations of one open-loop call with limits of states
 _FIRST_CALLS = 5  # of `converging`, before a run
 _CONVEX = 1e-6  # relative eigenvalue below zero that is taken for rounding
 
@@ -69,13 +70,16 @@ class FixedPoint(Optimiser):
     """Fixed-point iteration in place of the reduced gradient.
 
     Args:
-        iterations: per call; 1 is the intended number, one step per control cycle.
+        iterations: per call without limits of states; 1 is the intended number, one step per control cycle.
         tolerance: of the stationarity (in the unit of the inputs), below which a plan is converged.
         feasible: violation of a state bound (in its unit) below which a plan counts as converged.
         map: the deformation that makes the next plan; Affine(gain=-2.0) is the full step, a Sigmoid's scale limits it.
         hessian: GaussNewton() or ExactHessian(); None is Gauss-Newton without limits of states; with them the exact Hessian, and
-            Gauss-Newton first where a remembered plan is improved until it converges.
+            Gauss-Newton first where a remembered plan is improved.
         damping: mu >= 0 added to the input's curvature, in units of it: 0 is Gauss-Newton, large values are gradient descent.
+        most_iterations: of one call with limits of states in a loop. The call ends where the plan is solved, a remembered plan
+            usually after a handful. A call that uses all of them is NOT_CONVERGED, and returns the better one of its plan and the
+            plan in force.
 
     Raises:
         InvalidValue: fewer than one iteration, a tolerance that is not positive, or a negative damping.
@@ -87,6 +91,7 @@ class FixedPoint(Optimiser):
     hessian: HessianModel | None = None
     damping: float = 0.0
     feasible: float = 1e-8
+    most_iterations: Count = 50
 
     def __post_init__(self) -> None:
         require_settings("FixedPoint", self.iterations, self.tolerance)
@@ -130,15 +135,15 @@ class FixedPoint(Optimiser):
         return shifted_limited(ocp, memory) if ocp.bounds_states else shifted_plain(ocp, memory)
 
     def step(self, ocp: OptimalControl) -> ca.Function:
-        """Every call does the same `iterations`; compiled, it runs as the loops in C."""
+        """Every call does the same `iterations`; with limits of states it ends where the plan is solved."""
         if ocp.bounds_states:
-            return limited_step(ocp, self._limited(self.iterations, realtime=True))
+            return limited_step(ocp, self._limited(self.most_iterations))
         return plain_step(ocp, self._plain(self.iterations, converging=False))
 
     def converging(self, ocp: OptimalControl) -> ca.Function:
         """Stop where the tolerance is met, or where the iteration does not contract."""
         if ocp.bounds_states:
-            return limited_step(ocp, self._limited(_MOST_LIMITED, realtime=False))
+            return limited_step(ocp, self._limited(_MOST_LIMITED))
         return plain_step(ocp, self._plain(MOST, converging=True))
 
     def rescue(self, ocp: OptimalControl) -> ca.Function | None:
@@ -147,7 +152,7 @@ class FixedPoint(Optimiser):
             return None
         # Here the settings are numbers: a rescue runs outside the loop, for the numbers of one call.
         own = settled(self, ocp.setting_numbers)
-        limited = limited_step(replace(ocp, settings=()), own._limited(_MOST_LIMITED, realtime=False))
+        limited = limited_step(replace(ocp, settings=()), own._limited(_MOST_LIMITED))
         return rescue(ocp, self.converging(ocp), self.memory(ocp), limited)
 
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:
@@ -159,16 +164,8 @@ class FixedPoint(Optimiser):
         hessian = self.hessian or GaussNewton()
         return PlainSettings(self.tolerance, self.map, hessian, self.damping, iterations, converging)
 
-    def _limited(self, iterations: int, *, realtime: bool) -> LimitedSettings:
-        return LimitedSettings(
-            self.tolerance,
-            self.feasible,
-            self.map,
-            self.hessian,
-            self.damping,
-            iterations=iterations,
-            realtime=realtime,
-        )
+    def _limited(self, iterations: int) -> LimitedSettings:
+        return LimitedSettings(self.tolerance, self.feasible, self.map, self.hessian, self.damping, iterations)
 
 
 EXAMPLES = (FixedPoint(iterations=20, tolerance=1e-6), FixedPoint(iterations=1, tolerance=1e-6))

@@ -1,8 +1,9 @@
 """Two optimisers in a row: the second one is called where the first one ends without a usable plan.
 
-A plan is usable when its status is OK or NOT_CONVERGED. Both start from the last plan that was used. After a plan of the second
-optimiser, the first one begins its next call from that plan's inputs alone. A run logs the number of plans of the second optimiser
-as `second_plans`, and its metrics show it.
+A plan is usable when its status is OK or NOT_CONVERGED. `FixedPoint` says INFEASIBLE wherever hard limits of states cannot be kept,
+and the second one is called there. Both start from the last plan that was used. After a plan of the second optimiser, the first one
+begins its next call from that plan's inputs alone. A run logs the number of plans of the second optimiser as `second_plans`, and
+its metrics show it.
 """
 
 from __future__ import annotations

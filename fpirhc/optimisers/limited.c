@@ -17,7 +17,7 @@ typedef struct {
   casadi_real weight[COUNT], lean[COUNT], costates[(N + 1) * NS], g[N * NU], filter[FILTER][2];
   casadi_real inside[2][NU], gaps[N * NS], price, mu, floor, delta, error, alpha, alpha_dual, theta, phi, dphi;
   Certificate last;
-  int phase, place_of, fresh, again, slacks, misses, steps, halvings, raises, filtered, start, use_exact, stuck, rolled, ahead;
+  int phase, place_of, fresh, again, slacks, misses, steps, halvings, raises, filtered, start, use_exact, stuck, rolled, rewarms;
   int descends; /* whether interior plans are rollouts with gaps that lower phi, because the filter gave up */
   Scratch scratch;
 } Machine;
@@ -108,6 +108,19 @@ static int is_done(const Certificate* c) {
   return c->left <= TOLERANCE && c->broken <= FEASIBLE && c->error <= SCALED_TOLERANCE;
 }
 
+/* The stationarity with which a plan is returned: multipliers of limits that are not near count as zero. */
+static casadi_real returned_left(Machine* m, const Point* p) {
+  int k;
+  casadi_real push[COUNT], g[N * NU], left = 0;
+  pushes(push, &m->limits, p, m->y.z, NEAR_LIMIT);
+  adjoint(p, push, g);
+  for (k = 0; k < N * NU; ++k) {
+    casadi_real u = p->u[k];
+    left = larger(left, fabs(u - between(u - g[k] / curvature[k % NU], m->limits.at[0][k % NU], m->limits.at[1][k % NU])));
+  }
+  return all_finite(g, N * NU) ? left : 10 * FINITE;
+}
+
 /* Begin without a memory: the inputs given or fed forward; the state held, rolled out, or the reference. */
 static void begin_cold(Machine* m, Point* p, In s0, In data, In lower, In upper, In inputs) {
   int i, j, l;
@@ -158,7 +171,7 @@ static void enter_interior(Machine* m, Point* p) {
   m->phase = INTERIOR, m->again = m->use_exact = 1, m->filtered = m->raises = m->halvings = 0;
   if (m->place_of == BEGINS) {
     m->slacks = WARM;
-    m->mu = REALTIME ? between(m->mu, MU_WARM * COST, MU_MOST * COST) : MU_WARM * COST, m->floor = MU_END * COST;
+    m->mu = MU_WARM * COST, m->floor = MU_END * COST;
     if (m->misses == 0) return;
   }
   for (k = 0; k < N * NU; ++k) p->u[k] = m->best_u[k];
@@ -188,6 +201,13 @@ static void advance_interior(Machine* m, const Point* p) {
     m->filtered = 0;
   }
   if (m->mu <= m->floor && larger(rest, most / COST) <= 0.3 * sqrt(m->floor / COST)) enter_pure(m, p, ENDS);
+}
+
+/* A remembered plan that a step can hardly leave is too near its limits for its barrier: take a higher one, and slacks to it. */
+static int rewarmed(Machine* m) {
+  if (m->start >= 0 || m->place_of != BEGINS || m->alpha >= POOR || m->rewarms >= MOST_REWARMS || m->mu >= MU_MOST * COST) return 0;
+  m->mu = smaller(10 * m->mu, MU_MOST * COST), m->slacks = WARM, m->filtered = 0;
+  return ++m->rewarms;
 }
 
 static int passes(Machine* m, casadi_real theta, casadi_real phi) {
@@ -227,12 +247,6 @@ static void adopt_costates(Machine* m, casadi_real share) {
   for (k = NS; k < (N + 1) * NS; ++k) m->costates[k] += share * (m->move.costates[k] - m->costates[k]);
 }
 
-/* mu of a real-time iteration follows how well the last step went. */
-static void adapt_mu(Machine* m, casadi_real rest) {
-  if (m->alpha < 0.5 || rest > 0.3) m->mu = smaller(10 * m->mu, MU_MOST * COST);
-  else if (m->alpha > 0.9 && rest < 0.05) m->mu = larger(m->mu / 5, MU_WARM * COST);
-}
-
 /* Judge the plan that was expanded; returns whether it is the new one. */
 static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, In data, In lower, In upper) {
   Duals y;
@@ -243,7 +257,6 @@ static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, I
     for (k = 0; k < (N + 1) * NS && rolled; ++k) ok &= fabs(p->x[k]) <= 100 * spread[k % NS];
     if (!ok) { restart(m, p, s0, data, lower, upper); return 1; }
     if (m->phase == PURE) enter_pure(m, p, BEGINS);
-    if (m->phase == PURE && REALTIME && m->error > NEAR && ITERATIONS < SEVERAL) enter_interior(m, p);
     return 1;
   }
   if (m->phase == PURE) {
@@ -252,8 +265,7 @@ static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, I
     int halved, waits;
     ok = ok && (c = certified(&m->limits, p, m->next_z, g), c.error < FINITE);
     halved = ok && c.error <= 0.5 * m->error;
-    /* A call of few iterations must have two left to get back inside. */
-    waits = m->misses < PATIENCE && c.error < HOPELESS && (!REALTIME || m->ahead > 2);
+    waits = m->misses < PATIENCE && c.error < HOPELESS;
     ok = ok && (halved || waits) && ++m->steps <= PURE_STEPS;
     if (!ok) { enter_interior(m, old); return 0; }
     /* Gauss-Newton goes on only where the contraction that was seen ends the call with one more step. */
@@ -274,28 +286,22 @@ static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, I
     trial_duals(m, p, &y);
     log_terms(m, p, &y, &theta, &phi);
     phi += m->descends ? m->price * sum_of_gaps(p) : 0;
-    ok = fabs(phi) <= FINITE && fabs(theta) <= FINITE && (REALTIME || (m->descends ? falls_enough(m, phi) : passes(m, theta, phi)));
+    ok = fabs(phi) <= FINITE && fabs(theta) <= FINITE && (m->descends ? falls_enough(m, phi) : passes(m, theta, phi));
   }
   if (ok) {
     adopt_costates(m, m->alpha);
     m->y = y;
-    if (REALTIME) {
-      casadi_real least, most, rest = barrier_error(m, p, &least, &most);
-      adapt_mu(m, rest);
-      m->last = certified(&m->limits, p, y.z, m->g);
-      if (m->last.error < NEAR) enter_pure(m, p, BEGINS);
-      return 1;
-    }
     m->delta = m->halvings >= 3 ? larger(4 * m->delta, 1e-4) : m->halvings ? m->delta : m->delta > 5e-7 ? m->delta / 5 : 0;
     if (m->descends) m->delta = larger(m->delta, LEAST_DAMPING);
     m->halvings = m->raises = 0;
-    advance_interior(m, p);
+    if (!rewarmed(m)) advance_interior(m, p);
     return 1;
   }
-  if (++m->halvings <= 8 && !REALTIME) { m->alpha *= 0.5; return 0; }
+  if (++m->halvings <= 8) { m->alpha *= 0.5; return 0; }
   m->halvings = m->filtered = 0;
   m->delta = larger(10 * m->delta, 1e-3);
-  if (++m->raises > MOST_RAISES || m->delta > 1e8 || REALTIME) { restart(m, old, s0, data, lower, upper); return 0; }
+  /* The barrier of a remembered plan has been raised before: a first guess is cheaper than damping. */
+  if (m->start < 0 || ++m->raises > MOST_RAISES || m->delta > 1e8) { restart(m, old, s0, data, lower, upper); return 0; }
   if (m->descends) m->use_exact = 0;
   m->again = 1; /* the same plan, a shorter step */
   return 0;
@@ -318,8 +324,7 @@ static void direct(Machine* m, Point* p, In s0, In data, In lower, In upper) {
   if (!ok) {
     m->delta = larger(10 * m->delta, 1e-6);
     m->fresh = 2; /* try again from the same plan */
-    if (m->delta > 1e8 && REALTIME) m->stuck = 1;
-    else if (m->delta > 1e8) restart(m, p, s0, data, lower, upper);
+    if (m->delta > 1e8) restart(m, p, s0, data, lower, upper);
   } else if (m->phase == PURE) {
     pure_multipliers(&m->limits, p, &m->y, &m->move, m->next_z);
   } else {
@@ -338,7 +343,7 @@ static void begin(Machine* m, Point* p, In memory, In s0, In data, In lower, In 
   int k, known = all_finite(memory, MEMORY) && memory[MEMORY - 2] > 0, has_guess = 0;
   In z = memory + N * NU + 2 * N * NS + N * NU * NS;
   set_limits(&m->limits, lower, upper);
-  m->stuck = m->again = m->rolled = m->descends = m->filtered = m->raises = m->halvings = m->misses = m->steps = 0;
+  m->stuck = m->again = m->rolled = m->descends = m->filtered = m->raises = m->halvings = m->misses = m->steps = m->rewarms = 0;
   m->price = m->alpha = m->alpha_dual = m->dphi = m->theta = m->phi = m->error = 0;
   m->last.error = m->last.left = m->last.violation = m->last.broken = 10 * FINITE;
   for (k = 0; k < COUNT; ++k) m->y.z[0][k] = known ? z[k] : 0, m->y.z[1][k] = known ? z[COUNT + k] : 0;
@@ -365,12 +370,12 @@ static void remember(const Machine* m, const Point* p, Out memory) {
   for (k = 0; k < N * NS; ++k) memory[N * NU + k] = p->x[NS + k], memory[N * NU + N * NS + k] = m->costates[NS + k];
   for (k = 0; k < N * NU * NS; ++k) memory[N * NU + 2 * N * NS + k] = m->move.k[k];
   for (k = 0; k < COUNT; ++k) z[k] = m->y.z[0][k], z[COUNT + k] = m->y.z[1][k];
-  memory[MEMORY - 2] = REALTIME ? m->mu / COST : MU_WARM;
+  memory[MEMORY - 2] = MU_WARM;
   memory[MEMORY - 1] = m->delta;
 }
 
 /* The next plan to expand stands in p; returns whether it is rolled out. */
-static int next_plan(Machine* m, const Point* best, Point* p, int final) {
+static int next_plan(Machine* m, const Point* best, Point* p) {
   int k, pure = !m->fresh && m->phase == PURE, descends = m->phase == INTERIOR && m->descends;
   casadi_real share = m->fresh || pure ? 0 : m->alpha;
   In du = descends ? m->move.v : m->move.du;
@@ -386,7 +391,26 @@ static int next_plan(Machine* m, const Point* best, Point* p, int final) {
   }
   for (k = 0; k < N * NS; ++k) m->gaps[k] = (1 - share) * (best->f[k] - best->x[k + NS]);
   if (descends && !m->fresh) return 1;
-  return m->fresh ? m->fresh == 1 && m->slacks == COLD && m->start == ROLLED : pure || (REALTIME && final);
+  return m->fresh ? m->fresh == 1 && m->slacks == COLD && m->start == ROLLED : pure;
+}
+
+/* Cost of a plan with the price of its violations. */
+static casadi_real priced_cost(const Limits* limits, const Point* p) {
+  int side, i, r, k;
+  casadi_real sum = p->value;
+  EACH_LIMIT(limits)
+    if (r >= NU) sum += capacity(r) * larger(-distance(limits, p, side, i, r), 0);
+  return sum;
+}
+
+/* The remembered plan, rolled out with its feedback; 0 where there is none, or it is not finite. */
+static int plan_in_force(Machine* m, Point* p, In memory, In s0, In data, In lower, In upper) {
+  int k;
+  if (!all_finite(memory, MEMORY) || !(memory[MEMORY - 2] > 0)) return 0;
+  for (k = 0; k < N * NU; ++k) p->u[k] = memory[k];
+  for (k = 0; k < NS; ++k) p->x[k] = s0[k];
+  for (k = 0; k < N * NS; ++k) p->x[NS + k] = memory[N * NU + k];
+  return expand(p, memory + N * NU + 2 * N * NS, 1, 0, s0, data, lower, upper, &m->scratch);
 }
 
 int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {
@@ -396,17 +420,17 @@ int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_rea
   Machine m;
   Point *best = m.points, *p = m.points + 1, *other;
   Certificate c = {0, 0, 0, 0};
-  int i, posed = sane(s0, data, lower, upper), count = 0, empty = 0, status, ok = 0;
+  int i, posed = sane(s0, data, lower, upper), count = 0, empty = 0, status, ok = 0, ended = 0;
   (void)iw, (void)w, (void)mem;
   for (i = 0; i < NU; ++i) empty |= lower[i] > upper[i];
   begin(&m, best, memory, s0, data, lower, upper);
   for (; posed; ++count) {
-    int final = count == ITERATIONS, rolled = next_plan(&m, best, p, final), accepted;
-    m.ahead = ITERATIONS - count;
+    int final = count == ITERATIONS, rolled = next_plan(&m, best, p), accepted;
     ok = expand(p, m.move.k, rolled, m.descends && m.phase == INTERIOR ? m.gaps : 0, s0, data, box(&m, 0, lower, upper), box(&m, 1, upper, lower), &m.scratch);
     accepted = judged(&m, best, p, ok, rolled, s0, data, lower, upper);
     if (accepted) other = best, best = p, p = other, m.rolled = rolled && !m.descends;
-    if (final || m.stuck || (!m.fresh && m.phase == PURE && is_done(&m.last))) break;
+    ended = !m.fresh && m.phase == PURE && is_done(&m.last) && returned_left(&m, best) <= TOLERANCE;
+    if (final || m.stuck || ended) break;
     if (!m.fresh && (accepted || m.again)) m.again = 0, direct(&m, best, s0, data, lower, upper);
   }
   ok = posed;
@@ -415,18 +439,19 @@ int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_rea
     ok = expand(p, m.move.k, 1, 0, s0, data, lower, upper, &m.scratch);
     if (ok) best = p;
   }
+  if (posed && !ended) {
+    p = best == m.points ? m.points + 1 : m.points;
+    if (plan_in_force(&m, p, memory, s0, data, lower, upper) && (!ok || priced_cost(&m.limits, p) < priced_cost(&m.limits, best))) best = p, ok = 1;
+  }
   if (ok) {
-    casadi_real push[COUNT], g[N * NU];
+    casadi_real g[N * NU];
     c = certified(&m.limits, best, m.y.z, g);
-    pushes(push, &m.limits, best, m.y.z, NEAR_LIMIT);
-    adjoint(best, push, g);
-    for (c.left = 0, i = 0; i < N * NU; ++i)
-      c.left = larger(c.left, fabs(best->u[i] - between(best->u[i] - g[i] / curvature[i % NU], lower[i % NU], upper[i % NU])));
+    c.left = returned_left(&m, best);
     ok = c.error < FINITE;
   }
-  /* A call of few iterations may still get inside; one that has tried everything has not. */
+  /* A call that ends at its most iterations may still get inside; one that has tried everything has not. */
   if (is_done(&c)) status = ok && outside(&m.limits, best) > KEPT_SHARE ? INFEASIBLE : CONVERGED;
-  else status = c.violation > NEAR_LIMIT && !REALTIME ? INFEASIBLE : NOT_CONVERGED;
+  else status = c.violation > NEAR_LIMIT && m.stuck ? INFEASIBLE : NOT_CONVERGED;
   status = empty ? INFEASIBLE : !ok ? NON_FINITE : status;
   if (res[0])
     for (i = 0; i < N * NU; ++i)

@@ -6,8 +6,8 @@ free (multiple shooting), with limits of states that give way at a price (exact 
 contract, and ends as soon as they do. A plan is OK by its own first-order conditions once it is rolled out, never by the barrier's
 residual. Where the limits cannot be kept, the result is a plan of least violation nearby, with the status INFEASIBLE.
 
-With `realtime` a call does a fixed number of iterations without a search: interior steps by the fraction to the boundary, with a
-barrier that follows how well they go, and pure steps near a solution.
+A call ends where its plan is solved, where all first guesses have failed, or at its most iterations. In the last two cases the
+remembered plan stays in force where it is better: its cost with the price of its violations is compared.
 """
 
 from __future__ import annotations
@@ -97,8 +97,6 @@ def _sizes(ocp: OptimalControl, measures: Scales) -> dict[str, object]:
 
 def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]:
     names = (
-        "NEAR",
-        "SEVERAL",
         "PATIENCE",
         "HOPELESS",
         "AHEAD",
@@ -110,6 +108,8 @@ def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]
         "MU_ROUNDS",
         "FILTER",
         "MOST_RAISES",
+        "MOST_REWARMS",
+        "POOR",
         "LEAST_DAMPING",
         "NEARLY",
         "ABOVE",
@@ -139,7 +139,6 @@ def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]
         "FEASIBLE": repr(float(settings.feasible)),
         "SCALED_TOLERANCE": repr(settings.scaled_tolerance(measures)),
         "ITERATIONS": settings.iterations,
-        "REALTIME": int(settings.realtime),
         "PLAIN_FIRST": int(settings.plain_first),
     }
 

@@ -7,15 +7,15 @@ import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.sweep import Expansion, expand, expansion_shapes
-from fpirhc.optimisers.base import FEASIBLE, KEPT, clip, sane, stationarity
-from fpirhc.optimisers.certified import Certified, certify
+from fpirhc.optimisers.base import FEASIBLE, KEPT, clip, sane
+from fpirhc.optimisers.certified import Certified
 from fpirhc.optimisers.guess import guesses
 from fpirhc.optimisers.limited_memory import limited_memory
 from fpirhc.optimisers.limited_settings import FILTER, MU_END, MU_WARM, LimitedSettings
 from fpirhc.optimisers.limited_turn.call import Call
 from fpirhc.optimisers.limited_turn.phases import begin_cold
 from fpirhc.optimisers.limited_turn.state import BEGINS, PURE, WARM, State, as_point, choose, constant, fixed, point
-from fpirhc.optimisers.limited_turn.turn import Turn, is_usable
+from fpirhc.optimisers.limited_turn.turn import Turn, is_usable, returned_left
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import FINITE, is_finite
 
@@ -23,7 +23,7 @@ _SCALARS = (
     *("mu", "floor", "delta", "error", "alpha", "alpha_dual", "theta", "phi", "dphi"),
     *("last_error", "last_left", "last_violation", "last_broken"),
     *("phase", "place_of", "fresh", "again", "slacks", "misses", "steps", "halvings", "raises", "filtered", "start"),
-    *("use_exact", "stuck", "rolled", "accepted", "count", "ends", "descends", "price"),
+    *("use_exact", "stuck", "rolled", "rewarms", "met", "accepted", "count", "ends", "descends", "price"),
 )
 
 _BLOCK = 20  # turns; most plans need fewer
@@ -123,7 +123,7 @@ def _empty_state(ocp: OptimalControl, rows: int, remembered: dict[str, ca.MX]) -
 def _results(call: Call, s: State, memory: ca.MX, posed: ca.MX) -> list[ca.MX]:
     """Plan, diagnostics and memory after the last turn."""
     layout = limited_memory(call.ocp)
-    p, c, usable = _last_plan(call, s)
+    p, c, usable = _last_plan(call, s, memory)
     ok = ca.logic_and(ca.logic_and(posed, usable), c.error < FINITE)
     numbers = ca.if_else(ok, ca.vertcat(p.value, c.left, c.violation), ca.MX.zeros(3))
     before = ca.reshape(memory[: p.inputs.numel()], *p.inputs.shape)
@@ -136,16 +136,16 @@ def _results(call: Call, s: State, memory: ca.MX, posed: ca.MX) -> list[ca.MX]:
             "plan_costates": ca.vec(s["costates"]),
             "plan_gains": ca.vec(s["gains"]),
             "plan_multipliers": ca.vec(s["z"]),
-            "plan_barrier": s["mu"] / call.scales.cost if call.settings.realtime else ca.MX(MU_WARM),
+            "plan_barrier": ca.MX(MU_WARM),
             "plan_damping": s["delta"],
         }
     )
     forgotten = ca.if_else(posed, ca.MX.zeros(layout.size), memory)
-    diagnostics = ca.vertcat(numbers, s["count"], _status(call, p, c, ok))
+    diagnostics = ca.vertcat(numbers, s["count"], _status(call, s, p, c, ok))
     return [plan, diagnostics, ca.if_else(ok, next_memory, forgotten)]
 
 
-def _last_plan(call: Call, s: State) -> tuple[Expansion, Certified, ca.MX]:
+def _last_plan(call: Call, s: State, memory: ca.MX) -> tuple[Expansion, Certified, ca.MX]:
     """The last plan, rolled out where it is not; how far it is from the first-order conditions; and whether it is finite."""
     ocp, old = call.ocp, point(s)
     none = ca.MX.zeros(ocp.state.size, ocp.stages)
@@ -155,15 +155,30 @@ def _last_plan(call: Call, s: State) -> tuple[Expansion, Certified, ca.MX]:
     needed = ca.logic_or(ca.logic_not(s["rolled"]), s["fresh"] > 0)
     usable = ca.logic_or(ca.logic_not(needed), is_usable(again))
     p = Expansion(*(ca.if_else(needed, a, b) for a, b in zip(again, old, strict=True)))
-    c = call.certified(p, s["z"])
-    slope = certify(ocp, call.limits, p, s["z"], call.limits.distance(p) <= FEASIBLE)
-    return p, c._replace(left=stationarity(ocp, p.inputs, slope, call.lower, call.upper)), usable
+    p, usable = _better_in_force(call, s, memory, p, usable)
+    return p, call.certified(p, s["z"])._replace(left=returned_left(call, p, s["z"])), usable
 
 
-def _status(call: Call, p: Expansion, c: Certified, ok: ca.MX) -> ca.MX:
+def _better_in_force(call: Call, s: State, memory: ca.MX, p: Expansion, usable: ca.MX) -> tuple[Expansion, ca.MX]:
+    """The remembered plan, rolled out, where the call has not met the conditions and its own plan is not better."""
+    ocp, known = call.ocp, is_finite(memory)
+    m = limited_memory(ocp).split(ca.if_else(known, memory, 0))
+    n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
+    states = ca.horzcat(call.s0, ca.reshape(m["plan_states"], ns, n))
+    inputs, gains = ca.reshape(m["plan_inputs"], nu, n), ca.reshape(m["plan_gains"], nu, ns * n)
+    none = ca.MX.zeros(ns, n)
+    old = Expansion(*expand(ocp)(inputs, states, gains, 1, none, call.s0, call.data, call.lower, call.upper))
+    better = ca.logic_or(ca.logic_not(usable), call.limits.priced(old) < call.limits.priced(p))
+    there = ca.logic_and(ca.logic_and(known, m["plan_barrier"] > 0), ca.logic_and(s["met"] == 0, is_usable(old)))
+    taken = ca.logic_and(there, better)
+    chosen = Expansion(*(ca.if_else(taken, a, b) for a, b in zip(old, p, strict=True)))
+    return chosen, ca.logic_or(usable, taken)
+
+
+def _status(call: Call, s: State, p: Expansion, c: Certified, ok: ca.MX) -> ca.MX:
     solved = ca.if_else(call.limits.outside(p) > KEPT, int(Status.INFEASIBLE), int(Status.OK))
-    # A call of few iterations may still get inside; one that has tried everything has not.
-    far = ca.logic_and(c.violation > FEASIBLE, not call.settings.realtime)
+    # A call that ends at its most iterations may still get inside; one that has tried everything has not.
+    far = ca.logic_and(c.violation > FEASIBLE, s["stuck"])
     unsolved = ca.if_else(far, int(Status.INFEASIBLE), int(Status.NOT_CONVERGED))
     status = ca.if_else(ok, ca.if_else(call.is_done(c), solved, unsolved), int(Status.NON_FINITE))
     return ca.if_else(ca.mmax(call.lower - call.upper) > 0, int(Status.INFEASIBLE), status)

@@ -8,20 +8,17 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.horizon.hessian_models import HessianModel
 from fpirhc.optimisers.scales import Scales
 
-NEAR = 1e-3  # scaled error below which a remembered plan is improved by pure steps at once
-SEVERAL = 3  # iterations per call from which on pure steps are tried first in any case
 PATIENCE = 3  # pure steps in a row that may fail to halve the error: the active limits are changing
 HOPELESS = 1e2  # scaled error from which on there is no patience: multipliers are at their largest value
 AHEAD = 0.1  # of the tolerance: where one more step by Gauss-Newton is expected to arrive, the exact Hessian is not computed
 PURE_STEPS = 10
-MU_WARM, MU_MOST = (
-    1e-4,
-    0.1,
-)  # barrier parameter of a remembered plan, and most of a real-time iteration, in units of the cost
+MU_WARM, MU_MOST = 1e-4, 0.1  # barrier parameter of a remembered plan, and how far it is raised, in units of the cost
 # Where pure steps are tried first, and last: at the last one limits whose multipliers nearly vanish are 1e-7 of a unit away.
 MU_END, MU_LEAST = 1e-5, 1e-15
 MU_ROUNDS = 8  # reductions after one accepted plan
 FILTER = 64  # pairs that the filter holds
+POOR = 0.1  # share of a step from a remembered plan below which its barrier is raised, at most so often in a call
+MOST_REWARMS = 3
 MOST_RAISES = 12  # of the Levenberg-Marquardt term before another first plan is tried
 LEAST_DAMPING = 1e-7  # of the Levenberg-Marquardt term of descents, and of the fall that a plan of theirs must bring
 NEARLY, ABOVE = (
@@ -43,7 +40,6 @@ class LimitedSettings:
         hessian: second derivatives of the quadratic model; None: exact.
         damping: added to the curvature of the inputs, in units of it.
         iterations: most iterations of one call.
-        realtime: a fixed number of iterations without a search.
     """
 
     tolerance: float
@@ -52,12 +48,11 @@ class LimitedSettings:
     hessian: HessianModel | None
     damping: float
     iterations: int
-    realtime: bool
 
     @property
     def plain_first(self) -> bool:
         """Whether a remembered plan is improved by Gauss-Newton before the exact Hessian is computed."""
-        return self.hessian is None and not self.realtime
+        return self.hessian is None
 
     def scaled_tolerance(self, scales: Scales) -> float:
         """Return the tolerance in units of the inputs' half ranges."""

@@ -206,11 +206,11 @@ def same_optimum(seed: int) -> bool:
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
-@pytest.mark.parametrize(("iterations", "realtime"), [(300, False), (1, True), (5, True)])
-def test_driver_and_graph_agree_with_limits(iterations, realtime):
+@pytest.mark.parametrize("iterations", [300, 4])
+def test_driver_and_graph_agree_with_limits(iterations):
     """The loops in C and the composed graph do the same turns: cold, warm, and from a first state outside its limits."""
     ocp, data, first = first_horizon("reactor")
-    graph = limited_step(ocp, fp.FixedPoint(1, tolerance_of(ocp))._limited(iterations, realtime=realtime))
+    graph = limited_step(ocp, fp.FixedPoint(1, tolerance_of(ocp))._limited(iterations))
     compiled = native(graph)
     assert compiled.compiled
     memories = [np.zeros(graph.size1_in(4))] * 2
@@ -234,7 +234,7 @@ def test_descents_solve_what_the_filter_gives_up(number):
     ocp = transcribe(case.plant, reference, case.horizon, case.cost, case.limits)
     data = stage_data(case.plant, reference, case.horizon, case.cost)(0.0, case.plant.approximate)
     first = case.first(ocp, first_states(case, 100, 1)[:, number])
-    graph = limited_step(ocp, fp.FixedPoint(1, tolerance_of(ocp))._limited(1000, realtime=False))
+    graph = limited_step(ocp, fp.FixedPoint(1, tolerance_of(ocp))._limited(1000))
     values = first, data, ocp.input_lower, ocp.input_upper, np.zeros(graph.size1_in(4))
     (one, diagnostics, _), (other, other_diagnostics, _) = graph(*values), native(graph).function(*values)
     assert int(diagnostics[4]) == fp.Status.OK
@@ -279,29 +279,3 @@ def test_horizons_with_limits_of_inputs_only_are_rescued(start):
     assert plan.status == fp.Status.OK
     assert known(plan.cost) <= known(other.cost) * (1 + 3e-5)
     assert Judge(ocp)(plan.inputs, first, np.asarray(data.full())).residual <= 1e-6
-
-
-@pytest.mark.parametrize("iterations", [1, 3])
-def test_a_few_iterations_per_cycle_stay_near_the_limits_with_a_wrong_model(iterations):
-    """The quadrotor, 13 % lighter than its model: its limits are left by a fifth at most, and no plan is held.
-
-    Converged SQP leaves them by .12: the model is wrong. Pure steps alone turn it over.
-    """
-    case = FOREIGN["quadrotor"]()
-    problem = fp.Problem(
-        plant=case.plant,
-        reference=case.reference,
-        start={"x": 0.0, "z": 0.0, "tilt": 0.0},
-        period=case.horizon.step,
-        duration=3.0,
-        limits=case.limits,
-        horizon=case.horizon,
-        cost=case.cost,
-    )
-    run = fp.simulate(problem, fp.RecedingHorizon(fp.FixedPoint(iterations, tolerance=1e-4)), seed=0)
-    assert run.stop is None
-    assert set(fp.measure(problem, run).statuses) <= {"OK", "NOT_CONVERGED"}
-    lower, upper = case.limits.state_bounds(case.plant)
-    half = 0.5 * (upper - lower)
-    beyond = np.maximum(run["state"] - upper, lower - run["state"]) / np.where(np.isfinite(half), half, 1.0)
-    assert beyond.max() <= 0.2

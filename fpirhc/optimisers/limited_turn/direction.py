@@ -48,8 +48,7 @@ class Direction:
         now = choose(now, pure, now, {**now, "t": y.t, "e": y.e, **fixed(slacks=KEPT)})
         delta = ca.fmax(10 * s["delta"], 1e-6)
         failed = {**now, "delta": delta, **fixed(fresh=2, use_exact=1)}
-        over = {**failed, **fixed(stuck=1)} if call.settings.realtime else restart(call, failed)
-        failed = choose(failed, delta > 1e8, over, failed)
+        failed = choose(failed, delta > 1e8, restart(call, failed), failed)
         stepped = {**now, "v": v, "gains": gains, "dx": dx, "du": du, "swept": swept}
         steps = {**stepped, "next_z": limits.pure_multipliers(p, held, du, dx)}
         inside = self._inside(stepped, p, y, s["mu"])

@@ -7,13 +7,13 @@ import casadi as ca
 from fpirhc.horizon.sweep import Expansion
 from fpirhc.optimisers.bounds import Interior
 from fpirhc.optimisers.certified import barrier_error
-from fpirhc.optimisers.limited_settings import LEAST_DAMPING, MOST_RAISES, MU_MOST, MU_ROUNDS, MU_WARM, NEAR
+from fpirhc.optimisers.limited_settings import LEAST_DAMPING, MOST_RAISES, MOST_REWARMS, MU_MOST, MU_ROUNDS, POOR
 from fpirhc.optimisers.limited_turn.call import Call
 from fpirhc.optimisers.limited_turn.descent import falls_enough, sum_of_gaps
 from fpirhc.optimisers.limited_turn.filter import passes_filter
 from fpirhc.optimisers.limited_turn.merit import merit, trial
 from fpirhc.optimisers.limited_turn.phases import enter_pure, restart
-from fpirhc.optimisers.limited_turn.state import BEGINS, ENDS, State, as_last, as_point, choose, fixed, point
+from fpirhc.optimisers.limited_turn.state import BEGINS, ENDS, WARM, State, as_point, choose, fixed, point
 from fpirhc.symbolic.expression import FINITE
 
 
@@ -25,8 +25,6 @@ def judge_interior(call: Call, s: State, p: Expansion, usable: ca.MX) -> State:
     finite = ca.logic_and(ca.fabs(phi) <= FINITE, ca.fabs(theta) <= FINITE)
     passes, filtered = passes_filter(call, s, theta, phi)
     passes = ca.if_else(s["descends"], falls_enough(s, phi, call.scales.cost), passes)
-    if call.settings.realtime:
-        passes, filtered = ca.MX(1), {}
     ok = ca.logic_and(ca.logic_and(usable, finite), passes)
     taken = {**s, **filtered, **as_point(p), "t": y.t, "e": y.e, "z": y.z}
     taken["costates"] = s["costates"] + s["alpha"] * (s["swept"] - s["costates"])
@@ -40,15 +38,26 @@ def _advanced(call: Call, s: State) -> State:
     """After an accepted plan: a new mu, and pure steps where they may end the phase."""
     y = Interior(s["t"], s["e"], s["z"])
     rest, least, most = barrier_error(call.limits, call.scales, point(s), y, s["costates"])
-    if call.settings.realtime:
-        s = {**s, "mu": _adapted_barrier(call, s, rest), **as_last(call.certified(point(s), s["z"]))}
-        near = s["last_error"] < NEAR
-        return choose(s, near, enter_pure(call, s, BEGINS), s)
     cost, delta = call.scales.cost, _eased_damping(s)
+    s = {**s, "delta": delta, **fixed(halvings=0, raises=0)}
+    higher = {
+        **s,
+        "mu": ca.fmin(10 * s["mu"], MU_MOST * cost),
+        "rewarms": s["rewarms"] + 1,
+        **fixed(slacks=WARM, filtered=0),
+    }
     mu, filtered = _lowered_barrier(call, s, rest, (least, most))
-    s = {**s, "mu": mu, "filtered": filtered, "delta": delta, **fixed(halvings=0, raises=0)}
+    lower = {**s, "mu": mu, "filtered": filtered}
     close = ca.fmax(rest, most / cost) <= 0.3 * ca.sqrt(s["floor"] / cost)
-    return choose(s, ca.logic_and(mu <= s["floor"], close), enter_pure(call, s, ENDS), s)
+    lower = choose(lower, ca.logic_and(mu <= s["floor"], close), enter_pure(call, lower, ENDS), lower)
+    return choose(s, _is_hardly_left(call, s), higher, lower)
+
+
+def _is_hardly_left(call: Call, s: State) -> ca.MX:
+    """Whether the step from a remembered plan was so short that the plan is too near its limits for its barrier."""
+    remembered = ca.logic_and(s["start"] < 0, s["place_of"] == BEGINS)
+    raisable = ca.logic_and(s["rewarms"] < MOST_REWARMS, s["mu"] < MU_MOST * call.scales.cost)
+    return ca.logic_and(ca.logic_and(remembered, raisable), s["alpha"] < POOR)
 
 
 def _eased_damping(s: State) -> ca.MX:
@@ -79,23 +88,13 @@ def _lowered_barrier(call: Call, s: State, rest: ca.MX, products: tuple[ca.MX, c
     return mu, filtered
 
 
-def _adapted_barrier(call: Call, s: State, rest: ca.MX) -> ca.MX:
-    """Return mu of a real-time iteration, which follows how well the last step went."""
-    cost, mu, alpha = call.scales.cost, s["mu"], s["alpha"]
-    badly = ca.logic_or(alpha < 0.5, rest > 0.3)
-    well = ca.logic_and(alpha > 0.9, rest < 0.05)
-    lower = ca.fmax(mu / 5, MU_WARM * cost)
-    return ca.if_else(badly, ca.fmin(10 * mu, MU_MOST * cost), ca.if_else(well, lower, mu))
-
-
 def _shortened(call: Call, s: State) -> State:
     """After a rejected plan: a shorter step, then more damping, then another first guess."""
     halved = {**s, "halvings": s["halvings"] + 1, "alpha": 0.5 * s["alpha"]}
     more = {"delta": ca.fmax(10 * s["delta"], 1e-3), "raises": s["raises"] + 1}
     raised = {**s, **fixed(halvings=0, filtered=0), **more}
-    if call.settings.realtime:
-        return restart(call, raised)
-    gives_up = ca.logic_or(raised["raises"] > MOST_RAISES, raised["delta"] > 1e8)
+    # The barrier of a remembered plan has been raised before: a first guess is cheaper than damping.
+    gives_up = ca.logic_or(ca.logic_or(s["start"] < 0, raised["raises"] > MOST_RAISES), raised["delta"] > 1e8)
     again = {**raised, **fixed(again=1), "use_exact": ca.if_else(s["descends"], 0, s["use_exact"])}
     raised = choose(s, gives_up, restart(call, raised), again)
     return choose(s, s["halvings"] + 1 <= 8, halved, raised)

@@ -5,16 +5,7 @@ from __future__ import annotations
 import casadi as ca
 
 from fpirhc.optimisers.guess import guesses
-from fpirhc.optimisers.limited_settings import (
-    DESCENT,
-    LAST_START,
-    LEAST_DAMPING,
-    MU_END,
-    MU_LEAST,
-    MU_MOST,
-    MU_WARM,
-    REFERENCE,
-)
+from fpirhc.optimisers.limited_settings import DESCENT, LAST_START, LEAST_DAMPING, MU_END, MU_LEAST, MU_WARM, REFERENCE
 from fpirhc.optimisers.limited_turn.call import Call
 from fpirhc.optimisers.limited_turn.state import (
     BEGINS,
@@ -27,7 +18,6 @@ from fpirhc.optimisers.limited_turn.state import (
     as_best,
     as_last,
     choose,
-    constant,
     fixed,
     point,
 )
@@ -46,9 +36,7 @@ def enter_interior(call: Call, s: State) -> State:
     s = {**s, **fixed(phase=INTERIOR, again=1, use_exact=1, filtered=0, raises=0, halvings=0)}
     best = {"point_inputs": s["best_inputs"], "point_states": s["best_states"], "z": s["best_z"]}
     back = {**s, **best, **fixed(fresh=1)}
-    warm = constant(MU_WARM * cost)
-    mu = ca.fmin(ca.fmax(s["mu"], warm), MU_MOST * cost) if call.settings.realtime else warm
-    near = {"mu": mu, **fixed(slacks=WARM, floor=MU_END * cost)}
+    near = fixed(mu=MU_WARM * cost, slacks=WARM, floor=MU_END * cost)
     starts = choose(s, s["misses"] == 0, {**s, **near}, {**back, **near})
     floor = 0.01 * s["floor"]
     stuck = ca.logic_or(s["stuck"], floor < MU_LEAST * cost)

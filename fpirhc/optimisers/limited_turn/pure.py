@@ -17,9 +17,6 @@ def judge_pure(call: Call, s: State, p: Expansion, usable: ca.MX) -> State:
     c = call.certified(p, s["next_z"])
     halved = c.error <= 0.5 * s["error"]
     waits = ca.logic_and(s["misses"] < PATIENCE, c.error < HOPELESS)
-    if call.settings.realtime:
-        # A call of few iterations must have two left to get back inside.
-        waits = ca.logic_and(waits, call.settings.iterations - s["count"] > 2)
     patient = ca.logic_and(ca.logic_or(halved, waits), s["steps"] + 1 <= PURE_STEPS)
     ok = ca.logic_and(ca.logic_and(usable, c.error < FINITE), patient)
     taken = {**s, **as_point(p), **as_last(c), "z": s["next_z"], "costates": s["swept"], "steps": s["steps"] + 1}

@@ -14,13 +14,14 @@ from __future__ import annotations
 import casadi as ca
 
 from fpirhc.horizon.sweep import Expansion, expand
-from fpirhc.optimisers.certified import Certified
-from fpirhc.optimisers.limited_settings import NEAR, ROLLED, SEVERAL
+from fpirhc.optimisers.base import FEASIBLE, stationarity
+from fpirhc.optimisers.certified import Certified, certify
+from fpirhc.optimisers.limited_settings import ROLLED
 from fpirhc.optimisers.limited_turn.call import Call
 from fpirhc.optimisers.limited_turn.descent import box, descending
 from fpirhc.optimisers.limited_turn.direction import Direction
 from fpirhc.optimisers.limited_turn.interior import judge_interior
-from fpirhc.optimisers.limited_turn.phases import enter_interior, enter_pure, restart
+from fpirhc.optimisers.limited_turn.phases import enter_pure, restart
 from fpirhc.optimisers.limited_turn.pure import judge_pure
 from fpirhc.optimisers.limited_turn.state import BEGINS, COLD, PURE, State, as_point, choose, fixed, point
 from fpirhc.optimisers.search import deformed_move
@@ -42,18 +43,21 @@ class Turn:
     def turned(self, s: State) -> State:
         """Return the whole state after one turn."""
         final = s["count"] >= self._call.settings.iterations
-        p, rolled, usable = self._next(s, final)
+        p, rolled, usable = self._next(s)
         s = {**s, **self._judged(s, p, rolled, usable)}
-        ends = ca.logic_or(ca.logic_or(final, s["stuck"]), self._limits_met(s))
-        s = {**s, "ends": ends, "count": s["count"] + ca.logic_not(ends)}
+        met = self._limits_met(s)
+        ends = ca.logic_or(ca.logic_or(final, s["stuck"]), met)
+        s = {**s, "ends": ends, "met": met, "count": s["count"] + ca.logic_not(ends)}
         needed = ca.logic_and(s["fresh"] == 0, ca.logic_or(s["accepted"], s["again"]))
         return self._direction.directed(s, ca.logic_and(needed, ca.logic_not(ends)))
 
     def _limits_met(self, s: State) -> ca.MX:
         last = Certified(s["error"] * 0, s["last_left"], s["last_violation"], s["last_broken"], s["last_error"])
-        return ca.logic_and(ca.logic_and(s["fresh"] == 0, s["phase"] == PURE), self._call.is_done(last))
+        left = returned_left(self._call, point(s), s["z"])
+        done = ca.logic_and(self._call.is_done(last), left <= self._call.settings.tolerance)
+        return ca.logic_and(ca.logic_and(s["fresh"] == 0, s["phase"] == PURE), done)
 
-    def _next(self, s: State, final: ca.MX) -> tuple[Expansion, ca.MX, ca.MX]:
+    def _next(self, s: State) -> tuple[Expansion, ca.MX, ca.MX]:
         """The next plan, expanded; whether it is rolled out, and whether it is finite."""
         call, old, fresh = self._call, point(s), s["fresh"] > 0
         pure = ca.logic_and(ca.logic_not(fresh), s["phase"] == PURE)
@@ -64,8 +68,7 @@ class Turn:
         states = old.states + ca.if_else(ca.logic_and(share > 0, ca.logic_not(descent)), share * s["dx"], 0)
         gaps = ca.if_else(descent, (1 - share) * (old.next_states - old.states[:, 1:]), 0)
         starts = ca.logic_and(ca.logic_and(s["fresh"] == 1, s["slacks"] == COLD), s["start"] == ROLLED)
-        last = ca.logic_and(final, int(call.settings.realtime))
-        rolled = ca.if_else(fresh, starts, ca.logic_or(ca.logic_or(pure, last), descent))
+        rolled = ca.if_else(fresh, starts, ca.logic_or(pure, descent))
         p = Expansion(*self._expand(inputs, states, s["gains"], rolled, gaps, call.s0, call.data, *box(call, s)))
         return p, rolled, is_usable(p)
 
@@ -83,14 +86,18 @@ class Turn:
         far = ca.mmax(ca.fabs(p.states) - 100 * ca.horzcat(call.spread[:, 0], call.spread)) > 0
         fit = ca.logic_and(usable, ca.logic_not(ca.logic_and(rolled, far)))
         pure = enter_pure(call, new, BEGINS)
-        if call.settings.realtime and call.settings.iterations < SEVERAL:
-            pure = choose(pure, pure["error"] > NEAR, enter_interior(call, pure), pure)
         begun = choose(new, new["phase"] == PURE, pure, new)
         first = choose(s, fit, begun, {**restart(call, new), **fixed(accepted=1)})
         again = choose(s, usable, new, {**s, **fixed(fresh=0)})
         retried = s["fresh"] == 2
         judged = choose(s, retried, again, first)
         return {**judged, "accepted": ca.if_else(retried, usable, 1)}
+
+
+def returned_left(call: Call, p: Expansion, z: ca.MX) -> ca.MX:
+    """Return the stationarity with which a plan is returned: multipliers of limits that are not near count as zero."""
+    slope = certify(call.ocp, call.limits, p, z, call.limits.distance(p) <= FEASIBLE)
+    return stationarity(call.ocp, p.inputs, slope, call.lower, call.upper)
 
 
 def is_usable(p: Expansion) -> ca.MX:
