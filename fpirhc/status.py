@@ -50,8 +50,8 @@ _REMEDIES = {
     "limits, soften state limits, or lengthen the horizon.",
     Status.HELD: "the optimiser failed and the stated policy replaced its plan, or a slot's input had too little "
     "effect and the command was held: see the cycles counted here and the signals around them.",
-    Status.NON_FINITE: "a signal became NaN or infinite: look at the first such signal of the run; the "
-    "model is outside its domain or the loop diverged.",
+    Status.NON_FINITE: "a signal became NaN or infinite, and the cycle was skipped: look at the first such signal of the run; the "
+    "measurement is outside the model's domain, or the loop diverged.",
     Status.BAD_SAMPLE: "a measurement was not finite, implausible, or out of date: the cycle was skipped, with the last command "
     "and every memory as it was; look at the sensor, or widen the plausible range.",
     Status.RESTARTED: "the memory was not finite and was forgotten: the controller began anew; look at where the memory is kept.",

@@ -1,7 +1,7 @@
 """The gate in front of a controller: a bad sample is a skipped cycle.
 
-    sample fits:  the controller's step, unchanged
-    otherwise:    the last command again, and every memory as it was
+    sample fits, and the step is finite:  the controller's step, unchanged
+    otherwise:                            the last command again, and every memory as it was
 
 A sample fits when time, state and response - or the raw measurements that they are estimated from - are finite and inside their
 plausible range. The results of a skipped cycle are dropped. What is remembered is selected, never blended: a product with NaN would
@@ -12,7 +12,7 @@ An implausible sample is doubted, not refused for ever: after 20 of them in a ro
 controller is given what is measured, up to 100 times the range. What is not finite is never believed.
 
 Before the first good sample nothing has begun: the command is the one before the run, and the memory is that of the start. A memory
-that is not finite is forgotten, and the controller begins anew.
+that is not finite is forgotten, and the controller begins anew. So is one with which no step is finite (`step_outcome`).
 
 The gate is built once, around the composed step. Loop, stepper, virtual machine and C have it alike.
 """
@@ -26,6 +26,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import clip
+from fpirhc.controllers.step_outcome import FAILED, counted, is_fine, is_trial, kept
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, Derived, Values
 from fpirhc.symbolic.expression import Signals, expression
@@ -89,7 +90,8 @@ class Gate:
         held = Signal(HELD, plant.input.elements, plant.input.units, tuple(float(v) for v in first))
         good = [replace(s, name=f"good_{s.name}", start=starts.get(s.name, s.start)) for s in self.stored.signals]
         doubted = [scalar(DOUBTED)] if self.plausible else []
-        return Layout((held, *good, *doubted)) + self.controller_memory
+        failed = [] if "memory" in self.trusted else [scalar(FAILED)]
+        return Layout((held, *good, *doubted, *failed)) + self.controller_memory
 
     @property
     def controller_memory(self) -> Layout:
@@ -120,14 +122,19 @@ class Gate:
             seen = last_good if self.inner.opaque else {}
             sample = [seen.get(r, getattr(s, r)) for r in self.inner.reads.names]
             memory = self.controller_memory.join({m: getattr(s, m) for m in self.controller_memory.names})
-            usable = expression(1.0) if "memory" in self.trusted else finite(memory, opaque=self.inner.opaque)
-            memory_next, shown, command = choose(fits, usable, memory, sample, held)
+            usable, failed = expression(1.0), None
+            if "memory" not in self.trusted:
+                failed = getattr(s, FAILED)
+                usable = ca.logic_and(finite(memory, opaque=self.inner.opaque), ca.logic_not(is_trial(failed)))
+            memory_next, shown, command, fine = choose(fits, usable, memory, sample, held)
             values = trace.split(shown)
             if "status" in trace:
                 status = ca.if_else(usable, values["status"], int(Status.RESTARTED))
+                status = ca.if_else(fine, status, int(Status.NON_FINITE))
                 values["status"] = ca.if_else(fits, status, int(Status.BAD_SAMPLE))
             remembered = {**self.controller_memory.split(memory_next), HELD: command}
-            remembered |= {f"good_{n}": v for n, v in last_good.items()}
+            remembered |= {FAILED: counted(failed, fits, fine)} if failed is not None else {}
+            remembered |= {f"good_{n}": ca.if_else(fine, v, getattr(s, f"good_{n}")) for n, v in last_good.items()}
             remembered |= {DOUBTED: doubted} if self.plausible else {}
             return {**values, "command": command, **{f"{m}_next": v for m, v in remembered.items()}}
 
@@ -198,15 +205,17 @@ class Gate:
 
     def _selected(
         self, fits: Expression, usable: Expression, memory: Expression, sample: Sequence[Expression], held: Expression
-    ) -> tuple[Expression, Expression, Expression]:
-        """(memory, trace, command) of a step of scalar code: it is evaluated, and its results are selected."""
+    ) -> tuple[Expression, Expression, Expression, Expression]:
+        """(memory, trace, command, whether the step is fine) of scalar code: it is evaluated, and its results are selected."""
         remembered = ca.if_else(usable, memory, ca.DM(self.inner.memory.start()))
         memory_next, trace, command = self.inner.function(remembered, *sample)
-        return ca.if_else(fits, memory_next, remembered), trace, ca.if_else(fits, command, held)
+        fine = is_fine(memory_next, command, trace, self.inner.trace, opaque=False)
+        keeps = ca.logic_and(fits, fine)
+        return kept(keeps, memory_next, memory, opaque=False), trace, kept(keeps, command, held, opaque=False), fine
 
     def _switched(
         self, fits: Expression, usable: Expression, memory: Expression, sample: Sequence[Expression], held: Expression
-    ) -> tuple[Expression, Expression, Expression]:
+    ) -> tuple[Expression, Expression, Expression, Expression]:
         """The same of a graph: one of three branches is evaluated, so that a long memory is not selected entry by entry."""
         step = self.inner.function
         symbols = [ca.MX.sym(step.name_in(k), step.size1_in(k)) for k in range(step.n_in())]
@@ -220,4 +229,6 @@ class Gate:
         )
         choice = ca.Function.conditional("fpirhc_gate_choice", [skipped, running], restarted)
         memory_next, trace, command = choice(ca.if_else(fits, 2 - usable, 0), memory, *sample, held)
-        return memory_next, trace, command
+        fine = is_fine(memory_next, command, trace, self.inner.trace, opaque=True)
+        keeps = ca.logic_or(ca.logic_not(fits), fine)  # a skipped cycle has its memory and its command already
+        return kept(keeps, memory_next, memory, opaque=True), trace, ca.if_else(keeps, command, held), fine

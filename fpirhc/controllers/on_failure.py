@@ -15,6 +15,8 @@ from fpirhc.status import Status
 from fpirhc.symbolic.functions import nan_where
 from fpirhc.symbolic.layout import Expression
 
+STOPPED = "stopped"  # signal of a policy that stops: NaN where it does, which ends a run by this name
+
 
 class OnFailure(Checked, ABC):
     """Contract: the input to apply when the solve failed, and the status to report."""
@@ -22,6 +24,11 @@ class OnFailure(Checked, ABC):
     @property
     def uses_feedforward(self) -> bool:
         """Whether the input that the model needs along the reference is applied; False by default."""
+        return False
+
+    @property
+    def stops(self) -> bool:
+        """Whether a failed solve ends the run; False by default."""
         return False
 
     @abstractmethod
@@ -73,6 +80,11 @@ class Feedforward(OnFailure):
 @dataclass(frozen=True)
 class StopRun(OnFailure):
     """Stop: the planned input becomes NaN, which holds the last command and ends the run with this status."""
+
+    @property
+    def stops(self) -> bool:
+        """True: a failed solve ends the run."""
+        return True
 
     def choose(
         self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression

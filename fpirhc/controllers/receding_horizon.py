@@ -22,7 +22,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
 from fpirhc.controllers.contract import Planner
 from fpirhc.controllers.first_plan import built_first_memory, first_memory
-from fpirhc.controllers.on_failure import HoldPlan, OnFailure
+from fpirhc.controllers.on_failure import STOPPED, HoldPlan, OnFailure
 from fpirhc.controllers.own_reference import motion_of, own_signals, own_values, preview_of
 from fpirhc.controllers.planned_model import as_planned, held_model
 from fpirhc.controllers.replanning import FromMeasurement, Replanning
@@ -41,6 +41,7 @@ from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, Derived, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
+from fpirhc.symbolic.functions import nan_where
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import DERIVED, PREFIX, LiveNumber, is_live, live_numbers, nominal, settled
 from fpirhc.task.outside import previewed_values
@@ -188,7 +189,8 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     feedforward_of = _feedforward(problem)
     low, high = problem.limits.input_ends(plant)
     logged = tuple(scalar(name) for name in optimiser.logged)
-    writes = (like(plant.input, "planned"), Signal("solve", _SOLVE), scalar("_solve_status"), *logged)
+    stopped = (scalar(STOPPED),) if on_failure.stops else ()
+    writes = (like(plant.input, "planned"), Signal("solve", _SOLVE), scalar("_solve_status"), *stopped, *logged)
 
     def step(s: Signals) -> dict[str, Value]:
         own = own_values(problem, s)
@@ -213,6 +215,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
             "solve": diagnostics,
             "_solve_status": judged,
             "plan_begun_next": 1,
+            **({STOPPED: nan_where(failed)} if on_failure.stops else {}),
             **remembered_next,
             **shown,
         }

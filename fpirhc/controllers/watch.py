@@ -20,6 +20,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.step_outcome import was_skipped
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block
@@ -70,7 +71,7 @@ def watch_block(problem: Problem, controller: Controller, status: str, *, longes
             now |= _fit(past, s.deformed, s.realised, gain, window)
             worse = ca.if_else(now["watch_growing"] > window - 0.5, int(Status.NOT_CONTRACTING), worse)
         fine = before < int(Status.NOT_CONVERGED) + 0.5
-        counts = before != int(Status.BAD_SAMPLE)  # a skipped cycle is no evidence
+        counts = ca.logic_not(was_skipped(before))  # a skipped cycle is no evidence
         stays = ca.logic_and(ca.logic_not(counts), usable)
         # The two are never both other than zero, and NaN in the one that is dropped does no harm.
         remembered = ca.if_else(counts, parts.join(now), 0) + ca.if_else(stays, s.watch, 0)

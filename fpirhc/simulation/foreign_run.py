@@ -7,9 +7,10 @@ from typing import TypeAlias
 
 import numpy as np
 
+from fpirhc.simulation.dropped_steps import Dropped
 from fpirhc.simulation.ranges import ranges_of
+from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.layout import Layout
 from fpirhc.task.problem import Problem
 
 Patch: TypeAlias = tuple[int, np.ndarray, np.ndarray]  # cycle, places in the memory, their values
@@ -18,7 +19,7 @@ Patch: TypeAlias = tuple[int, np.ndarray, np.ndarray]  # cycle, places in the me
 def run_foreign(
     problem: Problem,
     start: np.ndarray,
-    trace: Layout,
+    loop: Composite,
     evaluator: Evaluator,
     seed: int,
     tables: Sequence[np.ndarray],
@@ -30,7 +31,7 @@ def run_foreign(
     Args:
         problem: with a foreign reality.
         start: first memory of the loop.
-        trace: layout of the log.
+        loop: one cycle, which the log is of.
         evaluator: of one cycle of the loop.
         seed: with which the reality is reset.
         tables: disturbances and the sensors' random series, one row per cycle.
@@ -40,7 +41,7 @@ def run_foreign(
     Raises:
         InvalidProblem: a bad first answer.
     """
-    foreign, cycles = problem.foreign, problem.cycles
+    foreign, cycles, trace, dropped = problem.foreign, problem.cycles, loop.trace, Dropped(loop)
     assert foreign is not None
     memory, *inputs = evaluator.arguments
     *random, answer, held = inputs
@@ -55,9 +56,9 @@ def run_foreign(
         if failure:
             return log[:k], stopped(problem, k, f"a solver failed ({failure})")
         memory_next, row, sent = evaluator.results
-        if not np.isfinite(row).all():
-            column = trace.columns[int(np.argmin(np.isfinite(row)))]
-            return log[:k], stopped(problem, k, f"signal '{column}' is not finite")
+        bad = dropped.first_bad(row[None, :], log[k - 1] if k else None)
+        if bad is not None:
+            return log[:k], stopped(problem, k, f"signal '{trace.columns[bad[1]]}' is not finite")
         outside = ranges.first_outside(row[None, :])
         if outside is not None:
             return log[:k], stopped(problem, k, outside[1])

@@ -13,9 +13,9 @@ import casadi as ca
 
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.gate import Gate
+from fpirhc.controllers.step_outcome import was_skipped
 from fpirhc.controllers.watch import watch_block
 from fpirhc.describe import describe
-from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, compose
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.finite import FINITE
@@ -74,7 +74,7 @@ def _count_block() -> Block:
     def step(s: Signals) -> dict[str, Expression]:
         before = getattr(s, count.name)
         safe = ca.if_else(ca.fabs(before) <= FINITE, before, 0)
-        total = safe + (s.status == int(Status.BAD_SAMPLE))
+        total = safe + was_skipped(s.status)
         return {SKIPPED: total, f"{count.name}_next": total}
 
     return Block("count", Layout((scalar("status"),)), Layout((scalar(SKIPPED),)), step, Layout((count,)))

@@ -18,6 +18,7 @@ from fpirhc.describe import describe
 from fpirhc.fields.checked_call import checked_call
 from fpirhc.simulation.changes import Changes, in_force
 from fpirhc.simulation.common_columns import with_common_columns
+from fpirhc.simulation.dropped_steps import Dropped
 from fpirhc.simulation.foreign_run import Patch, run_foreign, stopped
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.ranges import ranges_of
@@ -98,7 +99,7 @@ class Simulator:
         force = in_force(self.live, self.loop, problem, settings or {}, changes or {})
         problem, controller = force.problem, force.controller
         start = start_memory(self.loop, problem, controller, force.numbers)
-        common = (problem, start, self.loop.trace, self.evaluator, seed, disturbed, progress)
+        common = (problem, start, self.loop, self.evaluator, seed, disturbed, progress)
         run_cycles = _run_chunks if problem.foreign is None else _run_foreign
         logged, stop = run_cycles(*common, force.patches, setpoints)
         layout, log = with_common_columns(self.loop.trace, logged)
@@ -246,7 +247,7 @@ def sensing_table(problem: Problem, seed: int, cycles: int) -> np.ndarray:
 def _run_chunks(
     problem: Problem,
     start: np.ndarray,
-    trace: Layout,
+    loop: Composite,
     evaluator: Evaluator,
     seed: int,
     disturbed: bool,
@@ -254,7 +255,7 @@ def _run_chunks(
     patches: Sequence[tuple[int, np.ndarray, np.ndarray]] = (),
     setpoints: Setpoints | None = None,
 ) -> tuple[np.ndarray, str | None]:
-    cycles = problem.cycles
+    cycles, trace, dropped = problem.cycles, loop.trace, Dropped(loop)
     padded = (-(-cycles // CHUNK) + (1 if patches else 0)) * CHUNK
     tables = _tables(problem, seed, padded, disturbed, setpoints)
     log, ranges = np.empty((padded, trace.size)), ranges_of(problem, trace)
@@ -270,7 +271,7 @@ def _run_chunks(
         if why:
             return log[:at].copy(), _failed(at, problem, why)
         rows = log[at:end]
-        bad = _first_bad(rows)
+        bad = dropped.first_bad(rows, log[at - 1] if at else None)
         if bad is not None:
             row, column = bad
             return log[: at + row].copy(), _why(trace, at + row, column, problem)
@@ -297,7 +298,7 @@ def _pieces(cycles: int, cuts: Sequence[int]) -> list[tuple[int, int]]:
 def _run_foreign(
     problem: Problem,
     start: np.ndarray,
-    trace: Layout,
+    loop: Composite,
     evaluator: Evaluator,
     seed: int,
     disturbed: bool,
@@ -307,7 +308,7 @@ def _run_foreign(
 ) -> tuple[np.ndarray, str | None]:
     tables = _tables(problem, seed, problem.cycles, disturbed, setpoints)
     try:
-        return run_foreign(problem, start, trace, evaluator, seed, tables, progress, patches)
+        return run_foreign(problem, start, loop, evaluator, seed, tables, progress, patches)
     except SystemError as error:
         raise unwrapped(error) from None
 
@@ -316,19 +317,6 @@ def _tables(problem: Problem, seed: int, cycles: int, disturbed: bool, setpoints
     """Disturbances, the sensors' random series, and set-points of every cycle, where there are any."""
     random = float(disturbed) * disturbance_table(problem, seed, cycles), sensing_table(problem, seed, cycles)
     return [table for table in (*random, set_point_table(problem, setpoints, cycles)) if table.shape[1]]
-
-
-def _first_bad(rows: np.ndarray) -> tuple[int, int] | None:
-    """Row and column of the first value that is not finite."""
-    # A sum is finite only if every summand is, and it is fast; where it overflows the entries are checked one by one.
-    with np.errstate(all="ignore"):
-        if np.isfinite(np.sum(rows)):
-            return None
-    finite = np.isfinite(rows)
-    if finite.all():
-        return None
-    row = int(np.argmin(finite.all(axis=1)))
-    return row, int(np.argmin(finite[row]))
 
 
 def _evaluated(evaluator: Evaluator) -> str:

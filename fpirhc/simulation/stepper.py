@@ -46,8 +46,9 @@ class Stepper(Checked):
 
     A bad sample skips the cycle: one that is not finite, outside its plausible range, or (with `max_age`) out of date. The command
     is the last one, every memory stays as it was, the status is BAD_SAMPLE, and the signal 'skipped' counts. Before the first good
-    sample the command is the one before the run. A memory that is not finite is forgotten: the controller begins anew, with the
-    status RESTARTED. Where a solver raises, the cycle is skipped with the status SOLVER_FAILED; `why_failed` has its words.
+    sample the command is the one before the run. A sample for which the model has no number skips the cycle too, as NON_FINITE. A
+    memory that is not finite is forgotten, and so is one with which good samples give nothing finite: the controller begins anew,
+    with the status RESTARTED. Where a solver raises, the cycle is skipped with the status SOLVER_FAILED; `why_failed` has its words.
     Commands at a limit for long and an iteration that does not contract have the statuses SATURATED and NOT_CONTRACTING.
 
     One stepper serves one thread. Two threads at the same time are refused; give each a stepper of its own.

@@ -175,7 +175,10 @@ def test_a_review_says_what_it_covers() -> None:
 
 @pytest.mark.parametrize(("gain", "verdict"), [(0.5, "yes"), (3.5, "no")])
 def test_a_review_judges_the_gain_by_the_settled_map(gain: float, verdict: str) -> None:
-    """P = R^ r / R for a request r: the slope is R^ / R along the way, and a run does what the verdict says."""
+    """P = R^ r / R for a request r: the slope is R^ / R along the way, and a run does what the verdict says.
+
+    Too large a gain asks for a negative power, for which the model has no command: such steps are skipped, until it gets warm.
+    """
     problem, controller = heated(element(), duration=20.0), fp.Cascade(STATIC, affine(gain))
     by_question = {
         a.question: a for a in fp.review(problem, {"one": controller}, mismatch=0.0, seed=0).controllers["one"]
@@ -185,7 +188,7 @@ def test_a_review_judges_the_gain_by_the_settled_map(gain: float, verdict: str) 
     signs = by_question["Do the eigenvalues of the response Jacobian have one sign?"].numbers
     assert signs["largest"] == pytest.approx(slopes.max(), rel=0.02)
     assert str(by_question["Is the map's gain admissible?"].verdict) == verdict
-    assert (np.abs(run["error.power"][-20:]).max() > 100) == (verdict == "no")
+    assert (np.abs(run["error.power"][20:60]).max() > 100) == (verdict == "no")
 
 
 def test_a_static_map_has_no_error_once_it_is_right() -> None:

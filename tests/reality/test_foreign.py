@@ -263,9 +263,7 @@ def test_memory_that_changes_during_the_run():
     start = start_memory(ready.loop, problem, ready.controller)
     place = np.arange(start.size)[ready.loop.memory.slice("parameters")]
     patches: list[list[Patch]] = [[], [(50, place, np.array([2.0]))]]
-    before, after = (
-        run_foreign(problem, start, ready.loop.trace, ready.evaluator, 0, [], None, one)[0] for one in patches
-    )
+    before, after = (run_foreign(problem, start, ready.loop, ready.evaluator, 0, [], None, one)[0] for one in patches)
     commands = [log[:, ready.loop.trace.slice("command")].ravel() for log in (before, after)]
     assert np.array_equal(commands[0][:50], commands[1][:50])
     assert commands[1][50] == pytest.approx(0.5 * commands[0][50], rel=1e-12)
@@ -293,6 +291,6 @@ def test_solver_that_fails_ends_the_run():
     ready = simulator(problem, CONTROLLERS["computed torque"], compiled=False)
     failing: Any = FailingStep(ready.evaluator)
     start = start_memory(ready.loop, problem, ready.controller)
-    log, stop = run_foreign(problem, start, ready.loop.trace, failing, 0, [], None)
+    log, stop = run_foreign(problem, start, ready.loop, failing, 0, [], None)
     assert len(log) == 10
     assert "a solver failed (solver has no solution) at t = 0.01 s (cycle 10)" in str(stop)

@@ -1,0 +1,244 @@
+"""A finite sample outside the model's domain is a skipped tick: the command is held, every memory stays, the status says so.
+
+The plant is a tank below whose bottom the model has no flow, h' = (u - s sqrt(h)) / A: a level measured as -2 mm is a number, and
+the model's response to it is none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.step_outcome import FAILED, PATIENCE
+from fpirhc.deformation.base import Deformation
+from fpirhc.members import Example, examples
+from fpirhc.simulation.dropped_steps import Dropped
+from fpirhc.simulation.loop import close_loop
+from fpirhc.simulation.sample import raw_measurements
+from fpirhc.status import Status
+from fpirhc.symbolic.native import find_compiler
+
+SHAPE = fp.Sigmoid(gain=-0.5, scale=2.0)
+TRACK = fp.Exponential(rate=3.0)
+PLAN = fp.FixedPoint(iterations=2, tolerance=1e-3)
+TANK = fp.Problem(
+    plant=fp.Plant(
+        coordinates={"h": "m"},
+        inputs={"u": "l/s"},
+        order=1,
+        response=lambda h, u, p: {"h": (u.u - p.s * ca.sqrt(h.h)) / 1.5},
+        parameters={"s": fp.Parameter(approximate=1.0, exact=0.6, unit="l/s/m^0.5")},
+    ),
+    reference=fp.Trajectory(lambda t: {"h": 0.12 + 0.05 * ca.sin(t)}),
+    start={"h": 0.1},
+    period=0.02,
+    duration=2.0,
+    limits=fp.Limits(inputs={"u": (0.0, 2.0)}),
+    horizon=fp.Horizon(stages=4, step=0.1),
+    cost=fp.Quadratic(states={"h": 1e3}, rate={"u": 1e-3}),
+)
+BELOW = -2e-3  # m
+BAD = 60  # cycle
+MAPS: tuple[Deformation, ...] = tuple(
+    m
+    for e in examples("deformations", SHAPE)
+    if (m := e.value if isinstance(e, Example) else e).channels in (None, 1) and m.effective_gain() >= 0
+)
+CONTROLLERS: dict[str, Controller] = {
+    **{f"{type(m).__name__}-{k}": fp.ComputedTorque(TRACK, m) for k, m in enumerate(MAPS)},
+    "plan": fp.RecedingHorizon(PLAN, SHAPE),
+    "plan every five cycles": fp.RecedingHorizon(PLAN, SHAPE, replanning=fp.FromMeasurementTracked(TRACK)),
+    "plan, feedforward": fp.RecedingHorizon(PLAN, SHAPE, on_failure=fp.Feedforward()),
+}
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
+
+
+@cache
+def measurements() -> tuple[np.ndarray, np.ndarray]:
+    """Times and samples of an ordinary run."""
+    run = fp.simulate(TANK, fp.ComputedTorque(TRACK, SHAPE), seed=0, compiled=False)
+    return run.time, raw_measurements(run)
+
+
+def status(stepper: fp.Stepper) -> Status:
+    return Status(int(stepper.trace()["status"][0]))
+
+
+def before_the_fault(stepper: fp.Stepper) -> tuple[np.ndarray, np.ndarray]:
+    """Command and memory after the good cycles."""
+    times, rows = measurements()
+    command, memory = np.zeros(1), stepper.start()
+    for k in range(BAD):
+        command, memory = stepper.step_measured(times[k], rows[k], memory)
+    return command, memory
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_sample_outside_the_domain_is_a_skipped_tick(name):
+    """Nothing but two counts changes, and afterwards every command is that of the tick left out, bit for bit."""
+    stepper = fp.Stepper(TANK, CONTROLLERS[name], compiled=False)
+    times, rows = measurements()
+    command, memory = before_the_fault(stepper)
+    held, after = stepper.step_measured(times[BAD], rows[BAD] * [0, 1] + [BELOW, 0], memory)
+    assert status(stepper) == Status.NON_FINITE
+    assert stepper.trace()["skipped"] == 1
+    assert np.array_equal(held, command)
+    changed = [stepper.memory.columns[k] for k in np.flatnonzero(after != memory)]
+    assert changed == [FAILED, "skipped_before"]
+    for k in range(BAD + 1, BAD + 12):
+        one, after = stepper.step_measured(times[k], rows[k], after)
+        other, memory = stepper.step_measured(times[k], rows[k], memory)
+        assert np.array_equal(one, other)
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["Sigmoid-0", "plan"])
+def test_compiled_code_skips_alike(name):
+    """C and the virtual machine hold, keep and go on alike, also over many such samples."""
+    name = next(n for n in CONTROLLERS if n.startswith(name.partition("-")[0]))
+    steppers = [fp.Stepper(TANK, CONTROLLERS[name], compiled=c) for c in (False, True)]
+    assert [s.compiled for s in steppers] == [False, True]
+    times, rows = measurements()
+    memories = [s.start() for s in steppers]
+    for k in range(80):
+        row = rows[k] * [0, 1] + [BELOW, 0] if k in {0, 30} or 40 <= k < 65 else rows[k]
+        results = [s.step_measured(times[k], row, m) for s, m in zip(steppers, memories, strict=True)]
+        memories = [memory for _, memory in results]
+        np.testing.assert_allclose(results[0][0], results[1][0], rtol=1e-9, atol=1e-12, equal_nan=False)
+        assert len({status(s) for s in steppers}) == 1
+        assert (status(steppers[0]) == Status.NON_FINITE) == (row[0] < 0)
+
+
+def test_what_was_learned_survives_a_sensor_below_the_bottom():
+    """However long the sensor is wrong: trials with the memory of the start fail too, so the memory is not at fault."""
+    stepper = fp.Stepper(TANK, fp.ComputedTorque(TRACK, SHAPE), compiled=False)
+    times, rows = measurements()
+    _, memory = before_the_fault(stepper)
+    learned = memory
+    for k in range(5 * PATIENCE):
+        _, learned = stepper.step_measured(times[BAD] + k * TANK.period, rows[BAD] * [0, 1] + [BELOW, 0], learned)
+        assert status(stepper) == Status.NON_FINITE
+    one, _ = stepper.step_measured(times[BAD], rows[BAD], learned)
+    other, _ = stepper.step_measured(times[BAD], rows[BAD], memory)
+    assert np.array_equal(one, other)
+
+
+# Loops
+
+
+NOISY = replace(TANK, sensing=fp.Sensing(sensors={"h": fp.Sensor(noise=fp.Noise(0.12))}))
+
+
+def noisy_run(controller: Controller, *, compiled: bool) -> fp.Run:
+    return fp.simulate(NOISY, controller, seed=3, compiled=compiled)
+
+
+@pytest.mark.parametrize("name", ["Sigmoid", "plan"])
+def test_loop_goes_on_and_equals_the_stepper(name):
+    """Noise shows some levels below the bottom: the run goes on, is finite, and the stepper repeats its commands."""
+    controller = CONTROLLERS[next(n for n in CONTROLLERS if n.startswith(name))]
+    run = noisy_run(controller, compiled=False)
+    shown = raw_measurements(run)
+    assert run.stop is None
+    assert np.isfinite(run.log).all()
+    below = shown[:, 0] < 0
+    assert 3 <= below.sum() < 40
+    assert np.array_equal(run["status"].ravel() == Status.NON_FINITE, below)
+    held = run["command"][1:][below[1:]]
+    assert np.array_equal(held, run["command"][:-1][below[1:]])
+    stepper = fp.Stepper(NOISY, controller, compiled=False, plausible={"h": (-10.0, 10.0)})
+    memory = stepper.start()
+    for k in range(run.cycles):
+        command, memory = stepper.step_measured(run.time[k], shown[k], memory)
+        assert np.array_equal(command, run["command"][k])
+        assert status(stepper) == run["status"][k]
+    assert fp.measure(NOISY, run)["status"]["NON_FINITE"] == below.sum()
+
+
+@needs_compiler
+def test_compiled_loop_goes_on_alike():
+    """The same log in C and in the virtual machine."""
+    one, other = (noisy_run(fp.ComputedTorque(TRACK, SHAPE), compiled=c) for c in (False, True))
+    assert other.compiled
+    np.testing.assert_allclose(one.log, other.log, rtol=1e-9, atol=1e-9, equal_nan=False)
+
+
+def test_a_plant_that_leaves_its_domain_still_ends_the_run():
+    """What the loop logs of the plant itself is no step that could be dropped."""
+    start = replace(TANK, start={"h": 0.004}, reference=fp.Trajectory(lambda t: {"h": 0.004 - t}))
+    run = fp.simulate(start, fp.ComputedTorque(TRACK, SHAPE), seed=0, compiled=False)
+    assert run.stop is not None
+    assert "is not finite" in run.stop
+
+
+def test_a_plan_that_stops_still_ends_the_run():
+    """StopRun asks for the end, and says so."""
+    stopping = fp.RecedingHorizon(PLAN, SHAPE, on_failure=fp.StopRun())
+    run = noisy_run(stopping, compiled=False)
+    assert run.stop is not None
+    assert "signal 'planned.u' is not finite" in run.stop
+
+
+def test_what_ends_a_run_in_its_log():
+    """Of a dropped step: what is not the controller's own, and numbers beyond all sense; of any other step: what is not finite."""
+    loop = close_loop(TANK, fp.ComputedTorque(TRACK, SHAPE))
+    size, status_at, own = (
+        loop.trace.size,
+        loop.trace.slice("status").start,
+        loop.trace.slice("command_unclipped").start,
+    )
+    time = loop.trace.slice("time").start
+
+    def judged(status: Status, place: int, value: float) -> tuple[tuple[int, int] | None, float]:
+        rows = np.ones((3, size))
+        rows[:, status_at] = [Status.OK, status, Status.OK]
+        rows[1, place] = value
+        return Dropped(loop).first_bad(rows, None), rows[1, place]
+
+    assert judged(Status.NON_FINITE, own, np.nan) == (None, 1.0)
+    assert judged(Status.NON_FINITE, time, np.nan)[0] == (1, time)
+    assert judged(Status.NON_FINITE, time, 1e200)[0] == (1, time)
+    assert judged(Status.OK, own, np.nan)[0] == (1, own)
+    assert judged(Status.OK, own, 1e200)[0] is None
+
+
+# Algebraic states
+
+
+def with_algebraic(**changes: Any) -> fp.Problem:
+    """The same tank, with the outflow as an algebraic state: z^2 = s^2 h has no solution below the bottom."""
+    plant = fp.Plant(
+        coordinates={"h": "m"},
+        inputs={"u": "l/s"},
+        order=1,
+        response=lambda h, u, p, z: {"h": (u.u - z.flow) / 1.5},
+        parameters={"s": fp.Parameter(approximate=1.0, exact=0.6, unit="l/s/m^0.5")},
+        algebraic=fp.Algebraic(
+            units={"flow": "l/s"},
+            equations=lambda h, u, p, z: {"flow": z.flow**2 - p.s**2 * h.h},
+            guess={"flow": 0.3},
+            steps=8,
+        ),
+    )
+    return replace(TANK, plant=plant, **changes)
+
+
+@pytest.mark.parametrize("controller", [fp.ComputedTorque(TRACK, SHAPE), fp.RecedingHorizon(PLAN, SHAPE)])
+def test_algebraic_states_without_a_solution(controller):
+    """Newton's method does not arrive, and the cycle is skipped as one with a square root of a negative number."""
+    stepper = fp.Stepper(with_algebraic(), controller, compiled=False)
+    times, rows = measurements()
+    command, memory = before_the_fault(stepper)
+    held, after = stepper.step_measured(times[BAD], rows[BAD] * [0, 1] + [BELOW, 0], memory)
+    assert status(stepper) == Status.NON_FINITE
+    assert np.array_equal(held, command)
+    one, _ = stepper.step_measured(times[BAD + 1], rows[BAD + 1], after)
+    other, _ = stepper.step_measured(times[BAD + 1], rows[BAD + 1], memory)
+    assert np.array_equal(one, other)
