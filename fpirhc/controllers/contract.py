@@ -61,6 +61,9 @@ class Planner:
         tracking: the law that keeps the plant on the planned motion between plans; None: the plan's first response is the desired
             one.
         margins: distances that plans keep from limits of states; None: those of the problem's horizon.
+        consistent: whether a plan on outputs starts at the state at which the model has the measured ones; None: where the response
+            is corrected.
+        adapts: whether a deformation corrects the response.
     """
 
     optimiser: Optimiser
@@ -68,6 +71,16 @@ class Planner:
     restarts: bool
     tracking: Tracking | None
     margins: Mapping[str, Sequence[float]] | None = None
+    consistent: bool | None = False
+    adapts: bool = False
+
+    def corrects(self, plant: Plant) -> bool:
+        """Return whether the inverse makes the plant's response that of the plan: a deformation does, or a disturbance of it."""
+        return self.adapts or any(one.response_disturbance for one in plant.outputs.values())
+
+    def starts_consistent(self, plant: Plant) -> bool:
+        """Return whether plans start where the model has the measured outputs (`fpirhc.horizon.consistent_state`)."""
+        return bool(plant.outputs) and (self.corrects(plant) if self.consistent is None else self.consistent)
 
     def planned(self, problem: Problem) -> Problem:
         """Return the problem with the cost and the margins of the plans."""

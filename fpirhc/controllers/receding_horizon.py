@@ -4,7 +4,7 @@ Every n-th cycle (one stage of the horizon) the optimiser plans inputs u_0 ... u
 response that the model gives to the plan's first input is the nominal one; it is re-evaluated in every cycle at the measured
 (or propagated) state, deformed, inverted, and applied. The deformation changes the command by
 
-    delta = command - inverse model(q^Des),
+    delta = command - planned input,
 
 so the optimiser is given input bounds shifted by -delta of the last cycle, and its plan stays feasible for the actuator.
 
@@ -20,6 +20,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
+from fpirhc.controllers.consistent_start import at_consistent_start, consistent_start
 from fpirhc.controllers.contract import Planner
 from fpirhc.controllers.first_plan import built_first_memory, first_memory
 from fpirhc.controllers.on_failure import STOPPED, HoldPlan, OnFailure
@@ -77,7 +78,9 @@ class RecedingHorizon(Controller):
     @property
     def planner(self) -> Planner:
         """Optimiser, cost, start and margins of the plans, and the tracking law between plans."""
-        return Planner(self.optimiser, self.cost, self.replanning.restarts, self.replanning.law, self.margins)
+        ways = self.replanning
+        adapts = self.deformation.adapts
+        return Planner(self.optimiser, self.cost, ways.restarts, ways.law, self.margins, ways.consistent, adapts)
 
     @property
     def model_acts_at_once(self) -> bool:
@@ -139,6 +142,10 @@ class RecedingHorizon(Controller):
         before, after, late, remembered = self.replanning.parts(problem)
         plan = every(_plan_block(problem, self.optimiser, self.on_failure), cycles)
         closing, delays = closing_blocks(problem, self.deformation, [scalar("_solve_status")])
+        if self.planner.starts_consistent(plant):
+            before, after = (at_consistent_start(plant, some) for some in (before, after))
+            before = [consistent_start(plant), *before]
+            closing = closing if self.planner.corrects(plant) else at_consistent_start(plant, closing)
         if self.follows_model:
             held, own = held_model(problem)
             after, delays = [held, *(as_planned(block, problem) for block in after)], [*delays, own]
@@ -326,18 +333,14 @@ def _feedforward(problem: Problem) -> ca.Function:
 
 
 def _command_shift_block(problem: Problem, deformation: Deformation) -> Block:
-    """Block (state, desired, command, parameters) -> the deformation's change of the command; zero without adaptation."""
+    """Block (planned input, command) -> the deformation's change of the command; zero without adaptation."""
     plant = problem.plant
-    inverse = plant.inverse_function
-    reads = Layout((plant.state, plant.response_signal("desired"), plant.input, plant.parameter))
+    reads, writes = Layout((like(plant.input, "planned"), plant.input)), Layout((like(plant.input, "command_shift"),))
 
     def step(s: Signals) -> dict[str, Expression]:
-        if not deformation.adapts:
-            return {"command_shift": 0 * s.command}
-        return {"command_shift": s.command - inverse(s.state, s.desired, s.parameters)}
+        return {"command_shift": s.command - s.planned if deformation.adapts else 0 * s.command}
 
-    writes = Layout((like(plant.input, "command_shift"),))
-    return Block("command_shift", reads, writes, step, opaque=plant.inverse_opaque)
+    return Block("command_shift", reads, writes, step)
 
 
 EXAMPLES = (RecedingHorizon(FixedPoint(iterations=2, tolerance=1e-3), Sigmoid(gain=-0.5, scale=50.0)),)

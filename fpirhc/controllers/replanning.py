@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import casadi as ca
 
@@ -43,6 +43,11 @@ class Replanning(Checked, ABC):
         """Whether every plan starts from the measured state."""
 
     @property
+    def consistent(self) -> bool | None:
+        """Whether a plan on outputs starts at the state at which the model has the measured ones; see `FromMeasurement`."""
+        return False
+
+    @property
     @abstractmethod
     def law(self) -> Tracking | None:
         """The law that keeps the plant on the planned motion between plans; None: the plan's response is the desired one."""
@@ -54,7 +59,15 @@ class Replanning(Checked, ABC):
 
 @dataclass(frozen=True)
 class FromMeasurement(Replanning):
-    """Plan from the measured state; the plan's first response is the desired one, without a tracking law."""
+    """Plan from the measured state; the plan's first response is the desired one, without a tracking law.
+
+    Args:
+        consistent: whether a plan on outputs starts at the state at which the model has the measured outputs and derivatives, see
+            `fpirhc.horizon.consistent_state`; None: where a deformation, or a believed disturbance of the response, makes the
+            plant's response that of the plan: the plant then moves as that plan foresees. Coordinates are always consistent.
+    """
+
+    consistent: bool | None = field(default=None, kw_only=True, metadata={"setting": False})
 
     @property
     def restarts(self) -> bool:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import casadi as ca
 import numpy as np
 
@@ -12,7 +10,7 @@ from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import kind
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.task.reference import Reference
 
 
@@ -94,16 +92,11 @@ def stage_data(
 
 
 def shifted_reference(plant: Plant, layout: Layout, nodes: int) -> ca.Function:
-    """Function (data, state, measured outputs, parameters) -> data whose reference is that of the measured outputs.
+    """Function (data, state, measured outputs, parameters) -> data whose reference is less the distance of the outputs.
 
-    A wrong model computes other outputs and derivatives than are measured, y^(k) - h_k(x, p) = d^(k). A plan takes d^(r) as zero,
-    as it is where a deformation makes the response of the plant that of the model, so
-
-        d^(k)(t + tau) = sum_{j >= k} d^(j)(t) tau^(j-k) / (j-k)!,    j < r.
-
-    In the cycles T of a map these are divided differences, and tau^n is tau (tau - T) ... (tau - (n - 1) T), as Newton has it.
-
-    The errors of the model's outputs plus d are those of the model's outputs where d is subtracted from the reference.
+    The distance d = y - h(x, p) of the measured outputs from the model's, at the state from which the plan starts, is held over the
+    horizon. That of the derivatives is not extrapolated: a polynomial is the motion of a chain of integrators, and no other model
+    stays on it. Behind a deformation the plan starts where there is no distance (see `consistent_state`).
 
     Args:
         plant: the model, with outputs.
@@ -111,23 +104,14 @@ def shifted_reference(plant: Plant, layout: Layout, nodes: int) -> ca.Function:
         nodes: number of columns of the data.
     """
     x, u, p = plant.symbols()
-    y, column, now = ca.SX.sym("y", plant.output.size), ca.SX.sym("data", layout.size), ca.SX.sym("now")
+    y, column = ca.SX.sym("y", plant.output.size), ca.SX.sym("data", layout.size)
     error = y - plant.output_function(x, ca.SX.zeros(u.numel()), p, ca.SX.zeros(len(plant.names)))
-    elements, later = plant.output.elements, column[layout.slice("time")] - now
     place, difference = layout.slice("reference"), ca.SX.zeros(layout.size)
-    for k, element in enumerate(elements):
-        higher = [i for i, e in enumerate(elements) if e.startswith(element) and not e[len(element) :].strip("'")]
-        powers = [elements[i].count("'") - element.count("'") for i in higher]
-        terms = (error[i] * _power(later, n, plant) / math.factorial(n) for i, n in zip(higher, powers, strict=True))
-        difference[place.start + k] = sum(terms, start=ca.SX(0))
-    one = ca.Function("fpirhc_shifted_column", [column, now, x, y, p], [ca.densify(column - difference)])
+    for k, element in enumerate(plant.output.elements):
+        if not element.endswith("'"):
+            difference[place.start + k] = error[k]
+    one = ca.Function("fpirhc_shifted_column", [column, x, y, p], [ca.densify(column - difference)])
     sizes = {"x": x.numel(), "y": y.numel(), "p": p.numel()}
     data, arguments = ca.MX.sym("data", layout.size, nodes), [ca.MX.sym(name, size) for name, size in sizes.items()]
-    repeated = [ca.repmat(v, 1, nodes) for v in (data[layout.slice("time"), 0], *arguments)]
+    repeated = [ca.repmat(v, 1, nodes) for v in arguments]
     return ca.Function("fpirhc_shifted_reference", [data, *arguments], [one.map(nodes)(data, *repeated)])
-
-
-def _power(time: Expression, exponent: int, plant: Plant) -> Expression:
-    if plant.step is None:
-        return time**exponent
-    return math.prod((time - k * plant.sampling for k in range(exponent)), start=ca.SX(1))

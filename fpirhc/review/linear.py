@@ -29,7 +29,7 @@ from fpirhc.errors import NotSupported
 from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.review.neutral import hidden_modes
-from fpirhc.review.plan_feedback import PlanGain
+from fpirhc.review.plan_feedback import PlanGain, gain_entries
 from fpirhc.review.straight import Slopes, straightened
 from fpirhc.sensing import Sensing
 from fpirhc.simulation.loop import close_loop
@@ -155,15 +155,15 @@ def linear_parameters(
 def linear_plant(plant: Plant, sign: float) -> Plant:
     """Return a plant of the same coordinates and inputs whose parameters are the entries of A and B.
 
-    The first n nx entries are A, the next B, the last [K, L] of a plan's feedback, which the plant itself does not use.
+    The first n nx entries are A, the next B, the last those of a plan's feedback, which the plant itself does not use.
     Its own values are A = 0, and B = 1 on the controlled coordinates, times `sign` on the exact side.
     """
     n, nx, nu = len(plant.names), plant.state.size, len(plant.inputs)
     gain = np.zeros((n, nu))
     gain[list(plant.controlled_indices), range(nu)] = 1.0
     names = [f"a{k}" for k in range(n * nx)] + [f"b{k}" for k in range(n * nu)]
-    names += [f"f{k}" for k in range(nu * (nx + nu))]
-    values = np.concatenate([np.zeros(n * nx), gain.ravel(), np.zeros(nu * (nx + nu))])
+    names += [f"f{k}" for k in range(gain_entries(nx, nu))]
+    values = np.concatenate([np.zeros(n * nx), gain.ravel(), np.zeros(gain_entries(nx, nu))])
     parameters = {name: Parameter(v, sign * v, "1") for name, v in zip(names, values, strict=True)}
 
     def response(*arguments: Named) -> Mapping[str, Expression]:

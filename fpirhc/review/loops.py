@@ -79,12 +79,12 @@ def _loops(grid: ReviewGrid, controller: Controller) -> Loops:
     def at(place: int, draw: int) -> LinearLoop:
         here = (grid.drawn_states[draw, place], grid.commands[draw, place])
         slopes = straight.slopes_on(here[0], grid.draws[draw])
-        feedback = straight.feedback_on(gains[place], here[0], grid.draws[draw], believed)
+        feedback = straight.feedback_on(gains[place], *here, grid.draws[draw], believed)
         own, model = (linear_parameters(slopes, *here, p, feedback) for p in (grid.draws[draw], believed))
         return matrices.at(own, model)
 
     first = (grid.states[places[0]], grid.commands[0, places[0]])
-    feedback = straight.feedback_on(gains[places[0]], first[0], believed, believed)
+    feedback = straight.feedback_on(gains[places[0]], *first, believed, believed)
     model = linear_parameters(straight.slopes_on(first[0], believed), *first, believed, feedback)
     ideal = loop_matrices(problem, without_deformation(stand_in)).at(model, model)
     drawn = [at(k, d) for k, d in _pairs(grid, places) if np.isfinite(grid.commands[d, k]).all()]
@@ -108,7 +108,7 @@ def loops_at(grid: ReviewGrid, controller: Controller, places: Sequence[int]) ->
     for k, gain in zip(places, feedbacks, strict=True):
         here = (grid.states[k], grid.commands[0, k])
         slopes = straight.slopes_on(here[0], grid.draws[0])
-        feedback = straight.feedback_on(gain, here[0], grid.draws[0], believed)
+        feedback = straight.feedback_on(gain, *here, grid.draws[0], believed)
         loops.append(matrices.at(*(linear_parameters(slopes, *here, p, feedback) for p in (grid.draws[0], believed))))
     return loops
 
@@ -137,7 +137,7 @@ def ideal_loops(grid: ReviewGrid, controller: Controller, count: int) -> list[tu
     loops = []
     for k, gain in zip(places, feedbacks, strict=True):
         slopes = straight.slopes_on(grid.states[k], believed)
-        feedback = straight.feedback_on(gain, grid.states[k], believed, believed)
+        feedback = straight.feedback_on(gain, grid.states[k], needed[k], believed, believed)
         model = linear_parameters(slopes, grid.states[k], needed[k], believed, feedback)
         effect = controlled_gain(straight.plant, straight.slopes, grid.states[k], needed[k], believed)
         loops.append((matrices.at(model, model), effect))
@@ -173,4 +173,5 @@ def plan_gains_at(grid: ReviewGrid, plan: Planner | None, times: list[float], be
     cost = plan.cost or problem.cost
     assert problem.horizon is not None
     assert cost is not None
-    return gains_at(problem, problem.horizon, cost, times, believed, grid.states_at)
+    consistent = plan.starts_consistent(problem.plant)
+    return gains_at(problem, problem.horizon, cost, times, believed, grid.states_at, consistent=consistent)

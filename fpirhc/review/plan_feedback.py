@@ -8,10 +8,11 @@ reference they bind nowhere. An end that must be met, C x_N = 0, enters exactly,
 
 `PlanFeedback` is the tracking law with which a plan that restarts from the measured state enters the linear loop,
 
-    q^Des = A^ x + B^ (K x + L u_before)      in deviations from the reference,
+    q^Des = A^ x + B^ u + D x + E u,      u = K x + L u_before      in deviations from the reference,
 
-as if the plan were renewed in every cycle. The input before is then the command of one stage ago: the plan limits the change of the
-inputs per stage and not per cycle. The shift of the command by the deformation is no part of it.
+D and E are zero unless the plan starts at another state than the measured one (`plan_of_outputs`). It is as if the plan were
+renewed in every cycle. The input before is then the command of one stage ago: the plan limits the change of the inputs per stage
+and not per cycle. The shift of the command by the deformation is no part of it.
 """
 
 from __future__ import annotations
@@ -37,6 +38,25 @@ from fpirhc.tracking.base import Tracking
 
 
 @dataclass(frozen=True, eq=False)
+class PlanStart:
+    """The state at which a plan on outputs starts, near a point.
+
+    Args:
+        state: x*, shape (nx,).
+        by_state: its slopes by the measured state, (nx, nx).
+        by_outputs: its slopes by the measured outputs, (nx, ny).
+        response: slopes of the model's response there by its state, (nu, nx).
+        response_by_input: by the planned input, (nu, nu).
+    """
+
+    state: np.ndarray
+    by_state: np.ndarray
+    by_outputs: np.ndarray
+    response: np.ndarray
+    response_by_input: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class PlanGain:
     """The first gains of a plan.
 
@@ -44,16 +64,29 @@ class PlanGain:
         state: K, shape (nu, nx).
         before: L, shape (nu, nu); zero unless the plan weighs the change of its inputs.
         outputs: K_d, shape (nu, ny), of the distance of measured outputs from the model's; None without outputs.
+        start: where the plan starts; None: at the measured state.
+        response: D, shape (nu, nx), the response of the plan's start less that of the model at the measured state; None: zero.
+        response_by_input: E, shape (nu, nu); None: zero.
     """
 
     state: np.ndarray
     before: np.ndarray
     outputs: np.ndarray | None = None
+    start: PlanStart | None = None
+    response: np.ndarray | None = None
+    response_by_input: np.ndarray | None = None
 
     @property
     def entries(self) -> np.ndarray:
-        """The entries of [K, L] by rows, shape (nu (nx + nu),)."""
-        return np.hstack([self.state, self.before]).ravel()
+        """The entries of [[K, L], [D, E]] by rows, shape (2 nu (nx + nu),)."""
+        response = np.zeros_like(self.state) if self.response is None else self.response
+        by_input = np.zeros_like(self.before) if self.response_by_input is None else self.response_by_input
+        return np.block([[self.state, self.before], [response, by_input]]).ravel()
+
+
+def gain_entries(nx: int, nu: int) -> int:
+    """Return the number of entries of a plan's gains."""
+    return 2 * nu * (nx + nu)
 
 
 def no_gain(plant: Plant) -> PlanGain:
@@ -64,7 +97,7 @@ def no_gain(plant: Plant) -> PlanGain:
 
 @dataclass(frozen=True)
 class PlanFeedback(Tracking):
-    """The feedback of a plan on a linear plant, whose last parameters are the entries of [K, L].
+    """The feedback of a plan on a linear plant, whose last parameters are the entries of [[K, L], [D, E]].
 
     Args:
         cycles: control cycles of one stage, after which a command is the input before; 0: the plan does not use it.
@@ -73,27 +106,29 @@ class PlanFeedback(Tracking):
     cycles: int = 0
 
     def law(self, plant: Plant, period: float) -> Block:
-        """Block (state, target, nominal, parameters, commands of one stage) -> desired."""
+        """Block (state, target, nominal, parameters, inputs of one stage) -> desired."""
         del period
-        target = Signal("_target", plant.state.elements, plant.state.units)
-        commands = (self._commands(plant, ""),) if self.cycles else ()
-        reads = (plant.state, target, plant.response_signal("nominal"), plant.parameter, *commands)
-        nx, nu = plant.state.size, plant.input.size
+        reads = (
+            plant.state,
+            self._target(plant),
+            plant.response_signal("nominal"),
+            plant.parameter,
+            *self._kept(plant),
+        )
+        nu = plant.input.size
 
         def step(s: Signals) -> dict[str, Expression]:
-            deviation = s.state - s._target
-            gains = ca.reshape(s.parameters[plant.parameter.size - nu * (nx + nu) :], nx + nu, nu).T
-            planned = ca.mtimes(gains[:, :nx], deviation)
-            if self.cycles:
-                planned = planned + ca.mtimes(gains[:, nx:], s._commands_of_stage[-nu:])
-            return {"desired": s.nominal + plant.controlled_response_function(deviation, planned, s.parameters)}
+            deviation, planned = s.state - s._target, self._planned(plant, s)
+            response = plant.controlled_response_function(deviation, planned, s.parameters)
+            besides = ca.mtimes(_gains(plant, s)[nu:, :], ca.vertcat(deviation, planned))
+            return {"desired": s.nominal + response + besides}
 
         return Block("tracking", Layout(reads), Layout((plant.response_signal("desired"),)), step)
 
     def update(self, plant: Plant, period: float) -> Block:
-        """Block (state, desired, parameters, commands of one stage) -> these, one cycle later; the newest stands first.
+        """Block (state, target, parameters, inputs of one stage) -> these, one cycle later; the newest stands first.
 
-        A plan's rate counts from the command without the shift by the deformation: the model's inverse of the desired response.
+        A plan's rate counts from the planned input: the command without the shift by the deformation.
         """
         del period
         if not self.cycles:
@@ -104,11 +139,22 @@ class PlanFeedback(Tracking):
 
         def step(s: Signals) -> dict[str, Expression]:
             older = [s._commands_of_stage[:keep]] if keep else []
-            newest = plant.inverse_function(s.state, s.desired, s.parameters)
-            return {"_commands_of_stage_after": ca.vertcat(newest, *older)}
+            return {"_commands_of_stage_after": ca.vertcat(self._planned(plant, s), *older)}
 
-        reads = Layout((plant.state, plant.response_signal("desired"), plant.parameter, self._commands(plant, "")))
+        reads = Layout((plant.state, self._target(plant), plant.parameter, *self._kept(plant)))
         return Block("tracking_update", reads, Layout((self._commands(plant, "_after"),)), step)
+
+    def _planned(self, plant: Plant, s: Signals) -> Expression:
+        nx, nu = plant.state.size, plant.input.size
+        gains = _gains(plant, s)[:nu, :]
+        planned = ca.mtimes(gains[:, :nx], s.state - s._target)
+        return planned + ca.mtimes(gains[:, nx:], s._commands_of_stage[-nu:]) if self.cycles else planned
+
+    def _target(self, plant: Plant) -> Signal:
+        return Signal("_target", plant.state.elements, plant.state.units)
+
+    def _kept(self, plant: Plant) -> tuple[Signal, ...]:
+        return (self._commands(plant, ""),) if self.cycles else ()
 
     def delays(self, plant: Plant) -> tuple[Delay, ...]:
         """The commands of one stage, where the plan uses the input before."""
@@ -117,6 +163,12 @@ class PlanFeedback(Tracking):
     def _commands(self, plant: Plant, suffix: str) -> Signal:
         names = tuple(f"{i} {k}" for k in range(self.cycles) for i in plant.input.elements)
         return Signal(f"_commands_of_stage{suffix}", names, plant.input.units * self.cycles)
+
+
+def _gains(plant: Plant, s: Signals) -> Expression:
+    nx, nu = plant.state.size, plant.input.size
+    count = gain_entries(nx, nu)
+    return ca.reshape(s.parameters[plant.parameter.size - count :], nx + nu, 2 * nu).T
 
 
 def plan_gains(

@@ -1,12 +1,14 @@
 """A plan on outputs near the reference: feedback of the state, of the measured outputs, and of the input before.
 
-A plan follows the reference less d, the distance of the measured outputs from the model's, extrapolated over the horizon (see
-`shifted_reference`). In deviations,
+A plan starts at x_s, the measured state or the one at which the model has the measured outputs (see `consistent_state`), and
+follows the reference less d, the distance of the measured outputs from those of the model at x_s (see `shifted_reference`). In
+deviations,
 
-    u = u* + K x + K_d d + L (u_before - u*),        d = (C - C^) x,
+    u = u* + K x_s + K_d d + L (u_before - u*),        x_s = (X + Y C) x,        d = C x - C^ x_s,
 
-with the slopes C and C^ of y, y', ... by the state, of the plant that moves and of the model. K_d is the feedforward of the Riccati
-recursion for a reference that is shifted by each entry of d,
+with the slopes C and C^ of y, y', ... by the state, of the plant that moves and of the model, and those of x_s by state and
+outputs, X and Y. The response asked for is that of the model at x_s. K_d is the feedforward of the Riccati recursion for a
+reference that is shifted by each entry of d,
 
     v_k = q_k + A' v_{k+1} + (S + B' P A)' g_k,      g_k = -(R + B' P B)^-1 (r_k + B' v_{k+1}),      K_d = g_0,
 
@@ -24,13 +26,15 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
+from fpirhc.horizon.consistent_state import consistent_state
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stage, linear_stage, stage_symbols
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.review.plan_feedback import PlanGain, plan_gains
+from fpirhc.plant.plant import Plant
+from fpirhc.review.plan_feedback import PlanGain, PlanStart, plan_gains
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem import Problem
 
@@ -44,15 +48,25 @@ def gains_at(
     times: Sequence[float],
     believed: np.ndarray,
     states_at: Callable[[np.ndarray], np.ndarray],
+    *,
+    consistent: bool = False,
 ) -> list[PlanGain]:
-    """Return the gains of plans on outputs, or on coordinates; arguments as in `plan_gains`."""
+    """Return the gains of plans on outputs, or on coordinates; arguments as in `plan_gains` and `output_plan_gains`."""
     if not problem.plant.outputs:
         return plan_gains(problem, horizon, cost, times, believed, states_at)
-    return output_plan_gains(problem, horizon, cost, times, states_at(np.array(times)), believed)
+    states = states_at(np.array(times))
+    return output_plan_gains(problem, horizon, cost, times, states, believed, consistent=consistent)
 
 
 def output_plan_gains(
-    problem: Problem, horizon: Horizon, cost: Cost, times: Sequence[float], states: np.ndarray, believed: np.ndarray
+    problem: Problem,
+    horizon: Horizon,
+    cost: Cost,
+    times: Sequence[float],
+    states: np.ndarray,
+    believed: np.ndarray,
+    *,
+    consistent: bool = False,
 ) -> list[PlanGain]:
     """Return the gains of the plans that start on the reference at these times.
 
@@ -63,6 +77,7 @@ def output_plan_gains(
         times: at which the plans start.
         states: of the plant that moves at these times, shape (m, nx).
         believed: parameters of the model, shape (np,).
+        consistent: whether plans start where the model has the measured outputs.
     """
     plant = problem.plant
     horizon = replace(horizon, margins={})
@@ -73,16 +88,37 @@ def output_plan_gains(
     )
     sweep = (linear_stage(ocp), hessian_stage(ocp, GaussNewton()), hessian_end(ocp), *_slopes_by_data(ocp))
     reference, controlled = problem.reference.function(plant), list(plant.face.controlled_indices)
+    start_at = _starts(plant) if consistent else None
     gains = []
     for time, state in zip(times, states, strict=True):
         clock = time + horizon.step * np.arange(ocp.stages)
         seen, responses = (np.asarray(v.full()) for v in reference.map(ocp.stages)(clock[None, :]))
         table, y = data_of(time, believed), seen[:, 0]
-        data = np.asarray(shifted(table, state, y, believed).full())
-        moves = [np.asarray(shifted(table, state, y + e, believed).full()) - data for e in np.eye(len(y))]
-        motion = _motion(ocp, plant.inverse_function, state, responses[controlled], data, believed)
-        gains.append(_gains(sweep, *motion, data, moves, plant.state.size))
+        start = None if start_at is None else start_at(state, y, responses[controlled, 0], believed)
+        begin = state if start is None else start.state
+        data = np.asarray(shifted(table, begin, y, believed).full())
+        moves = [np.asarray(shifted(table, begin, y + e, believed).full()) - data for e in np.eye(len(y))]
+        motion = _motion(ocp, plant.inverse_function, begin, responses[controlled], data, believed)
+        gain = _gains(sweep, *motion, data, moves, plant.state.size)
+        gains.append(replace(gain, start=start))
     return gains
+
+
+def _starts(plant: Plant) -> Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], PlanStart]:
+    """Function (state, outputs, response, parameters) -> where the model has these outputs, and its slopes there."""
+    x, y, p = (ca.MX.sym(one.name, one.size) for one in (plant.state, plant.output, plant.parameter))
+    found = consistent_state(plant)(x, y, p)
+    moved = ca.Function("fpirhc_start", [x, y, p], [found, *(ca.densify(ca.jacobian(found, v)) for v in (x, y))])
+    s, u, q = plant.symbols()
+    response = plant.controlled_response_function(s, u, q)
+    slopes = ca.Function("fpirhc_response_slopes", [s, u, q], [ca.densify(ca.jacobian(response, v)) for v in (s, u)])
+
+    def start(state: np.ndarray, outputs: np.ndarray, wanted: np.ndarray, believed: np.ndarray) -> PlanStart:
+        at, *ways = (np.asarray(m.full()) for m in moved(state, outputs, believed))
+        planned = plant.inverse_function(at, wanted, believed)
+        return PlanStart(at.ravel(), *ways, *(np.asarray(m.full()) for m in slopes(at, planned, believed)))
+
+    return start
 
 
 def _motion(

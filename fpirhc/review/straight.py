@@ -11,7 +11,7 @@ T is that of the plant that moves: the outputs are measured on it, and a model's
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TypeAlias
 
@@ -43,22 +43,32 @@ class Straight:
     change: ca.Function | None = None
     shown: ca.Function | None = None
 
-    def feedback_on(self, gain: PlanGain, state: np.ndarray, exact: np.ndarray, believed: np.ndarray) -> PlanGain:
+    def feedback_on(
+        self, gain: PlanGain, state: np.ndarray, command: np.ndarray, exact: np.ndarray, believed: np.ndarray
+    ) -> PlanGain:
         """Return a plan's feedback in the coordinates of the plant that moves; without outputs the gain itself.
 
         Args:
             gain: in the states x, and of d = (C - C^) x.
             state: of the point, shape (nx,).
+            command: there, shape (nu,).
             exact: parameters of the plant that moves, shape (np,).
             believed: those of the model.
         """
         if self.change is None or gain.outputs is None:
             return gain
         assert self.shown is not None
-        real, model = (np.asarray(self.shown(state, p).full()) for p in (exact, believed))
-        whole = gain.state + gain.outputs @ (real - model)
+        start = gain.start
+        at = state if start is None else start.state
+        real, model = np.asarray(self.shown(state, exact).full()), np.asarray(self.shown(at, believed).full())
+        moved = np.eye(len(state)) if start is None else start.by_state + start.by_outputs @ real
         change = np.asarray(self.change(state, exact).full())
-        return PlanGain(np.linalg.solve(change.T, whole.T).T, gain.before)
+        planned = np.linalg.solve(change.T, (gain.state @ moved + gain.outputs @ (real - model @ moved)).T).T
+        if start is None:
+            return PlanGain(planned, gain.before)
+        here, by_input = (np.asarray(m.full())[: len(command)] for m in self.slopes(state, command, believed))
+        besides = np.linalg.solve(change.T, (start.response @ moved - here).T).T
+        return replace(gain, state=planned, response=besides, response_by_input=start.response_by_input - by_input)
 
     def slopes_on(self, state: np.ndarray, exact: np.ndarray) -> Slopes:
         """Return the function (state, input, parameters) -> A (n, nx), B (n, nu) in the coordinates of the plant that moves.

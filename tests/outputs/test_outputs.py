@@ -496,7 +496,8 @@ def test_a_deviation_needs_references_of_all_states() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "described"), [("CTC", 0.142), ("CTC+FPI", 0.0126), ("RHC", 0.108), ("RHC+FPI", 0.00684)]
+    ("name", "described"),
+    [("CTC", 0.142), ("CTC+FPI", 0.0126), ("RHC", 0.356), ("RHC consistent", 0.0851), ("RHC+FPI", 0.00875)],
 )
 def test_the_shipped_anaesthesia_does_what_its_description_says(name: str, described: float) -> None:
     task = fp.load_problem("anaesthesia")

@@ -17,6 +17,7 @@ from test_outputs import SHORT, TWO_MASS, arm, circle, hill, on_outputs, planned
 
 import fpirhc as fp
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
+from fpirhc.horizon.consistent_state import consistent_state
 from fpirhc.learning.estimators.disturbed import disturbed
 from fpirhc.studies.comparison.information import information
 
@@ -128,7 +129,8 @@ def test_a_plan_does_not_see_a_disturbance_of_the_response_and_the_inverse_does(
     problem = replace(planned(), duration=1.0, measure_from=0.0)
     run = simulated(problem, fp.Estimating(PLAN, ANSWER))
     plant, k = problem.plant, 30
-    without = plant.controlled_response_function(run["state"][k], run["planned"][k], [5.5]).full().ravel()
+    start = consistent_state(plant)(run["state"][k], run["output"][k], [5.5])
+    without = plant.controlled_response_function(start, run["planned"][k], [5.5]).full().ravel()
     assert np.allclose(run["desired"][k], without)
     aimed = run["desired"][k] - run["estimate"][k]
     assert np.allclose(run["command"][k], plant.inverse_function(run["state"][k], aimed, [5.5]).full().ravel())

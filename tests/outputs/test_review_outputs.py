@@ -52,7 +52,7 @@ def test_the_feedback_of_a_plan_is_what_a_plan_does() -> None:
     straight = straightened(problem)
     assert straight.change is not None
     assert gain.outputs is not None
-    feedback = straight.feedback_on(gain, problem.start_state, plant.exact, plant.approximate)
+    feedback = straight.feedback_on(gain, problem.start_state, np.array([LEVEL]), plant.exact, plant.approximate)
     change = straight.change(problem.start_state, plant.exact).full()
 
     def first(**settings: Any) -> float:
@@ -64,7 +64,8 @@ def test_the_feedback_of_a_plan_is_what_a_plan_does() -> None:
         for n in ("C", "E")
     ]
     assert np.allclose((feedback.state @ change).ravel(), slopes, rtol=1e-5)
-    assert np.abs(gain.outputs).min() > 1  # the wrong curve counts
+    assert np.abs(gain.outputs[0, 0]) > 1  # the wrong curve counts, and its slope is not extrapolated
+    assert gain.outputs[0, 1] == 0
     before = (first(input_before={"u": LEVEL + size}) - first(input_before={"u": LEVEL - size})) / (2 * size)
     assert feedback.before.item() == pytest.approx(before, rel=1e-5)
 

@@ -10,6 +10,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.own_reference import own_signals
 from fpirhc.errors import FpirhcError
+from fpirhc.horizon.consistent_state import consistent_state
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
@@ -76,6 +77,7 @@ def measure_optimality(
         return None
     data_of = stage_data(planned.plant, planned.reference, planned.horizon, planned.cost, signals=ahead)
     of_measured = shifted_reference(planned.plant, ocp.data, ocp.stages + 1) if planned.plant.outputs else None
+    begin = consistent_state(planned.plant) if planner.starts_consistent(planned.plant) else None
     stride = cycles_per_stage(problem.horizon, problem.period)
     plans = np.arange(stride, run.cycles, stride)
     rows = plans[np.unique(np.linspace(0, plans.size - 1, SAMPLES).astype(int))] if plans.size else plans
@@ -85,10 +87,11 @@ def measure_optimality(
     excess = []
     for row in rows:
         shift = run["command_shift"][row - 1]
-        first = ocp.start(states[row], run["command"][row - 1] - shift).full().ravel()
+        state = states[row] if begin is None else begin(states[row], seen[row], parameters[row])
+        first = ocp.start(state, run["command"][row - 1] - shift).full().ravel()
         data = np.asarray(data_of(times[row], parameters[row]).full())
         if of_measured is not None:
-            data = np.asarray(of_measured(data, states[row], seen[row], parameters[row]).full())
+            data = np.asarray(of_measured(data, state, seen[row], parameters[row]).full())
         best = solve(first, data, ocp.input_lower - shift, ocp.input_upper - shift)
         cost_of_plan = run["solve.cost"][row]
         if best is not None and run["status"][row] <= Status.NOT_CONVERGED:

@@ -1,0 +1,95 @@
+"""The state of the model at which its outputs and their derivatives are the measured ones, y^(j) = h_j(x*, p), j < r.
+
+A wrong model computes other derivatives of its outputs at the measured state than are measured. A deformation makes y^(r) that of
+the model, so the plant moves like the model along y, y', ..., y^(r-1). A plan foresees this where it starts from the same numbers:
+then y(t) = h(x^(t)) for every input, since both obey y^(r) = L_f^r h (x*(y, y', ...), u). At the measured state it holds only where
+the response of the model does not depend on the state.
+
+The state is looked for by Newton's method, along the directions in which other inputs of the past would have moved it,
+
+    x* = x + sum_j sum_{k < r_j} c_jk ad_f^k g b_j,
+
+with the inputs b_j that move y_j^(r_j) alone, column j of (L_g L_f^(r-1) h)^-1, as many numbers as equations. <dL_f^l h_i, ad_f^k
+g b_j> is zero for k < r_i - 1 - l and (-1)^k at i = j for k = r_i - 1 - l, so the equations are triangular in k and regular
+wherever the inverse is, whatever the orders and the units. With equal orders b_j cancels.
+
+Where the steps do not contract, the state goes a part of the way or stays, continuously, so that no sample decides between two
+plans. What is left over of the outputs is held over the horizon (see `shifted_reference`).
+
+References:
+    A. Isidori, Nonlinear Control Systems, 3rd ed., Springer 1995, lemmas 4.1.1 and 5.1.1.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from fpirhc.plant.instant import response_orders
+from fpirhc.plant.plant import Plant
+
+_STEPS = 4
+_GOOD, _POOR = 0.25, 0.5  # last step by the first: below, the state is found; above, it is not looked for
+
+
+def consistent_state(plant: Plant) -> ca.Function:
+    """Return the Function (state, outputs, parameters) -> state at which the model has the controlled ones of these outputs.
+
+    Args:
+        plant: the model, with outputs; no controlled one has the order 0.
+    """
+    newton = _newton(plant)
+    start, y, p = (
+        ca.MX.sym("x", plant.state.size),
+        ca.MX.sym("y", plant.output.size),
+        ca.MX.sym("p", plant.parameter.size),
+    )
+    x, sizes = start, []
+    for _ in range(_STEPS):
+        move, size = newton(x, y, p)
+        x = x + move
+        sizes.append(size)
+    found = _trusted(plant.state.size)(start, x, sizes[0], sizes[-1])
+    return ca.Function("fpirhc_consistent_state", [start, y, p], [found], ["x", "y", "p"], ["found"])
+
+
+def _trusted(count: int) -> ca.Function:
+    """Function (start, end, size of the first step, of the last) -> as far from start to end as the contraction is worth."""
+    start, end = ca.SX.sym("start", count), ca.SX.sym("end", count)
+    first, last = ca.SX.sym("first"), ca.SX.sym("last")
+    whole = (_POOR - _GOOD) * ca.if_else(first > 0, first, 1)
+    share = ca.fmax(0, ca.fmin(1, (_POOR * first - last) / whole))
+    # What is not a number compares as false.
+    reached = ca.if_else(last <= _GOOD * first, end, start + share * (end - start))
+    found = ca.if_else(last <= _POOR * first, reached, start)
+    return ca.Function("fpirhc_trusted_state", [start, end, first, last], [found])
+
+
+def _newton(plant: Plant) -> ca.Function:
+    """Function (state, outputs, parameters) -> (move of the state, sum of the inputs' pulses that would have made it)."""
+    x, _, p = plant.symbols()
+    y, orders = ca.SX.sym("y", plant.output.size), response_orders(plant)
+    rows = [k for k, e in enumerate(plant.output.elements) if e.rstrip("'") in orders]
+    outputs = plant.output_function(x, ca.SX.zeros(len(plant.inputs)), p, ca.SX.zeros(len(plant.names)))[rows]
+    basis, pulses = _basis(plant, x, p, list(orders.values()))
+    seen = ca.mtimes(ca.jacobian(outputs, x), basis)
+    c = ca.solve(ca.densify(seen), y[rows] - outputs)
+    size = ca.sum1(ca.fabs(ca.mtimes(pulses, c)))  # a maximum would skip what is not a number
+    return ca.Function("fpirhc_newton_of_outputs", [x, y, p], [ca.densify(ca.mtimes(basis, c)), ca.densify(size)])
+
+
+def _basis(plant: Plant, x: ca.SX, p: ca.SX, orders: list[int]) -> tuple[ca.SX, ca.SX]:
+    """The directions, a column per order of every output; and the inputs of each, one below the other by k."""
+    still, u = ca.SX.zeros(len(plant.inputs)), ca.SX.sym("u", len(plant.inputs))
+    drift, moved = plant.derivative_function(x, still, p), plant.derivative_function(x, u, p)
+    alone = ca.SX.eye(len(orders))
+    if len(set(orders)) > 1:
+        slope = ca.substitute(ca.jacobian(plant.controlled_response_function(x, u, p), u), u, still)
+        alone = ca.solve(ca.densify(slope), alone)
+    field = ca.substitute(ca.jacobian(moved, u), u, still)
+    columns, pulses = [], []
+    for k in range(max(orders)):
+        chosen = alone[:, [j for j, order in enumerate(orders) if order > k]]
+        columns.append(ca.mtimes(field, chosen))
+        pulses.append(chosen)
+        field = ca.horzcat(*(ca.jtimes(drift, x, g) - ca.jtimes(g, x, drift) for g in ca.horzsplit(field)))
+    return ca.horzcat(*columns), ca.diagcat(*pulses)
