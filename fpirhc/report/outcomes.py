@@ -1,4 +1,4 @@
-"""Colours of outcomes: green is better, red worse, amber mixed; no difference and not comparable have none."""
+"""Colours of outcomes: green is better, red worse, amber mixed or doubtful; no difference and not comparable have none."""
 
 from __future__ import annotations
 
@@ -8,7 +8,14 @@ if TYPE_CHECKING:
     from fpirhc.studies.comparison.compare import Comparison
     from fpirhc.studies.comparison.outcome import Outcome
 
-_STYLES = {"better": "green", "worse": "bold red", "mixed": "yellow", "no difference": "", "not comparable": "dim"}
+_STYLES = {
+    "better": "green",
+    "worse": "bold red",
+    "mixed": "yellow",
+    "doubtful": "yellow",
+    "no difference": "",
+    "not comparable": "dim",
+}
 
 
 def terminal_style(outcome: Outcome | None) -> str:

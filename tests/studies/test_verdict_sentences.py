@@ -11,6 +11,7 @@ from hand_made_runs import CYCLES, SOLVE
 
 from fpirhc.simulation.metrics import Metrics, known_metrics
 from fpirhc.simulation.run import Run
+from fpirhc.studies.comparison.caveats import Yardstick
 from fpirhc.studies.comparison.compare import Entry
 from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.studies.comparison.timing import CycleTime, Price
@@ -46,8 +47,8 @@ def said(*entries: Entry, skipped=None, headline=None) -> tuple[str, ...]:
     return tuple(finding.text for finding in findings(entries, skipped or {}, headline))
 
 
-def first(*entries: Entry, scales=None) -> Finding:
-    return findings(entries, {}, None, scales)[0]
+def first(*entries: Entry, scales=None, **against: Any) -> Finding:
+    return findings(entries, {}, None, Yardstick(scales or {}, **against))[0]
 
 
 def no_difference(**adaptive: Any) -> str:
@@ -167,6 +168,56 @@ def test_price(price, words):
     """
     plain, adaptive = entry("RHC"), entry("FPI", "RHC", errors={"y": 0.5}, facts={"price": price})
     assert said(plain, adaptive) == (f"FPI lowers the rms error of y from 1 to 0.5 m (2 times less){words}",)
+
+
+# Why a smaller error is no success
+
+
+def test_a_pair_is_compared_with_the_plant_left_alone():
+    """A servo that never moves has 0.346 rad: 0.389 in place of 0.543 is no success, and the sentence says so first."""
+    plain, adaptive = entry("RHC", errors={"z": 0.543}), entry("FPI", "RHC", errors={"z": 0.389})
+    assert first(plain, adaptive, alone={"z": 0.346}) == Finding(
+        "RHC and FPI do worse than the plant left alone, whose input stays as it was before the run: rms error 0.346 rad in z. "
+        "FPI lowers the rms error of z from 0.543 to 0.389 rad (1.4 times less).",
+        Outcome.DOUBTFUL,
+        ("RHC", "FPI"),
+        {"z": 0.389 / 0.543},
+    )
+    assert first(plain, adaptive, alone={"z": 0.39}).outcome is Outcome.BETTER
+    assert first(plain, adaptive).outcome is Outcome.BETTER
+    two = entry("RHC", errors={"y": 1.0, "z": 0.5}), entry("FPI", "RHC", errors={"y": 0.5, "z": 0.25})
+    assert first(*two, alone={"y": 0.4, "z": 2.0}).outcome is Outcome.BETTER  # it has brought z down
+    worse = first(entry("RHC", errors={"y": 0.1}), entry("FPI", "RHC", errors={"y": 0.5}), alone={"y": 0.4})
+    assert worse.outcome is Outcome.WORSE
+    assert worse.text.endswith(
+        "0.5 m (5 times more). FPI does worse than the plant left alone, whose input stays as it was before the run: rms error "
+        "0.4 m in y."
+    )
+
+
+def test_an_error_beyond_the_range_of_the_reference_is_a_failure_of_both():
+    """From 295 to 49.7 m along a reference of 2 m is no success; the reason follows."""
+    lost: dict[str, Any] = {"measured": {"status": {"NOT_CONVERGED": CYCLES}}}
+    plain, adaptive = entry("RHC", errors={"y": 295.0}), entry("FPI", "RHC", errors={"y": 49.7}, **lost)
+    failed = first(plain, adaptive, ranges={"y": 2.0})
+    assert failed.outcome is Outcome.NOT_COMPARABLE
+    assert failed.text == (
+        "Neither RHC nor FPI follows the reference: the rms error of y is 295 and 49.7 m, the range of its reference 2. Its plans "
+        "did not converge in 100 % of the cycles (those of RHC in 0 %), so this is not the optimum of its cost: give the optimiser "
+        "more iterations, then compare."
+    )
+    assert first(plain, entry("FPI", "RHC", errors={"y": 1.9}), ranges={"y": 2.0}).outcome is Outcome.BETTER
+
+
+def test_reasons_stand_before_a_positive_verdict():
+    """Plans that did not converge and commands at their limits make it doubtful."""
+    unsolved = {"status": {"NOT_CONVERGED": 0.42 * CYCLES}}
+    finding = first(entry("RHC"), entry("FPI", "RHC", errors={"y": 0.5}, measured=unsolved))
+    assert finding.outcome is Outcome.DOUBTFUL
+    assert finding.text.startswith("Its plans did not converge in 42 % of the cycles")
+    assert finding.text.endswith("then compare. FPI lowers the rms error of y from 1 to 0.5 m (2 times less).")
+    few = {"status": {"NOT_CONVERGED": 0.04 * CYCLES}}
+    assert first(entry("RHC"), entry("FPI", "RHC", errors={"y": 0.5}, measured=few)).outcome is Outcome.BETTER
 
 
 # The other rows

@@ -28,8 +28,8 @@ def causes(plain: Entry, adaptive: Entry) -> str:
         _gain_cause(adaptive),
         _slew_cause(plain, adaptive),
         _effort_cause(adaptive),
-        _plan_cause(plain, adaptive),
-        _limit_cause(plain, adaptive),
+        plan_cause(plain, adaptive),
+        limit_cause(plain, adaptive),
     )
     return "".join(f" {sentence}" for sentence in sentences if sentence)
 
@@ -65,7 +65,8 @@ def _effort_cause(entry: Entry) -> str:
     )
 
 
-def _plan_cause(plain: Entry, adaptive: Entry) -> str:
+def plan_cause(plain: Entry, adaptive: Entry) -> str:
+    """Return a sentence where plans that did not converge are a reason; else nothing."""
     before, after = (_share(e, "status", Status.NOT_CONVERGED.name) / max(1, e.run.cycles) for e in (plain, adaptive))
     swings = (
         before < 0.5 * after and _share(adaptive, "clipped_share", "") >= _OFTEN
@@ -78,7 +79,8 @@ def _plan_cause(plain: Entry, adaptive: Entry) -> str:
     )
 
 
-def _limit_cause(plain: Entry, adaptive: Entry) -> str:
+def limit_cause(plain: Entry, adaptive: Entry) -> str:
+    """Return a sentence where commands at their limits are a reason; else nothing."""
     before, after = (_share(e, "clipped_share", "") for e in (plain, adaptive))
     if after < _OFTEN:
         return ""

@@ -91,17 +91,23 @@ def major(changes: Mapping[str, Change]) -> dict[str, Change]:
 
 def scales(problem: Problem) -> dict[str, float]:
     """Return the scale of every judged coordinate."""
+    moving = ranges(problem)
+    return {name: moving.get(name) or _tolerance(problem, name) for name in problem.judged_names}
+
+
+def ranges(problem: Problem) -> dict[str, float]:
+    """Return the range of every reference that moves, the start included."""
     plant = problem.plant
     function = problem.reference.function(plant)
     times = np.linspace(0.0, problem.duration, _SAMPLES)
     states = np.asarray(function.map(_SAMPLES)(times[None, :])[0].full())
     wanted = np.column_stack([problem.start_output, states])
-    ranges = {}
+    moving = {}
     for name in problem.judged_names:
         row = wanted[plant.output.elements.index(name)]
-        moves = np.ptp(row) > ROUNDING * max(1.0, float(np.abs(row).max()))
-        ranges[name] = float(np.ptp(row)) if moves else _tolerance(problem, name)
-    return ranges
+        if np.ptp(row) > ROUNDING * max(1.0, float(np.abs(row).max())):
+            moving[name] = float(np.ptp(row))
+    return moving
 
 
 def _tolerance(problem: Problem, name: str) -> float:

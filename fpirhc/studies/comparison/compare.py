@@ -25,9 +25,11 @@ from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, judged_run, simulator
-from fpirhc.studies.comparison.changes import scales
+from fpirhc.studies.comparison.caveats import Yardstick
+from fpirhc.studies.comparison.changes import ranges, scales
 from fpirhc.studies.comparison.entry_facts import has_exact_model, plan_every, weighed
 from fpirhc.studies.comparison.information import Information, information, sentences
+from fpirhc.studies.comparison.left_alone import error_left_alone
 from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import Optimality, measure_optimality
 from fpirhc.studies.comparison.outcome import Finding, Outcome
@@ -236,7 +238,8 @@ def compare(
     ran, skipped = _entries(task, selected, seed, compiled, progress, loops, changes or {})
     sizes = scales(task.problem)
     entries = beside_each_other(task.problem, ran, loops, sizes, compiled=compiled)
-    judged = findings(entries, skipped, task.headline, sizes)
+    yardstick = Yardstick(sizes, ranges(task.problem), error_left_alone(task.problem, seed=seed))
+    judged = findings(entries, skipped, task.headline, yardstick)
     return Comparison(
         problem=task.name,
         title=task.title,

@@ -13,6 +13,7 @@ class Outcome(StrEnum):
     BETTER = "better"
     WORSE = "worse"
     MIXED = "mixed"
+    DOUBTFUL = "doubtful"  # a smaller error, and a reason why it is no success
     NO_DIFFERENCE = "no difference"
     NOT_COMPARABLE = "not comparable"
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from fpirhc.plant.units import with_space
 from fpirhc.studies.comparison.causes import causes
+from fpirhc.studies.comparison.caveats import Yardstick, caveats, left_alone_is_better, not_followed
 from fpirhc.studies.comparison.changes import Change, major, outcome_of, times
 from fpirhc.studies.comparison.other_rows import remarks
 from fpirhc.studies.comparison.outcome import Finding, Outcome
@@ -25,7 +26,7 @@ def findings(
     entries: Sequence[Entry],
     skipped: Mapping[str, str],
     headline: tuple[str, str] | None,
-    scales: Mapping[str, float] | None = None,
+    yardstick: Yardstick | None = None,
 ) -> tuple[Finding, ...]:
     """Return the verdict's sentences: the headline pair first, the other pairs, what other rows show, what was not run.
 
@@ -33,21 +34,22 @@ def findings(
         entries: the controllers that ran.
         skipped: reasons why others did not.
         headline: names without and with adaptation of the pair that comes first.
-        scales: by which errors are judged, by coordinate; 1 where not named.
+        yardstick: what errors are measured against; None: each in its own unit.
     """
+    measure = yardstick or Yardstick()
     by_name = {e.name: e for e in entries}
     pairs = [(by_name[e.pair], e) for e in entries if e.pair in by_name]
     first = [p for p in pairs if headline and (p[0].name, p[1].name) == headline]
     receding = [p for p in pairs if "solve" in p[1].run.layout]
     ordered = list(dict.fromkeys([*first, *receding, *pairs]))
-    judged = [judge(plain, adaptive, scales or {}) for plain, adaptive in ordered] or [_no_pair(entries)]
-    judged += remarks(entries, ordered[0] if ordered else None, scales or {})
+    judged = [judge(plain, adaptive, measure) for plain, adaptive in ordered] or [_no_pair(entries)]
+    judged += remarks(entries, ordered[0] if ordered else None, measure.scales)
     if skipped:
         judged.append(Finding("Not run: " + "; ".join(f"{name} ({why})" for name, why in skipped.items()) + "."))
     return tuple(judged)
 
 
-def judge(plain: Entry, adaptive: Entry, scales: Mapping[str, float]) -> Finding:
+def judge(plain: Entry, adaptive: Entry, yardstick: Yardstick) -> Finding:
     """Return what adaptation does to one pair."""
     pair = (plain.name, adaptive.name)
     if adaptive.run.stop is not None:
@@ -58,7 +60,7 @@ def judge(plain: Entry, adaptive: Entry, scales: Mapping[str, float]) -> Finding
         return Finding(
             f"{adaptive.name} finishes where {plain.name} does not ({plain.run.stop}).", Outcome.BETTER, pair
         )
-    changes = _changes(plain, adaptive, scales)
+    changes = _changes(plain, adaptive, yardstick.scales)
     lost = [c.name for c in changes.values() if not math.isfinite(c.before + c.after)]
     if lost or not changes:
         text = f"{adaptive.name} and {plain.name} cannot be compared: the error of {', '.join(lost) or 'nothing'} is no number."
@@ -68,10 +70,16 @@ def judge(plain: Entry, adaptive: Entry, scales: Mapping[str, float]) -> Finding
     outcome = outcome_of(counted)
     beside = _minor(adaptive, [c for n, c in weighed.items() if n not in counted])
     beside += _not_weighed(adaptive, [c for n, c in changes.items() if n not in weighed])
+    ratios = {n: c.ratio for n, c in counted.items()}
+    lost_both = not_followed(plain, adaptive, list(counted), yardstick)
+    if lost_both:
+        return Finding(f"{lost_both}{causes(plain, adaptive)}", Outcome.NOT_COMPARABLE, pair, ratios)
     text = _SENTENCES[outcome](plain, adaptive, list(counted.values())) + beside
     if outcome is not Outcome.BETTER:
-        text += causes(plain, adaptive)
-    return Finding(text, outcome, pair, {n: c.ratio for n, c in counted.items()})
+        worse = left_alone_is_better(plain, adaptive, list(counted), yardstick)
+        return Finding(text + (f" {worse}" if worse else "") + causes(plain, adaptive), outcome, pair, ratios)
+    against = caveats(plain, adaptive, list(counted), yardstick)
+    return Finding(f"{against} {text}" if against else text, Outcome.DOUBTFUL if against else outcome, pair, ratios)
 
 
 def _changes(plain: Entry, adaptive: Entry, scales: Mapping[str, float]) -> dict[str, Change]:

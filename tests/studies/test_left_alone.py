@@ -1,0 +1,54 @@
+"""The error of a plant that is left alone, against the integral of its motion by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.studies.comparison.changes import ranges
+from fpirhc.studies.comparison.left_alone import error_left_alone
+
+
+def tank(**changes: Any) -> fp.Problem:
+    """Y' = -2 y + u with u = 3 held: y = 1.5 - 0.5 exp(-2 t) from y = 1, while the reference is 1.5 + 0.1 sin t."""
+    plant = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "m/s"},
+        order=1,
+        response=lambda q, u, p: {"y": -p.rate * q.y + u.u},
+        parameters={"rate": fp.Parameter(5.0, 2.0, "1/s")},
+    )
+    usual: dict[str, Any] = {"plant": plant, "reference": fp.Trajectory(lambda t: {"y": 1.5 + 0.1 * ca.sin(t)})}
+    usual |= {"start": {"y": 1.0}, "period": 1e-2, "duration": 2.0, "input_before": {"u": 3.0}}
+    return fp.Problem(**(usual | changes))
+
+
+def test_the_exact_plant_moves_under_the_input_before():
+    """It is the exact plant, from the start of the problem, measured from `measure_from` on."""
+    t = np.arange(200) * 1e-2
+    error = 0.1 * np.sin(t) + 0.5 * np.exp(-2 * t)
+    assert error_left_alone(tank(), seed=0)["y"] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-6)
+    late = error_left_alone(tank(measure_from=1.0), seed=0)["y"]
+    assert late == pytest.approx(np.sqrt(np.mean(error[100:] ** 2)), rel=1e-6)
+
+
+def test_a_run_that_ends_early_is_no_yardstick():
+    """A plant that blows up when it is left alone gives no number."""
+    runaway = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "m/s"},
+        order=1,
+        response=lambda q, u, p: {"y": p.rate * q.y**3 + u.u},
+        parameters={"rate": fp.Parameter(400.0, 400.0, "1/(m2 s)")},
+    )
+    assert error_left_alone(tank(plant=runaway), seed=0) == {}
+
+
+def test_ranges_are_those_of_references_that_move():
+    """The start counts; a set-point that is held where it starts has none."""
+    assert ranges(tank(duration=10.0))["y"] == pytest.approx(0.6, rel=1e-3)
+    assert ranges(tank(reference=fp.Trajectory(lambda t: {"y": 1.0 + 0 * t}))) == {}
