@@ -18,6 +18,7 @@ class Status(IntEnum):
     SOLVER_FAILED = 7
     SATURATED = 8
     NOT_CONTRACTING = 9
+    BAD_TIME = 12
 
     @property
     def severity(self) -> int:
@@ -34,6 +35,7 @@ _BEST_TO_WORST = (
     Status.OK,
     Status.NOT_CONVERGED,
     Status.BAD_SAMPLE,
+    Status.BAD_TIME,
     Status.SATURATED,
     Status.INFEASIBLE,
     Status.HELD,
@@ -54,6 +56,8 @@ _REMEDIES = {
     "measurement is outside the model's domain, or the loop diverged.",
     Status.BAD_SAMPLE: "a measurement was not finite, implausible, or out of date: the cycle was skipped, with the last command "
     "and every memory as it was; look at the sensor, or widen the plausible range.",
+    Status.BAD_TIME: "the time of the step cannot follow that of the last one: it repeats, goes back, or has another unit; the "
+    "cycle was skipped. Give every step the time of its cycle.",
     Status.RESTARTED: "the memory was not finite and was forgotten: the controller began anew; look at where the memory is kept.",
     Status.SOLVER_FAILED: "a solver raised an error: the cycle was skipped, with the last command and every memory as it was; "
     "use FixedPoint(), or look at the measurement that the solver was given.",

@@ -58,5 +58,6 @@ def is_trial(failed: Expression) -> Expression:
 
 
 def was_skipped(status: Expression) -> Expression:
-    """Return whether a cycle of this status was skipped: its sample or its step was not good."""
-    return ca.logic_or(status == int(Status.BAD_SAMPLE), status == int(Status.NON_FINITE))
+    """Return whether a cycle of this status was skipped: its sample, its time or its step was not good."""
+    bad = ca.logic_or(status == int(Status.BAD_SAMPLE), status == int(Status.NON_FINITE))
+    return ca.logic_or(bad, status == int(Status.BAD_TIME))

@@ -1,6 +1,6 @@
 """A controller as it runs against a machine: behind its gate, with a fingerprint in its memory, and watched.
 
-fingerprint -> gate (controller) -> watch -> count of skipped cycles
+fingerprint, clock -> gate (controller) -> watch -> count of skipped cycles
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
+from fpirhc.controllers.base import fed
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.gate import Gate
 from fpirhc.controllers.step_outcome import was_skipped
 from fpirhc.controllers.watch import watch_block
 from fpirhc.describe import describe
+from fpirhc.simulation.clock import CLOCK, clock_block, clock_status_block
 from fpirhc.symbolic.block import Block, Composite, compose
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.finite import FINITE
@@ -24,7 +26,7 @@ from fpirhc.task.problem import Problem
 
 FINGERPRINT = "fingerprint"  # first entry of the memory
 SKIPPED = "skipped"  # number of skipped cycles since the start
-_STATUS = "_status_of_cycle"
+_STATUS, _GATED = "_status_of_cycle", "_status_of_gate"
 
 
 @dataclass(frozen=True)
@@ -49,11 +51,13 @@ def machine_step(problem: Problem, controller: Controller, gate: Gate, watch: Wa
         gate: around the controller's step.
         watch: the limits of the watch.
     """
-    block = _renamed(gate.block(), "status", _STATUS)
+    block = _renamed(gate.block(), "status", _GATED)
     longest = round(watch.saturated_after / problem.period)
     watched = watch_block(problem, controller, _STATUS, longest=longest, window=watch.window)
     own = _identity_block(fingerprint(problem, controller, block.memory))
-    return compose("controller", gate.reads, [own, block, watched, _count_block()], outputs=("command",))
+    timed = fed(block, "time", Signal(CLOCK)), clock_status_block(problem, _GATED, _STATUS)
+    blocks = [own, clock_block(problem), *timed, watched, _count_block()]
+    return compose("controller", gate.reads, blocks, outputs=("command",))
 
 
 def fingerprint(problem: Problem, controller: Controller, memory: Layout) -> float:

@@ -28,9 +28,15 @@ def numbers(name: str, value: object, size: int) -> np.ndarray:
     """Return `value` as float64, shape (size,).
 
     Raises:
-        InvalidValue: text, truth values, None, complex numbers, or anything else that is not made of real numbers.
+        InvalidValue: text, truth values, masked arrays, None, complex numbers, or anything else that is not made of real numbers.
         InvalidShape: a wrong number of entries, or a matrix.
     """
+    if isinstance(value, np.ma.MaskedArray):
+        raise InvalidValue(
+            f"argument '{name}' is a masked array; a missing number is NaN: {name}.filled(np.nan) skips the cycle"
+        )
+    if isinstance(value, list | tuple) and any(isinstance(v, bool | np.bool_) for v in value):
+        raise InvalidValue(f"argument '{name}' must be made of real numbers, got {_short(value)} with a truth value")
     try:
         array = np.asarray(value)
     except (TypeError, ValueError) as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import isnan
+from time import perf_counter
 from typing import NoReturn
 
 import numpy as np
@@ -15,6 +16,7 @@ from fpirhc.controllers.live_settings import Numbers, live_settings
 from fpirhc.controllers.plausible import plausible_range
 from fpirhc.errors import ConcurrentUse
 from fpirhc.fields.checked import Checked
+from fpirhc.simulation.deadline import Clock, Deadline
 from fpirhc.simulation.machine import FINGERPRINT, Watch
 from fpirhc.simulation.numbers_now import NumbersNow
 from fpirhc.simulation.sample import numbers as numbers_of
@@ -26,6 +28,8 @@ from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
+
+_TRUTHS = (bool, np.bool_)
 
 
 class Stepper(Checked):
@@ -46,10 +50,14 @@ class Stepper(Checked):
 
     A bad sample skips the cycle: one that is not finite, outside its plausible range, or (with `max_age`) out of date. The command
     is the last one, every memory stays as it was, the status is BAD_SAMPLE, and the signal 'skipped' counts. Before the first good
-    sample the command is the one before the run. A sample for which the model has no number skips the cycle too, as NON_FINITE. A
-    memory that is not finite is forgotten, and so is one with which good samples give nothing finite: the controller begins anew,
-    with the status RESTARTED. Where a solver raises, the cycle is skipped with the status SOLVER_FAILED; `why_failed` has its words.
-    Commands at a limit for long and an iteration that does not contract have the statuses SATURATED and NOT_CONTRACTING.
+    sample the command is the one before the run. A sample for which the model has no number skips the cycle too, as NON_FINITE.
+    So does a time that cannot follow the last one, as BAD_TIME (`fpirhc.simulation.clock`). A memory that is not finite is
+    forgotten, and so is one with which good samples give nothing finite: the controller begins anew, with the status RESTARTED.
+    Where a solver raises, the cycle is skipped with the status SOLVER_FAILED; `why_failed` has its words. Commands at a limit for
+    long and an iteration that does not contract have the statuses SATURATED and NOT_CONTRACTING.
+
+    A step that takes longer than `Stepper(..., deadline=1e-3)` is late: `stepper.deadline` has the number of late steps, whether
+    the last one was late, the worst one, and the 99.9th percentile, and so has the stepper's text.
 
     One stepper serves one thread. Two threads at the same time are refused; give each a stepper of its own.
 
@@ -71,6 +79,8 @@ class Stepper(Checked):
         watch: Watch | None = None,
         bounded: bool = True,
         live: Sequence[str] = (),
+        deadline: float | None = None,
+        clock: Clock = perf_counter,
     ) -> None:
         """Compose the controller's Function, and compile it where `compiled` is set and there is a compiler.
 
@@ -84,13 +94,19 @@ class Stepper(Checked):
             watch: when SATURATED and NOT_CONTRACTING are reported; None: after 1 s, and over 50 cycles.
             bounded: whether an optimiser whose call may take any time is refused.
             live: paths of the live settings.
+            deadline: longest time of a step, s; longer ones are counted, see `deadline`. None: no step is timed.
+            clock: function that returns the time for that, s.
 
         Raises:
             InvalidProblem: an unknown name or a wrong interval in `plausible`.
             InvalidName: a live setting that does not exist.
+            InvalidValue: a deadline that is no positive number.
             NotSupported: an optimiser without a bound of its time; a setting that cannot be live.
             CompileError: the compiler fails on a controller with live settings.
         """
+        self.deadline = None if deadline is None else Deadline(deadline, clock)
+        if self.deadline is not None:
+            vars(self)["step"] = self.deadline.timed(self.step)  # a stepper without a deadline pays nothing
         settings = live_settings(problem, controller, live)
         ready = checked(problem, settings.controller)
         if bounded:
@@ -102,6 +118,7 @@ class Stepper(Checked):
         self.signals: Layout = self._composite.trace
         self.measures = measures(problem, ready)  # names of the raw measurements
         self.why_failed = ""
+        self._title = f"{problem.name}, {controller.task_name or type(controller).__name__}"
         self._may_fail = self._composite.opaque  # scalar code cannot fail
         function = backend.function if backend else self._composite.function
         parameters = ready.parameters(ready.model_plant(problem))
@@ -116,6 +133,12 @@ class Stepper(Checked):
         self._memory, self._command = arguments.memory, arguments.command
         self._new_command, self._new_memory = arguments.command_next.copy, arguments.memory_next.copy
         self._more = arguments.ages or bool(arguments.beside)
+
+    def __repr__(self) -> str:
+        """What it is of, how it runs, and how it keeps its deadline."""
+        backend = "compiled C" if self.compiled else "virtual machine"
+        facts = [self._title, backend, *([] if self.deadline is None else [str(self.deadline)])]
+        return f"Stepper({', '.join(facts)})"
 
     def start(self) -> np.ndarray:
         """Return the memory of the controller before its first cycle, with the settings in force."""
@@ -161,9 +184,11 @@ class Stepper(Checked):
         except IndexError:
             _refuse_thread()
         try:
-            if settings or setpoints or isinstance(time, bool):
+            if settings or setpoints or isinstance(time, _TRUTHS):
                 self._take(time, settings, setpoints)
             try:
+                if not (state.__class__ is realised.__class__ is memory.__class__ is np.ndarray):
+                    raise TypeError  # masked arrays are arrays to a view
                 self._time[0] = time
                 self._state[:] = state
                 self._realised[:] = realised
@@ -291,7 +316,7 @@ class Stepper(Checked):
             self.change(settings)
         if setpoints:
             self.aim(setpoints)
-        if isinstance(time, bool):
+        if isinstance(time, _TRUTHS):
             one_number("time", time)
 
     def _failed(self, why: str) -> tuple[np.ndarray, np.ndarray]:

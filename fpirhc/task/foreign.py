@@ -158,9 +158,13 @@ class Foreign(Checked):
 
 def _real_numbers(answer: object) -> np.ndarray | None:
     """The answer as real numbers; None where it is none."""
+    if isinstance(answer, np.ma.MaskedArray):  # what lies under a mask is no measurement
+        return None
+    if isinstance(answer, list | tuple) and any(isinstance(v, bool | np.bool_) for v in answer):
+        return None
     try:
         column = np.asarray(answer)
-        return column.astype(float) if column.dtype.kind in "biuf" else None
+        return column.astype(float) if column.dtype.kind in "iuf" else None
     except (TypeError, ValueError):  # rows of different lengths, or an object that refuses to become an array
         return None
 

@@ -91,7 +91,7 @@ def test_sample_outside_the_domain_is_a_skipped_tick(name):
     assert stepper.trace()["skipped"] == 1
     assert np.array_equal(held, command)
     changed = [stepper.memory.columns[k] for k in np.flatnonzero(after != memory)]
-    assert changed == [FAILED, "skipped_before"]
+    assert [name for name in changed if not name.startswith("clock.")] == [FAILED, "skipped_before"]
     for k in range(BAD + 1, BAD + 12):
         one, after = stepper.step_measured(times[k], rows[k], after)
         other, memory = stepper.step_measured(times[k], rows[k], memory)
@@ -125,8 +125,9 @@ def test_what_was_learned_survives_a_sensor_below_the_bottom():
     for k in range(5 * PATIENCE):
         _, learned = stepper.step_measured(times[BAD] + k * TANK.period, rows[BAD] * [0, 1] + [BELOW, 0], learned)
         assert status(stepper) == Status.NON_FINITE
-    one, _ = stepper.step_measured(times[BAD], rows[BAD], learned)
-    other, _ = stepper.step_measured(times[BAD], rows[BAD], memory)
+    later = times[BAD] + 5 * PATIENCE * TANK.period
+    one, _ = stepper.step_measured(later, rows[BAD], learned)
+    other, _ = stepper.step_measured(later, rows[BAD], memory)
     assert np.array_equal(one, other)
 
 

@@ -52,6 +52,12 @@ def status(stepper: fp.Stepper) -> Status:
     return Status(int(stepper.trace()["status"][0]))
 
 
+def changed(stepper: fp.Stepper, after: np.ndarray, before: np.ndarray) -> list[str]:
+    """Numbers of the memory that a skipped cycle changed; the clock goes on."""
+    names = [stepper.memory.columns[k] for k in np.flatnonzero(after != before)]
+    return [name for name in names if not name.startswith("clock.")]
+
+
 # Bad samples
 
 
@@ -67,8 +73,7 @@ def test_bad_sample_is_a_skipped_tick(name, what):
     assert status(stepper) == Status.BAD_SAMPLE
     assert stepper.trace()["skipped"] == 1
     assert np.array_equal(held, command)
-    changed = np.flatnonzero(after != memory)
-    assert [stepper.memory.columns[k] for k in changed] == ["skipped_before"]
+    assert changed(stepper, after, memory) == ["skipped_before"]
     for k in range(13, 25):
         with_fault, after = stepper.step(*sample(run, k), after)
         without, memory = stepper.step(*sample(run, k), memory)
@@ -102,8 +107,8 @@ def test_poisoned_memory_restarts_the_controller(name):
     assert np.array_equal(memory, begun)
     held, memory = stepper.step(*sample(run, 3, state=np.nan), poisoned)
     assert np.isfinite(held).all()
-    command, memory = stepper.step(*sample(run, 3), memory)
-    assert np.array_equal(command, expected)
+    command, memory = stepper.step(*sample(run, 4), memory)
+    assert np.array_equal(command, stepper.step(*sample(run, 4), stepper.start())[0])
 
 
 @by_name
@@ -331,7 +336,7 @@ def test_solver_that_raises_is_a_skipped_tick():
     assert np.array_equal(held, command)
     assert status(stepper) == Status.SOLVER_FAILED
     assert stepper.why_failed == "OSQP failed"
-    assert [stepper.memory.columns[k] for k in np.flatnonzero(after != memory)] == ["skipped_before"]
+    assert changed(stepper, after, memory) == ["skipped_before"]
     assert np.array_equal(stepper.step(*sample(run, 2), after)[0], stepper.step(*sample(run, 2), memory)[0])
 
 
