@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.conformance.controller import two_masses
+from fpirhc.conformance.belief_cycle import Cycle
 from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
+from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.computed_torque import ComputedTorque
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.wrappers.exact_model import ExactModel
 from fpirhc.sensing.belief import Belief
 from fpirhc.sensing.measured import Measured
+from fpirhc.sensing.observability import unobservable
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.sensing.sensor import Sensor
 from fpirhc.simulation.run import Run
@@ -32,6 +34,10 @@ Array = npt.NDArray[Any]
 _CYCLES = 20
 _SAME = 1e-9  # of the largest state
 _NOISE = 1e-3  # of the first measured values' size
+_OTHER = 1.01  # factor of exact parameters
+_UNSEEN = 1e-6  # part of a direction that counts as none
+_LONG, _WRONG = 400, 0.1  # samples, and first error beside the largest state
+_LEFT, _OVERSHOOT = 0.25, 3.0  # shares of that error: later, and at any time
 
 
 def check_belief(
@@ -141,9 +147,77 @@ def one_step_with_the_controller(trial: _Trial, generator: np.random.Generator) 
         hold(same, f"in cycle {k} a stepper believes another state than the run")
 
 
+def exact_parameters_are_unknown(trial: _Trial, generator: np.random.Generator) -> None:
+    """Prediction and correction do not depend on the exact parameters, which nobody knows of a real plant."""
+    plant = trial.problem.plant
+    other = replace(trial.problem, plant=plant.with_exact(_OTHER * plant.exact))
+    one, two = Cycle(trial.belief, trial.problem), Cycle(trial.belief, other)
+    sample = one.sample(generator)
+    same = all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one(sample), two(sample), strict=True))
+    hold(
+        same,
+        f"with exact parameters {_OTHER - 1:.0%} larger, and the same evidence, it believes another state; use evidence.parameters",
+    )
+
+
+def old_samples_do_nothing(trial: _Trial, generator: np.random.Generator) -> None:
+    """A sample from before the run, which a dead time shows again, corrects (`counts` = 0) and moves (`moves` = 0) nothing."""
+    cycle = Cycle(trial.belief, trial.problem)
+    sample = replace(cycle.sample(generator), counts=0.0)
+    change = float(np.abs(cycle(sample)[0] - cycle(replace(sample, measured=sample.measured + 1.0))[0]).max())
+    hold(
+        change == 0,
+        f"with counts = 0 a measurement that is larger by 1 changes the believed state by {change:.3g}; select with if_else",
+    )
+    still = replace(cycle.sample(generator), moves=0.0)
+    change = float(np.abs(cycle(still)[0] - cycle(replace(still, command=still.command + 1.0))[0]).max())
+    hold(
+        change == 0,
+        f"with moves = 0 a command that is larger by 1 changes the believed state by {change:.3g}; move by evidence.moves",
+    )
+
+
+def unseen_errors_are_free(trial: _Trial, generator: np.random.Generator) -> None:
+    """An error that no measurement shows is one of those that `free` names; a review judges whether they decay."""
+    size = trial.problem.plant.state.size
+    slopes, shown = [np.zeros((size, size))], [generator.normal(size=(1, size))]
+    basis = np.asarray(trial.belief.free(slopes, shown, [0]))
+    unseen = unobservable(slopes, [np.vstack([shown[0], np.eye(size)[:1]])])
+    rest = unseen - basis @ (np.linalg.pinv(basis) @ unseen) if basis.size else unseen
+    missed = float(np.linalg.norm(rest, axis=0).max(initial=0.0))
+    hold(
+        within(missed, _UNSEEN),
+        f"free() names {basis.shape[1]} directions for a model at rest of which one number is shown and one state is known; "
+        f"{unseen.shape[1]} of {size} never show, and a part of {missed:.2g} of one of them is missing; use unobservable()",
+    )
+
+
+def wrong_start_is_corrected(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """Started wrong in what is measured, with the exact model and no noise, it comes to believe what is measured."""
+    plant, used = trial.problem.plant, trial.belief.uses(trial.problem.sensing.measures(trial.problem.plant))
+    places = [plant.state.elements.index(n) for n in used if n in plant.state.elements]
+    every = np.eye(plant.state.size)
+    free = np.asarray(trial.belief.free([every], [every[places]], places)) if places else np.zeros((0, 0))
+    seen = [k for k in places if not free.size or np.abs(free[k]).max() < _UNSEEN]
+    if not seen:
+        return  # it corrects nothing that is measured, and says so
+    size = _WRONG * (1 + float(np.abs(trial.problem.start_state).max()))
+    errors = Cycle(trial.belief, trial.problem).errors(seen, size, _LONG)
+    most, late = float(errors.max()), float(errors[_LONG // 2 :].max())
+    hold(
+        within(most, _OVERSHOOT * size) and within(late, _LEFT * size),
+        f"started wrong by {size:.3g} in what is measured it is wrong by up to {most:.3g} in {_LONG} samples without noise, and by "
+        f"{late:.3g} in the later half of them: it does not converge to the plant; look at its gains and at what it remembers",
+    )
+
+
 LAWS = (
     frozen_value,
     facts_hold,
+    exact_parameters_are_unknown,
+    unseen_errors_are_free,
+    old_samples_do_nothing,
+    wrong_start_is_corrected,
     right_model_believes_what_is,
     lives_in_the_time_of_the_samples,
     finite_under_noise,

@@ -2,33 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
+from fpirhc.conformance.controller_facts import FACTS
 from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
+from fpirhc.conformance.loops import Trial, anything, two_masses
 from fpirhc.controllers.base import Controller, compose_controller
 from fpirhc.controllers.contract import checked, resolved
 from fpirhc.describe import describe
-from fpirhc.horizon.cost import Quadratic
-from fpirhc.horizon.horizon import Horizon
-from fpirhc.plant.plant import Parameter, Plant
-from fpirhc.sensing.base import response_names
-from fpirhc.sensing.sensing import Sensing
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.sample import raw_measurements
-from fpirhc.simulation.simulate import simulate
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.status import Status
 from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.task.limits import Limits
-from fpirhc.task.outside import really_known
 from fpirhc.task.problem import Problem
-from fpirhc.task.reference import Trajectory
 
 Array = npt.NDArray[Any]
 
@@ -54,80 +45,16 @@ def check_controller(
         AssertionError: the first law that does not hold, in one sentence.
         FpirhcError: the controller cannot serve the problem.
     """
-    keep(controller, _Trial(controller, problem or two_masses(), seed, left, compiled), LAWS, seed)
+    keep(controller, Trial(controller, problem or two_masses(), seed, left, compiled), LAWS, seed)
 
 
-def two_masses() -> Problem:
-    """Return two masses between springs with a model that is wrong in mass and stiffness, for 2 s."""
-    plant = Plant(
-        coordinates={"a": "m", "b": "m"},
-        inputs={"Fa": "N", "Fb": "N"},
-        parameters={
-            "m": Parameter(approximate=1.4, exact=1.0, unit="kg"),
-            "k": Parameter(approximate=2.0, exact=3.0, unit="N/m"),
-        },
-        response=lambda q, v, u, p: {
-            "a": (u.Fa - p.k * (2 * q.a - q.b) - 0.2 * v.a) / p.m,
-            "b": (u.Fb - p.k * (2 * q.b - q.a) - 0.2 * v.b) / p.m,
-        },
-    )
-    weights = {"a": 1e2, "b": 1e2, "a'": 1.0, "b'": 1.0}
-    return Problem(
-        plant=plant,
-        reference=Trajectory(lambda t: {"a": 0.3 * ca.sin(2 * t), "b": 0.2 * ca.cos(t)}),
-        start={"a": 0.4, "b": -0.1},
-        period=5e-3,
-        duration=2.0,
-        limits=Limits(inputs={"Fa": (-30.0, 30.0), "Fb": (-30.0, 30.0)}),
-        horizon=Horizon(stages=12, step=2e-2),
-        cost=Quadratic(states=weights, deviation={"Fa": 1e-3, "Fb": 1e-3}),
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _Trial:
-    """A controller on a problem."""
-
-    controller: Controller
-    problem: Problem
-    seed: int
-    left: float
-    compiled: bool
-
-    @cached_property
-    def run(self) -> Run:
-        """The closed loop with the wrong model, in CasADi's virtual machine."""
-        return self.simulated(self.problem)
-
-    def simulated(self, problem: Problem) -> Run:
-        return simulate(problem, self.controller, seed=self.seed, compiled=False)
-
-    @cached_property
-    def stepper(self) -> Stepper:
-        """The controller alone, in CasADi's virtual machine."""
-        return Stepper(
-            self.problem,
-            checked(self.problem, self.controller),
-            compiled=False,
-            bounded=False,
-            plausible=_anything(self.problem),
-        )
-
-
-def _anything(problem: Problem) -> dict[str, tuple[float, float]]:
-    """No sample of a simulated run is implausible, also not of one that diverges."""
-    sensing, plant = problem.sensing, problem.plant
-    names = sensing.measures(plant) if sensing.estimates else (*plant.state.elements, *response_names(plant))
-    return dict.fromkeys(names, (-np.inf, np.inf))
-
-
-def frozen_value(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+def frozen_value(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """A controller is a frozen value that can be hashed, copied and described."""
     is_a_frozen_value(trial.controller)
     is_a_frozen_value(resolved(trial.problem, trial.controller))
 
 
-def facts_hold(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+def facts_hold(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """The facts of a controller hold: its inner controller can be exchanged, no automatic setting is left, a planner plans."""
     ready = checked(trial.problem, trial.controller)
     hold(
@@ -151,7 +78,7 @@ def facts_hold(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: 
         hold(seen, f"its inner controller reads '{name}' for '{read}', which is no signal of the run")
 
 
-def writes_a_command_and_a_status(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+def writes_a_command_and_a_status(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """A cycle writes what every run logs: reference, error, desired, deformed, command, clipped, status."""
     written = compose_controller(trial.problem, trial.controller).trace
     expected = ("reference", "error", "desired", "deformed", "command", "clipped", "status")
@@ -164,9 +91,9 @@ def writes_a_command_and_a_status(trial: _Trial, generator: np.random.Generator)
     )
 
 
-def exact_model_tracks(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+def exact_model_tracks(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """With an exact model, ideal sensors and no disturbance, the error of every judged coordinate goes to zero."""
-    problem = _exact(trial.problem)
+    problem = trial.exact
     run = trial.simulated(problem)
     hold(run.stop is None, f"with the exact model the run ends early: {run.stop}")
     errors = np.abs(run["true_error"])
@@ -180,27 +107,17 @@ def exact_model_tracks(trial: _Trial, generator: np.random.Generator) -> None:  
         )
 
 
-def _exact(problem: Problem) -> Problem:
-    parameters = {
-        name: Parameter(approximate=p.exact, exact=p.exact, unit=p.unit, outside=p.outside)
-        for name, p in problem.plant.parameters.items()
-    }
-    plant = replace(problem.plant, parameters=parameters)
-    signals = really_known(problem.signals)
-    return replace(problem, plant=plant, disturbances={}, sensing=Sensing(), signals=signals)
-
-
-def same_command_everywhere(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+def same_command_everywhere(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """The loop, a Stepper, a second Stepper and compiled C give the same command for the same measurements."""
     run, scale = trial.run, 1 + float(np.abs(trial.run["command"]).max())
     steppers = {
         "a Stepper": trial.stepper,
         "a second Stepper": Stepper(
-            trial.problem, trial.controller, compiled=False, bounded=False, plausible=_anything(trial.problem)
+            trial.problem, trial.controller, compiled=False, bounded=False, plausible=anything(trial.problem)
         ),
     }
     if trial.compiled:
-        compiled = Stepper(trial.problem, trial.controller, bounded=False, plausible=_anything(trial.problem))
+        compiled = Stepper(trial.problem, trial.controller, bounded=False, plausible=anything(trial.problem))
         if compiled.compiled:
             steppers["compiled C"] = compiled
     for what, stepper in steppers.items():
@@ -220,7 +137,7 @@ def _replayed(stepper: Stepper, run: Run) -> Array:
     return commands
 
 
-def same_arguments_same_command(trial: _Trial, generator: np.random.Generator) -> None:
+def same_arguments_same_command(trial: Trial, generator: np.random.Generator) -> None:
     """A cycle depends on its arguments alone: two calls with the same arguments give the same result."""
     run, stepper = trial.run, trial.stepper
     memory, measured = stepper.start(), raw_measurements(run)
@@ -235,7 +152,7 @@ def same_arguments_same_command(trial: _Trial, generator: np.random.Generator) -
         memory = next_memory
 
 
-def command_keeps_the_limits(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+def command_keeps_the_limits(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """No command leaves the limits of the inputs, also where they are half of the commands without limits."""
     plant, commands = trial.problem.plant, trial.run["command"]
     middle, most = 0.5 * (commands.max(axis=0) + commands.min(axis=0)), 0.5 * np.ptp(commands, axis=0)
@@ -266,20 +183,20 @@ def command_keeps_the_limits(trial: _Trial, generator: np.random.Generator) -> N
             )
 
 
-def bad_measurement_never_acts(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+def bad_measurement_never_acts(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """A measurement that is not finite gives a finite command within the limits and a status, and does no lasting harm."""
     for bad in (np.nan, np.inf):
         for k, name in enumerate(trial.problem.plant.state.elements):
             _measured_once(trial, bad, k, f"'{name}' measured as {bad} in cycle {_STEPS}")
 
 
-def bad_response_never_acts(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+def bad_response_never_acts(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """A measured response that is not finite gives finite commands within the limits, then and later."""
     for bad in (np.nan, np.inf):
         _measured_once(trial, bad, None, f"a response measured as {bad} in cycle {_STEPS}")
 
 
-def _measured_once(trial: _Trial, bad: float, entry: int | None, what: str) -> None:
+def _measured_once(trial: Trial, bad: float, entry: int | None, what: str) -> None:
     """Replay a run with one bad value in one cycle: of an entry of the state, or (None) of the whole response."""
     run, lower, upper = trial.run, *trial.problem.limits.input_bounds(trial.problem.plant)
     # A stepper's gate keeps bad samples away; the controller itself must survive them too, inside of another one.
@@ -318,4 +235,5 @@ LAWS = (
     bad_response_never_acts,
     exact_model_tracks,
     facts_hold,
+    *FACTS,
 )

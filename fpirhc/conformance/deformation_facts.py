@@ -80,6 +80,13 @@ class _Cycles:
             requests[k] = request.item()
         return requests
 
+    def calm_memory(self) -> Array:
+        """The memory after cycles without errors, in which every pair has become one of this run."""
+        request, memory = ca.DM(0.0), ca.DM(self.layout.start())
+        for _ in range(_WARM + 2 * self.wait):
+            request, memory = self.function(request, 0.0, 0.0, memory)
+        return np.asarray(memory.full())[:, 0]
+
     def impulse_response(self, history: Array) -> Array:
         """Change of the requests by one error after a history of errors, per unit of the error."""
         size = _SMALL * self.amplitude
@@ -173,10 +180,56 @@ def reach_is_told(trial: _Cycles, generator: np.random.Generator) -> None:
         )
 
 
+def adaptation_is_told(trial: _Cycles, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """`adapts` is true where a response changes a request, and only there: a map that says no is compared as no adaptation."""
+    changed = float(np.abs(trial.impulse_response(np.zeros(_WARM + 2 * trial.wait))).max())
+    adapts = trial.deformation.adapts
+    hold(
+        changed > 0 if adapts and trial.deformation.constant else adapts or changed == 0,
+        f"`adapts` is {str(adapts).lower()}, but an error of the response changes the request by {changed:.3g} per unit",
+    )
+
+
+def desired_passes_as_told(trial: _Cycles, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """`slows_desired` is false where a change of the desired response is a change of the request at once, and only there."""
+    deformation, size = trial.deformation, _SMALL * trial.amplitude
+    calm = trial.calm_memory()
+    before, after = (float(trial.function(0.0, 0.0, d, calm)[0]) for d in (0.0, size))
+    passes, share = abs(after - before - size) <= _SAME * size, (after - before) / size
+    if deformation.slows_desired:
+        first = deformation.effective_gain() * (1 - deformation.error_pole)
+        told = not passes or abs(first - 1) <= _SAME or not deformation.constant
+    else:
+        told = passes
+    hold(
+        told,
+        f"`slows_desired` is {str(deformation.slows_desired).lower()}, but of a change of the desired response the request has the "
+        f"share {share:.4g} one cycle later: the rate of its loop would be judged wrongly",
+    )
+
+
+def leak_is_told(trial: _Cycles, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """An error changes the next request by the effective gain times 1 - `leak` times 1 - `error_pole`."""
+    deformation = trial.deformation
+    if not deformation.constant or not deformation.adapts:
+        return
+    first = float(trial.impulse_response(np.zeros(_WARM + 2 * trial.wait))[0])
+    gain, leak, pole = deformation.effective_gain(), deformation.leak, deformation.error_pole
+    expected = -gain * (1 - leak) * (1 - pole)
+    hold(
+        abs(first - expected) <= _SAME * abs(gain),
+        f"its leak is {leak:g}, its error_pole {pole:g} and its gain {gain:.4g}, but an error of one changes the next request by "
+        f"{first:.4g} and not by {expected:.4g}: limits of its gain would be those of another map",
+    )
+
+
 LAWS = (
     inner_can_be_exchanged,
     automatic_settings_are_chosen,
+    adaptation_is_told,
+    desired_passes_as_told,
     constant_map_keeps_its_gain,
     filter_and_pairing_are_told,
     reach_is_told,
+    leak_is_told,
 )

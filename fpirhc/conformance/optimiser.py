@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from fpirhc.conformance.horizons import BOUND, CORRIDOR, STAGES, Trial, TrialHorizon, TrialPlan
+from fpirhc.conformance.horizons import BOUND, CORRIDOR, STAGES, STEP, Trial, TrialHorizon, TrialPlan
 from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
+from fpirhc.describe import replaced
 from fpirhc.errors import InvalidValue
-from fpirhc.optimisers.base import FEASIBLE, Optimiser
+from fpirhc.optimisers.base import FEASIBLE, UNKNOWN_ITERATIONS, Optimiser
 from fpirhc.status import Status
 
 _SLACK = 2.0  # allowed error of a stationarity, in tolerances
 _DIFFERENCE = 1e-6  # relative error of central differences of a cost
 _TRIALS = 3
+_FAR = 1e6  # size of a state from which no plan is converged after a few iterations
+_ROUNDING = 1e-8  # of the numbers of such a plan, relative
+_SOLVERS = ("Nlpsol", "Conic", "Rootfinder", "Integrator", "External", "CallbackInternal")
 _FEW = 5  # calls on a problem without solution
 
 
@@ -40,8 +46,8 @@ def frozen_value(trial: Trial, generator: np.random.Generator) -> None:  # noqa:
     is_a_frozen_value(trial.optimiser)
 
 
-def remembers_a_plan(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """The memory holds the plan in `plan_inputs`, and step and shift keep its size."""
+def remembers_a_plan(trial: Trial, generator: np.random.Generator) -> None:
+    """The memory holds the plan that was given in `plan_inputs`, and step and shift keep its size."""
     task = trial.linear
     layout = task.layout
     hold("plan_inputs" in layout, f"memory() lays out {list(layout.names)}, but not 'plan_inputs'")
@@ -52,6 +58,67 @@ def remembers_a_plan(trial: Trial, generator: np.random.Generator) -> None:  # n
     hold(shapes == expected, f"step gives {shapes}, expected {expected}: plan, diagnostics, memory")
     size = task.shifted.numel_out(0)
     hold(size == layout.size, f"shifted() gives {size} entries, the memory has {layout.size}")
+    plan = task.called(generator.normal(size=2), layout.start())
+    kept = float(np.abs(plan.memory[layout.slice("plan_inputs")] - plan.inputs[0]).max())
+    hold(
+        within(kept, 1e-9 * (1 + np.abs(plan.inputs).max())),
+        f"'plan_inputs' in its memory differs from the plan that it gave by {kept:.3g}: the next call would not begin with it",
+    )
+
+
+def work_is_bounded_as_told(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """Where `unbounded` names a reason a solver is called; arithmetic of a fixed length takes no longer than it takes."""
+    told, task = trial.optimiser.unbounded, trial.linear
+    functions = (task.step, *task.step.find_functions())
+    solvers = [f.name() for f in functions if any(f.is_a(kind, True) for kind in _SOLVERS)]
+    hold(
+        not told or bool(solvers),
+        f"`unbounded` says '{told}', but its step calls no solver and always does the same work: a real loop would refuse it",
+    )
+
+
+def numbers_are_true_far_away(trial: Trial, generator: np.random.Generator) -> None:
+    """From a state as large as 1e6 one call reports the stationarity that the plan has, and OK only where it is converged."""
+    task = trial.linear
+    state, (by_u, by_s) = _FAR * generator.normal(size=2), task.squares
+    plan = task.called(state, task.layout.start())
+    if plan.status not in (Status.OK, Status.NOT_CONVERGED):
+        return
+    slope = 2 * by_u.T @ (by_u @ plan.inputs[0] + by_s @ state)
+    residual = float(np.abs(slope).max() / (STEP * task.ocp.curvature[0]))
+    floor = _ROUNDING * _FAR
+    hold(
+        within(plan.stationarity - residual, 0.01 * residual + floor),
+        f"far from a solution it reports the stationarity {plan.stationarity:.4g} of a plan that has {residual:.4g}",
+    )
+    hold(
+        plan.status != Status.OK or residual <= _SLACK * trial.tolerance + floor,
+        f"it calls a plan OK whose stationarity is {residual:.4g}, above {trial.tolerance:g}",
+    )
+
+
+def iterations_are_counted(trial: Trial, generator: np.random.Generator) -> None:
+    """The number of iterations that it reports is what the plan took: allowed that many, it finds the same plan."""
+    most = getattr(trial.optimiser, "iterations", None)
+    if not isinstance(most, int):
+        return
+    task, state = trial.linear, generator.normal(size=2)
+    plan = task.called(state, task.layout.start())
+    count = float(plan.diagnostics[3])
+    if not 0 <= count < most:
+        hold(count <= most or count == UNKNOWN_ITERATIONS, f"it reports {count:g} iterations, of at most {most}")
+        return
+    allowed_as_many = replaced(trial.optimiser, "iterations", max(1, round(count)))
+    if allowed_as_many is None:
+        return
+    fewer = replace(task, optimiser=allowed_as_many)
+    again = fewer.called(state, fewer.layout.start())
+    missed = float(np.abs(again.inputs - plan.inputs).max())
+    allowed = 2 * _SLACK * task.reach * trial.tolerance + 1e-9
+    hold(
+        within(missed, allowed),
+        f"it reports {count:g} iterations, but with iterations={max(1, round(count))} an input of its plan is off by {missed:.3g}",
+    )
 
 
 def linear_plan_is_riccati(trial: Trial, generator: np.random.Generator) -> None:
@@ -221,9 +288,12 @@ def solution_stays(trial: Trial, generator: np.random.Generator) -> None:
 LAWS = (
     frozen_value,
     remembers_a_plan,
+    work_is_bounded_as_told,
+    numbers_are_true_far_away,
     linear_plan_is_riccati,
     plan_is_stationary,
     status_is_honest,
+    iterations_are_counted,
     bounds_of_inputs_are_kept,
     bounds_of_a_call_count,
     infeasible_is_told,

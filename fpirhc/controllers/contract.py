@@ -160,6 +160,11 @@ class Controller(Checked, ABC):
         return problem.plant if self.inner is None else self.inner.model_plant(problem)
 
     @property
+    def knows_exact(self) -> bool:
+        """Whether its command depends on the plant's exact parameters; such a controller is a bound to compare with."""
+        return False if self.inner is None else self.inner.knows_exact
+
+    @property
     def learns(self) -> bool:
         """Whether its model or its gains change during a run."""
         return False if self.inner is None else self.inner.learns

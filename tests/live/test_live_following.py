@@ -8,8 +8,8 @@ from typing import Any, cast
 import pytest
 
 import fpirhc as fp
-from fpirhc.conformance.controller import two_masses
 from fpirhc.conformance.live import check_live
+from fpirhc.conformance.loops import two_masses
 from fpirhc.errors import InvalidValue
 from fpirhc.problem_files.problem_file import load_problem
 from fpirhc.simulation.simulate import simulator

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 import fpirhc as fp
-from fpirhc.conformance.controller import two_masses
 from fpirhc.conformance.live import check_live, number_paths
+from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError
 from fpirhc.members import Example, examples

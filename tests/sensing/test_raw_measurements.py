@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.conformance.controller import two_masses
+from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.contract import Controller
 from fpirhc.errors import InvalidProblem, InvalidShape
 from fpirhc.members import examples

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.conformance.controller import two_masses
+from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.largest_response import largest_response
 from fpirhc.deformation.base import Deformation
 from fpirhc.sensing.base import response_names

@@ -13,7 +13,7 @@ import pytest
 from plants import linear
 
 import fpirhc as fp
-from fpirhc.conformance.controller import two_masses
+from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.plausible import plausible_range
 from fpirhc.deformation.base import Deformation

@@ -39,6 +39,11 @@ class ExactModel(Controller):
         """The deformation of the wrapped controller."""
         return self.controller.deformation
 
+    @property
+    def knows_exact(self) -> bool:
+        """True: that is what it is for."""
+        return True
+
     def inner_problem(self, problem: Problem) -> Problem:
         """Return the problem with the exact parameters as approximate ones, so that work before a run uses them too."""
         plant = self.model_plant(problem)

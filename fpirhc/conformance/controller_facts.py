@@ -1,0 +1,227 @@
+"""Laws about what a controller says of itself, and about what it may know.
+
+A review, a comparison and a reader believe the facts of a controller. They are compared with what its cycles do when they are given
+the motion of a recorded run: with another deformation, other exact parameters, a state near the reference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fpirhc.conformance.laws import hold, within
+from fpirhc.conformance.loops import Replay, Trial, coarse_steps, spelled_by_states
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import checked
+from fpirhc.deformation.affine import Affine
+from fpirhc.deformation.identity import Identity
+from fpirhc.errors import FpirhcError
+from fpirhc.simulation.run import Run
+from fpirhc.simulation.simulate import simulate
+from fpirhc.task.problem import Problem
+
+Array = npt.NDArray[Any]
+
+_OTHER = 1.01  # factor of exact parameters
+_PROBE = 0.3  # effective gain of the map with which a controller's wiring is looked at
+_SAME = 1e-9  # relative
+_NEAR = 1e-6  # distance from the reference at which a law is linear
+_SLOPE = 1e-3  # relative error of a difference quotient
+_ALIKE = 0.05  # of the largest command: what two spellings of a plant may differ by in unconverged plans
+_SHORT = 40  # cycles
+
+
+def exact_parameters_are_unknown(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """The command does not depend on the exact parameters, which nobody knows of a real plant, unless `knows_exact` says so."""
+    plant = trial.problem.plant
+    if trial.controller.knows_exact or not plant.parameters:
+        return
+    other = replace(trial.problem, plant=plant.with_exact(plant.exact * _OTHER))
+    one, two = (Replay(p, trial.controller, trial.run) for p in (trial.problem, other))
+    for k, (cycle, moved) in enumerate(zip(one.cycles(), two.cycles(), strict=True)):
+        command, its = cycle["command"], moved["command"]
+        hold(
+            np.array_equal(command, its, equal_nan=True),
+            f"with exact parameters {_OTHER - 1:.0%} larger, and the same approximate ones and measurements, its command of cycle "
+            f"{k} is {its} in place of {command}; use plant.approximate, or state knows_exact = True where this is meant",
+        )
+
+
+def deformation_acts(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """A deformation acts: with half of its gain the commands are others, or adaptation is compared that is not there."""
+    deformation = trial.controller.deformation
+    if not deformation.adapts:
+        return
+    weaker = _with_deformation(trial, deformation.with_effective_gain(0.5 * deformation.effective_gain()))
+    if weaker is None:
+        return
+    replays = (Replay(trial.problem, c, trial.run) for c in (trial.controller, weaker))
+    differ = (
+        not np.array_equal(a["command"], b["command"]) for a, b in zip(*(r.cycles() for r in replays), strict=True)
+    )
+    hold(
+        any(differ),
+        f"with half of the effective gain {deformation.effective_gain():.3g} its commands are the same in all {trial.run.cycles} "
+        "cycles of a run with a wrong model; use the deformation, closing_blocks(problem, self.deformation)",
+    )
+
+
+def desired_response_is_deformed(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """Where `deforms_response` is true the signal 'deformed' is the map of the logged 'desired', and only there."""
+    ready = checked(trial.problem, trial.controller)
+    gain = _PROBE if ready.deformation.effective_gain() >= 0 else -_PROBE
+    probe = _with_deformation(trial, Affine(gain=-2 * gain))
+    if probe is None or not ready.deformation.adapts or ready.response(trial.problem) is not None:
+        return
+    before, missed, moved = None, 0.0, 0.0
+    for k, cycle in enumerate(Replay(trial.problem, probe, trial.run).cycles()):
+        free = cycle["clipped"][0] == 0 and k > trial.problem.longest_warm_up
+        if free and before is not None:
+            expected = before - gain * (trial.run["realised"][k] - cycle["desired"])
+            size = 1 + np.abs(expected).max()
+            missed = max(missed, float(np.abs(cycle["deformed"] - expected).max() / size))
+            moved = max(moved, float(np.abs(cycle["deformed"] - cycle["desired"]).max() / size))
+        before = cycle["deformed"] if free else None
+    does = missed <= _SAME
+    if ready.deforms_response:
+        hold(
+            does,
+            f"deforms_response is true, but with the affine map of gain {gain:g} its 'deformed' misses "
+            f"r - {gain:g} (realised - desired) by the share {missed:.3g}; log the desired response that is deformed",
+        )
+    else:
+        hold(
+            not does or moved <= _SAME,
+            f"deforms_response is false, but its 'deformed' is r - {gain:g} (realised - desired) in every cycle: reviews "
+            "would look for its deformation elsewhere",
+        )
+
+
+def learning_remembers(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """A controller that `learns` commands otherwise later: without its deformation, for the same measurement."""
+    if not trial.controller.learns:
+        return
+    plain = trial.controller
+    if plain.deformation.adapts:
+        plain = _with_deformation(trial, Identity()) or plain
+    replay = Replay(trial.problem, plain, trial.run)
+    memories = [cycle.memory for cycle in replay.cycles()]
+    begin = min(int(np.ceil(trial.problem.longest_warm_up)) + 2, len(memories) - 1)
+    early, late = (replay.cycle(begin, memories[k])["command"] for k in (begin, -1))
+    hold(
+        not np.array_equal(early, late),
+        f"learns is true, but after {len(memories)} cycles with a wrong model its command for the measurement of cycle {begin} is "
+        f"still {late}: reviews would take its convergence for unknown",
+    )
+
+
+def model_is_of_the_plant(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """The parameters of its model, `model_plant`, have the exact values of the plant that a run moves, or of the problem's."""
+    problem = trial.problem
+    own = trial.controller.model_plant(problem).parameters
+    plants = (problem.plant, problem.real_plant)
+    wrong = [n for n, p in own.items() if all(n in q.parameters and q.parameters[n].exact != p.exact for q in plants)]
+    if wrong:
+        name, plant = wrong[0], problem.plant
+        hold(
+            False,
+            f"model_plant() says that the exact '{name}' is {own[name].exact:.6g}, the plant has "
+            f"{plant.parameters[name].exact:.6g}: results would be compared with a plant that is not there",
+        )
+
+
+def law_is_what_it_does(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """Near the reference it feeds the error back with the gains of its `law`, from which reviews read its speed."""
+    ready, plant = checked(trial.problem, trial.controller), trial.problem.plant
+    if ready.law is None or ready.planner is not None or ready.feeds or plant.outputs or plant.step is not None:
+        return
+    k = min(int(np.ceil(trial.problem.longest_warm_up)) + 2, trial.run.cycles - 1)
+    replay = Replay(trial.problem, ready, trial.run)
+    memory = [cycle.memory for cycle, _ in zip(replay.cycles(), range(k), strict=False)][-1]
+    on = replay.cycle(k, memory)["reference"]
+    at = replay.cycle(k, memory, state=on)["desired"]
+    for row, (name, order) in enumerate(zip(plant.names, plant.orders, strict=True)):
+        feedback = ready.law.feedback(order)
+        if feedback is None or name not in plant.controlled_names:
+            continue
+        for s, gain in enumerate(feedback.gains[-order:]):
+            place = plant.state.elements.index(name + "'" * s)
+            moved = replay.cycle(k, memory, state=on - _NEAR * (np.arange(on.size) == place))["desired"]
+            slope = float(moved[row] - at[row]) / _NEAR
+            hold(
+                within(slope - gain, _SLOPE * (1 + abs(gain))),
+                f"near the reference the error of '{plant.state.elements[place]}' is fed back with {slope:.6g}, its law "
+                f"{type(ready.law).__name__} says {gain:.6g}",
+            )
+
+
+def outputs_are_controlled(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """If `outputs_unusable` is empty, the same plant given by states, with the coordinates as outputs, gets the same commands."""
+    spelled = spelled_by_states(trial.problem)
+    if spelled is None or trial.controller.outputs_unusable(spelled):
+        return
+    trials = [_moved(replace(p, duration=_SHORT * p.period, measure_from=0.0), trial) for p in (trial.exact, spelled)]
+    if None in trials:
+        return
+    one, other = (run["command"] for run in trials if run is not None)
+    size = 1e-12 + float(np.abs(one).max())
+    missed = float(np.abs(one - other).max()) if one.shape == other.shape else np.inf
+    hold(
+        within(missed, _ALIKE * size),
+        f"outputs_unusable() is empty, but where the coordinates are outputs of states in another order its commands differ by "
+        f"{missed:.3g}, of {size:.3g}; read plant.output and not plant.state, or give the reason why it cannot",
+    )
+
+
+def maps_are_controlled(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """If `maps_unusable` is empty, it does not drive away a plant that moves in coarse steps and is known exactly."""
+    problem = coarse_steps()
+    if trial.controller.maps_unusable(problem):
+        return
+    run = _moved(problem, trial)
+    if run is None:
+        return
+    errors = np.abs(run["true_error"])
+    rest, first = float(errors[-run.cycles // 4 :].max()), float(errors[0].max())
+    hold(
+        run.stop is None and within(rest, first * (1 + _SAME)),
+        f"maps_unusable() is empty, but the error {first:.3g} of stocks that are filled in steps of {problem.period:g} s is "
+        f"{rest:.3g} after {run.cycles} steps; write its law for differences of steps, or give the reason why it cannot",
+    )
+
+
+def _moved(problem: Problem, trial: Trial) -> Run | None:
+    """A run on another problem, which the controller says it can control; None where it refuses it for another reason."""
+    try:
+        return simulate(problem, trial.controller, seed=trial.seed, compiled=False)
+    except FpirhcError:
+        return None
+    except Exception as error:
+        kind = "a map" if problem.plant.step is not None else "a plant with outputs"
+        hold(False, f"it says that it can control {kind}, but cannot be built for one: {' '.join(str(error).split())}")
+        raise
+
+
+def _with_deformation(trial: Trial, deformation: Any) -> Controller | None:
+    """The controller with another deformation; None where it takes none, or not this one."""
+    try:
+        other = trial.controller.with_deformation(deformation)
+        checked(trial.problem, other)
+    except FpirhcError:
+        return None
+    return other
+
+
+FACTS = (
+    exact_parameters_are_unknown,
+    deformation_acts,
+    desired_response_is_deformed,
+    learning_remembers,
+    model_is_of_the_plant,
+    law_is_what_it_does,
+    outputs_are_controlled,
+    maps_are_controlled,
+)

@@ -1,0 +1,95 @@
+"""A wrong member of a family is caught by the public laws, with the law that it breaks; the right one beside it is not.
+
+Each of the 38 differs in one thing from a member that keeps all laws. A law that does not know a reason to refuse it would let it
+into every comparison.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from wrong import controllers, maps, observers, optimisers
+from wrong.tables import CONTROLLERS, MAPS, OBSERVERS, OPTIMISERS
+
+import fpirhc as fp
+
+DEFORMATION = fp.Sigmoid(gain=-0.5)
+
+
+def caught(check, member, law, sentence):
+    """One sentence that names the class, the law, the numbers and what to do."""
+    with pytest.raises(
+        AssertionError, match=f"^{type(member).__name__} breaks the law '{law}': .*{sentence}.*The law: "
+    ):
+        check(member)
+
+
+def check_controller(member):
+    fp.check_controller(member, seed=1, compiled=False)
+
+
+def check_optimiser(member):
+    fp.check_optimiser(member, tolerance=1e-6, seed=1)
+
+
+@pytest.mark.parametrize("wrong", CONTROLLERS, ids=lambda c: c.__name__)
+def test_a_wrong_controller_is_caught(wrong):
+    """It cheats, or says of itself what is not so."""
+    caught(check_controller, wrong(6.0, DEFORMATION), *CONTROLLERS[wrong])
+
+
+@pytest.mark.parametrize("wrong", MAPS, ids=lambda c: c.__name__)
+def test_a_wrong_map_is_caught(wrong):
+    """Its facts are another map's."""
+    caught(lambda m: fp.check_deformation(m, seed=1), wrong(0.3, 5.0), *MAPS[wrong])
+
+
+@pytest.mark.parametrize("wrong", OPTIMISERS, ids=lambda c: c.__name__)
+def test_a_wrong_optimiser_is_caught(wrong):
+    """Its plan, its numbers or its memory are not what they are said to be."""
+    caught(check_optimiser, wrong(100, 1e-6), *OPTIMISERS[wrong])
+
+
+@pytest.mark.parametrize("wrong", OBSERVERS, ids=lambda c: c.__name__)
+def test_a_wrong_observer_is_caught(wrong):
+    """It uses what it cannot know, or does not come to the truth."""
+    caught(lambda m: fp.check_belief(m, seed=1), wrong(0.4), *OBSERVERS[wrong])
+
+
+def test_a_diverging_observer_is_caught():
+    """The same class with a gain above two: every correction is wrong by more than the error was."""
+    caught(
+        lambda m: fp.check_belief(m, seed=1),
+        observers.ConstantGain(3.0),
+        "wrong start is corrected",
+        "does not converge",
+    )
+
+
+def test_the_right_members_are_not_refused():
+    """Every wrong member is one change away from a right one."""
+    check_controller(controllers.Gentle(6.0, DEFORMATION))
+    fp.check_deformation(maps.Softsign(0.3, 5.0), seed=1)
+    check_optimiser(optimisers.HeavyBall(100, 1e-6))
+    fp.check_belief(observers.ConstantGain(0.4), seed=1)
+
+
+def test_nobody_wrong_is_left_out():
+    """A class that is added to the wrong members stands in the tables."""
+    tables: dict[Any, Any] = {controllers: CONTROLLERS, maps: MAPS, optimisers: OPTIMISERS, observers: OBSERVERS}
+    right = {controllers.Gentle, maps.Softsign, optimisers.HeavyBall, observers.ConstantGain, observers.Told}
+    for module, table in tables.items():
+        own = {c for c in vars(module).values() if isinstance(c, type) and c.__module__ == module.__name__}
+        assert own - right == {*table}
+
+
+def test_a_controller_that_knows_the_exact_parameters_may_say_so():
+    """As the bound of a comparison: the same command, honestly named."""
+
+    class Honest(controllers.KnowsThePlant):
+        knows_exact = True
+
+    check_controller(Honest(6.0, DEFORMATION))
+    assert fp.ExactModel(controllers.Gentle(6.0)).knows_exact
+    assert not fp.ComputedTorque(fp.Exponential(rate=6.0)).knows_exact

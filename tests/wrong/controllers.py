@@ -1,0 +1,157 @@
+"""Twelve controllers that break the contract, each in one thing, and the right one that they are made from."""
+
+# ruff: noqa: ARG002 - arguments are those of the contract
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+
+import fpirhc as fp
+from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
+from fpirhc.deformation import Deformation, Identity
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.layout import Layout
+
+
+@dataclass(frozen=True)
+class Gentle(Controller):
+    """q''Des = q''N + rate^2 e + 2 rate e', saturated; a controller that keeps every law."""
+
+    rate: float
+    deformation: Deformation = field(default_factory=Identity)
+    limit: float = 40.0
+
+    def blocks(self, problem):
+        """Return reference, law and the closing blocks."""
+        plant = problem.plant
+        size = len(plant.names)
+
+        def step(s):
+            error = s.reference - s.state
+            wanted = self.rate**2 * error[:size] + 2 * self.rate * error[size:]
+            nominal = s._reference_response
+            return {"nominal": nominal, "desired": nominal + self.limit * ca.tanh(wanted / self.limit)}
+
+        reads = Layout((plant.state, like(plant.state, "reference"), plant.response_signal("_reference_response")))
+        writes = Layout((plant.response_signal("nominal"), plant.response_signal("desired")))
+        closing, delays = closing_blocks(problem, self.deformation)
+        return [reference_block(problem), Block("law", reads, writes, step), *closing], delays
+
+    def changed(self, problem, name, change):
+        """Return its blocks with the step of one of them wrapped: change(step, signals)."""
+        blocks, delays = Gentle.blocks(self, problem)
+        return [
+            replace(b, step=lambda s, b=b: change(b.step, s)) if name in (b.name, "every") else b for b in blocks
+        ], delays
+
+
+class KnowsThePlant(Gentle):
+    """Inverts the plant and not the model."""
+
+    def blocks(self, problem):
+        """Wrong."""
+
+        def exact(step, s):
+            if hasattr(s, "parameters"):
+                s.parameters = ca.DM(problem.plant.exact)
+            return step(s)
+
+        return self.changed(problem, "every", exact)
+
+
+class LeavesTheLimits(Gentle):
+    """Gives the command before it is limited."""
+
+    def blocks(self, problem):
+        """Wrong."""
+        return self.changed(problem, "limit", lambda step, s: {**step(s), "command": s.command_unclipped})
+
+
+class SaysItLearns(Gentle):
+    """Learns nothing."""
+
+    @property
+    def learns(self):
+        """Wrong."""
+        return True
+
+
+class SaysItDeformsNoResponse(Gentle):
+    """Deforms the response all the same."""
+
+    @property
+    def deforms_response(self):
+        """Wrong."""
+        return False
+
+
+class DeformsAnotherResponse(Gentle):
+    """Deforms another desired response than the one that it logs."""
+
+    def blocks(self, problem):
+        """Wrong."""
+
+        def louder(step, s):
+            s.desired = 1.05 * s.desired
+            return step(s)
+
+        return self.changed(problem, "deform", louder)
+
+
+class TellsAnotherModel(Gentle):
+    """Names a plant as its model that is neither the problem's nor the real one."""
+
+    def model_plant(self, problem):
+        """Wrong."""
+        return problem.plant.with_exact(problem.plant.exact * 1.1)
+
+
+class IsGivenTheExactParameters(Gentle):
+    """Asks the loop for the exact parameters."""
+
+    def parameters(self, plant):
+        """Wrong."""
+        return plant.exact
+
+
+class AlwaysOk(Gentle):
+    """Hides a command that was held."""
+
+    def blocks(self, problem):
+        """Wrong."""
+        return self.changed(problem, "judge", lambda step, s: {"status": 0 * s._held})
+
+
+class SaysItControlsOutputs(Gentle):
+    """Takes the state for the output."""
+
+    def outputs_unusable(self, problem):
+        """Wrong."""
+        return ""
+
+
+class IgnoresItsDeformation(Gentle):
+    """Builds itself without the deformation that it was given."""
+
+    def blocks(self, problem):
+        """Wrong."""
+        return Gentle(self.rate).blocks(problem)
+
+
+class NamesAnotherLaw(Gentle):
+    """Tells of a law ten times as fast."""
+
+    @property
+    def law(self):
+        """Wrong."""
+        return fp.Exponential(rate=10 * self.rate, integral=False)
+
+
+class SaysItControlsMaps(Gentle):
+    """Takes differences of steps for derivatives."""
+
+    def maps_unusable(self, problem):
+        """Wrong."""
+        return ""

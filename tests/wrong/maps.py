@@ -1,0 +1,144 @@
+"""Twelve deformations that break the contract, each in one thing, and the right one that they are made from."""
+
+# ruff: noqa: ARG002 - arguments are those of the contract
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import casadi as ca
+
+from fpirhc.deformation import Deformation
+
+
+@dataclass(frozen=True)
+class Softsign(Deformation):
+    """r+ = r - gain e / sqrt(1 + |e|^2 / size^2) with e = f - d; a map that keeps every law."""
+
+    gain: float
+    size: float
+
+    def step(self, request, response, desired, memory):
+        """Return the next request."""
+        error = response - desired
+        return request - self.gain * error / ca.sqrt(1 + ca.sumsqr(error) / self.size**2), {}
+
+    def effective_gain(self):
+        """The slope at zero error."""
+        return self.gain
+
+    def secant_gain(self):
+        """The slope at zero error is the largest one."""
+        return self.gain
+
+    def largest_step(self):
+        """The step of an infinite error."""
+        return abs(self.gain) * self.size
+
+    def with_effective_gain(self, gain):
+        """Return the map with another gain."""
+        return replace(self, gain=gain)
+
+
+class HalfTheStep(Softsign):
+    """Steps are twice as long as it says."""
+
+    def largest_step(self):
+        """Wrong."""
+        return 0.5 * super().largest_step()
+
+
+class HalfTheSecant(Softsign):
+    """Steps per unit are twice as long as it says."""
+
+    def secant_gain(self):
+        """Wrong."""
+        return 0.5 * self.gain
+
+
+class MovesItsFixedPoint(Softsign):
+    """Changes the request where the response is the desired one."""
+
+    def step(self, request, response, desired, memory):
+        """Wrong."""
+        return super().step(request, response, desired, memory)[0] + 1e-3, {}
+
+
+class DividesByZero(Softsign):
+    """Is 0 / 0 where the response is the desired one."""
+
+    def step(self, request, response, desired, memory):
+        """Wrong."""
+        error = response - desired
+        return request - self.gain * error / ca.norm_2(error) * ca.norm_2(error), {}
+
+
+class OtherSign(Softsign):
+    """Tells the gain with the other sign."""
+
+    def effective_gain(self):
+        """Wrong."""
+        return -self.gain
+
+
+class Kinked(Softsign):
+    """Has twice the gain for errors below zero."""
+
+    def step(self, request, response, desired, memory):
+        """Wrong."""
+        error = response - desired
+        bent = ca.if_else(error > 0, error, 2 * error)
+        return request - self.gain * bent / ca.sqrt(1 + ca.sumsqr(error) / self.size**2), {}
+
+
+class LouderFarOut(Softsign):
+    """Has a larger gain for large requests and does not tell their reach."""
+
+    def step(self, request, response, desired, memory):
+        """Wrong."""
+        step = super().step(request, response, desired, memory)[0] - request
+        return request + step * (1 + 0.2 * ca.tanh(ca.sumsqr(request) / 1e6)), {}
+
+
+class GivesAnotherGain(Softsign):
+    """Is asked for a gain and gives twice of it."""
+
+    def with_effective_gain(self, gain):
+        """Wrong."""
+        return replace(self, gain=2 * gain)
+
+
+class SaysDesiredPassesAtOnce(Softsign):
+    """Is the plain form and says that it is not."""
+
+    @property
+    def slows_desired(self):
+        """Wrong."""
+        return False
+
+
+class SaysItFilters(Softsign):
+    """Names a filter that it does not have."""
+
+    @property
+    def error_pole(self):
+        """Wrong."""
+        return 0.9
+
+
+class SaysItDoesNotAdapt(Softsign):
+    """Adapts."""
+
+    @property
+    def adapts(self):
+        """Wrong."""
+        return False
+
+
+class SaysItLeaks(Softsign):
+    """Names a leak that it does not have."""
+
+    @property
+    def leak(self):
+        """Wrong."""
+        return 0.5
