@@ -2,7 +2,7 @@
 
     y^(k)(t + tau) = h_k(x(t + tau), p) + sum_{j >= k} d^(j)(t) tau^(j-k) / (j-k)!,      d^(j) = y^(j) - h_j(x, p),   j < r,
 
-as in a plan (`shifted_reference`): where a deformation makes the response of the plant that of the model, d^(r) is zero.
+where d^(r) is taken as zero: over a dead time, which is short. Over a horizon it is not, see `consistent_state`.
 """
 
 from __future__ import annotations

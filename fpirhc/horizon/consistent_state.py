@@ -13,8 +13,9 @@ with the inputs b_j that move y_j^(r_j) alone, column j of (L_g L_f^(r-1) h)^-1,
 g b_j> is zero for k < r_i - 1 - l and (-1)^k at i = j for k = r_i - 1 - l, so the equations are triangular in k and regular
 wherever the inverse is, whatever the orders and the units. With equal orders b_j cancels.
 
-Where the steps do not contract, the state goes a part of the way or stays, continuously, so that no sample decides between two
-plans. What is left over of the outputs is held over the horizon (see `shifted_reference`).
+Where the steps do not contract, or would leave a physical range of the plant, the state goes a part of the way or stays,
+continuously, so that no sample decides between two plans. What is left over of the outputs is held over the horizon (see
+`shifted_reference`).
 
 References:
     A. Isidori, Nonlinear Control Systems, 3rd ed., Springer 1995, lemmas 4.1.1 and 5.1.1.
@@ -22,53 +23,66 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import casadi as ca
 
 from fpirhc.plant.instant import response_orders
 from fpirhc.plant.plant import Plant
 
 _STEPS = 4
-_GOOD, _POOR = 0.25, 0.5  # last step by the first: below, the state is found; above, it is not looked for
+_GOOD, _POOR = 0.25, 0.5  # last step by the first: up to here the state is found, and from here on it stays
+_INSIDE = 0.99  # of the way to the end of a physical range, where a model may have no slope
 
 
 def consistent_state(plant: Plant) -> ca.Function:
     """Return the Function (state, outputs, parameters) -> state at which the model has the controlled ones of these outputs.
 
     Args:
-        plant: the model, with outputs; no controlled one has the order 0.
+        plant: the model, with outputs. The command moves those of order 0 at once, so no state has them, and they are left out.
     """
-    newton = _newton(plant)
     start, y, p = (
         ca.MX.sym("x", plant.state.size),
         ca.MX.sym("y", plant.output.size),
         ca.MX.sym("p", plant.parameter.size),
     )
+    orders = response_orders(plant)
+    if not any(orders.values()):  # nothing but outputs that the command moves at once
+        return ca.Function("fpirhc_consistent_state", [start, y, p], [start], ["x", "y", "p"], ["found"])
+    newton = _newton(plant, orders)
     x, sizes = start, []
     for _ in range(_STEPS):
         move, size = newton(x, y, p)
         x = x + move
         sizes.append(size)
-    found = _trusted(plant.state.size)(start, x, sizes[0], sizes[-1])
+    found = _trusted(plant)(start, x, sizes[0], sizes[-1])
     return ca.Function("fpirhc_consistent_state", [start, y, p], [found], ["x", "y", "p"], ["found"])
 
 
-def _trusted(count: int) -> ca.Function:
-    """Function (start, end, size of the first step, of the last) -> as far from start to end as the contraction is worth."""
+def _trusted(plant: Plant) -> ca.Function:
+    """Function (start, end, size of the first step, of the last) -> as far from start to end as contraction and ranges let it."""
+    count = plant.state.size
     start, end = ca.SX.sym("start", count), ca.SX.sym("end", count)
     first, last = ca.SX.sym("first"), ca.SX.sym("last")
     whole = (_POOR - _GOOD) * ca.if_else(first > 0, first, 1)
     share = ca.fmax(0, ca.fmin(1, (_POOR * first - last) / whole))
+    for name, (lowest, highest) in plant.ranges.items():
+        k = plant.state.elements.index(name)
+        way = end[k] - start[k]
+        room = _INSIDE * ca.fmax(0, ca.if_else(way > 0, highest - start[k], start[k] - lowest))
+        leaves = ca.fabs(way) > room
+        share = ca.fmin(share, ca.if_else(leaves, room / ca.if_else(leaves, ca.fabs(way), 1), 1))
     # What is not a number compares as false.
-    reached = ca.if_else(last <= _GOOD * first, end, start + share * (end - start))
+    reached = ca.if_else(share < 1, start + share * (end - start), end)
     found = ca.if_else(last <= _POOR * first, reached, start)
     return ca.Function("fpirhc_trusted_state", [start, end, first, last], [found])
 
 
-def _newton(plant: Plant) -> ca.Function:
+def _newton(plant: Plant, orders: Mapping[str, int]) -> ca.Function:
     """Function (state, outputs, parameters) -> (move of the state, sum of the inputs' pulses that would have made it)."""
     x, _, p = plant.symbols()
-    y, orders = ca.SX.sym("y", plant.output.size), response_orders(plant)
-    rows = [k for k, e in enumerate(plant.output.elements) if e.rstrip("'") in orders]
+    y = ca.SX.sym("y", plant.output.size)
+    rows = [k for k, e in enumerate(plant.output.elements) if orders.get(e.rstrip("'"), 0)]
     outputs = plant.output_function(x, ca.SX.zeros(len(plant.inputs)), p, ca.SX.zeros(len(plant.names)))[rows]
     basis, pulses = _basis(plant, x, p, list(orders.values()))
     seen = ca.mtimes(ca.jacobian(outputs, x), basis)

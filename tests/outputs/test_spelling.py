@@ -1,0 +1,163 @@
+"""A plant is the same plant, whether it is written in (y, y', ..., y^(r-1)) or by its states with the output y.
+
+The model is wrong in both, and computes other derivatives of its output at the measured state. The plan starts where it has the
+measured ones, so plan and plant move as they do in the coordinates. The inverse stays at the measured state; with the increment
+of the command, u_k = u_{k-1} + (d_k - f_k) / beta^, it is the same one there. The outputs are linear in the states, so that
+Runge-Kutta's formula is the same in both.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from test_outputs import simulated
+
+import fpirhc as fp
+from fpirhc.controllers.base import Controller
+
+TANKS = fp.load_problem("leaking_tanks")
+
+
+def tanks() -> fp.Problem:
+    """The leaking tanks by their states, with the levels as outputs."""
+    plant, cost = TANKS.problem.plant, TANKS.problem.cost
+    assert isinstance(cost, fp.Quadratic)
+    states = fp.Plant.of_states(
+        states=plant.coordinates,
+        inputs=plant.inputs,
+        parameters=plant.parameters,
+        rates=plant.response,
+        outputs={name: fp.Output("m", lambda x, p, name=name: x[name]) for name in plant.names},
+        controlled=("h1",),
+    )
+    return replace(TANKS.problem, plant=states, cost=replace(cost, states={}, outputs=cost.states))
+
+
+@pytest.mark.parametrize("name", TANKS.controllers)
+def test_tanks_with_their_levels_as_outputs_are_the_tanks(name: str) -> None:
+    """Every controller, in noise. Only h1 is controlled; the distance of h2 is held, and is zero."""
+    one, other = (replace(p, duration=40.0, measure_from=0.0) for p in (TANKS.problem, tanks()))
+    plain, run = (simulated(p, TANKS.controllers[name]) for p in (one, other))
+    for signal in ("state", "command", "realised", "command_shift"):
+        np.testing.assert_allclose(run[signal], plain[signal], rtol=1e-9, atol=1e-9)
+    assert np.ptp(run["command"]) > 10
+
+
+# Plants whose outputs are linear in the state, and the same plants with their outputs as coordinates.
+
+UNIT = "1"
+
+
+def chain(order: int, wrong: Sequence[float]) -> fp.Plant:
+    """x_k' = -a_k x_k + x_{k+1}, the last one -b x^3 + sin x_0 + u; y = x_0."""
+    last, numbers = order - 1, {**{f"a{k}": 1.0 + 0.3 * k for k in range(order - 1)}, "b": 0.4}
+
+    def rates(x: Any, u: Any, p: Any) -> dict[str, Any]:
+        moves = {f"x{k}": x[f"x{k + 1}"] - p[f"a{k}"] * x[f"x{k}"] for k in range(last)}
+        return {**moves, f"x{last}": u.u - p.b * x[f"x{last}"] ** 3 + ca.sin(x.x0)}
+
+    return fp.Plant.of_states(
+        states={f"x{k}": UNIT for k in range(order)},
+        inputs={"u": UNIT},
+        parameters={n: fp.Parameter(v * w, v, UNIT) for (n, v), w in zip(numbers.items(), wrong, strict=True)},
+        rates=rates,
+        outputs={"y": fp.Output(UNIT, lambda x, p: x.x0)},
+    )
+
+
+def unequal(wrong: Sequence[float]) -> fp.Plant:
+    """Two outputs of orders 2 and 1, of 1 and of 1000 in their units, which both inputs move."""
+    numbers = {"a": 1.0, "b": 0.5, "c": 0.8}
+    return fp.Plant.of_states(
+        states={"x0": UNIT, "x1": UNIT, "w": UNIT},
+        inputs={"u": UNIT, "s": UNIT},
+        parameters={n: fp.Parameter(v * k, v, UNIT) for (n, v), k in zip(numbers.items(), wrong, strict=True)},
+        rates=lambda x, u, p: {
+            "x0": x.x1 - p.a * x.x0 + 0.3 * x.w,
+            "x1": u.u + 0.4 * u.s - p.b * x.x1**3,
+            "w": u.s - 0.2 * u.u - p.c * x.w + 0.5 * ca.sin(x.x0),
+        },
+        outputs={"y": fp.Output(UNIT, lambda x, p: x.x0), "z": fp.Output("10^-3", lambda x, p: 1e3 * x.w)},
+    )
+
+
+def in_outputs(plant: fp.Plant) -> fp.Plant:
+    """The plant with its outputs as coordinates: y^(r) = L_f^r h(x, u, p) at the x that has y, y', ..., y^(r-1)."""
+    x, u, p = plant.symbols()
+    seen = plant.output_function(x, ca.SX.zeros(u.numel()), p, ca.SX.zeros(x.numel()))
+    slope = ca.Function("slope", [p], [ca.jacobian(seen, x)])
+
+    def response(*arguments: Any) -> Mapping[str, Any]:
+        *derivatives, inputs, parameters = arguments
+        z = ca.vertcat(*(derivatives[e.count("'")][e.rstrip("'")] for e in plant.output.elements))
+        state = ca.solve(slope(parameters.vector), z)
+        values = plant.controlled_response_function(state, inputs.vector, parameters.vector)
+        return dict(zip(plant.outputs, ca.vertsplit(values), strict=True))
+
+    face = plant.face
+    names = [f"d{k}" for k in range(max(face.orders))] + ["u", "p"]
+    kind = inspect.Parameter.POSITIONAL_ONLY
+    vars(response)["__signature__"] = inspect.Signature([inspect.Parameter(n, kind) for n in names])
+    order = dict(zip(face.names, face.orders, strict=True))
+    return fp.Plant(face.coordinates, plant.inputs, plant.parameters, response, order=order)
+
+
+def both(plant: fp.Plant, start: Mapping[str, float] | None = None, **settings: Any) -> tuple[fp.Problem, fp.Problem]:
+    """The task on the plant by its states, and on the plant in its outputs."""
+    sizes = {"y": 1.0, "z": 1e3}
+    weights, rate = {n: 1 / sizes[n] ** 2 for n in plant.outputs}, dict.fromkeys(plant.inputs, 1e-3)
+    begin = dict.fromkeys(plant.state.elements, 0.0) | dict(start or {})
+    seen = plant.output_function(np.array(list(begin.values())), 0, plant.exact, np.zeros(len(begin)))
+    common: dict[str, Any] = {
+        "reference": fp.Trajectory(lambda t: {n: sizes[n] * (1 - ca.cos(1.5 * t)) for n in plant.outputs}),
+        "period": 0.02,
+        "duration": 0.6,
+        "horizon": fp.Horizon(stages=10, step=0.1),
+        "limits": fp.Limits(inputs=dict.fromkeys(plant.inputs, (-50.0, 50.0))),
+        **settings,
+    }
+    states = fp.Problem(plant=plant, start=begin, cost=fp.Quadratic(outputs=weights, rate=rate), **common)
+    first = dict(zip(plant.output.elements, seen.full().ravel(), strict=True))
+    return states, fp.Problem(
+        plant=in_outputs(plant), start=first, cost=fp.Quadratic(states=weights, rate=rate), **common
+    )
+
+
+PLANTS = {"order 2": lambda w: chain(2, w[:2]), "order 3": lambda w: chain(3, w), "orders 2 and 1": unequal}
+OPTIMISER = fp.FixedPoint(iterations=12, tolerance=1e-11)
+WHOLE = fp.ModelReferenced(fp.Affine(-2.0))  # the whole response error in one cycle: an increment of the command
+
+
+def agree(states: fp.Problem, coordinates: fp.Problem, controller: Controller) -> fp.Run:
+    """The run by states, after it was compared with that in the outputs."""
+    run, plain = (simulated(p, controller) for p in (states, coordinates))
+    for signal, same in (("output", "state"), ("command", "command"), ("realised", "realised"), ("planned", "planned")):
+        scale = np.abs(plain[same]).max(axis=0)
+        np.testing.assert_allclose(run[signal] / scale, plain[same] / scale, atol=1e-9)
+    return run
+
+
+@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_adaptive_plans_on_a_plant_are_those_on_the_plant_in_its_outputs(name: str, seed: int) -> None:
+    wrong = np.random.default_rng(seed).uniform(0.6, 1.6, 3)
+    run = agree(*both(PLANTS[name](wrong)), fp.RecedingHorizon(OPTIMISER, WHOLE))
+    assert np.abs(run["command_shift"]).max() > 0.1
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_so_are_plans_without_adaptation_that_start_there(name: str) -> None:
+    """From a start at which model and plant have other derivatives; the inverse returns the planned input."""
+    wrong = np.random.default_rng(3).uniform(0.6, 1.6, 3)
+    states, coordinates = both(PLANTS[name](wrong), {"x0": 0.4, "x1": -0.2})
+    controller = fp.RecedingHorizon(OPTIMISER, replanning=fp.FromMeasurement(consistent=True))
+    run = agree(states, coordinates, controller)
+    np.testing.assert_allclose(run["command"], run["planned"], atol=1e-12)
+    free = simulated(states, fp.RecedingHorizon(OPTIMISER))
+    assert np.abs(free["command"] - run["command"]).max() > 0.1  # the default is another plan
