@@ -19,6 +19,8 @@ import numpy as np
 from fpirhc.controllers.contract import Controller, checked, resolved
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotSupported, nearest
 from fpirhc.fields.checked import expects_whole_number
+from fpirhc.fields.given import described
+from fpirhc.fields.real_number import real_number
 from fpirhc.symbolic.block import Block, Composite, Delay, open_settings
 from fpirhc.symbolic.constants import holds_nan
 from fpirhc.symbolic.layout import Layout, Signal, scalar
@@ -150,14 +152,15 @@ class LiveSettings:
                 raise InvalidName(f"setting '{path}' is not live in this loop.{nearest(path, self.paths)}")
             parts = [(path, value)] if ends == [path] else self._parts(path, value, ends)
             for name, part in parts:
-                if isinstance(part, bool) or not isinstance(part, int | float | np.number) or math.isnan(part):
-                    raise InvalidValue(f"setting '{name}': expected a number, got {part!r}")
-                values[name] = float(part)
+                number = real_number(part)
+                if number is None or math.isnan(number):
+                    raise InvalidValue(f"setting '{name}': expected a number, got {described(part)}")
+                values[name] = number
         return values
 
     def _parts(self, path: str, value: object, ends: list[str]) -> list[tuple[str, object]]:
-        if not isinstance(value, Sequence) or len(value) != 2:
-            raise InvalidValue(f"setting '{path}' is an interval: expected a pair (lower, upper), got {value!r}")
+        if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or len(value) != 2:
+            raise InvalidValue(f"setting '{path}' is an interval: expected a pair (lower, upper), got {described(value)}")
         both = {f"{path}.{k}": value[k] for k in (0, 1)}
         for name in both.keys() - set(ends):
             if both[name] != self._content(name):

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.fields.given import described, mended
+from fpirhc.fields.given import described, mended, shortened
 from fpirhc.fields.kinds import Range
+from fpirhc.fields.real_number import real_number
 from fpirhc.symbolic.number import SymbolicNumber
 
 
@@ -87,17 +88,17 @@ class Number(Expected):
 
     def fits(self, value: object) -> bool:
         """Whether it is such a number; truth values are none."""
-        if type(value) in _OFTEN and (
-            type(value) is int or not self.whole
-        ):  # without the slow tests of abstract classes
-            number = typing.cast(float, value)
-            return number == number and (self.within is None or self.within.holds(number))  # noqa: PLR0124 -- NaN
-        if isinstance(value, SymbolicNumber):
-            return True
-        kind = numbers.Integral if self.whole else numbers.Real
-        if isinstance(value, bool | np.bool_) or not isinstance(value, kind):
+        if type(value) not in _OFTEN:  # the tests of abstract classes are slow
+            if isinstance(value, SymbolicNumber):
+                return True
+            if isinstance(value, np.ndarray):
+                return False
+        if self.whole and not isinstance(value, numbers.Integral):
             return False
-        return not math.isnan(value) and (self.within is None or self.within.holds(float(value)))
+        number = real_number(value)
+        if number is None:  # a whole number beyond the largest float is a whole number
+            return self.whole and type(value) is int and (self.within is None or self.within.holds(value))
+        return not math.isnan(number) and (self.within is None or self.within.holds(number))
 
 
 @dataclass(frozen=True)
@@ -150,8 +151,8 @@ class Entries(Expected):
         """Every key and every entry."""
         assert isinstance(value, Mapping)
         for key, entry in value.items():
-            yield f": name {key!r}", self.key, key
-            yield f"[{key!r}]", self.value, entry
+            yield f": name {shortened(key)}", self.key, key
+            yield f"[{shortened(key)}]", self.value, entry
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 import casadi as ca
+import numpy as np
 
 if TYPE_CHECKING:
     from fpirhc.fields.expected import Expected
@@ -32,7 +33,14 @@ def described(value: object) -> str:
         return f"the function {getattr(value, '__name__', value)}{_signature(value)}"
     if value is None or isinstance(value, int | float | tuple | list | dict | set):
         return _SHORT.repr(value)
+    if isinstance(value, np.ndarray):
+        return f"an array of the shape {value.shape} and the type {value.dtype}"
     return f"a value of the class {type(value).__name__}"
+
+
+def shortened(value: object) -> str:
+    """Return a value as Python writes it, with a gap in the middle where it is long."""
+    return _SHORT.repr(value)
 
 
 def mended(expected: Expected, value: object) -> str:

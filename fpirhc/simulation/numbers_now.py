@@ -8,6 +8,7 @@ import numpy as np
 
 from fpirhc.controllers.live_settings import LiveSettings, Numbers
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue
+from fpirhc.fields.named_entries import named_entries
 from fpirhc.simulation.set_points import SetpointsNow, set_points_now
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.live import PREFIX
@@ -50,8 +51,11 @@ class NumbersNow:
         """Put numbers of live settings in force, by path, and return whether they were accepted.
 
         Raises:
+            InvalidField: no mapping of names.
             InvalidName: a setting that is not live.
         """
+        if not named_entries("settings", settings):
+            return True
         before = {path: value for path, value in self.numbers.items() if path in self._live.paths}
         try:
             _, _, numbers = self._live.changed({**before, **self._live.flat(settings)})
@@ -67,9 +71,12 @@ class NumbersNow:
         """Put set-points in force, by coordinate or output, and return whether they were accepted.
 
         Raises:
+            InvalidField: no mapping of names.
             InvalidName: a coordinate without set-point.
             InvalidShape: neither one number nor one per node.
         """
+        if not named_entries("setpoints", setpoints):
+            return True
         try:
             row = set_points_now(self._live.problem, setpoints, self._setpoints)
         except InvalidValue as error:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from numbers import Real
-
 import numpy as np
 
 from fpirhc.errors import InvalidShape, InvalidValue
+from fpirhc.fields.given import described
+from fpirhc.fields.real_number import real_number
 from fpirhc.simulation.run import Run
 
 
@@ -58,11 +58,10 @@ def one_number(name: str, value: object) -> float:
     Raises:
         InvalidValue: anything that is not one real number.
     """
-    if isinstance(value, np.ndarray) and value.size == 1 and value.dtype.kind in "fiu":
-        return float(value.item())
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
-        raise InvalidValue(f"argument '{name}' must be a number of seconds, got {_short(value)}")
-    return float(value)
+    number = real_number(value)
+    if number is None:
+        raise InvalidValue(f"argument '{name}' must be a number of seconds, got {described(value)}")
+    return number
 
 
 def _short(value: object) -> str:

@@ -8,6 +8,9 @@ import numpy as np
 
 from fpirhc.controllers.own_reference import given_signals
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
+from fpirhc.fields.given import described
+from fpirhc.fields.real_number import real_number
+from fpirhc.fields.user_code import called
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Steps
 from fpirhc.task.steps import check_values, in_force, pairs
@@ -58,10 +61,9 @@ def set_points_now(problem: Problem, setpoints: SetpointsNow, before: np.ndarray
     names = problem.plant.face.names
     rows = before.reshape(-1, len(names)).copy()
     for name, value in setpoints.items():
-        try:
-            numbers = np.asarray(value, dtype=float).ravel()
-        except (TypeError, ValueError):
-            raise InvalidValue(f"set-point of '{name}': expected a number, got {value!r}") from None
+        numbers = _numbers(value)
+        if numbers is None:
+            raise InvalidValue(f"set-point of '{name}': expected a number, got {described(value)}")
         if numbers.size not in (1, len(rows)):
             wanted = "one number" if len(rows) == 1 else f"one number, or {len(rows)}: now and at every later node"
             raise InvalidShape(f"set-point of '{name}': expected {wanted}, got {numbers.size}")
@@ -90,7 +92,20 @@ def _values(problem: Problem, name: str, steps: Steps | Callable[[float], float]
     """Set-points of one coordinate at some times, of the same shape."""
     if not callable(steps):
         return in_force(pairs(name, steps), times, problem.period)
-    try:
-        return np.array([float(steps(float(t))) for t in times.ravel()]).reshape(times.shape)
-    except (TypeError, ValueError) as error:
-        raise InvalidValue(f"set-points of '{name}': the function of time does not return a number ({error})") from None
+    what = f"set-points of '{name}': the function of time"
+    given = [called(what, steps, float(t)) for t in times.ravel()]
+    values = [real_number(one) for one in given]
+    if None in values:
+        wrong = given[values.index(None)]
+        raise InvalidValue(f"{what} does not return a number, but {described(wrong)}")
+    return np.array(values, dtype=float).reshape(times.shape)
+
+
+def _numbers(value: object) -> np.ndarray | None:
+    """One number, or several; None where something else is among them."""
+    one = real_number(value)
+    if one is not None:
+        return np.array([one])
+    several = isinstance(value, Sequence | np.ndarray) and not isinstance(value, str | np.ma.MaskedArray)
+    numbers = [real_number(entry) for entry in np.ravel(value).tolist()] if several else [None]
+    return None if None in numbers else np.array(numbers, dtype=float)

@@ -66,6 +66,7 @@ class Simulator:
         """Whether a solver inside starts a run at its last solution (OSQP does), so that a run depends on the runs before."""
         return any(f.class_name() == "OsqpInterface" for f in self.loop.function.find_functions())
 
+    @checked_call
     def run(
         self,
         *,

@@ -175,6 +175,7 @@ class Stepper(Checked):
         Raises:
             InvalidShape: a wrong number of entries, named.
             InvalidValue: an argument that is not made of numbers, or the memory of another controller.
+            InvalidField: settings or set-points that are no mapping of names.
             InvalidName: a setting that is not live; a coordinate without set-point.
             ConcurrentUse: another thread is inside this stepper.
         """
@@ -184,7 +185,7 @@ class Stepper(Checked):
         except IndexError:
             _refuse_thread()
         try:
-            if settings or setpoints or isinstance(time, _TRUTHS):
+            if settings is not None or setpoints is not None or isinstance(time, _TRUTHS):
                 self._take(time, settings, setpoints)
             try:
                 if not (state.__class__ is realised.__class__ is memory.__class__ is np.ndarray):
@@ -193,7 +194,7 @@ class Stepper(Checked):
                 self._state[:] = state
                 self._realised[:] = realised
                 self._memory[:] = memory
-            except (TypeError, ValueError, NotImplementedError):
+            except (TypeError, ValueError, OverflowError, NotImplementedError):
                 self._arguments.accept(time, state, realised, memory, self.measures)
             if self._memory[0] != self._fingerprint:
                 self._arguments.refuse_foreign_memory()
@@ -312,9 +313,9 @@ class Stepper(Checked):
 
     def _take(self, time: object, settings: Numbers | None, setpoints: SetpointsNow | None) -> None:
         """Put numbers in force, and refuse a truth value as time."""
-        if settings:
+        if settings is not None:
             self.change(settings)
-        if setpoints:
+        if setpoints is not None:
             self.aim(setpoints)
         if isinstance(time, _TRUTHS):
             one_number("time", time)

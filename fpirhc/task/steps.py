@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from numbers import Real
 
 import numpy as np
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.given import described
+from fpirhc.fields.real_number import real_number
 from fpirhc.plant.plant import Plant
 from fpirhc.task.limits import Limits
 from fpirhc.task.reference import Steps
@@ -27,10 +28,12 @@ def pairs(name: str, steps: Steps) -> list[tuple[float, float]]:
     text = f"set-points of '{name}'"
     if not entries or any(not isinstance(e, Sequence | np.ndarray) or len(e) != 2 for e in entries):
         raise InvalidValue(f"{text}: expected a number, or pairs (time, set-point), got {steps!r}")
-    for value in (v for entry in entries for v in entry):
-        if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or not math.isfinite(value):
-            raise InvalidValue(f"{text}: expected finite numbers, got {value!r}")
-    numbers = [(float(time), float(value)) for time, value in entries]
+    numbers: list[tuple[float, float]] = []
+    for entry in entries:
+        time, value = map(real_number, entry)
+        if time is None or value is None or not (math.isfinite(time) and math.isfinite(value)):
+            raise InvalidValue(f"{text}: expected finite numbers, got {described(entry if len(entries) > 1 else steps)}")
+        numbers.append((time, value))
     times = [time for time, _ in numbers]
     if times[0] != 0 or any(later <= time for time, later in pairwise(times)):
         raise InvalidValue(f"{text}: the times must begin at 0 and increase, got {times}")

@@ -1,0 +1,157 @@
+"""Whatever is given as a setting, a set-point or a time ends in one clear error, or is refused and counted; it is never a raw one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.errors import InvalidField, InvalidName, InvalidProblem, InvalidShape, InvalidValue
+from fpirhc.fields.real_number import real_number
+from fpirhc.problem_files.problem_file import load_problem
+from fpirhc.simulation.simulate import simulator
+
+TASK = load_problem("two_mass")
+PROBLEM = replace(
+    TASK.problem, reference=fp.Setpoint({"q1": 0.1, "q2": 0.2}, rate=3.0), duration=0.02, measure_from=0.0
+)
+CONTROLLER = TASK.controllers["CTC+FPI (eq 6)"]
+HUGE = 10**400  # a whole number that is no float
+GAIN, ENDS = "deformation.gain", "limits.inputs.Q1"
+
+
+@pytest.fixture(scope="module")
+def stepper():
+    """A stepper with a gain and an interval that are live."""
+    return fp.Stepper(PROBLEM, CONTROLLER, compiled=False, live=[GAIN, ENDS])
+
+
+def sample(stepper):
+    """Arguments of a step at rest."""
+    size = stepper.signals["desired"].size
+    return 0.0, np.array(PROBLEM.start_state), np.zeros(size), stepper.start()
+
+
+NUMBERS = [
+    (3, 3.0),
+    (0.5, 0.5),
+    (np.float32(0.5), 0.5),
+    (np.int8(-3), -3.0),
+    (np.array([[2.0]]), 2.0),
+    (Fraction(1, 4), 0.25),
+    (float("inf"), float("inf")),
+    *((no, None) for no in (HUGE, True, np.bool_(False), "1", None, 1j, [1.0], {}, np.zeros(2), Fraction(HUGE))),
+    *((no, None) for no in (np.timedelta64(1, "s"), np.datetime64("2020-01-01"), np.ma.array([1.0], mask=True))),
+]
+
+
+@pytest.mark.parametrize(("value", "number"), NUMBERS, ids=lambda v: repr(v)[:20])
+def test_what_counts_as_one_real_number(value, number):
+    """What Python and numpy have as real numbers, and nothing that only converts to one."""
+    assert real_number(value) == number
+
+
+REFUSED = [
+    ({GAIN: HUGE}, "expected a number, got 1000"),
+    ({GAIN: [-0.4]}, r"expected a number, got \[-0.4\]"),
+    ({GAIN: np.timedelta64(1, "s")}, "timedelta64"),
+    ({GAIN: np.bool_(True)}, "expected a number"),
+    ({GAIN: float("nan")}, "expected a number, got nan"),
+    ({ENDS: (1, HUGE)}, "Q1.1': expected a number"),
+    ({ENDS: 5}, r"pair \(lower, upper\), got 5"),
+    ({ENDS: "ab"}, "pair"),
+]
+
+
+@pytest.mark.parametrize(("settings", "words"), REFUSED, ids=lambda v: str(v)[:25])
+def test_wrong_settings_are_refused_and_counted(settings, words, stepper):
+    """The numbers in force stay, and the step of that cycle has the command that it has without them."""
+    before, numbers = stepper.refused, stepper.numbers
+    expected, _ = stepper.step(*sample(stepper))
+    command, _ = stepper.step(*sample(stepper), settings=settings)
+    assert np.array_equal(command, expected)
+    assert (stepper.refused, stepper.numbers) == (before + 1, numbers)
+    with pytest.raises(InvalidValue, match=words):
+        raise InvalidValue(stepper.why_refused)
+
+
+@pytest.mark.parametrize("name", ["settings", "setpoints"])
+@pytest.mark.parametrize(
+    ("entries", "words"),
+    [
+        (5, "expected a mapping {name: number}, got 5"),
+        ([(GAIN, -0.4)], "expected a mapping"),
+        (np.array([1.0, 2.0]), r"an array of the shape \(2,\)"),
+        ("q1", "the text 'q1'"),
+        ({1: 2.0, None: 3.0}, "the name 1.*\n.*the name None"),
+    ],
+    ids=lambda v: str(v)[:20],
+)
+def test_what_is_no_mapping_of_names_is_named(entries, words, name, stepper):
+    """It is a mistake in the caller's program, told as an unknown name is; the stepper goes on working."""
+    with pytest.raises(InvalidField, match=rf"(?s){name}.*{words}"):
+        stepper.step(*sample(stepper), **{name: entries})
+    command, _ = stepper.step(*sample(stepper))
+    assert np.isfinite(command).all()
+
+
+SETPOINTS = [HUGE, "0.3", None, {}, 1j, True, np.timedelta64(1, "s"), np.array(["a"]), float("inf"), [[1.0, "a"]]]
+
+
+@pytest.mark.parametrize("value", SETPOINTS, ids=lambda v: repr(v)[:20])
+def test_wrong_set_points_are_refused_and_counted(value, stepper):
+    """A text, a truth value and a duration are no set-points, though numpy makes numbers of them."""
+    before, points = stepper.refused, stepper.setpoints
+    assert not stepper.aim({"q1": value})
+    assert (stepper.refused, stepper.setpoints) == (before + 1, points)
+    assert "q1" in stepper.why_refused
+
+
+def test_right_numbers_of_every_kind_are_taken(stepper):
+    """A number of numpy, an array with one entry, and an array as an interval."""
+    assert stepper.change({GAIN: np.float32(-0.5), ENDS: np.array([-40.0, 40.0])})
+    assert stepper.aim({"q1": np.array([0.25]), "q2": np.int64(1)})
+    assert stepper.numbers[GAIN] == -0.5
+    assert stepper.setpoints == {"q1": 0.25, "q2": 1.0}
+    with pytest.raises(InvalidShape, match="expected one number, got 2"):
+        stepper.aim({"q1": [0.1, 0.2]})
+
+
+@pytest.mark.parametrize("time", [np.timedelta64(1, "s"), np.datetime64("2020-01-01"), "0", None, HUGE, [0.0], 1j])
+def test_what_is_no_time_is_named(time, stepper):
+    """Also in the time stamp of a sample."""
+    with pytest.raises(InvalidValue, match="'time' must be a number of seconds, got"):
+        stepper.step(time, *sample(stepper)[1:])
+
+
+RUNS = [
+    ({"changes": {"0.01": {GAIN: -0.4}}}, InvalidField, "got the text '0.01'; write 0.01 without quotes"),
+    ({"changes": {HUGE: {GAIN: -0.4}}}, InvalidField, "name 1000"),
+    ({"changes": [(0.01, {GAIN: -0.4})]}, InvalidField, "changes"),
+    ({"settings": {1: 2.0}}, InvalidField, "name 1: expected a text"),
+    ({"settings": 5}, InvalidField, "settings: expected"),
+    ({"settings": {GAIN: HUGE}}, InvalidField, "expected a number"),
+    ({"setpoints": 5}, InvalidField, "setpoints: expected"),
+    ({"setpoints": {"q1": [(0, HUGE)]}}, InvalidField, "expected a number"),
+    ({"setpoints": {"q9": 1.0}}, InvalidName, "'q9' is unknown"),
+    ({"setpoints": {"q1": lambda t: 1 / (t - t)}}, InvalidProblem, "'q1': the function of time .*ZeroDivisionError"),
+    ({"setpoints": {"q1": lambda t: HUGE}}, InvalidValue, "does not return a number, but 1000"),  # noqa: ARG005
+    ({"setpoints": {"q1": lambda t: "a"}}, InvalidValue, "does not return a number, but the text 'a'"),  # noqa: ARG005
+]
+
+
+@pytest.fixture(scope="module")
+def loop():
+    """A loop with a gain that is live."""
+    return simulator(PROBLEM, CONTROLLER, compiled=False, live=[GAIN])
+
+
+@pytest.mark.parametrize(("given", "error", "words"), RUNS, ids=lambda v: str(v)[:30])
+def test_wrong_numbers_of_a_run_are_named(given, error, words, loop):
+    """Before the run; a loop that is ready checks as `simulate` does."""
+    for run in (lambda: loop.run(seed=0, **given), lambda: fp.simulate(PROBLEM, CONTROLLER, seed=0, **given)):
+        with pytest.raises(error, match=words):
+            run()
