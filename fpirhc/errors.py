@@ -95,12 +95,12 @@ class WorkerDied(FpirhcError, RuntimeError):
     """Worker processes died repeatedly."""
 
 
-def nearest(name: str, valid: Iterable[str]) -> str:
-    """Return ' Did you mean ...? Valid: ...', the end of a message about an unknown `name`."""
+def nearest(name: object, valid: Iterable[str]) -> str:
+    """Return ' Did you mean ...? Valid: ...', the end of a message about an unknown `name`, which may be no text."""
     names = [str(one) for one in valid]
     if not names:
         return " No names are valid here."
-    close = get_close_matches(name, names, n=1, cutoff=0.5)
+    close = get_close_matches(name, names, n=1, cutoff=0.5) if isinstance(name, str) else []
     hint = f" Did you mean '{close[0]}'?" if close else ""
     return f"{hint} Valid: {', '.join(names)}."
 

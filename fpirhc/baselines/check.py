@@ -19,6 +19,7 @@ from fpirhc.baselines.settings import settings_of
 from fpirhc.baselines.variants import names_by_source, nominal, variants
 from fpirhc.errors import BaselineError, FpirhcError, InvalidValue
 from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.studies.comparison.compare import select, versions
 
@@ -84,7 +85,7 @@ def measure_expected(
     task: Task,
     controllers: Sequence[str],
     *,
-    seed: int = 0,
+    seed: Seed = 0,
     seeds: int = 8,
     compiled: bool = True,
     processes: int = 1,
@@ -107,7 +108,7 @@ def compose_baseline(
     expectations: Mapping[str, Expected],
     reason: str,
     *,
-    seed: int = 0,
+    seed: Seed = 0,
     seeds: int = 8,
     compiled: bool = True,
 ) -> Baseline:
@@ -171,7 +172,7 @@ def accept(
     task: Task,
     reason: str,
     *,
-    seed: int = 0,
+    seed: Seed = 0,
     seeds: int = 8,
     baselines: Path | None = None,
     compiled: bool = True,

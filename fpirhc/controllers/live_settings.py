@@ -160,7 +160,9 @@ class LiveSettings:
 
     def _parts(self, path: str, value: object, ends: list[str]) -> list[tuple[str, object]]:
         if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or len(value) != 2:
-            raise InvalidValue(f"setting '{path}' is an interval: expected a pair (lower, upper), got {described(value)}")
+            raise InvalidValue(
+                f"setting '{path}' is an interval: expected a pair (lower, upper), got {described(value)}"
+            )
         both = {f"{path}.{k}": value[k] for k in (0, 1)}
         for name in both.keys() - set(ends):
             if both[name] != self._content(name):

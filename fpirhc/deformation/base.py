@@ -8,7 +8,6 @@ first order every map here is r+ = r - a (f - d) with one number a, its effectiv
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ import casadi as ca
 from fpirhc.describe import replaced
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.real_number import finite_number
 from fpirhc.symbolic.layout import Expression, Layout
 
 Wrapping = TypeVar("Wrapping")
@@ -258,4 +258,4 @@ def require_numbers(owner: str, values: Mapping[str, float]) -> None:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return finite_number(value)

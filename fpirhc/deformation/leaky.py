@@ -22,6 +22,7 @@ import math
 
 from fpirhc.deformation.queue import Cycles, every
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.real_number import finite_number
 
 _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped
 _LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists
@@ -91,7 +92,7 @@ def default_pole(product: float, uncertainty: float) -> float:
 
 def check_pole(owner: str, pole: float) -> None:
     """Raise InvalidValue where the pole is outside [0, 1)."""
-    if not (isinstance(pole, int | float) and 0 <= pole < 1):
+    if not (finite_number(pole) and 0 <= pole < 1):
         raise InvalidValue(f"{owner}(pole={pole!r}): expected a number from 0 (no leak) to below 1")
 
 

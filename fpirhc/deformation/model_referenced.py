@@ -21,7 +21,6 @@ f^ reaches the iteration the way f does: after the same dead time, through the s
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -32,6 +31,7 @@ from fpirhc.deformation.leaky import check_pole, chosen_pole
 from fpirhc.deformation.queue import Cycles, Queue, check_cycles, check_uncertainty, every, several
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.fields.real_number import finite_number
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
@@ -65,7 +65,7 @@ class ModelReferenced(Wrapper):
         check_cycles("ModelReferenced", self.measurement, "measurement")
         check_cycles("ModelReferenced", self._delays)
         taus = every(self.lag)
-        if not taus or not all(isinstance(t, int | float) and math.isfinite(t) and t >= 0 for t in taus):
+        if not taus or not all(finite_number(t) and t >= 0 for t in taus):
             raise InvalidValue(
                 f"ModelReferenced(lag={self.lag!r}): expected a time constant of at least 0 s, or a tuple with one per input"
             )

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.fields.real_number import finite_number
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.functions import ceil, entry_at
 from fpirhc.symbolic.layout import Expression
@@ -130,7 +131,7 @@ def check_longest(owner: str, longest: float | None, cycles: Cycles) -> None:
 def check_cycles(owner: str, cycles: Cycles, name: str = "cycles") -> None:
     """Raise InvalidValue for a dead time that is negative, not finite, or beyond 1000 cycles, and for an empty tuple."""
     values = every(cycles)
-    if not values or not all(isinstance(c, int | float) and math.isfinite(c) and 0 <= c <= MOST for c in values):
+    if not values or not all(finite_number(c) and 0 <= c <= MOST for c in values):
         raise InvalidValue(
             f"{owner}({name}={cycles!r}): expected a dead time between 0 and {MOST} control cycles, or a tuple with one for "
             "every controlled coordinate"

@@ -33,9 +33,8 @@ def described(value: object) -> str:
         return f"the function {getattr(value, '__name__', value)}{_signature(value)}"
     if value is None or isinstance(value, int | float | tuple | list | dict | set):
         return _SHORT.repr(value)
-    if isinstance(value, np.ndarray):
-        return f"an array of the shape {value.shape} and the type {value.dtype}"
-    return f"a value of the class {type(value).__name__}"
+    array = f"an array of the shape {value.shape} and the type {value.dtype}" if isinstance(value, np.ndarray) else ""
+    return array or f"a value of the class {type(value).__name__}"
 
 
 def shortened(value: object) -> str:

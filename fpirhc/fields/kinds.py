@@ -35,6 +35,9 @@ class Range:
 Finite: TypeAlias = Annotated[float, Range("a finite number", open_low=True, open_high=True)]
 Positive: TypeAlias = Annotated[float, Range("a finite number above 0", low=0.0, open_low=True, open_high=True)]
 NotNegative: TypeAlias = Annotated[float, Range("a finite number of at least 0", low=0.0, open_high=True)]
+Deviation: TypeAlias = Annotated[  # its square is finite, and not zero
+    float, Range("a positive number from 1e-100 to 1e100", low=1e-100, high=1e100)
+]
 Duration: TypeAlias = Annotated[
     float, Range("a number from 1e-12 to 1e12 in the plant's unit of time", low=1e-12, high=1e12)
 ]
@@ -43,4 +46,5 @@ Accuracy: TypeAlias = Annotated[
 ]
 Count: TypeAlias = Annotated[int, Range("a whole number from 1 to 1000000", low=1, high=1e6)]
 Few: TypeAlias = Annotated[int, Range("a whole number from 1 to 1000", low=1, high=1000)]
+Seed: TypeAlias = Annotated[int, Range("a whole number of at least 0, from which random numbers are drawn", low=0)]
 CountOrZero: TypeAlias = Annotated[int, Range("a whole number of at least 0", low=0)]

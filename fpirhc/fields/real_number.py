@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from numbers import Real
 
 import numpy as np
@@ -25,3 +26,9 @@ def real_number(value: object) -> float | None:
         return float(value)
     except (OverflowError, TypeError, ValueError):  # 10**400; a class of somebody's that only says that it is a number
         return None
+
+
+def finite_number(value: object) -> bool:
+    """Return whether it is one real number that is finite."""
+    number = real_number(value)
+    return number is not None and math.isfinite(number)

@@ -30,6 +30,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.fields.real_number import finite_number
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.symbolic.layout import Expression, Named
 
@@ -77,7 +78,7 @@ def check_map(plant: Plant, mistakes: Mistakes) -> None:
             mistakes.add("step is missing: a map needs the length of its step; write Plant.of_map(..., step=...)")
         return
     step = plant.step
-    if isinstance(step, bool) or not isinstance(step, int | float) or not (math.isfinite(step) and step > 0):
+    if not (finite_number(step) and step > 0):
         mistakes.add(f"step must be a positive number, in {plant.time_unit}, got {step!r}")
     elif plant.next is not None and set(plant.orders) != {1}:
         mistakes.add("order: every state of a map has the order 1; later steps are found from outputs")

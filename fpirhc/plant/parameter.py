@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.real_number import finite_number
 from fpirhc.plant.spread import Spread
 
 
@@ -56,7 +57,7 @@ def check_parameters(parameters: Mapping[str, Parameter], mistakes: Mistakes) ->
         numbers = True
         for which in ("approximate", "exact"):
             value = getattr(parameter, which)
-            if not isinstance(value, int | float) or not math.isfinite(value):
+            if not finite_number(value):
                 mistakes.add(f"parameter '{name}': {which} must be a finite number, got {value!r}")
                 numbers = False
         mistake = (_bounds_mistake(parameter) or _spread_mistake(parameter)) if numbers else ""

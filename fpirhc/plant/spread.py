@@ -14,6 +14,7 @@ from statistics import NormalDist
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.real_number import real_number
 
 TAILS = 2.0  # standard deviations at which normal distributions are cut off; 95 % of the uncut one lie inside
 _NORMAL = NormalDist()
@@ -138,7 +139,7 @@ def _check_width(spread: Spread, absolute: float | None, relative: float | None)
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return real_number(value) is not None
 
 
 EXAMPLES = (

@@ -9,6 +9,7 @@ from typing import Any
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
+from fpirhc.fields.real_number import finite_number
 from fpirhc.problem_files.settings import current_setting
 
 DIGITS = 4  # of every number that is tried, so that a written number is exactly the tried one
@@ -95,7 +96,7 @@ def check_tuning(tuning: Any, controllers: Mapping[str, Controller]) -> None:
 
 
 def _check(span: Span | LogSpan, kind: str) -> None:
-    numbers = all(isinstance(v, int | float) and math.isfinite(v) for v in (span.low, span.high))
+    numbers = all(finite_number(v) for v in (span.low, span.high))
     if not numbers or not span.low < span.high:
         raise InvalidValue(f"{kind}({span.low!r}, {span.high!r}): expected two finite numbers, the smaller one first")
 

@@ -11,6 +11,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import NotSupported
 from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.kinds import Seed
 from fpirhc.plant.mismatch import check_mismatch
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
@@ -88,7 +89,7 @@ class Prediction:
 
 @checked_call
 def predict_response(
-    problem: Problem, controller: Controller, *, mismatch: float | None = None, seed: int = 0, compiled: bool = True
+    problem: Problem, controller: Controller, *, mismatch: float | None = None, seed: Seed = 0, compiled: bool = True
 ) -> Prediction:
     """Return the predicted effect of the controller's deformation, from one run of the model and no run of the plant.
 

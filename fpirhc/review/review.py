@@ -9,6 +9,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked, resolved
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.kinds import Seed
 from fpirhc.review.answer import Answer, Review, Verdict
 from fpirhc.review.chatter import chatter_small
 from fpirhc.review.commands import commands_inside
@@ -42,7 +43,7 @@ from fpirhc.task.problem import Problem
 
 
 @checked_call
-def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch: float, seed: int) -> Review:
+def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch: float, seed: Seed) -> Review:
     """Return the answers to all questions that can be answered before a run.
 
     Args:

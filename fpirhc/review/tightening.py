@@ -32,6 +32,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.kinds import Seed
 from fpirhc.review.grid import each, review_grid
 from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import ideal_loops
@@ -54,7 +55,7 @@ def tightened(
     mismatch: float | None = None,
     widen: float = 1.1,
     passes: int = 12,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> Controller:
     """Return the controller whose plans keep a margin from the limits of states, and with which the plants keep the limits.
 
@@ -87,7 +88,7 @@ def state_margins(
     mismatch: float | None = None,
     widen: float = 1.1,
     passes: int = 12,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> Margins:
     """Return the margins of `tightened` by name of the limited state, one number for every stage; arguments as there."""
     if not 0 < widen < np.inf:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.real_number import real_number
 from fpirhc.task.disturbance import Disturbance
 
 
@@ -42,4 +43,5 @@ class Sensor(Checked):
 
 
 def _within(value: object, lower: float, upper: float) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and lower < value < upper
+    number = real_number(value)
+    return number is not None and lower < number < upper

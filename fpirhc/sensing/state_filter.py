@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.real_number import finite_number
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, known_by_positions, spline_weights
 from fpirhc.symbolic.block import Block
@@ -46,7 +47,7 @@ class StateVariableFilter(DerivativeEstimator):
     bandwidth: float
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.bandwidth, int | float) and 0 < self.bandwidth < math.inf):
+        if not (finite_number(self.bandwidth) and self.bandwidth > 0):
             raise InvalidValue(
                 f"StateVariableFilter(bandwidth={self.bandwidth!r}): expected a positive number of rad/s"
             )

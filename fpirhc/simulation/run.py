@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, cast
 import numpy as np
 
 from fpirhc.errors import InvalidName, nearest
+from fpirhc.fields.checked_call import checked_call
 from fpirhc.status import Status
 from fpirhc.summary import line, number, table
 from fpirhc.symbolic.layout import Layout
@@ -85,8 +86,7 @@ class Run:
             return self.log[:, self.layout.slice(name)]
         if name in self.layout.columns:
             return self.log[:, self.layout.columns.index(name)]
-        valid = [*self.layout.names, *self.layout.columns]
-        raise InvalidName(f"signal '{name}' is not in this run.{nearest(name, valid)}")
+        raise self._unknown(name)
 
     @property
     def time(self) -> np.ndarray:
@@ -119,8 +119,19 @@ class Run:
         return [(a * self.period, b * self.period, int(slots[a])) for a, b in zip(starts, ends, strict=True)]
 
     def unit(self, column: str) -> str:
-        """Return the unit of one column."""
+        """Return the unit of one column.
+
+        Raises:
+            InvalidName: an unknown column; the nearest one is offered.
+        """
+        if column not in self.layout.columns:
+            raise self._unknown(column)
         return self.layout.units[self.layout.columns.index(column)]
+
+    def _unknown(self, name: object) -> InvalidName:
+        valid = [*self.layout.names, *self.layout.columns]
+        rows = "" if isinstance(name, str) else " A run is read by names; run.log has its cycles by number."
+        return InvalidName(f"signal '{name}' is not in this run.{rows}{nearest(name, valid)}")
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return all signals as a pandas DataFrame with one column per entry, indexed by time."""
@@ -136,6 +147,7 @@ class Run:
 
         return run_figure(self)
 
+    @checked_call
     def save(self, path: str | Path) -> None:
         """Write the run to a .npz file (no pickle), at once or not at all.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import cast
 
 import numpy as np
 
@@ -107,5 +108,5 @@ def _numbers(value: object) -> np.ndarray | None:
     if one is not None:
         return np.array([one])
     several = isinstance(value, Sequence | np.ndarray) and not isinstance(value, str | np.ma.MaskedArray)
-    numbers = [real_number(entry) for entry in np.ravel(value).tolist()] if several else [None]
+    numbers = [real_number(entry) for entry in cast(Sequence[object], value)] if several else [None]
     return None if None in numbers else np.array(numbers, dtype=float)

@@ -16,6 +16,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.describe import describe
 from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.kinds import Seed
 from fpirhc.simulation.changes import Changes, in_force
 from fpirhc.simulation.common_columns import with_common_columns
 from fpirhc.simulation.dropped_steps import Dropped
@@ -70,7 +71,7 @@ class Simulator:
     def run(
         self,
         *,
-        seed: int,
+        seed: Seed,
         name: str = "",
         variant: Problem | None = None,
         disturbed: bool = True,
@@ -170,7 +171,7 @@ def simulate(
     problem: Problem,
     controller: Controller,
     *,
-    seed: int,
+    seed: Seed,
     name: str = "",
     compiled: bool = True,
     flags: Sequence[str] = (),

@@ -142,8 +142,8 @@ class Layout:
         self.slice(name)
         return self.signals[self.names.index(name)]
 
-    def __contains__(self, name: str) -> bool:
-        return name in self._slices
+    def __contains__(self, name: object) -> bool:
+        return isinstance(name, str) and name in self._slices
 
     def __add__(self, other: Layout) -> Layout:
         return Layout(self.signals + other.signals)
@@ -156,7 +156,7 @@ class Layout:
         """
         try:
             return self._slices[name]
-        except KeyError:
+        except (KeyError, TypeError):  # TypeError: a list or a range of numbers
             raise InvalidName(f"signal '{name}' is unknown.{nearest(name, self.names)}") from None
 
     def start(self) -> np.ndarray:
@@ -174,11 +174,15 @@ class Layout:
         Raises:
             InvalidName: an unknown signal.
             InvalidShape: a wrong number of entries.
+            InvalidValue: no numbers.
         """
         flat = self.start()
         for name, value in values.items():
             place = self.slice(name)
-            entries = np.asarray(value, dtype=float).ravel()
+            try:
+                entries = np.asarray(value, dtype=float).ravel()
+            except (OverflowError, TypeError, ValueError):
+                raise InvalidValue(f"signal '{name}' is made of numbers, got {value!r}") from None
             if entries.size != place.stop - place.start:
                 raise InvalidShape(f"signal '{name}' has {place.stop - place.start} entries, got {entries.size}")
             flat[place] = entries

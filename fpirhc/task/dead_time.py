@@ -21,6 +21,7 @@ import casadi as ca
 
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.real_number import finite_number
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
@@ -116,10 +117,10 @@ class DeadTime(Checked):
         mistakes.unknown("before: input", self.before, plant.inputs)
         mistakes.unknown("longest: input or measurement", self.longest, (*plant.inputs, MEASUREMENT))
         for name, value in self.before.items():
-            if not isinstance(value, int | float) or not math.isfinite(value):
+            if not finite_number(value):
                 mistakes.add(f"before: '{name}' must be a finite number, got {value!r}")
         for name, value in [*self.inputs.items(), (MEASUREMENT, self.measurement)]:
-            if not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
+            if not finite_number(value) or value < 0:
                 mistakes.add(f"'{name}' must be a number of at least 0, in {unit}, got {value!r}")
             elif value > MOST * period:
                 mistakes.add(
@@ -131,7 +132,7 @@ class DeadTime(Checked):
                     f"'{name}' is {value:g} {unit}, longer than its stated longest={{'{name}': {self.longest[name]:g}}}"
                 )
         for name, value in self.longest.items():
-            if not isinstance(value, int | float) or not 0 < value <= MOST * period:
+            if not finite_number(value) or not 0 < value <= MOST * period:
                 mistakes.add(f"longest: '{name}' must be from above 0 to {MOST} control cycles, got {value!r} {unit}")
         mistakes.raise_if_any()
 

@@ -11,6 +11,7 @@ import numpy as np
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.expected import takes
+from fpirhc.fields.real_number import finite_number
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Expression, Value
@@ -103,10 +104,10 @@ class Limits(Checked):
         for name in sorted(self.prices.keys() & self.soft.keys()):
             mistakes.add(f"'{name}' is both soft and priced; choose one")
         for name, price in self.prices.items():
-            if not isinstance(price, int | float) or not 0 < price < math.inf:
+            if not finite_number(price) or not 0 < price < math.inf:
                 mistakes.add(f"prices: the price of '{name}' must be a positive number, got {price!r}")
         for name, weight in self.soft.items():
-            if not isinstance(weight, int | float) or not 0 < weight < math.inf:
+            if not finite_number(weight) or not 0 < weight < math.inf:
                 mistakes.add(f"soft: the weight of '{name}' must be a positive number, got {weight!r}")
         mistakes.raise_if_any()
 

@@ -14,6 +14,7 @@ import numpy as np
 from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Duration
+from fpirhc.fields.real_number import finite_number
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.regular_gain import Bounds, nominal_run, singular_gain
@@ -300,7 +301,7 @@ def _check_times(problem: Problem, mistakes: Mistakes) -> None:
     unit = problem.time_unit
     for name in ("period", "duration"):
         value = getattr(problem, name)
-        if not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
+        if not finite_number(value) or value <= 0:
             mistakes.add(f"{name} must be a positive number, in {unit}, got {value!r}")
             return
     if problem.duration > MOST_CYCLES * problem.period:
@@ -341,7 +342,7 @@ def _check_start(problem: Problem, mistakes: Mistakes) -> None:
         if c not in problem.start:
             mistakes.add(f"start: {plant.words[0]} '{c}' has no first value; add '{c}': ...")
     for name, value in problem.start.items():
-        if not isinstance(value, int | float) or not math.isfinite(value):
+        if not finite_number(value):
             mistakes.add(f"start: '{name}' must be a finite number, got {value!r}")
             continue
         low, high = plant.ranges.get(name, (-math.inf, math.inf))

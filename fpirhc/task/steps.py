@@ -32,7 +32,9 @@ def pairs(name: str, steps: Steps) -> list[tuple[float, float]]:
     for entry in entries:
         time, value = map(real_number, entry)
         if time is None or value is None or not (math.isfinite(time) and math.isfinite(value)):
-            raise InvalidValue(f"{text}: expected finite numbers, got {described(entry if len(entries) > 1 else steps)}")
+            raise InvalidValue(
+                f"{text}: expected finite numbers, got {described(entry if len(entries) > 1 else steps)}"
+            )
         numbers.append((time, value))
     times = [time for time, _ in numbers]
     if times[0] != 0 or any(later <= time for time, later in pairwise(times)):

@@ -17,7 +17,6 @@ References:
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -29,6 +28,7 @@ from fpirhc.controllers.demands import command_demand
 from fpirhc.controllers.tracked import bounded, desired_blocks
 from fpirhc.deformation.base import Deformation, Demand, Mirror
 from fpirhc.errors import Mistakes
+from fpirhc.fields.real_number import finite_number
 from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
@@ -84,7 +84,7 @@ class ForceMRAC(Controller):
         mistakes = Mistakes("ForceMRAC")
         mistakes.unknown("model: parameter", self.model, problem.plant.parameters)
         for name, value in self.model.items():
-            if not isinstance(value, int | float) or not math.isfinite(value):
+            if not finite_number(value):
                 mistakes.add(f"model: '{name}' must be a finite number, got {value!r}")
         mistakes.raise_if_any()
 

@@ -27,6 +27,7 @@ from fpirhc.controllers.base import Controller, commanding_blocks, like, referen
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import Mistakes
+from fpirhc.fields.real_number import finite_number
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, total
@@ -97,7 +98,7 @@ class PID(Controller):
                 mistakes.add(
                     f"derivative: '{name}' of relative order {order} has at most {order - 1} gains of e', e'', ..."
                 )
-            if not all(isinstance(g, int | float) and math.isfinite(g) for g in gains):
+            if not all(finite_number(g) for g in gains):
                 mistakes.add(f"the gains of '{name}' must be finite numbers, got {gains!r}")
             elif float(at_start[k, k]) * self.proportional[name] <= 0:
                 mistakes.add(

@@ -8,7 +8,6 @@ Both choose only among admissible slots, those whose gain d y^(r)/du is large en
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeGuard
@@ -22,6 +21,7 @@ from fpirhc.controllers.slots.schedules import Schedule, check_stretch
 from fpirhc.controllers.slots.slot import Channel
 from fpirhc.controllers.slots.slot_modes import linear_modes
 from fpirhc.errors import Mistakes, NotSupported
+from fpirhc.fields.real_number import finite_number
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -134,7 +134,7 @@ def _check_choice(owner: str, dwell: float, hysteresis: float, problem: Problem,
 
 
 def _is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, int | float) and math.isfinite(value)
+    return finite_number(value)
 
 
 def _chosen(problem: Problem, channels: Sequence[Channel], score: Scores, dwell: float, hysteresis: float) -> Block:

@@ -18,6 +18,7 @@ import casadi as ca
 from fpirhc.controllers.slots.slot import Channel
 from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.real_number import finite_number
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, scalar
@@ -141,11 +142,7 @@ class Periodic(Schedule):
 
 
 def _is_span(span: object) -> bool:
-    return (
-        isinstance(span, tuple | list)
-        and len(span) == 3
-        and all(isinstance(t, int | float) and math.isfinite(t) for t in span[1:])
-    )
+    return isinstance(span, tuple | list) and len(span) == 3 and all(finite_number(t) for t in span[1:])
 
 
 def _check_visits(owner: str, visited: Iterable[str], names: Sequence[str], mistakes: Mistakes) -> None:
@@ -160,7 +157,7 @@ def _check_visits(owner: str, visited: Iterable[str], names: Sequence[str], mist
 def check_stretch(what: str, value: float, problem: Problem, mistakes: Mistakes) -> None:
     """Note a length of time that is no positive number or shorter than one control cycle."""
     unit = problem.time_unit
-    if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
+    if not (finite_number(value) and value > 0):
         mistakes.add(f"{what} must be a positive number, in {unit}, got {value!r}")
     elif value < problem.period * (1 - 1e-9):
         mistakes.add(f"{what} is {value:g} {unit}, shorter than one control cycle of {problem.period:g} {unit}")

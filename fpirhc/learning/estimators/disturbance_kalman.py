@@ -29,9 +29,9 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes, NotSupported
+from fpirhc.fields.kinds import Deviation
 from fpirhc.learning.estimators.base import Correct, Estimator, Seen
 from fpirhc.learning.estimators.disturbed import disturbance_name, disturbed
-from fpirhc.learning.estimators.uncertain import require_positive
 from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
@@ -62,19 +62,17 @@ class DisturbanceKalman(Estimator):
         noise: coordinate -> deviation of the white noise of its response in every cycle; zero where not named.
 
     Raises:
-        InvalidValue: no disturbance, no measured state, or a deviation that is not positive.
+        InvalidValue: no disturbance or no measured state.
     """
 
-    drift: Mapping[str, float]
-    measured: Mapping[str, float]
-    noise: Mapping[str, float] = field(default_factory=dict)
+    drift: Mapping[str, Deviation]
+    measured: Mapping[str, Deviation]
+    noise: Mapping[str, Deviation] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, values in (("drift", self.drift), ("measured", self.measured)):
             if not values:
                 raise InvalidValue(f"DisturbanceKalman({name}={{}}): name at least one")
-        for name in ("drift", "measured", "noise"):
-            require_positive(f"DisturbanceKalman.{name}", getattr(self, name))
 
     def model(self, plant: Plant) -> Plant:
         """The plant with the disturbances as parameters."""
@@ -146,7 +144,7 @@ class DisturbanceKalman(Estimator):
         try:
             p = scipy.linalg.solve_discrete_are(a.T, scaled.T, q, one)
             own = np.linalg.solve(scaled @ p @ scaled.T + one, scaled @ p).T / deviation
-        except np.linalg.LinAlgError:
+        except ValueError:  # LinAlgError is one, and deviations 1e100 apart make numbers that are not finite
             own = np.full((len(a), len(self.measured)), np.nan)
         gain[used] = own
         if not (

@@ -26,6 +26,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import Deviation
 from fpirhc.learning.estimators.base import Correct, Estimator, Seen
 from fpirhc.learning.estimators.uncertain import (
     Uncertain,
@@ -34,7 +35,6 @@ from fpirhc.learning.estimators.uncertain import (
     check_learner,
     deviations,
     forgetting_factor,
-    require_positive,
     residual_function,
 )
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -59,7 +59,7 @@ class MovingHorizon(Estimator):
     """
 
     parameters: Mapping[str, Uncertain]
-    noise: Mapping[str, float]
+    noise: Mapping[str, Deviation]
     window: int
     time: float
     iterations: int = 1
@@ -67,7 +67,6 @@ class MovingHorizon(Estimator):
     def __post_init__(self) -> None:
         if not self.parameters:
             raise InvalidValue("MovingHorizon(parameters={}): name at least one parameter to learn")
-        require_positive("MovingHorizon.noise", self.noise)
         if not self.time > 0:
             raise InvalidValue(f"MovingHorizon(time={self.time!r}): expected a positive number of seconds, or math.inf")
         for name, value, most in (("window", self.window, MOST), ("iterations", self.iterations, 20)):

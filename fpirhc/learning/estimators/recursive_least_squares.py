@@ -23,6 +23,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
+from fpirhc.fields.kinds import Deviation
 from fpirhc.learning.estimators.base import Correct, Estimator, Seen
 from fpirhc.learning.estimators.uncertain import (
     Uncertain,
@@ -31,7 +32,6 @@ from fpirhc.learning.estimators.uncertain import (
     check_learner,
     deviations,
     forgetting_factor,
-    require_positive,
     residual_function,
 )
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -52,13 +52,12 @@ class RecursiveLeastSquares(Estimator):
     """
 
     parameters: Mapping[str, Uncertain]
-    noise: Mapping[str, float]
+    noise: Mapping[str, Deviation]
     time: float
 
     def __post_init__(self) -> None:
         if not self.parameters:
             raise InvalidValue("RecursiveLeastSquares(parameters={}): name at least one parameter to learn")
-        require_positive("RecursiveLeastSquares.noise", self.noise)
         if not self.time > 0:
             raise InvalidValue(
                 f"RecursiveLeastSquares(time={self.time!r}): expected a positive number of seconds, or math.inf"

@@ -17,6 +17,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import Deviation
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression
 from fpirhc.task.problem import Problem
@@ -32,29 +33,16 @@ class Uncertain(Checked):
         deviation: usual distance from the approximate value, in its unit.
 
     Raises:
-        InvalidValue: bounds or a deviation that are not finite, swapped, or not positive.
+        InvalidValue: bounds that are not finite, or swapped.
     """
 
     lower: float
     upper: float
-    deviation: float
+    deviation: Deviation
 
     def __post_init__(self) -> None:
         if not -math.inf < self.lower < self.upper < math.inf:
             raise InvalidValue(f"Uncertain(lower={self.lower!r}, upper={self.upper!r}): expected finite lower < upper")
-        if not 0 < self.deviation < math.inf:
-            raise InvalidValue(f"Uncertain(deviation={self.deviation!r}): expected a positive number")
-
-
-def require_positive(owner: str, values: Mapping[str, float]) -> None:
-    """Check that every value is a finite positive number.
-
-    Raises:
-        InvalidValue: with a list of all other values.
-    """
-    wrong = [f"{n}={v!r}" for n, v in values.items() if not (isinstance(v, int | float) and 0 < v < math.inf)]
-    if wrong:
-        raise InvalidValue(f"{owner}({', '.join(wrong)}): expected finite positive numbers")
 
 
 def check_learner(owner: str, plant: Plant, parameters: Mapping[str, Uncertain], noise: Mapping[str, float]) -> None:

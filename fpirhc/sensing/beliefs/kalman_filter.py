@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.fields.kinds import Positive
+from fpirhc.fields.kinds import Deviation
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import values_of
 from fpirhc.sensing.belief import Belief, Correct, Evidence, Model, Predict, Remembered
@@ -49,9 +49,9 @@ class KalmanFilter(Belief):
         InvalidValue: no measured quantity, no noise.
     """
 
-    measured: Mapping[str, Positive]
-    noise: Mapping[str, Positive]
-    start: Mapping[str, Positive] = field(default_factory=dict)
+    measured: Mapping[str, Deviation]
+    noise: Mapping[str, Deviation]
+    start: Mapping[str, Deviation] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         require_named("KalmanFilter", measured=self.measured, noise=self.noise)

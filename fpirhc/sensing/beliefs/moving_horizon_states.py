@@ -27,7 +27,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidProblem, InvalidValue
-from fpirhc.fields.kinds import Positive
+from fpirhc.fields.kinds import Deviation, Positive
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.belief import Belief, Correct, Evidence, Model, Predict, Remembered
 from fpirhc.sensing.interior import Interior
@@ -58,10 +58,10 @@ class MovingHorizonStates(Belief):
         InvalidValue: no measured quantity, no noise; a window or iterations outside their range; bounds in the wrong order.
     """
 
-    measured: Mapping[str, Positive]
-    noise: Mapping[str, Positive]
+    measured: Mapping[str, Deviation]
+    noise: Mapping[str, Deviation]
     window: int
-    start: Mapping[str, Positive] = field(default_factory=dict)
+    start: Mapping[str, Deviation] = field(default_factory=dict)
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     iterations: int = 1
     barrier: Positive = 1e-2

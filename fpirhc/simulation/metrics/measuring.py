@@ -32,7 +32,7 @@ class Metrics:
     entries: Mapping[str, Metric]
 
     def __getitem__(self, name: str) -> Mapping[str, float]:
-        if name in self.entries:
+        if isinstance(name, str) and name in self.entries:
             return self.values.get(name, {})
         raise InvalidName(f"metric '{name}' is unknown.{nearest(name, self.entries)}")
 

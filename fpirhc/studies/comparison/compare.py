@@ -15,6 +15,7 @@ from fpirhc.deformation.base import innermost
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, NotSupported, nearest
 from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.response_prediction import Prediction, predict_response
 from fpirhc.simulation.changes import Changes
@@ -205,7 +206,7 @@ def select(task: Task, names: Sequence[str] | None) -> dict[str, Controller]:
 def compare(
     task: Task,
     *,
-    seed: int,
+    seed: Seed,
     controllers: Sequence[str] | None = None,
     compiled: bool = True,
     command: str = "",

@@ -12,6 +12,7 @@ from typing import Any
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked_call import checked_call
+from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import Values
 from fpirhc.simulation.metrics import Metric
@@ -106,7 +107,7 @@ def compare_scenarios(
     *,
     count: int,
     percent: float,
-    seed: int,
+    seed: Seed,
     folder: Path,
     controllers: Sequence[str] | None = None,
     baseline: str | None = None,

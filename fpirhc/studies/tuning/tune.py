@@ -24,7 +24,7 @@ import numpy as np
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.checked_call import checked_call
-from fpirhc.fields.kinds import CountOrZero
+from fpirhc.fields.kinds import CountOrZero, Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import current_setting, is_whole, with_settings
 from fpirhc.problem_files.tuning_spans import TuningSpans
@@ -116,7 +116,7 @@ def tune(
     task: Task,
     *,
     trials: int,
-    seed: int,
+    seed: Seed,
     folder: Path,
     controllers: Sequence[str] | None = None,
     count: int = 1,

@@ -1,0 +1,124 @@
+"""Calls with values that nobody expected raise an error of the library, which says what is wrong, and no raw one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.errors import InvalidField, InvalidName, InvalidShape, InvalidValue, NotSupported
+from fpirhc.problem_files.problem_file import load_problem
+
+TASK = load_problem("two_mass")
+PROBLEM = replace(TASK.problem, duration=0.02, measure_from=0.0)
+CONTROLLER = TASK.controllers["CTC+FPI (eq 6)"]
+HUGE = 10**400  # a whole number that is no float
+
+
+@pytest.fixture(scope="module")
+def run():
+    """A short run."""
+    return fp.simulate(PROBLEM, CONTROLLER, seed=0, compiled=False)
+
+
+@pytest.mark.parametrize("name", [0, None, 1.5, ["error"], slice(0, 2), np.array([1]), ("error", "q1"), "eror"])
+def test_signals_and_metrics_are_found_by_names(name, run):
+    """A number, a list or a range of rows is told as an unknown name is."""
+    metrics = fp.measure(PROBLEM, run)
+    steps: list[Any] = [run.__getitem__, run.unit, run.layout.__getitem__, run.layout.slice, metrics.__getitem__]
+    for find in steps:
+        with pytest.raises(InvalidName, match="Valid: "):
+            find(name)
+    assert name not in run.layout
+
+
+def test_the_rows_of_a_run_are_offered(run):
+    """Who wants a cycle by its number is told where it is; a near name is offered."""
+    with pytest.raises(InvalidName, match=r"run\.log has its cycles by number"):
+        run[0]
+    with pytest.raises(InvalidName, match=r"Did you mean 'error'\?"):
+        run["eror"]
+
+
+def test_a_layout_packs_numbers_only(run):
+    """By names of its own, of the right number."""
+    layout = run.layout
+    with pytest.raises(InvalidValue, match="'time' is made of numbers"):
+        layout.pack({"time": "now"})
+    with pytest.raises(InvalidName, match="Valid: "):
+        layout.pack({1: 2.0})
+    with pytest.raises(InvalidShape, match="'error' has 2 entries, got 1"):
+        layout.pack({"error": 1.0})
+    with pytest.raises(InvalidField, match=r"save\.path: expected"):
+        run.save(5)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "0", None, True])
+def test_seeds_are_whole_numbers_from_zero(seed):
+    """A generator of random numbers takes no other ones."""
+    calls: list[Any] = [
+        lambda: fp.simulate(PROBLEM, CONTROLLER, seed=seed),
+        lambda: fp.compare(TASK, seed=seed),
+        lambda: fp.review(PROBLEM, {}, mismatch=10.0, seed=seed),
+        lambda: fp.predict_response(PROBLEM, CONTROLLER, seed=seed),
+    ]
+    for call in calls:
+        with pytest.raises(InvalidField, match=r"seed: expected a whole number of at least 0"):
+            call()
+
+
+def pendulum(value):
+    """A pendulum whose mass has this value in model and plant."""
+    return fp.Plant(
+        coordinates={"angle": "rad"},
+        inputs={"torque": "N m"},
+        order=2,
+        response=lambda q, v, u, p: {"angle": u.torque / p.mass - 9.81 * ca.sin(q.angle)},
+        parameters={"mass": fp.Parameter(approximate=value, exact=value, unit="kg")},
+    )
+
+
+@pytest.mark.parametrize("value", [HUGE, np.timedelta64(1, "s"), np.bool_(True), "1", None, 1j])
+def test_what_is_no_number_is_no_parameter(value):
+    """A whole number that is no float is none, too."""
+    with pytest.raises(InvalidField, match=r"(?s)approximate: expected a number.*exact: expected a number"):
+        pendulum(value)
+
+
+@pytest.mark.parametrize("value", [2, np.int64(2), np.float32(2.0), np.uint8(2)])
+def test_every_kind_of_number_is_a_parameter(value):
+    """Whole numbers of numpy as well."""
+    assert pendulum(value).exact.tolist() == [2.0]
+
+
+FILTERS = [
+    lambda d: fp.KalmanFilter(measured={"angle": d}, noise={"angle": 1.0}),
+    lambda d: fp.KalmanFilter(measured={"angle": 1.0}, noise={"angle": d}),
+    lambda d: fp.KalmanFilter(measured={"angle": 1.0}, noise={"angle": 1.0}, start={"angle": d}),
+    lambda d: fp.MovingHorizonStates(measured={"angle": d}, noise={"angle": 1.0}, window=5),
+    lambda d: fp.DisturbanceKalman(drift={"angle": d}, measured={"angle": 1.0}),
+    lambda d: fp.DisturbanceKalman(drift={"angle": 1.0}, measured={"angle": d}),
+    lambda d: fp.RecursiveLeastSquares({"mass": fp.Uncertain(1.0, 3.0, 0.1)}, {"angle": d}, time=1.0),
+    lambda d: fp.MovingHorizon({"mass": fp.Uncertain(1.0, 3.0, 0.1)}, {"angle": d}, window=5, time=1.0),
+    lambda d: fp.Uncertain(1.0, 3.0, d),
+]
+
+
+@pytest.mark.parametrize("make", FILTERS, ids=range(len(FILTERS)))
+@pytest.mark.parametrize("deviation", [1e200, 1e-200, 0.0, -1.0, float("inf"), HUGE])
+def test_deviations_whose_square_is_no_number_are_refused(make, deviation):
+    """Filters are made of variances: 1e200 squared overflows, 1e-200 squared is zero."""
+    make(0.5)
+    with pytest.raises(InvalidField, match="expected a positive number from 1e-100 to 1e100"):
+        make(deviation)
+
+
+def test_deviations_that_leave_no_digit_are_refused_by_name():
+    """A hundred powers of ten apart the Riccati equation has no solution that numbers can hold."""
+    wild = fp.DisturbanceKalman(drift={"q1": 1e90}, measured={"q1": 1e-90}, noise={"q2": 1.0})
+    with pytest.raises(NotSupported, match="no stationary gain makes the filter stable"):
+        fp.simulate(PROBLEM, fp.Estimating(CONTROLLER, wild), seed=0)
