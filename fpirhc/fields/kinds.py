@@ -46,5 +46,5 @@ Accuracy: TypeAlias = Annotated[
 ]
 Count: TypeAlias = Annotated[int, Range("a whole number from 1 to 1000000", low=1, high=1e6)]
 Few: TypeAlias = Annotated[int, Range("a whole number from 1 to 1000", low=1, high=1000)]
-Seed: TypeAlias = Annotated[int, Range("a whole number of at least 0, from which random numbers are drawn", low=0)]
+Seed: TypeAlias = Annotated[int, Range("a whole number of at least 0", low=0)]  # of random numbers
 CountOrZero: TypeAlias = Annotated[int, Range("a whole number of at least 0", low=0)]

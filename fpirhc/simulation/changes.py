@@ -9,7 +9,10 @@ import numpy as np
 
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.live_settings import LiveSettings, Numbers
-from fpirhc.errors import InvalidValue
+from fpirhc.errors import InvalidField, InvalidValue
+from fpirhc.fields.given import described
+from fpirhc.fields.named_entries import named_entries
+from fpirhc.fields.real_number import finite_number
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.live import PREFIX
 from fpirhc.task.problem import Problem
@@ -42,6 +45,8 @@ def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Nu
     Raises:
         InvalidName, InvalidValue: a setting that is not live, or a number that it does not accept; a time outside the run.
     """
+    named_entries("settings", settings)
+    _check_times(changes)
     if not (live.paths or settings or changes):
         return InForce(problem, live.controller, {}, (), ())
     first = replace(live, problem=problem)
@@ -65,6 +70,17 @@ def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Nu
         patches.append((cycle, *patch(loop, values)))
         record.append((cycle * problem.period, values))
     return InForce(ready, controller, numbers, patches, record)
+
+
+def _check_times(changes: Changes) -> None:
+    """Raise for anything but numbers by time."""
+    if not isinstance(changes, Mapping):
+        raise InvalidField([f"changes: expected a mapping {{time: {{name: number}}}}, got {described(changes)}"])
+    wrong = [f"changes: the time of a change is a number, got {described(t)}" for t in changes if not finite_number(t)]
+    if wrong:
+        raise InvalidField(wrong)
+    for time, numbers in changes.items():
+        named_entries(f"changes at {time:g}", numbers)
 
 
 def patch(loop: Composite, numbers: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ import numpy as np
 from fpirhc.controllers.own_reference import given_signals
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
 from fpirhc.fields.given import described
+from fpirhc.fields.named_entries import named_entries
 from fpirhc.fields.real_number import real_number
 from fpirhc.fields.user_code import called
 from fpirhc.task.problem import Problem
@@ -74,13 +75,14 @@ def set_points_now(problem: Problem, setpoints: SetpointsNow, before: np.ndarray
 
 
 def _steps(problem: Problem, setpoints: Setpoints | None) -> Setpoints:
-    _check_names(problem, setpoints or {})
-    return {**problem.reference.set_points, **(setpoints or {})}
+    given = {} if setpoints is None else setpoints
+    _check_names(problem, given)
+    return {**problem.reference.set_points, **given}
 
 
 def _check_names(problem: Problem, setpoints: Mapping[str, object]) -> None:
     known = problem.reference.set_points
-    for name in setpoints:
+    for name in named_entries("setpoints", setpoints):
         if not known:
             raise InvalidName(
                 f"set-point '{name}': the reference {type(problem.reference).__name__} is given none; use Setpoint(...)"

@@ -67,7 +67,6 @@ class Simulator:
         """Whether a solver inside starts a run at its last solution (OSQP does), so that a run depends on the runs before."""
         return any(f.class_name() == "OsqpInterface" for f in self.loop.function.find_functions())
 
-    @checked_call
     def run(
         self,
         *,
@@ -98,7 +97,9 @@ class Simulator:
             NotContractive: a gain with which the deformation cannot converge.
         """
         problem = variant or self.problem
-        force = in_force(self.live, self.loop, problem, settings or {}, changes or {})
+        force = in_force(
+            self.live, self.loop, problem, {} if settings is None else settings, {} if changes is None else changes
+        )
         problem, controller = force.problem, force.controller
         start = start_memory(self.loop, problem, controller, force.numbers)
         common = (problem, start, self.loop, self.evaluator, seed, disturbed, progress)

@@ -5,7 +5,7 @@ a library can never be another model's. It is compiled in a folder of its own, i
 place atomically: any number of processes may compile the same or different Functions at once. A library whose checksum does not
 fit is compiled again, and so is one that another user may have written (see `private_folder`).
 
-FPIRHC_CC names the compiler ('none' turns compilation off); FPIRHC_CACHE names the cache folder.
+FPIRHC_CC names the compiler ('none' turns compilation off); FPIRHC_CACHE names a folder, in which the cache has one of its own.
 A compiled Function has no derivatives: differentiate first, compile last.
 """
 
@@ -30,7 +30,7 @@ import casadi as ca
 
 from fpirhc.errors import CompileError, NotSupported
 from fpirhc.symbolic.driver import substitute
-from fpirhc.symbolic.private_folder import BUILDING, private_folder, read_own
+from fpirhc.symbolic.private_folder import BUILDING, own_name, private_folder, read_own
 from fpirhc.symbolic.work_vector import with_less_work
 
 # -ffp-contract=off: no fused multiply-add, so that C and the virtual machine round alike.
@@ -129,13 +129,16 @@ def generate(function: ca.Function) -> tuple[str, ...]:
 
 
 def cache_folder() -> Path:
-    """Folder of compiled libraries: FPIRHC_CACHE, or fpirhc in the user's cache.
+    """Folder of compiled libraries: the user's own one in FPIRHC_CACHE, which may be shared, or fpirhc in the user's cache.
 
     It is a temporary folder of this process where that one cannot be written, or belongs to another user.
     """
     setting = os.environ.get("FPIRHC_CACHE")
     try:
-        base = Path(setting) if setting else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fpirhc"
+        if setting:
+            base = Path(setting) / own_name()
+        else:
+            base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fpirhc"
         base = base.absolute()  # a bare file name would be looked for in the system's library folders
         private_folder(base)
         with tempfile.TemporaryFile(dir=base):

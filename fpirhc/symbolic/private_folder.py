@@ -1,7 +1,8 @@
 """A folder whose files may be run: the user's own, and writable by nobody else.
 
 A compiled library is code. In a folder that others may write to, such as one of mode 1777, another user could leave a library with
-a fitting checksum. So the folder must belong to the user and is closed to others; a file in it counts only where it is a regular
+a fitting checksum. So the folder must belong to the user and is closed to others. It is a folder of our own inside the one that the
+user named, whose mode is nobody's business here; a file in it counts only where it is a regular
 file of the user that nobody else may write to.
 """
 
@@ -25,12 +26,17 @@ def private_folder(folder: Path) -> Path:
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     facts = folder.stat()
-    if not _is_own(facts):
+    if not _is_own(facts) or not _is_own(folder.lstat()):  # a link of a stranger leads to what is not meant
         raise PermissionError(f"'{folder}' belongs to another user")
     if os.name == "posix" and stat.S_IMODE(facts.st_mode) & 0o077:
         folder.chmod(0o700)
     _remove_abandoned(folder)
     return folder
+
+
+def own_name() -> str:
+    """Return the name of the user's folder in a folder that several users may share."""
+    return f"fpirhc-{os.geteuid()}" if os.name == "posix" else "fpirhc"
 
 
 def read_own(path: Path) -> bytes:

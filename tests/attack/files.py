@@ -28,7 +28,7 @@ def flipped_bits(folder: Path, count: int, *, seed: int) -> int:
     from fpirhc.symbolic import native as module
 
     _compiled(folder)
-    library = next(p for p in folder.iterdir() if p.suffix in {".so", ".dylib", ".dll"})
+    library = next(p for p in folder.rglob("*") if p.suffix in {".so", ".dylib", ".dll"})
     generator, unnoticed = np.random.default_rng(seed), 0
     for path in (library, library.with_suffix(".sha256")):
         whole = path.read_bytes()

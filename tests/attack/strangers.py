@@ -74,7 +74,7 @@ def _runs(cache: Path, change: Callable[[Path], None]) -> bool:
     with _cache(cache):
         for factor in (7.0, 8.0):
             assert native(_model(factor)).compiled
-        mine, stranger = sorted(cache.glob("*.so"), key=lambda p: p.stat().st_mtime_ns)
+        mine, stranger = sorted(cache.rglob("*.so"), key=lambda p: p.stat().st_mtime_ns)
         mine.unlink()
         mine.write_bytes(stranger.read_bytes())
         mine.with_suffix(".sha256").write_bytes(stranger.with_suffix(".sha256").read_bytes())

@@ -53,7 +53,7 @@ CALLS: dict[str, tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]
         fp.simulate,
         (PROBLEM, CTC),
         {"seed": "a"},
-        "simulate.seed: expected a whole number, got the text 'a'",
+        "simulate.seed: expected a whole number of at least 0, got the text 'a'",
     ),
     "a problem in place of its file": (
         fp.compare,

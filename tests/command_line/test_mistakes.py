@@ -152,7 +152,7 @@ MISTAKES = {
     "numpy array of symbols": Mistake(
         "u.lift / p.mass - 9.81",
         "np.array([u.lift, q.z])",
-        "must be one scalar expression, got a value of the class ndarray",
+        "must be one scalar expression, got an array of the shape (2,)",
     ),
     "symbol as a setting": Mistake(
         "gain=-0.3",

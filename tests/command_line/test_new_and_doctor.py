@@ -19,6 +19,7 @@ from fpirhc.doctor.examine import Diagnosis
 from fpirhc.doctor.finding import Finding, Outcome, ask
 from fpirhc.scaffold.create import create_problem
 from fpirhc.symbolic.native import Native, cache_folder
+from fpirhc.symbolic.private_folder import own_name
 
 
 @pytest.fixture
@@ -155,8 +156,11 @@ def test_a_cache_that_others_may_write_is_closed(tmp_path, monkeypatch):
     """What is loaded from the cache is run, so nobody else may put a library there."""
     monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path))
     tmp_path.chmod(0o777)
+    own = tmp_path / own_name()
+    own.mkdir()
+    own.chmod(0o777)
     assert machine.cache()[0] == Outcome.OK
-    assert stat.S_IMODE(tmp_path.stat().st_mode) == 0o700
+    assert [stat.S_IMODE(p.stat().st_mode) for p in (tmp_path, own)] == [0o777, 0o700]
 
 
 def test_a_cache_that_cannot_be_made_is_a_warning(tmp_path, monkeypatch):

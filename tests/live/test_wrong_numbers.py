@@ -130,14 +130,15 @@ def test_what_is_no_time_is_named(time, stepper):
 
 
 RUNS = [
-    ({"changes": {"0.01": {GAIN: -0.4}}}, InvalidField, "got the text '0.01'; write 0.01 without quotes"),
-    ({"changes": {HUGE: {GAIN: -0.4}}}, InvalidField, "name 1000"),
-    ({"changes": [(0.01, {GAIN: -0.4})]}, InvalidField, "changes"),
-    ({"settings": {1: 2.0}}, InvalidField, "name 1: expected a text"),
-    ({"settings": 5}, InvalidField, "settings: expected"),
-    ({"settings": {GAIN: HUGE}}, InvalidField, "expected a number"),
-    ({"setpoints": 5}, InvalidField, "setpoints: expected"),
-    ({"setpoints": {"q1": [(0, HUGE)]}}, InvalidField, "expected a number"),
+    ({"changes": {"0.01": {GAIN: -0.4}}}, InvalidField, "got the text '0.01'"),
+    ({"changes": {HUGE: {GAIN: -0.4}}}, InvalidField, "1000000"),
+    ({"changes": [(0.01, {GAIN: -0.4})]}, InvalidField, "changes.*: expected"),
+    ({"changes": {0.01: 5}}, InvalidField, r"changes.*0\.01.*: expected"),
+    ({"settings": {1: 2.0}}, InvalidField, "name.* 1"),
+    ({"settings": 5}, InvalidField, "settings: expected .*, got 5"),
+    ({"settings": {GAIN: HUGE}}, InvalidValue, "expected a number"),
+    ({"setpoints": 5}, InvalidField, "setpoints: expected .*, got 5"),
+    ({"setpoints": {"q1": [(0, HUGE)]}}, InvalidValue, "expected .*number"),
     ({"setpoints": {"q9": 1.0}}, InvalidName, "'q9' is unknown"),
     ({"setpoints": {"q1": lambda t: 1 / (t - t)}}, InvalidProblem, "'q1': the function of time .*ZeroDivisionError"),
     ({"setpoints": {"q1": lambda t: HUGE}}, InvalidValue, "does not return a number, but 1000"),

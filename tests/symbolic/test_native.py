@@ -26,7 +26,7 @@ def cache(tmp_path, monkeypatch):
     """An empty cache, on disk and in memory."""
     monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(module, "_loaded", {})
-    return tmp_path / "cache"
+    return tmp_path / "cache" / private_folder.own_name()
 
 
 def model(factor: float, size: int = 3) -> ca.Function:
@@ -293,9 +293,39 @@ def test_folder_is_closed_to_others(cache):
 @needs_posix
 def test_folder_of_another_user_is_not_used(cache, monkeypatch):
     """A temporary folder takes its place."""
-    cache.mkdir()
+    cache.mkdir(parents=True)
     monkeypatch.setattr(private_folder, "_is_own", lambda facts: False)
     assert module.cache_folder() != cache
+
+
+@needs_posix
+@needs_compiler
+def test_a_shared_folder_stays_as_it_is(tmp_path, monkeypatch):
+    """FPIRHC_CACHE may name a folder that others use, too: its mode and what is in it are theirs."""
+    shared, theirs = tmp_path / "shared", tmp_path / "shared" / "building-a-house"
+    theirs.mkdir(parents=True)
+    os.utime(theirs, (0, 0))
+    shared.chmod(0o1777)
+    monkeypatch.setenv("FPIRHC_CACHE", str(shared))
+    monkeypatch.setattr(module, "_loaded", {})
+    assert native(model(9.0)).compiled
+    own = shared / private_folder.own_name()
+    assert stat.S_IMODE(shared.stat().st_mode) == 0o1777
+    assert sorted(shared.iterdir()) == sorted([theirs, own])
+    assert (stat.S_IMODE(own.stat().st_mode), len(_libraries(own))) == (0o700, 1)
+
+
+@needs_posix
+def test_a_link_of_a_stranger_is_not_followed(cache, tmp_path, monkeypatch):
+    """In a shared folder anybody can put a link to a folder of the user's in the place of the cache."""
+    private = tmp_path / "documents"
+    private.mkdir(mode=0o755)
+    cache.parent.mkdir()
+    cache.symlink_to(private)
+    link = cache.lstat().st_ino
+    monkeypatch.setattr(private_folder, "_is_own", lambda facts: facts.st_ino != link)
+    assert module.cache_folder() != cache
+    assert stat.S_IMODE(private.stat().st_mode) == 0o755
 
 
 @needs_compiler

@@ -142,8 +142,9 @@ class DisturbanceKalman(Estimator):
         # In units of their deviations: variances 1e17 apart leave the Riccati solver without a digit.
         scaled, one = c / deviation[:, None], np.eye(len(deviation))
         try:
-            p = scipy.linalg.solve_discrete_are(a.T, scaled.T, q, one)
-            own = np.linalg.solve(scaled @ p @ scaled.T + one, scaled @ p).T / deviation
+            with np.errstate(all="ignore"):  # what overflows is no stable filter, below
+                p = scipy.linalg.solve_discrete_are(a.T, scaled.T, q, one)
+                own = np.linalg.solve(scaled @ p @ scaled.T + one, scaled @ p).T / deviation
         except ValueError:  # LinAlgError is one, and deviations 1e100 apart make numbers that are not finite
             own = np.full((len(a), len(self.measured)), np.nan)
         gain[used] = own
