@@ -12,6 +12,7 @@ from __future__ import annotations
 import time as wall
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -19,9 +20,10 @@ import numpy.typing as npt
 
 from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import CountOrZero
+from fpirhc.fields.kinds import CountOrZero, Positive
 from fpirhc.plant.instant import response_orders
 from fpirhc.plant.plant import Plant
+from fpirhc.task.giving_up import Caller, GaveUp
 
 _LONGEST = 60  # characters of an answer that are shown
 
@@ -58,7 +60,9 @@ class Foreign(Checked):
         measures: name -> unit of every measured quantity, in the order of its answers: elements of the model's state ("q1", "q1'"),
             outputs and their derivatives, and, where the response is measured, highest derivatives of what is controlled ("q1''").
         holds: consecutive bad answers that are bridged with the last good one; the next one ends the run. 0: the first ends it.
-        deadline: longest wall time of an answer, s; a later one is bad. None: the body may take its time, as a simulator does.
+        deadline: longest wall time of an answer, s; a later one is bad. With a deadline the body is called by a thread of its own:
+            where it does not return, it is given up, and called again when it has returned. None: it may take its time, as a
+            simulator does.
         clock: function that returns the wall time, s.
 
     Raises:
@@ -68,7 +72,7 @@ class Foreign(Checked):
     body: Body
     measures: Mapping[str, str]
     holds: CountOrZero = 0
-    deadline: float | None = None
+    deadline: Positive | None = None
     clock: Callable[[], float] = field(default=wall.perf_counter, metadata={"setting": False})
 
     def __post_init__(self) -> None:
@@ -124,21 +128,37 @@ class Foreign(Checked):
         Raises:
             InvalidProblem: a bad answer.
         """
-        reading = self._answer(lambda: self.body.reset(seed), "reset", timed=False)
+        reading = self._answer(lambda: self.body.reset(seed), "reset", None)
         if reading.values is None:
             raise InvalidProblem(f"reality: {reading.mistake}")
         return reading.values
 
     def read(self, time: float, command: np.ndarray) -> Reading:
-        """Return the answer to a command."""
-        return self._answer(lambda: self.body.step(time, command), "step", timed=True)
+        """Return the answer to a command; with a deadline it is waited for no longer."""
+        return self._answer(lambda: self.body.step(time, command), "step", self.deadline)
 
-    def _answer(self, ask: Callable[[], npt.ArrayLike], method: str, *, timed: bool) -> Reading:
+    @cached_property
+    def _caller(self) -> Caller:
+        """The thread that calls the body; there is one, because a body that is given up is still inside its call."""
+        return Caller()
+
+    def _answer(self, ask: Callable[[], npt.ArrayLike], method: str, deadline: float | None) -> Reading:
+        if self.deadline is None:
+            return self._judged(ask, method, deadline)
+        who = f"{method} of {type(self.body).__name__}"
+        try:
+            return self._caller.call(lambda: self._judged(ask, method, deadline), deadline, free_within=self.deadline)
+        except GaveUp as end:
+            what = "did not return" if end.begun else "was not called, because its last call has not returned"
+            return Reading(None, f"{who} {what} within {self.deadline:.3g} s, its deadline; it was given up")
+
+    def _judged(self, ask: Callable[[], npt.ArrayLike], method: str, deadline: float | None) -> Reading:
+        """The answer of a stranger's object, of which every part may raise: its numbers, its length, its words, its errors."""
         who, begin = f"{method} of {type(self.body).__name__}", self.clock()
         try:
             returned = ask()
         except (Exception, SystemExit) as error:  # noqa: BLE001  # whatever a stranger's object raises is a bad answer
-            return Reading(None, f"{who} raised {type(error).__name__}: {' '.join(str(error).split())}")
+            return Reading(None, f"{who} raised {type(error).__name__}{_words(error)}")
         elapsed = self.clock() - begin
         answer = _real_numbers(returned)
         expected = f"{len(self.measures)} numbers: {', '.join(self.measures)}"
@@ -151,26 +171,36 @@ class Foreign(Checked):
             return Reading(
                 None, f"{who} returned {list(self.measures)[place]} = {answer[place]}, expected a finite number"
             )
-        if timed and self.deadline is not None and elapsed > self.deadline:
-            return Reading(None, f"{who} took {elapsed:.3g} s, and its deadline is {self.deadline:.3g} s")
+        if deadline is not None and elapsed > deadline:
+            return Reading(None, f"{who} took {elapsed:.3g} s, and its deadline is {deadline:.3g} s")
         return Reading(answer)
 
 
 def _real_numbers(answer: object) -> np.ndarray | None:
     """The answer as real numbers; None where it is none."""
-    if isinstance(answer, np.ma.MaskedArray):  # what lies under a mask is no measurement
-        return None
-    if isinstance(answer, list | tuple) and any(isinstance(v, bool | np.bool_) for v in answer):
-        return None
     try:
+        if isinstance(answer, np.ma.MaskedArray):  # what lies under a mask is no measurement
+            return None
+        if isinstance(answer, list | tuple) and any(isinstance(v, bool | np.bool_) for v in answer):
+            return None
         column = np.asarray(answer)
         return column.astype(float) if column.dtype.kind in "iuf" else None
-    except (TypeError, ValueError):  # rows of different lengths, or an object that refuses to become an array
+    except Exception:  # noqa: BLE001  # rows of different lengths; an object that raises where numpy asks it for its numbers
         return None
+
+
+def _words(error: BaseException) -> str:
+    try:
+        return f": {' '.join(str(error).split())}"
+    except Exception:  # noqa: BLE001  # an exception of a stranger's that has no words
+        return ""
 
 
 def _short(answer: object) -> str:
-    text = " ".join(repr(answer).split())
+    try:
+        text = " ".join(repr(answer).split())
+    except Exception:  # noqa: BLE001
+        text = f"a value of the class {type(answer).__name__}"
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 

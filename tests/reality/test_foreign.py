@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 from dataclasses import replace
 from typing import Any
 
@@ -173,10 +174,128 @@ def test_answer_after_the_deadline():
     """A clock that jumps in the hundredth step stands for a body that is late."""
     problem = task()
     body = Wrapped(problem)
-    foreign = fp.Foreign(body, MEASURES, deadline=1e-3, clock=lambda: 0.01 * (body.calls >= 100))
+    foreign = fp.Foreign(body, MEASURES, deadline=100.0, clock=lambda: 1e3 * (body.calls >= 100))
     result = run(replace(problem, reality=foreign))
     assert result.cycles == 100
-    assert "took 0.01 s, and its deadline is 0.001 s" in str(result.stop)
+    assert "took 1e+03 s, and its deadline is 100 s" in str(result.stop)
+
+
+class Blocking(Wrapped):
+    """The same, and in its hundredth step it waits until it is released."""
+
+    def __init__(self, problem) -> None:
+        super().__init__(problem)
+        self.released, self.resets = threading.Event(), 0
+
+    def reset(self, seed):
+        """The start."""
+        self.resets += 1
+        return super().reset(seed)
+
+    def step(self, time, command):
+        """The answer, which may never come."""
+        good = super().step(time, command)
+        if self.calls == 100 and not self.released.is_set():
+            self.released.wait()
+        return good
+
+
+def test_a_body_that_blocks_is_given_up():
+    """The run ends as with every bad answer, and keeps what was before it; the body is not interrupted."""
+    problem = task()
+    body = Blocking(problem)
+    result = run(replace(problem, reality=fp.Foreign(body, MEASURES, deadline=0.05)))
+    body.released.set()
+    assert (result.cycles, body.calls) == (100, 100)
+    assert "step of Blocking did not return within 0.05 s, its deadline; it was given up at t = 0.1 s" in str(
+        result.stop
+    )
+
+
+def test_a_body_that_blocks_is_not_called_before_it_has_returned():
+    """Two calls at the same time would be two masters of one device: answers are held meanwhile, and a new run waits."""
+    problem = task(duration=0.2)
+    body = Blocking(problem)
+    held = replace(problem, reality=fp.Foreign(body, MEASURES, deadline=0.02, holds=3))
+    stopped = run(held)
+    assert body.calls == 100
+    assert np.flatnonzero(stopped["foreign_held"]).tolist() == [100, 101, 102]
+    assert "step of Blocking was not called, because its last call has not returned" in str(stopped.stop)
+    with pytest.raises(InvalidProblem, match="reset of Blocking was not called"):
+        run(held)
+    body.released.set()
+    again = run(held)
+    assert (again.stop, again.cycles, body.resets) == (None, problem.cycles, 2)
+
+
+class Hostile:
+    """An answer in which something raises."""
+
+    def __init__(self, *names) -> None:
+        self.names = names
+
+    def __array__(self, *arguments, **named):
+        """What numpy asks for."""
+        self._raise("array")
+        return np.zeros(3)
+
+    def __len__(self):
+        """Its length."""
+        self._raise("len")
+        return 3
+
+    def __repr__(self):
+        """Its words."""
+        self._raise("repr")
+        return "Hostile()"
+
+    def _raise(self, name):
+        if name in self.names:
+            raise ZeroDivisionError(name)
+
+
+class Speechless(Exception):
+    """An exception whose words raise."""
+
+    def __str__(self):
+        """No words."""
+        raise ZeroDivisionError
+
+
+def speechless(_answer):
+    """Raise it."""
+    raise Speechless
+
+
+class WithoutLength:
+    """A sequence that has no length."""
+
+    def __len__(self):
+        """No length."""
+        raise ZeroDivisionError
+
+    def __getitem__(self, place):
+        """No entry."""
+        raise ZeroDivisionError
+
+
+@pytest.mark.parametrize("deadline", [None, 60.0])
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (lambda _: Hostile("array"), r"returned Hostile\(\), expected 3 numbers"),
+        (lambda _: Hostile("array", "repr"), "returned a value of the class Hostile, expected 3 numbers"),
+        (lambda _: [Hostile("array", "len", "repr")] * 3, "returned a value of the class list, expected 3 numbers"),
+        (lambda _: WithoutLength(), "expected 3 numbers"),
+        (speechless, "step of Faulty raised Speechless at t"),
+    ],
+)
+def test_whatever_raises_in_an_answer_is_a_bad_answer(bad, words, deadline):
+    """A stranger's object may raise where it is turned into numbers, measured, or written down."""
+    problem = task(duration=0.11)
+    result = run(replace(problem, reality=fp.Foreign(Faulty(problem, bad), MEASURES, deadline=deadline)))
+    assert re.search(words, str(result.stop))
+    assert result.cycles == 100
 
 
 def test_bad_first_answer_is_an_error():
