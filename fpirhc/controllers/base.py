@@ -27,6 +27,8 @@ from fpirhc.controllers.mirror import measured_reads, mirror_blocks, with_measur
 from fpirhc.controllers.outside_block import ACTED, NOW, Told
 from fpirhc.controllers.own_reference import given_signals, motion_of, own_signals, own_values, with_reference
 from fpirhc.deformation.base import Deformation
+from fpirhc.errors import InvalidProblem
+from fpirhc.fields.given import described
 from fpirhc.plant.instant import nominal_responses
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
@@ -57,7 +59,7 @@ def compose_controller(problem: Problem, controller: Controller, *, ahead: bool 
             time, and the signals of the last cycle, where a block needs them.
     """
     ready = checked(problem, controller)
-    blocks, delays = ready.blocks(problem)
+    blocks, delays = _blocks_of(problem, ready)
     blocks = with_reference(problem, blocks)
     reads = controller_reads(problem, ready)
     if ahead:
@@ -65,6 +67,25 @@ def compose_controller(problem: Problem, controller: Controller, *, ahead: bool 
     else:
         blocks = with_measured_state(problem.plant, blocks)
     return compose_informed(problem, ready, reads, blocks, delays, ahead=ahead)
+
+
+def _blocks_of(problem: Problem, controller: Controller) -> tuple[list[Block], list[Delay]]:
+    """The blocks of a controller and what they remember.
+
+    Raises:
+        InvalidProblem: it gives something else.
+    """
+    given: object = controller.blocks(problem)
+    pair = given if isinstance(given, tuple) and len(given) == 2 else None
+    kinds = (Block, Delay)
+    if pair is None or not all(
+        isinstance(part, list | tuple) and all(isinstance(one, kind) for one in part)
+        for part, kind in zip(pair, kinds, strict=True)
+    ):
+        raise InvalidProblem(
+            f"{type(controller).__name__}.blocks(problem) must return two lists (blocks, delays), got {described(given)}"
+        )
+    return list(pair[0]), list(pair[1])
 
 
 def compose_informed(

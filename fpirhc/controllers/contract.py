@@ -7,7 +7,7 @@ controller is built for, unless it overrides them. So the facts pass through any
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Self
@@ -22,7 +22,8 @@ from fpirhc.deformation.base import Deformation, Demand, Mirror, with_inner
 from fpirhc.deformation.identity import Identity
 from fpirhc.describe import replaced
 from fpirhc.errors import NotSupported
-from fpirhc.fields.checked import Checked
+from fpirhc.fields.checked import Checked, unnamed_inner
+from fpirhc.fields.given import described
 from fpirhc.horizon.cost import Cost
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.plant.plant import Plant
@@ -115,6 +116,20 @@ class Controller(Checked, ABC):
 
     task_name: str = ""
     """Name under which a loaded task has the controller, for results; it is no setting."""
+
+    def lacks(self) -> Iterator[str]:
+        """Yield what a controller must have and this one has not: its deformation; what it wraps, by name."""
+        name, inner = type(self).__name__, self.inner
+        if inner is not None and not isinstance(inner, Controller):
+            yield f"{name}: `inner` is the controller that it wraps, or None, got {described(inner)}"
+            return
+        yield from unnamed_inner(self, Controller)
+        if not isinstance(getattr(self, "deformation", None), Deformation):
+            yield (
+                f"{name} has no `deformation`, which its contract Controller asks for: the map in use. Add the field "
+                "deformation: Deformation = field(default_factory=Identity); a wrapper has a property that returns "
+                "self.inner.deformation"
+            )
 
     @abstractmethod
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:

@@ -9,7 +9,7 @@ first order every map here is r+ = r - a (f - d) with one number a, its effectiv
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
 
@@ -17,7 +17,8 @@ import casadi as ca
 
 from fpirhc.describe import replaced
 from fpirhc.errors import InvalidValue, NotSupported
-from fpirhc.fields.checked import Checked
+from fpirhc.fields.checked import Checked, unnamed_inner
+from fpirhc.fields.given import described
 from fpirhc.fields.real_number import finite_number
 from fpirhc.symbolic.layout import Expression, Layout
 
@@ -103,6 +104,13 @@ class Deformation(Checked, ABC):
 
     else:
         inner = None  # a plain attribute, so that a dataclass may have a field of this name
+
+    def lacks(self) -> Iterator[str]:
+        """Yield what a map must have and this one has not: what it wraps, by name."""
+        if self.inner is not None and not isinstance(self.inner, Deformation):
+            yield f"{type(self).__name__}: `inner` is the map that it is around, or None, got {described(self.inner)}"
+        else:
+            yield from unnamed_inner(self, Deformation)
 
     def around(self, inner: Deformation) -> Self:
         """Return the same map around another inner one.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import sys
 from abc import ABCMeta
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 
 from fpirhc.errors import InvalidField
@@ -22,21 +22,26 @@ class _CheckedWhenCalled(ABCMeta):
     """Classes whose calls check the arguments before anything is made of them."""
 
     def __call__(cls, *arguments: object, **named: object) -> object:
-        if inspect.isabstract(cls):
-            mistakes: tuple[str, ...] = (f"{cls.__name__} is a contract; use one of its members",)
-        else:
-            mistakes = tuple(_arguments_of(cls).mistakes(arguments, named))
+        mistakes = _abstract(cls) if inspect.isabstract(cls) else tuple(_arguments_of(cls).mistakes(arguments, named))
+        if not mistakes:
+            value = type.__call__(cls, *arguments, **named)
+            mistakes = tuple(value.lacks())
         if mistakes:
             raise InvalidField(mistakes, users_place())
-        return type.__call__(cls, *arguments, **named)
+        return value
 
 
 class Checked(metaclass=_CheckedWhenCalled):
     """A value whose arguments are checked when it is made.
 
     Raises:
-        InvalidField: all wrong arguments together: unknown or missing names, wrong types, numbers out of the range of their kind.
+        InvalidField: all wrong arguments together: unknown or missing names, wrong types, numbers out of the range of their kind;
+            of a class of a user's own, what its contract asks for and it lacks.
     """
+
+    def lacks(self) -> Iterator[str]:
+        """Yield what the contract of the class asks for and this value does not have, beside abstract methods."""
+        yield from ()
 
 
 def field_names(owner: type) -> tuple[str, ...]:
@@ -48,6 +53,25 @@ def expects_whole_number(owner: type, name: str) -> bool:
     """Whether a field of a class is declared as a whole number, with or without a range."""
     one = _arguments_of(owner).expected.get(name)
     return isinstance(one, Number) and one.whole
+
+
+def unnamed_inner(value: object, contract: type) -> Iterator[str]:
+    """Yield a mistake for a wrapper that does not say what it wraps: a value of its own contract in a field, and no `inner`."""
+    for name, content in getattr(value, "__dict__", {}).items():
+        if isinstance(content, contract) and getattr(value, "inner", None) is None:
+            yield (
+                f"{type(value).__name__} holds a {contract.__name__} in '{name}' and has no `inner`, by which its contract "
+                f"{contract.__name__} finds it; add a property `inner` that returns self.{name}"
+            )
+
+
+def _abstract(cls: type) -> tuple[str, ...]:
+    """Why an abstract class has no values: it is a contract, or lacks methods of one."""
+    missing = sorted(getattr(cls, "__abstractmethods__", ()))
+    if any(name in vars(cls) for name in missing):
+        return (f"{cls.__name__} is a contract; use one of its members",)
+    owners = {name: next(base for base in cls.__mro__ if name in vars(base)).__name__ for name in missing}
+    return tuple(f"{cls.__name__} has no {name}(...), which its contract {owners[name]} asks for" for name in missing)
 
 
 @cache

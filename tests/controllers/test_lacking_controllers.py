@@ -1,0 +1,131 @@
+"""A controller or a map of a user's own that lacks what its contract asks for is told so by name, in the line that makes it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import pytest
+
+import fpirhc as fp
+from fpirhc.controllers.base import Controller
+from fpirhc.deformation import Deformation, Identity
+from fpirhc.errors import InvalidField, InvalidProblem
+from fpirhc.problem_files.problem_file import load_problem
+
+TASK = load_problem("two_mass")
+PROBLEM = replace(TASK.problem, duration=0.01, measure_from=0.0)
+LAW = fp.ComputedTorque(fp.Exponential(rate=6.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Around(Controller):
+    """A wrapper that says neither what it wraps nor which map is in use."""
+
+    other: Controller
+
+    def blocks(self, problem):
+        """Those of the other one."""
+        return self.other.blocks(problem)
+
+
+@dataclass(frozen=True, eq=False)
+class Alone(Controller):
+    """A controller without a map."""
+
+    rate: float = 1.0
+
+    def blocks(self, problem):
+        """None, in a wrong form."""
+        del problem
+        return []
+
+
+@dataclass(frozen=True, eq=False)
+class Whole(Around):
+    """The wrapper with everything that its contract asks for."""
+
+    @property
+    def inner(self):
+        """What it wraps."""
+        return self.other
+
+    @property
+    def deformation(self):
+        """That of the inner one."""
+        return self.inner.deformation
+
+
+@dataclass(frozen=True, eq=False)
+class Formless(Alone):
+    """A controller with a map, and blocks in a wrong form."""
+
+    deformation: Deformation = field(default_factory=Identity)
+
+
+@dataclass(frozen=True, eq=False)
+class Halfway(Controller):
+    """A wrapper of something that is no controller."""
+
+    inner: Any
+    deformation: Deformation = field(default_factory=Identity)
+
+    def blocks(self, problem):
+        """Those of the inner one."""
+        return self.inner.blocks(problem)
+
+
+class Nothing(Controller):
+    """A controller that composes nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Doubled(Deformation):
+    """A map around another one, which it does not name."""
+
+    map: Deformation
+
+    def step(self, request, response, desired, memory):
+        """That of the other one."""
+        return self.map.step(request, response, desired, memory)
+
+    def effective_gain(self):
+        """Twice the other one's."""
+        return 2 * self.map.effective_gain()
+
+    secant_gain = largest_step = effective_gain
+
+    def with_effective_gain(self, gain):
+        """The same around a map with half of it."""
+        return Doubled(self.map.with_effective_gain(gain / 2))
+
+
+LACKING = [
+    (lambda: Around(LAW), "Around holds a Controller in 'other' and has no `inner`.*returns self.other"),
+    (lambda: Around(LAW), "Around has no `deformation`, which its contract Controller asks for"),
+    (lambda: Alone(), "^test_lacking_controllers.py, line .*: Alone has no `deformation`"),
+    (lambda: Halfway(5), "Halfway: `inner` is the controller that it wraps, or None, got 5"),
+    (lambda: Nothing(), r"Nothing has no blocks\(...\), which its contract Controller asks for"),
+    (lambda: Doubled(fp.Affine(-0.5)), "Doubled holds a Deformation in 'map' and has no `inner`"),
+]
+
+
+@pytest.mark.parametrize(("make", "words"), LACKING, ids=range(len(LACKING)))
+def test_what_is_lacking_is_told_in_the_line_that_makes_it(make, words):
+    """Not by an error inside the library, cycles later."""
+    with pytest.raises(InvalidField, match=f"(?s){words}"):
+        make()
+
+
+def test_blocks_of_a_wrong_form_are_named():
+    """Two lists are asked for."""
+    with pytest.raises(
+        InvalidProblem, match=r"Formless.blocks\(problem\) must return two lists \(blocks, delays\), got \[\]"
+    ):
+        fp.simulate(PROBLEM, Formless(), seed=0, compiled=False)
+
+
+def test_a_whole_wrapper_runs():
+    """It is the inner controller, bit for bit."""
+    one, other = (fp.simulate(PROBLEM, c, seed=0, compiled=False) for c in (LAW, Whole(LAW)))
+    assert (one["command"] == other["command"]).all()
