@@ -36,16 +36,16 @@ def numbers(name: str, value: object, size: int) -> np.ndarray:
             f"argument '{name}' is a masked array; a missing number is NaN: {name}.filled(np.nan) skips the cycle"
         )
     if isinstance(value, list | tuple) and any(isinstance(v, bool | np.bool_) for v in value):
-        raise InvalidValue(f"argument '{name}' must be made of real numbers, got {_short(value)} with a truth value")
+        raise InvalidValue(f"argument '{name}' must be made of real numbers, got {described(value)} with a truth value")
     try:
         array = np.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise InvalidValue(f"argument '{name}' is not made of numbers: {error}") from None
+    except Exception:  # noqa: BLE001 -- rows of different lengths; an object of a stranger's that raises where numpy asks it
+        raise InvalidValue(f"argument '{name}' is not made of numbers, got {described(value)}") from None
     if array.dtype.kind == "O":
-        raise InvalidValue(f"argument '{name}' is not made of numbers, got {_short(value)}; expected {size} numbers")
+        raise InvalidValue(f"argument '{name}' is not made of numbers, got {described(value)}; expected {size} numbers")
     if array.dtype.kind not in "fiu":
         raise InvalidValue(
-            f"argument '{name}' must be made of real numbers, got {_short(value)} of type '{array.dtype}'"
+            f"argument '{name}' must be made of real numbers, got {described(value)} of type '{array.dtype}'"
         )
     if array.size != size or sum(n != 1 for n in array.shape) > 1 or array.ndim == 0:
         raise InvalidShape(f"argument '{name}' has {size} entries (shape ({size},)), got shape {array.shape}")
@@ -62,8 +62,3 @@ def one_number(name: str, value: object) -> float:
     if number is None:
         raise InvalidValue(f"argument '{name}' must be a number of seconds, got {described(value)}")
     return number
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."

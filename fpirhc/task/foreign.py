@@ -199,7 +199,7 @@ def _words(error: BaseException) -> str:
 def _short(answer: object) -> str:
     try:
         text = " ".join(repr(answer).split())
-    except Exception:  # noqa: BLE001
+    except Exception:  # noqa: BLE001  # an answer that cannot write itself down
         text = f"a value of the class {type(answer).__name__}"
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -105,7 +105,7 @@ LACKING = [
     (lambda: Around(LAW), "Around has no `deformation`, which its contract Controller asks for"),
     (lambda: Alone(), "^test_lacking_controllers.py, line .*: Alone has no `deformation`"),
     (lambda: Halfway(5), "Halfway: `inner` is the controller that it wraps, or None, got 5"),
-    (lambda: Nothing(), r"Nothing has no blocks\(...\), which its contract Controller asks for"),
+    (cast(Any, Nothing), r"Nothing has no blocks\(...\), which its contract Controller asks for"),
     (lambda: Doubled(fp.Affine(-0.5)), "Doubled holds a Deformation in 'map' and has no `inner`"),
 ]
 
