@@ -340,6 +340,10 @@ def test_a_wrapper_that_hides_its_inner_controller_says_what_to_do():
         def inner(self):
             return self.wrapped[0]
 
+        @property
+        def deformation(self):
+            return self.inner.deformation
+
     with pytest.raises(NotSupported, match=r"override around\(\)"):
         Listed((PLAN,)).with_optimiser(fp.ReducedGradient(iterations=5, tolerance=1e-3))
 

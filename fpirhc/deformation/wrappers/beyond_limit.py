@@ -1,0 +1,45 @@
+"""A map whose gain may lie beyond the limit of its iteration: what is refused everywhere else is asked for here.
+
+A saturating map beyond its limit ends in a bounded oscillation, which is worth seeing; a map without saturation diverges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+from fpirhc.deformation.affine import Affine
+from fpirhc.deformation.sigmoid import Sigmoid
+from fpirhc.deformation.wrappers.base import Wrapper
+from fpirhc.symbolic.layout import Expression, Layout
+
+
+@dataclass(frozen=True)
+class BeyondLimit(Wrapper):
+    """The map as it is, at any gain of the right sign.
+
+    Args:
+        map: the wrapped deformation.
+    """
+
+    passes_pair: ClassVar[bool] = True
+
+    @property
+    def limited(self) -> bool:
+        """False: a gain beyond the limit is asked for."""
+        return False
+
+    def memory(self, elements: tuple[str, ...]) -> Layout:
+        """That of the map."""
+        return self.map.memory(elements)
+
+    def step(
+        self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+    ) -> tuple[Expression, dict[str, Expression]]:
+        """Return the step of the map."""
+        return self.map.step(request, response, desired, memory)
+
+
+EXAMPLES = (BeyondLimit(Sigmoid(gain=-1.5, shift=0.0, scale=20.0)), BeyondLimit(Affine(gain=-1.2)))
+"""Values on which the laws of maps are tried."""

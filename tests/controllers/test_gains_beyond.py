@@ -1,0 +1,74 @@
+"""A gain beyond the limit of its iteration is refused, built in or given while the loop runs, unless it is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.errors import NotContractive
+from fpirhc.problem_files.problem_file import load_problem
+from fpirhc.simulation.simulate import simulator
+
+TASK = load_problem("two_mass")
+PROBLEM = replace(TASK.problem, duration=0.05, measure_from=0.0)
+LAW = fp.ComputedTorque(fp.Exponential(rate=6.0))
+LARGEST = (
+    4 / 1.5
+)  # of an affine map, whose effective gain is half of its gain: |1 - a lambda| < 1, lambda = 1.5 and 1.3
+
+
+def affine(gain, around=lambda m: m):
+    """Computed torque with an affine map."""
+    return LAW.with_deformation(around(fp.Affine(gain=gain)))
+
+
+@pytest.mark.parametrize("gain", [-1.01 * LARGEST, -5.0, -1e300])
+def test_a_gain_beyond_the_limit_is_refused_in_every_way(gain):
+    """Built in, as a live setting of a run, of a stepper, and during a run: one message with the limit and a remedy."""
+    message = r"converges only for effective gains below 1.33.* use 0 < \|gain\| < 2.67.*BeyondLimit\(map\)"
+    path = "deformation.gain"
+    for make in (fp.Stepper, simulator):
+        with pytest.raises(NotContractive, match=message):
+            make(PROBLEM, affine(gain), compiled=False)
+    loop = simulator(PROBLEM, affine(-0.5), compiled=False, live=[path])
+    with pytest.raises(NotContractive, match=message):
+        loop.run(seed=0, settings={path: gain})
+    with pytest.raises(NotContractive, match=message):
+        loop.run(seed=0, changes={0.02: {path: gain}})
+    stepper = fp.Stepper(PROBLEM, affine(-0.5), compiled=False, live=[path])
+    assert not stepper.change({path: gain})
+    assert (stepper.refused, stepper.numbers[path]) == (1, -0.5)
+    assert "converges only for effective gains below 1.33" in stepper.why_refused
+
+
+@pytest.mark.parametrize("gain", [-0.99 * LARGEST, -0.1])
+def test_a_gain_below_the_limit_runs(gain):
+    """Also as a live setting."""
+    assert fp.simulate(PROBLEM, affine(-0.5), seed=0, settings={"deformation.gain": gain}).stop is None
+
+
+def test_who_asks_for_it_gets_it():
+    """The wrapper changes nothing but the refusal: below the limit the run is the same, bit by bit."""
+    one, other = (
+        fp.simulate(PROBLEM, affine(-0.5, around), seed=0, compiled=False) for around in (lambda m: m, fp.BeyondLimit)
+    )
+    assert np.array_equal(one["command"], other["command"])
+    beyond = fp.simulate(PROBLEM, affine(-1.02 * LARGEST, fp.BeyondLimit), seed=0, compiled=False)
+    assert np.abs(beyond["realised"] - beyond["desired"])[-1].max() > np.abs(one["realised"] - one["desired"])[-1].max()
+    with pytest.raises(NotContractive, match="wrong sign"):
+        fp.simulate(PROBLEM, affine(0.5, fp.BeyondLimit), seed=0)
+
+
+def test_a_map_that_lowers_its_gain_begins_where_it_likes():
+    """`Tuned` finds its gain on line, from twice the limit as well."""
+    fp.Stepper(PROBLEM, affine(-2 * LARGEST, lambda m: fp.Tuned(m, largest_gain=6.0)), compiled=False)
+
+
+def test_forms_of_the_iteration_have_their_own_limits():
+    """The model-referenced form at -1e300 is refused, too."""
+    with pytest.raises(NotContractive, match="effective gains below"):
+        fp.Stepper(PROBLEM, affine(-1e300, fp.ModelReferenced), compiled=False)
+    fp.Stepper(PROBLEM, affine(-0.9, fp.ModelReferenced), compiled=False)
