@@ -124,6 +124,11 @@ def shift(columns: ca.MX) -> ca.MX:
     return columns if columns.shape[1] == 1 else ca.horzcat(columns[:, 1:], columns[:, -1])
 
 
+def shift_gains(gains: ca.MX, size: int) -> ca.MX:
+    """Return a column of feedback one stage later, `size` entries a stage; the last stage, which is repeated, has none."""
+    return ca.vertcat(gains[size:, 0], ca.MX.zeros(size))  # [size:] alone is a row where there is one entry
+
+
 def clip(columns: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
     """Return every stage's input clipped to its box."""
     stages = columns.shape[1]

@@ -22,7 +22,7 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.split_stage import partial_count, split_hessian, stage_leaves
 from fpirhc.horizon.sweep import PIVOT
 from fpirhc.optimisers import limited_settings as numbers
-from fpirhc.optimisers.base import FEASIBLE, KEPT, shift
+from fpirhc.optimisers.base import FEASIBLE, KEPT, shift, shift_gains
 from fpirhc.optimisers.bounds import BOUNDARY, ENOUGH, HAIR, STIFF
 from fpirhc.optimisers.guess import guess
 from fpirhc.optimisers.limited_graph import limited_graph
@@ -52,7 +52,7 @@ def shifted_limited(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         name: ca.vec(shift(ca.reshape(parts[name], size, n)))
         for name, size in (("plan_inputs", nu), ("plan_states", ns), ("plan_costates", ns))
     }
-    shifted_parts["plan_gains"] = ca.vertcat(parts["plan_gains"][nu * ns :], ca.MX.zeros(nu * ns))
+    shifted_parts["plan_gains"] = shift_gains(parts["plan_gains"], nu * ns)
     shifted_parts["plan_multipliers"] = ca.vec(ca.horzcat(*(shift(side) for side in sides)))
     return layout.join({**parts, **shifted_parts})
 

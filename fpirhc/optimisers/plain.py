@@ -12,7 +12,7 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import PIVOT, rounds
 from fpirhc.horizon.split_stage import partial_count, stage_leaves
 from fpirhc.optimisers.anchor import ARMIJO, DRAWN_IN, ROUNDING, SHARE, SHORTER, SHORTEST, UNTRIED
-from fpirhc.optimisers.base import shift
+from fpirhc.optimisers.base import shift, shift_gains
 from fpirhc.optimisers.plain_graph import plain_graph
 from fpirhc.optimisers.plain_settings import MOST_PLAIN, PlainSettings, plain_memory
 from fpirhc.optimisers.search import deformed_move, first_gamma
@@ -34,11 +34,10 @@ def shifted_plain(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
     """Return the memory one stage later; the last stage, which is repeated, has no feedback."""
     layout, ns, nu, n = plain_memory(ocp), ocp.state.size, ocp.input.size, ocp.stages
     parts = layout.split(memory)
-    gains = ca.vertcat(parts["plan_gains"][nu * ns :], ca.MX.zeros(nu * ns))
     shifted_parts = {
         "plan_inputs": ca.vec(shift(ca.reshape(parts["plan_inputs"], nu, n))),
         "plan_states": ca.vec(shift(ca.reshape(parts["plan_states"], ns, n))),
-        "plan_gains": gains,
+        "plan_gains": shift_gains(parts["plan_gains"], nu * ns),
     }
     return layout.join({**parts, **shifted_parts})
 

@@ -16,7 +16,7 @@ def program_values(ocp: OptimalControl) -> ca.Function:
     """Function (w, p) -> cost, constraints and their first derivatives in one column."""
     nlp = program(ocp)
     slopes = ca.gradient(nlp["f"], nlp["x"]), ca.jacobian(nlp["g"], nlp["x"])
-    column = ca.vertcat(nlp["f"], nlp["g"], ca.densify(slopes[0]), slopes[1].nz[:])
+    column = ca.vertcat(nlp["f"], nlp["g"], ca.densify(slopes[0]), ca.vec(slopes[1].nz[:]))
     return ca.Function("fpirhc_program_values", [nlp["x"], nlp["p"]], [column])
 
 
