@@ -64,6 +64,10 @@ class ReferenceExpansion:
         columns = np.eye(stages * nu).reshape(-1, stages, nu)
         return np.array([self.hessian_times(column).ravel() for column in columns])
 
+    def growth(self) -> np.ndarray:
+        """Largest factor |eigenvalue of dF/ds| by which a motion grows in each stage, shape (N,)."""
+        return np.array([np.abs(np.linalg.eigvals(a)).max() if np.isfinite(a).all() else np.nan for a in self.a])
+
     def least_curvature(self) -> float:
         """Smallest eigenvalue of a stage's cost Hessian, relative to its largest."""
         blocks = np.block([[self.q, self.s.transpose(0, 2, 1)], [self.s, self.r]])

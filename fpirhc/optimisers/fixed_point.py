@@ -62,6 +62,7 @@ from fpirhc.symbolic.live import settled
 _DIGITS = 1e-15  # relative rounding of a number
 _MOST_LIMITED = 1000  # iterations of one open-loop call with limits of states
 _FIRST_CALLS = 5  # of `converging`, before a run
+_GROWTH = 1e8  # of a motion of the model over the horizon, beyond which half the digits of a plan's gradient are lost
 _CONVEX = 1e-6  # relative eigenvalue below zero that is taken for rounding
 
 
@@ -104,10 +105,11 @@ class FixedPoint(Optimiser):
         return "tolerance", "damping"
 
     def check(self, ocp: OptimalControl) -> None:
-        """Raise if the cost is not convex along the reference and the Hessian needs that, or the tolerance cannot be met.
+        """Raise if plans cannot be rolled out, the tolerance cannot be met, or the cost is not convex where the Hessian needs that.
 
         Raises:
-            NotSupported: a quadratic model of such a cost has no minimum; a model-referenced map.
+            NotSupported: a discretised model that runs away along the reference, as Runge-Kutta steps of fast modes do;
+                a cost whose quadratic model has no minimum; a model-referenced map.
             InvalidValue: a tolerance below the rounding of inputs.
         """
         require_own_requests("FixedPoint", self.map)
@@ -118,6 +120,7 @@ class FixedPoint(Optimiser):
                 f"FixedPoint(tolerance={self.tolerance:g}): inputs of this size are rounded to {rounding:.1g}; "
                 f"use {1e3 * rounding:.0g}"
             )
+        _require_rollouts(ocp.along.growth())
         least = ocp.along.least_curvature()
         if least < -_CONVEX and (self.hessian is None or self.hessian.needs_convex_cost):
             raise NotSupported(
@@ -166,6 +169,18 @@ class FixedPoint(Optimiser):
 
     def _limited(self, iterations: int) -> LimitedSettings:
         return LimitedSettings(self.tolerance, self.feasible, self.map, self.hessian, self.damping, iterations)
+
+
+def _require_rollouts(growth: np.ndarray) -> None:
+    """Raise if a motion of the model grows so much over the horizon, by these factors per stage, that rollouts have no digits."""
+    if np.prod(growth) <= _GROWTH or not np.isfinite(growth).all():
+        return
+    raise NotSupported(
+        f"FixedPoint rolls its plans out; the discretised model multiplies a motion by {growth.max():.3g} in a stage and by "
+        f"{np.prod(growth):.1g} over the horizon, so plans have no digits. Where the plant itself does not run away so, a fast "
+        f"mode is the cause: use Horizon(discretisation=RadauIIA()), or RungeKutta4(substeps=...) with more sub-steps; else use "
+        f"fewer or shorter stages"
+    )
 
 
 EXAMPLES = (FixedPoint(iterations=20, tolerance=1e-6), FixedPoint(iterations=1, tolerance=1e-6))
