@@ -17,7 +17,7 @@ import numpy as np
 
 from fpirhc.controllers.demands import plan_demand, reference_demand
 from fpirhc.controllers.form_check import check_form, check_maps, check_outputs
-from fpirhc.controllers.gain_check import check_gain_sign, check_response_delay
+from fpirhc.controllers.gain_check import check_gain_sign, check_gain_size
 from fpirhc.deformation.base import Deformation, Demand, Mirror, with_inner
 from fpirhc.deformation.identity import Identity
 from fpirhc.describe import replaced
@@ -361,7 +361,7 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
         return ready  # its own check judges a gain that acts on targets
     if ready.response(problem) is None:
         check_gain_sign(problem, ready.deformation)
-        check_response_delay(problem, ready.deformation)
+        check_gain_size(problem, ready.deformation)
         return ready
     late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
     if late or problem.reality or not problem.sensing.ideal:

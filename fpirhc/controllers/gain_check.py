@@ -2,8 +2,8 @@
 
 Where the eigenvalues of the response Jacobian at the start have real parts of both signs, no gain converges. Where they have one
 sign, gains of the other sign enlarge every error. Where the response is estimated or the error is filtered, the delay lowers the
-largest gain that converges. A gain that is too large for the plant alone is not refused: it ends in a bounded oscillation, which a
-run shows and the verdict explains.
+largest gain that converges. A gain beyond the limit, of the plant alone or behind these, is refused; `BeyondLimit`
+asks for it.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from fpirhc.errors import InvalidValue, NotContractive
 from fpirhc.plant.plant import Plant
 from fpirhc.task.problem import Problem
 
+_SOUGHT = 20.0  # effective gain times eigenvalue up to which limits are sought
 _NOTHING = 1e-12  # largest eigenvalue of a Jacobian that has no effect
 
 
@@ -38,30 +39,40 @@ def check_gain_sign(problem: Problem, deformation: Deformation) -> None:
         raise NotContractive(assess_gain(deformation, spectrum).text)
 
 
-def check_response_delay(problem: Problem, deformation: Deformation) -> None:
-    """Raise if a gain that converges on the plant itself is too large behind the delay of estimator and filter.
+def check_gain_size(problem: Problem, deformation: Deformation) -> None:
+    """Raise if a gain is beyond the limit of the iteration: that of the plant itself, or behind the delay of estimator and filter.
 
-    The dead time of the problem is added where all inputs have the same. Without estimator and filter dead time is not judged.
+    The dead time of the problem is added where all inputs have the same. Without estimator and filter dead time is not judged. A
+    map that changes its gain on line begins where it likes, and so does `BeyondLimit`.
 
     Raises:
         NotContractive: the gain is too large; the message names the limit, the gain, and remedies.
     """
     gain, form = deformation.effective_gain(), _form(deformation)
-    weights = _delayed_weights(problem, form) if gain else []
-    spectrum = _at_start(problem) if weights else None
+    if gain == 0 or not deformation.limited or not deformation.constant:
+        return
+    spectrum = _at_start(problem)
     if spectrum is None:
         return
+    late = _delayed_weights(problem, form)
+    weights = late or [np.ones(1)]
     eigenvalues = np.unique(np.round(spectrum.eigenvalues.ravel() * math.copysign(1, gain), 12))
 
     def limit(pairing: float) -> float:
         return min(form.limit(w, complex(v), pairing) for w in weights for v in eigenvalues)
 
-    if limit(form.pairing) <= abs(gain) < max(map(abs, linear_limit(spectrum.eigenvalues))):
-        # A window does not see requests that alternate; a fraction of a cycle in the pairing damps them.
-        delay = problem.response_delay
-        limits = {d: limit(d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0}
-        best = None if form.referenced else next((d for d, largest in limits.items() if abs(gain) < largest), None)
-        raise NotContractive(_too_late(problem, deformation, form, limit(form.pairing), best))
+    plain = not (late or form.referenced or form.leak)
+    largest = max(map(abs, linear_limit(spectrum.eigenvalues))) if plain else limit(form.pairing if late else 0.0)
+    largest = min(largest, _SOUGHT / float(np.abs(eigenvalues).max()))
+    if abs(gain) < largest:
+        return
+    if not late:
+        raise NotContractive(_too_large(deformation, spectrum, largest))
+    # A window does not see requests that alternate; a fraction of a cycle in the pairing damps them.
+    delay = problem.response_delay
+    limits = {d: limit(d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0}
+    best = None if form.referenced else next((d for d, most in limits.items() if abs(gain) < most), None)
+    raise NotContractive(_too_late(problem, deformation, form, largest, best))
 
 
 def product_limit(problem: Problem, deformation: Deformation) -> float | None:
@@ -125,11 +136,29 @@ def _late(weights: np.ndarray, cycles: float) -> np.ndarray:
     return np.convolve(weights, np.append(np.zeros(whole), [1 - share, share]))
 
 
+def _too_large(deformation: Deformation, spectrum: Spectrum, limit: float) -> str:
+    """What is wrong with a gain that is beyond the limit of the plant itself."""
+    gain = abs(deformation.effective_gain())
+    name, value = _named_gain(deformation)
+    values = spectrum.eigenvalues.ravel()
+    largest = values[np.argmax(np.abs(values))]
+    value_text = f"{largest.real if largest.imag == 0 else largest:.3g}"
+    return (
+        f"{type(deformation).__name__}({name}={value:.4g}): the iteration converges only for effective gains below {limit:.3g}, "
+        f"and this one is {gain:.3g} (the largest eigenvalue of the response Jacobian at the start is {value_text}); use "
+        f"0 < |{name}| < {limit / gain * abs(value):.3g}. To see what happens beyond: BeyondLimit(map)"
+    )
+
+
+def _named_gain(deformation: Deformation) -> tuple[str, float]:
+    """The gain as the user wrote it, with the name of its field; the effective gain of a map without one."""
+    own = getattr(deformation, deformation.gain_name, None)
+    return (deformation.gain_name, float(own)) if own is not None else ("effective gain", deformation.effective_gain())
+
+
 def _too_late(problem: Problem, deformation: Deformation, form: _Form, limit: float, pairing: float | None) -> str:
     gain, estimator = abs(deformation.effective_gain()), problem.sensing.estimator
-    own = getattr(deformation, deformation.gain_name, None)
-    name = deformation.gain_name if own is not None else "effective gain"
-    value = float(own) if own is not None else deformation.effective_gain()
+    name, value = _named_gain(deformation)
     delay = problem.response_delay
     reasons = [f"the response comes {delay:.4g} cycles late ({estimator})"] if delay else []
     reasons += [f"the error is filtered with the pole {form.pole:g}"] if form.pole else []

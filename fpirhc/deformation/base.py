@@ -135,6 +135,11 @@ class Deformation(Checked, ABC):
         return not own if self.inner is None else self.inner.constant and own == self.inner.memory(("q",)).names
 
     @property
+    def limited(self) -> bool:
+        """Whether a gain beyond the limit of the iteration is refused."""
+        return True if self.inner is None else self.inner.limited
+
+    @property
     def reach(self) -> Reach | None:
         """The setting that bounds the requests for which the gains hold; None where the gains hold for all requests."""
         return None if self.inner is None else self.inner.reach

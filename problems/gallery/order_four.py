@@ -66,7 +66,7 @@ filter = fp.DisturbanceKalman(drift={"q": 0.39}, measured={"q": 1e-3, "q'": 1e-3
 controllers = {
     "CTC": fp.ComputedTorque(tracking),
     "CTC+FPI": fp.ComputedTorque(tracking, fp.RFPT(offset=1e6, sign=-1.0, gain=5e-7)),
-    "CTC+FPI, gain too large": fp.ComputedTorque(tracking, fp.RFPT(offset=1e6, sign=-1.0, gain=1e-6)),
+    "CTC+FPI, gain too large": fp.ComputedTorque(tracking, fp.BeyondLimit(fp.RFPT(offset=1e6, sign=-1.0, gain=1e-6))),
     "RHC": plain,
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
     "RHC offset-free": fp.Estimating(plain, filter),
