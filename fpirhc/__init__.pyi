@@ -43,6 +43,7 @@ from .deformation.rfpt import RFPT
 from .deformation.rfpt_vector import RFPTVector
 from .deformation.rotation import Rotation
 from .deformation.sigmoid import Sigmoid
+from .deformation.wrappers.beyond_limit import BeyondLimit
 from .deformation.wrappers.damped import Damped
 from .deformation.wrappers.delayed import Increment, Paired
 from .deformation.wrappers.filtered import Filtered
@@ -143,6 +144,7 @@ __all__ = [
     "Answer",
     "BacksteppingMRAC",
     "Believed",
+    "BeyondLimit",
     "ByDesired",
     "ByError",
     "ByLookAhead",

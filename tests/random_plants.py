@@ -145,6 +145,7 @@ def dies_out(case: Case) -> bool:
     """Whether the simulated response error dies out; a gain of the wrong sign, refused otherwise, is run too."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(contract, "check_gain_sign", lambda *_: None)
+        patch.setattr(contract, "check_gain_size", lambda *_: None)
         run = fp.simulate(case.problem, case.controller, seed=0, compiled=False)
     if run.stop is not None:
         return False

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
+from fpirhc.broken import attempted
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked, resolved
 from fpirhc.errors import FpirhcError, InvalidValue
@@ -61,13 +62,27 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
     grid = review_grid(problem, mismatch, seed)
     if controls_order_zero(grid):
         return review_of_order_zero(grid, controllers)
-    general = [well_posed(grid), relative_orders(grid), inverse_exists(grid), commands_inside(grid)]
-    reach = horizon_long_enough(grid)
-    more = (question.ask(grid) for question in known_questions(ProblemQuestion))
-    general += [answer for answer in (reach, discretisation_follows(grid), *more) if answer is not None]
+    first = (well_posed, relative_orders, inverse_exists, commands_inside, horizon_long_enough, discretisation_follows)
+    general = _answers((*first, *(question.ask for question in known_questions(ProblemQuestion))), grid)
     runs = NominalRuns(grid.problem)
     answers = {name: _of(grid, one, general, runs) for name, one in controllers.items()}
     return Review(tuple(general), answers, mismatch)
+
+
+def _asked(ask: Callable[..., Answer | None], *about: object) -> Answer | None:
+    """The answer to a question; unknown where asking it breaks, under the name of its function."""
+    broken: list[str] = []
+    answer = attempted("the answer", ask, *about, broken=broken)
+    if not broken:
+        return answer
+    name = getattr(ask, "__name__", type(ask).__name__).strip("_").replace("_", " ")
+    return Answer(f"{name.capitalize()}?", Verdict.UNKNOWN, broken[0])
+
+
+def _answers(questions: Iterable[Callable[..., Answer | None]], *about: object) -> list[Answer]:
+    """The answers to those questions that have one."""
+    answers = (_asked(question, *about) for question in questions)
+    return [answer for answer in answers if answer is not None]
 
 
 def predict(problem: Problem, controller: Controller) -> Answer:
@@ -80,7 +95,7 @@ def predict(problem: Problem, controller: Controller) -> Answer:
     grid = review_grid(problem, 0.0, 0)
     own = replace(grid, draws=grid.draws[:1])  # the box does not matter
     ready = resolved(own.problem, controller)
-    general = [well_posed(own), inverse_exists(own), commands_inside(own)]
+    general = _answers((well_posed, inverse_exists, commands_inside), own)
     loops = loops_along(own, ready)
     case = Case(own, ready, loops, NominalRuns(own.problem))
     if ready.deforms_target:
@@ -97,29 +112,46 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: N
         ready.check(grid.problem)
     except FpirhcError as error:
         return (Answer("Does the controller fit the problem?", Verdict.NO, str(error), "See the message."),)
-    schedule = schedule_stable(grid.problem, ready)
+    broken: list[str] = []
+    schedule = _asked(schedule_stable, grid.problem, ready)
     if schedule is not None:
         return (schedule,)
-    loops = loops_along(grid, ready)
-    still = zero_dynamics(grid.problem, zero_dynamics_rate(grid), is_planned(ready), loops)
-    outer = [rates_inside(grid, ready, loops), still]
+    loops = attempted("the linear loop", loops_along, grid, ready, broken=broken)
+    if loops is None:
+        return (Answer("Is there a linear loop along the reference?", Verdict.UNKNOWN, broken[0]),)
     case = Case(grid, ready, loops, runs)
     of_map = _of_target if ready.deforms_target else _of_map
-    inner = of_map(case, general) if ready.deformation.adapts else []
-    return (*inner, *outer, margins_enough(grid.problem, loops, adapts=ready.deformation.adapts), *_more(case))
+    inner = (
+        attempted("the answers about the map", of_map, case, general, broken=broken) if ready.deformation.adapts else []
+    )
+    if inner is None:
+        inner = [Answer("Does the iteration converge?", Verdict.UNKNOWN, broken[0])]
+    outer = _answers((_rates, _zero_dynamics, _margins), case)
+    return (*inner, *outer, *_more(case))
+
+
+def _rates(case: Case) -> Answer | None:
+    return rates_inside(case.grid, case.controller, case.loops)
+
+
+def _zero_dynamics(case: Case) -> Answer | None:
+    return zero_dynamics(case.problem, zero_dynamics_rate(case.grid), is_planned(case.controller), case.loops)
+
+
+def _margins(case: Case) -> Answer | None:
+    return margins_enough(case.problem, case.loops, adapts=case.controller.deformation.adapts)
 
 
 def _more(case: Case) -> list[Answer]:
     """Answers to the questions that are found by discovery."""
     questions = (q for q in known_questions(ControllerQuestion) if _concerns(q, case.controller))
-    answers = (question.ask(case) for question in questions if not question.doubts)
-    return [answer for answer in answers if answer is not None]
+    return _answers((question.ask for question in questions if not question.doubts), case)
 
 
 def _doubtful(case: Case) -> list[Answer]:
     """Answers whose no speaks against convergence."""
-    answers = (q.ask(case) for q in known_questions(ControllerQuestion) if q.doubts and _concerns(q, case.controller))
-    return [answer for answer in answers if answer is not None]
+    questions = (q for q in known_questions(ControllerQuestion) if q.doubts and _concerns(q, case.controller))
+    return _answers((question.ask for question in questions), case)
 
 
 def _concerns(question: ControllerQuestion, controller: Controller) -> bool:
@@ -150,21 +182,32 @@ def _of_map(case: Case, general: list[Answer]) -> list[Answer]:
     except InvalidValue as error:
         return [Answer("Do the eigenvalues of the response Jacobian have one sign?", Verdict.UNKNOWN, str(error))]
     limit = largest_product(grid.problem, deformation, own.eigenvalues)
-    two_cycles = free_of_two_cycles(grid, controller, loops)
+    two_cycles = _asked(free_of_two_cycles, grid, controller, loops)
     suited = [*_speed_and_range(grid, controller, loops), *_doubtful(case)]
-    verdict = converges(grid, controller, loops, _doubts([*general, *suited, two_cycles]))
-    gains = [one_sign(own, boxed), gain_admissible(deformation, own, boxed, limit)]
-    law = [fast_enough(grid, controller, own), bears_lag(grid, controller, own), two_cycles]
-    known = [a for a in (*law, chatter_small(grid, controller)) if a is not None]
-    form = right_form(grid.problem, deformation)
-    return [verdict, box_converges(loops), *gains, *suited, *known, form, pays(case)]
+    answers = (
+        _asked(converges, grid, controller, loops, _doubts([*general, *suited, two_cycles])),
+        _asked(box_converges, loops),
+        _asked(one_sign, own, boxed),
+        _asked(gain_admissible, deformation, own, boxed, limit),
+        *suited,
+        _asked(fast_enough, grid, controller, own),
+        _asked(bears_lag, grid, controller, own),
+        two_cycles,
+        _asked(chatter_small, grid, controller),
+        _asked(right_form, grid.problem, deformation),
+        _asked(pays, case),
+    )
+    return [answer for answer in answers if answer is not None]
 
 
 def _speed_and_range(grid: ReviewGrid, controller: Controller, loops: Loops) -> list[Answer]:
     deformation, believed = controller.deformation, controller.parameters(grid.problem.plant)
     ideal = loops.ideal if is_planned(controller) else None
-    answers = [slew_enough(grid, deformation, believed, ideal), range_enough(grid, deformation, believed)]
-    return [a for a in answers if a is not None]
+    answers = (
+        _asked(slew_enough, grid, deformation, believed, ideal),
+        _asked(range_enough, grid, deformation, believed),
+    )
+    return [answer for answer in answers if answer is not None]
 
 
 def _doubts(answers: Sequence[Answer | None]) -> list[str]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
+from fpirhc.broken import attempted
 from fpirhc.contraction import contraction_along
 from fpirhc.contraction.identified import identified_factor
 from fpirhc.contraction.sampled import sampled_jacobians
@@ -27,19 +28,26 @@ _CHUNK = 500  # cycles whose costs are evaluated in one call
 Judgement = tuple[Signal, np.ndarray]
 
 
-def judgements(problem: Problem, controller: Controller, layout: Layout, log: np.ndarray) -> list[Judgement]:
-    """Return 'cost' by term where there is one of states that really are, and 'contraction' where the controller adapts."""
-    judged = []
+def judgements(
+    problem: Problem, controller: Controller, layout: Layout, log: np.ndarray, broken: list[str]
+) -> list[Judgement]:
+    """Return 'cost' by term where there is one of states that really are, and 'contraction' where the controller adapts.
+
+    Sentences about signals that break are added to `broken`.
+    """
+    judged: list[Judgement | None] = []
     # A cost of states that the reality does not have is nobody's.
     whole = "plant_state" in layout and layout["plant_state"].elements == problem.plant.state.elements
     if problem.cost is not None and problem.horizon is not None and whole:
-        judged.append(_costs(problem, layout, log))
+        judged.append(attempted("the signal 'cost'", _costs, problem, layout, log, broken=broken))
     gain = controller.deformation.effective_gain()
     of_responses = controller.response(problem) is None and not controller.deforms_target
     if gain != 0 and log.shape[0] and of_responses:
-        factors = _contraction(problem, controller, layout, log)
-        judged += [(scalar("contraction"), factors[:, None])] if np.isfinite(factors).all() else []
-    return judged
+        named = "the signal 'contraction'"
+        factors = attempted(named, _contraction, problem, controller, layout, log, broken=broken)
+        finite = factors is not None and np.isfinite(factors).all()
+        judged += [(scalar("contraction"), factors[:, None])] if factors is not None and finite else []
+    return [one for one in judged if one is not None]
 
 
 def _contraction(problem: Problem, controller: Controller, layout: Layout, log: np.ndarray) -> np.ndarray:

@@ -231,10 +231,12 @@ def judged_run(
     problem, controller = ready.problem, ready.controller
     if settings:
         problem, controller, _ = ready.live.changed(settings)
-    judged = judgements(problem, controller, run.layout, run.log)
+    broken: list[str] = []
+    judged = judgements(problem, controller, run.layout, run.log, broken)
     log = np.hstack([run.log, *(values for _, values in judged)])
     log.setflags(write=False)
-    return replace(run, layout=run.layout + Layout(tuple(signal for signal, _ in judged)), log=log)
+    facts = {**run.settings, "broken": broken} if broken else run.settings
+    return replace(run, layout=run.layout + Layout(tuple(signal for signal, _ in judged)), log=log, settings=facts)
 
 
 def disturbance_table(problem: Problem, seed: int, cycles: int) -> np.ndarray:

@@ -88,7 +88,7 @@ def test_all_forms_have_the_same_edge(form):
     )
     errors = {}
     for product in (1.9, 2.1):
-        controller = fp.ComputedTorque(fp.Exponential(rate=1.0), form(affine(product / 3)))
+        controller = fp.ComputedTorque(fp.Exponential(rate=1.0), fp.BeyondLimit(form(affine(product / 3))))
         run = fp.simulate(problem, controller, seed=0)
         late = run.time >= problem.measure_from
         errors[product] = np.abs(run["realised"] - run["desired"])[late].max()

@@ -82,7 +82,7 @@ def test_an_own_error_is_judged_by_the_error_that_it_removes():
 
 def test_what_does_not_finish():
     """A loop that diverges where the plain one finishes has failed; where the plain one diverges nothing is shown."""
-    wild = fp.ComputedTorque(PLAIN.tracking, fp.Affine(gain=-60.0))
+    wild = fp.ComputedTorque(PLAIN.tracking, fp.BeyondLimit(fp.Affine(gain=-60.0)))
     good = fp.ComputedTorque(PLAIN.tracking, SIGMOID)
     task = problem(duration=2.0, measure_from=0.1)
     loops = [simulator(task, c, compiled=False) for c in (good, wild)]

@@ -90,6 +90,7 @@ def _is_worse(run: fp.Run, bare: fp.Run) -> bool:
 def test_null_answers_on_random_closed_loops(monkeypatch):
     """A yes of the null test is never wrong; gains of the wrong sign, refused otherwise, are asked and run too."""
     monkeypatch.setattr(contract, "check_gain_sign", lambda *_: None)
+    monkeypatch.setattr(contract, "check_gain_size", lambda *_: None)
     assert wrong_null_answers(range(6)) == []
 
 
@@ -97,6 +98,7 @@ def test_null_answers_on_random_closed_loops(monkeypatch):
 def test_null_answers_on_three_hundred_closed_loops(monkeypatch):
     """The same on all."""
     monkeypatch.setattr(contract, "check_gain_sign", lambda *_: None)
+    monkeypatch.setattr(contract, "check_gain_size", lambda *_: None)
     assert wrong_null_answers(range(300)) == []
 
 

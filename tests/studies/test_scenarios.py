@@ -221,7 +221,7 @@ def test_an_error_as_large_as_the_motion_has_diverged(task):
 
 def test_runs_that_end_early_or_stray_are_told_apart(task):
     """A model with nine tenths of the gain too little makes FPI stray; a response that leaves its range ends the run."""
-    wild = fp.ComputedTorque(fp.Exponential(6.0), fp.RFPT(offset=1e4, sign=-1.0, gain=1.0))
+    wild = fp.ComputedTorque(fp.Exponential(6.0), fp.BeyondLimit(fp.RFPT(offset=1e4, sign=-1.0, gain=1.0)))
     strays = replace(task, controllers={"wild": wild})
     record = Bench(strays, Conditions(0, COMPARING, 0.0, compiled=False)).record(0, "wild")
     assert record["outcome"] in ("diverged", "ended early")

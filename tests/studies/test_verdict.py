@@ -53,7 +53,7 @@ def test_too_small_a_scale_is_recognised():
 
 def test_too_large_a_gain_is_recognised():
     """Beyond the linear limit the iteration is no contraction; the verdict says so and gives admissible gains."""
-    sentences = judged(fp.Rotation(fraction=1.4, radius=1e4))
+    sentences = judged(fp.BeyondLimit(fp.Rotation(fraction=1.4, radius=1e4)))
     assert "is too large" in sentences.verdict[0]
     assert sentences["adaptive"].contraction.predicted > 1
 

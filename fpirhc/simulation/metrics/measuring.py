@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from fpirhc.broken import attempted
 from fpirhc.errors import InvalidName, nearest
 from fpirhc.fields.checked_call import checked_call
 from fpirhc.simulation.metrics.base import Metric
@@ -25,11 +26,13 @@ class Metrics:
         values: numbers by metric and element; a single number has the element ''. Metrics that the run does not have are left out.
         units: units by metric and element.
         entries: the metrics that were measured, by name.
+        broken: sentences about those whose function raised an error; they have no numbers.
     """
 
     values: Mapping[str, Mapping[str, float]]
     units: Mapping[str, Mapping[str, str]]
     entries: Mapping[str, Metric]
+    broken: tuple[str, ...] = ()
 
     def __getitem__(self, name: str) -> Mapping[str, float]:
         if isinstance(name, str) and name in self.entries:
@@ -125,6 +128,8 @@ def measure(problem: Problem, run: Run, metrics: Sequence[Metric] | None = None)
         InvalidValue: a metric's function returned no numbers.
     """
     entries = known_metrics() if metrics is None else metrics
-    values = {m.name: numbers for m in entries if (numbers := m.values(problem, run))}
+    broken: list[str] = []
+    measured = {m.name: attempted(f"metric '{m.name}'", m.values, problem, run, broken=broken) for m in entries}
+    values = {name: numbers for name, numbers in measured.items() if numbers}
     units = {m.name: {e: m.unit_of(problem, e) for e in values[m.name]} for m in entries if m.name in values}
-    return Metrics(values, units, {m.name: m for m in entries})
+    return Metrics(values, units, {m.name: m for m in entries}, tuple(broken))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
-from typing import Any
+from typing import Any, cast
 
+from fpirhc.broken import attempted
 from fpirhc.contraction import ContractionReport, Spectrum, assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked, resolved
@@ -239,8 +241,11 @@ def compare(
     ran, skipped = _entries(task, selected, seed, compiled, progress, loops, changes or {})
     sizes = scales(task.problem)
     entries = beside_each_other(task.problem, ran, loops, sizes, compiled=compiled)
+    broken: list[str] = []
     yardstick = Yardstick(sizes, ranges(task.problem), error_left_alone(task.problem, seed=seed))
     judged = findings(entries, skipped, task.headline, yardstick)
+    pair = judged[0].pair
+    null = attempted("the null test", null_of_pair, task.problem, pair, entries, loops, sizes, seed=seed, broken=broken)
     return Comparison(
         problem=task.name,
         title=task.title,
@@ -255,10 +260,10 @@ def compare(
         settings=describe(task.problem),
         elapsed=time.perf_counter() - begin,
         pictures=task.pictures,
-        null=null_of_pair(task.problem, judged[0].pair, entries, loops, sizes, seed=seed),
+        null=null,
         time_unit=task.problem.time_unit,
         steps=task.problem.real_plant.step is not None,
-        information=sentences(task.problem, {e.name: e.information for e in entries if e.information}),
+        information=(*sentences(task.problem, {e.name: e.information for e in entries if e.information}), *broken),
     )
 
 
@@ -332,25 +337,39 @@ def _entry(
     loops[name] = simulator(problem, ready, compiled=compiled, live=live)
     run = judged_run(loops[name], seed=seed, name=name, progress=report, changes=changes)
     adaptive, every = ready.deformation.adapts, plan_every(problem, ready)
-    view = lyapunov_view(problem, ready, run)
+    broken = list(cast(Sequence[str], run.settings.get("broken", ())))
+    part = partial(attempted, broken=broken)
     metrics = measure(problem, run, task.metrics)
+    view = part("the Lyapunov function", lyapunov_view, problem, ready, run)
+    cycle = part("the time of a cycle", measure_cycle, problem, ready, run, compiled=compiled)
+    contraction = part("the contraction", _contraction, problem, ready, run, metrics)
+    optimality = part("the excess cost of the plans", measure_optimality, problem, ready, run, compiled=compiled)
+    predicts = adaptive and name in (task.headline or ())
+    prediction = part("the prediction", _predicted, problem, controller, compiled) if predicts else None
+    told = part("the sentence about what it measures", information, problem, ready, loops[name].loop, every)
     return Entry(
         name=name,
         run=run,
         metrics=metrics,
-        cycle=measure_cycle(problem, ready, run, compiled=compiled),
+        cycle=cycle,
         adaptive=adaptive,
         pair=_pair(controllers, name) if adaptive else None,
-        contraction=_contraction(problem, ready, run, metrics),
-        optimality=measure_optimality(problem, ready, run, compiled=compiled),
-        notes=(*_notes(controller, ready), *ready.notes(problem), *([view.text] if view else [])),
+        contraction=contraction,
+        optimality=optimality,
+        notes=(
+            *_notes(controller, ready),
+            *ready.notes(problem),
+            *([view.text] if view else []),
+            *broken,
+            *metrics.broken,
+        ),
         lyapunov=view,
-        prediction=_predicted(problem, controller, compiled) if adaptive and name in (task.headline or ()) else None,
+        prediction=prediction,
         weighed=weighed(problem, ready),
         exact=has_exact_model(problem, ready),
         learns=ready.learns,
         plan_every=every,
-        information=information(problem, ready, loops[name].loop, every),
+        information=told,
         automatic=tuple(controller.deformation.automatic),
     )
 

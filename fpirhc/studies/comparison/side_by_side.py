@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from fpirhc.broken import attempted
 from fpirhc.simulation.simulate import Simulator
 from fpirhc.studies.comparison.entry_facts import no_bound_because
 from fpirhc.studies.comparison.null_test import NullTest, null_test
@@ -86,9 +87,13 @@ def _beside(
     """The entry with its price, or with why its exact model is no bound."""
     controller, by_name = loops[entry.name].controller, {e.name: e for e in entries}
     if entry.exact and beaten_by(entry, entries, scales):
-        return replace(entry, no_bound=no_bound_because(problem, controller, entry.metrics, entry.optimality))
+        facts = problem, controller, entry.metrics, entry.optimality
+        why = attempted("why it is no bound", no_bound_because, *facts, broken=[])
+        return replace(entry, no_bound=why or ())
     plain = by_name.get(entry.pair or "")
     if plain is None:
         return entry
     both = (loops[plain.name].controller, plain.run), (controller, entry.run)
-    return replace(entry, price=measure_price(problem, *both, compiled=compiled))
+    broken: list[str] = []
+    price = attempted("the price of adaptation", measure_price, problem, *both, compiled=compiled, broken=broken)
+    return replace(entry, price=price, notes=(*entry.notes, *broken))

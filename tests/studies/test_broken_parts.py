@@ -1,0 +1,130 @@
+"""A question, a metric or a part of a comparison that breaks is told by its name, and the rest is there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.review import review as reviewing
+from fpirhc.review.answer import Verdict
+from fpirhc.simulation import run_signals
+from fpirhc.studies.comparison import compare as comparing
+
+TASK = fp.load_problem("two_mass")
+CONTROLLERS = {name: TASK.controllers[name] for name in ("CTC", "CTC+FPI (eq 6)")}
+PROBLEM = replace(TASK.problem, duration=0.05, measure_from=0.0, horizon=None, cost=None)
+WORDS = r"could not be computed \(LinAlgError: Array must not contain infs or NaNs\); the rest does not depend on it"
+
+
+def task(**changes):
+    """Computed torque without and with adaptation, for 50 cycles."""
+    small: dict[str, Any] = {
+        "problem": PROBLEM,
+        "controllers": CONTROLLERS,
+        "headline": tuple(CONTROLLERS),
+        "pictures": (),
+    }
+    return replace(TASK, **{**small, **changes})
+
+
+def breaks(*_arguments, **_named):
+    """What numpy does with a matrix that is not finite."""
+    raise np.linalg.LinAlgError("Array must not contain infs or NaNs")
+
+
+def test_a_broken_metric_is_told_by_its_name():
+    """The other metrics have their numbers, in `measure` and in a comparison."""
+    mine = fp.Metric("mine", lambda problem, run: 1 / 0)
+    rms = fp.Metric("largest", lambda problem, run: float(np.abs(run["error"]).max()))
+    run = fp.simulate(PROBLEM, CONTROLLERS["CTC"], seed=0, compiled=False)
+    metrics = fp.measure(PROBLEM, run, [mine, rms])
+    assert metrics["largest"][""] > 0
+    assert metrics["mine"] == {}
+    [sentence] = metrics.broken
+    assert sentence.startswith("metric 'mine' could not be computed (ZeroDivisionError: division by zero)")
+
+
+@pytest.mark.parametrize(
+    ("part", "name"),
+    [
+        ("lyapunov_view", "the Lyapunov function"),
+        ("measure_cycle", "the time of a cycle"),
+        ("_contraction", "the contraction"),
+        ("measure_optimality", "the excess cost of the plans"),
+        ("_predicted", "the prediction"),
+    ],
+)
+def test_a_part_of_a_comparison_that_breaks_loses_no_run(part, name, monkeypatch):
+    """The runs and their metrics are there, and the notes name the part."""
+    monkeypatch.setattr(comparing, part, breaks)
+    result = fp.compare(task(), seed=0, compiled=False)
+    assert [e.run.cycles for e in result.entries] == [50, 50]
+    assert all(e.metrics.rms_error["q1"] > 0 for e in result.entries)
+    assert any(note.startswith(f"{name} could not be computed (LinAlgError") for note in result.entries[1].notes)
+
+
+def test_a_null_test_that_breaks_loses_no_comparison(monkeypatch):
+    """It stands with the sentences about what is known."""
+    monkeypatch.setattr(comparing, "null_of_pair", breaks)
+    result = fp.compare(task(), seed=0, compiled=False)
+    assert result.null is None
+    assert any(s.startswith("the null test could not be computed (LinAlgError") for s in result.information)
+    assert len(result.entries) == 2
+
+
+def test_a_signal_that_breaks_after_the_run_does_not_lose_it(monkeypatch):
+    """The run has its own signals, and says which one is missing."""
+    monkeypatch.setattr(run_signals, "_contraction", breaks)
+    run = fp.simulate(PROBLEM, CONTROLLERS["CTC+FPI (eq 6)"], seed=0, compiled=False)
+    assert run.cycles == 50
+    assert "contraction" not in run.layout
+    [sentence] = cast(list[str], run.settings["broken"])
+    assert sentence.startswith("the signal 'contraction' could not be computed (LinAlgError")
+
+
+def answers(monkeypatch, *names):
+    """Questions with their answers, of the problem and of the adaptive controller, where some functions break."""
+    for name in names:
+        monkeypatch.setattr(reviewing, name, breaks)
+    review = fp.review(PROBLEM, CONTROLLERS, mismatch=20.0, seed=0)
+    return {a.question: a for a in review.problem}, {a.question: a for a in review.controllers["CTC+FPI (eq 6)"]}
+
+
+def test_a_question_that_breaks_is_unknown_by_name(monkeypatch):
+    """All other questions keep their answers, bit by bit."""
+    with monkeypatch.context() as context:
+        whole, of_map = answers(context)
+    with monkeypatch.context() as context:
+        broken, of_broken = answers(context, "commands_inside", "gain_admissible")
+    for before, after, name in ((whole, broken, "Breaks?"), (of_map, of_broken, "Breaks?")):
+        assert after[name].verdict == Verdict.UNKNOWN
+        assert "LinAlgError: Array must not contain" in after[name].evidence
+        assert len(after) == len(before)
+        assert {q: a.verdict for q, a in after.items() if q != name}.items() <= {
+            q: a.verdict for q, a in before.items()
+        }.items()
+
+
+def test_a_linear_loop_that_is_not_finite_is_unknown(monkeypatch):
+    """The controllers have that answer, and the problem has its own ones."""
+    whole, of_broken = answers(monkeypatch, "loops_along")
+    assert [(q, a.verdict) for q, a in of_broken.items()] == [
+        ("Is there a linear loop along the reference?", Verdict.UNKNOWN)
+    ]
+    assert len(whole) >= 4
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_a_parameter_of_two_to_the_63_is_reviewed():
+    """It made the matrices of a review overflow, which ended with an error inside the library."""
+    oscillator = fp.load_problem("van_der_pol")
+    plant = oscillator.problem.plant
+    stiff = replace(plant, parameters={**plant.parameters, "mu": replace(plant.parameters["mu"], exact=2**63)})
+    problem = replace(oscillator.problem, plant=stiff)
+    review = fp.review(problem, {"RHC": oscillator.controllers["RHC"]}, mismatch=20.0, seed=0)
+    assert any("could not be computed (LinAlgError" in answer.evidence for answer in review.problem)
+    assert len(review.controllers["RHC"]) >= 3
