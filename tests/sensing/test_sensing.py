@@ -308,7 +308,9 @@ def test_filtered_error(pole, share):
     assert fp.delayed_limit(np.ones(1), pole=pole) == pytest.approx(limit, rel=1e-4)
     gain = share * limit
     problem = resting(linear(1.0, 1.0), period=1e-4, duration=1e-2)
-    controller = fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Filtered(fp.Affine(gain=-2 * gain), pole))
+    controller = fp.ComputedTorque(
+        fp.Exponential(rate=1.0), fp.BeyondLimit(fp.Filtered(fp.Affine(gain=-2 * gain), pole))
+    )
     mode_values = modes(problem, controller)
     for root in np.roots([1, -(1 + pole - gain * (1 - pole)), pole]):
         assert np.abs(mode_values - root).min() < 2e-3
