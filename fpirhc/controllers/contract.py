@@ -84,11 +84,24 @@ class Planner:
         return bool(plant.outputs) and (self.corrects(plant) if self.consistent is None else self.consistent)
 
     def planned(self, problem: Problem) -> Problem:
-        """Return the problem with the cost and the margins of the plans."""
+        """Return the problem with the cost and the margins of the plans, and with limits that hold for the measured state."""
         costed = problem if self.cost is None else replace(problem, cost=self.cost)
-        if self.margins is None or costed.horizon is None:
+        if costed.horizon is None:
             return costed
-        return replace(costed, horizon=replace(costed.horizon, margins=self.margins))
+        horizon, measured = costed.horizon, self._measured(problem)
+        if self.margins is not None:
+            horizon = replace(horizon, margins=self.margins)
+        if measured:
+            horizon = replace(horizon, measured=measured)
+        return costed if horizon is costed.horizon else replace(costed, horizon=horizon)
+
+    def _measured(self, problem: Problem) -> tuple[str, ...]:
+        """The limited states that no output shows, where a plan starts at another state than the measured one."""
+        plant = problem.plant
+        if not self.starts_consistent(plant):
+            return ()
+        pairs = zip(plant.state.elements, plant.known_by_outputs, strict=True)
+        return tuple(e for e, place in pairs if place < 0 and e in problem.limits.states)
 
 
 class Controller(Checked, ABC):

@@ -35,7 +35,7 @@ from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.live_data import SCALE, STEEPEST, live_signals
 from fpirhc.horizon.nominal import feedforward, known_on_reference
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.stage_data import shifted_reference, stage_data
+from fpirhc.horizon.stage_data import offset_limits, shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.optimisers.fixed_point import FixedPoint
@@ -185,7 +185,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     assert problem.horizon is not None
     assert problem.cost is not None
     _check_reference(problem)
-    plant, ocp = problem.plant, _optimal_control(problem, optimiser)
+    plant, horizon, ocp = problem.plant, problem.horizon, _optimal_control(problem, optimiser)
     count = live_signals(ocp.settings, plant.input).size
     data_of = _stage_data(problem, count)
     preview = preview_of(problem)
@@ -205,6 +205,8 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
         data = running_data(s.time, *motion, s.parameters, *_live_rows(problem, optimiser, ocp, s))
         if plant.outputs:
             data = shifted_reference(plant, ocp.data, ocp.stages + 1)(data, s._plan_state, s.output, s.parameters)
+        if horizon.measured:
+            data = offset_limits(plant, horizon, ocp.data)(data, s._plan_state, s.state)
         # The shift of the last cycle is added to the plan's inputs, so their rate counts from the last command without it.
         first = ocp.start(s._plan_state, s._command_before - s._command_shift_last)
         lower, upper = _minus(low, s._command_shift_last), _minus(high, s._command_shift_last)
@@ -267,7 +269,9 @@ def _plan_reads(problem: Problem, ocp: OptimalControl) -> Layout:
     """Time, start of the plan, parameters, last command and its shift, derived numbers, outputs, own signals."""
     plant = problem.plant
     last = like(plant.input, "_command_shift_last"), like(plant.input, "_command_before")
+    assert problem.horizon is not None
     own, outputs = own_signals(problem), (plant.output,) if plant.outputs else ()
+    outputs = (*outputs, plant.state) if problem.horizon.measured else outputs
     start = like(plant.state, "_plan_state")
     return Layout((plant.time, start, *outputs, plant.parameter, *last, *_derived_signals(ocp), *own))
 

@@ -109,6 +109,13 @@ def narrowed(
     ]
 
 
+def measured(names: Collection[str], limits: Limits, plant: Plant, next_state: Expression) -> list[ConstraintState]:
+    """Limits of states that hold for the measured state, as entries; `next_state` is as it will be measured."""
+    places = {e: k for k, e in enumerate(plant.state.elements)}
+    units = dict(zip(plant.state.elements, plant.state.units, strict=True))
+    return [ConstraintState(_as_measured(e), units[e], next_state[places[e]], *limits.states[e]) for e in names]
+
+
 def hard(written: list[ConstraintState], soft: frozenset[str]) -> list[ConstraintState]:
     """The entries whose limits are not soft."""
     return [w for w in written if w.name not in soft]
@@ -134,6 +141,7 @@ def hard_state_bounds(limits: Limits, plant: Plant, replaced: Collection[str] = 
 def state_prices(limits: Limits, state: Signal, plant: Plant, step: float) -> np.ndarray:
     """Price of a violation of every entry's limits at one node (ns,), in cost per unit; infinite where limits are hard."""
     prices = {_entry(name, plant): step * price for name, price in limits.prices.items()}
+    prices |= {_as_measured(entry): price for entry, price in prices.items()}
     return np.array([prices.get(e, math.inf) for e in state.elements])
 
 
@@ -145,6 +153,10 @@ def soft_names(limits: Limits, plant: Plant) -> frozenset[str]:
 def _entry(name: str, plant: Plant) -> str:
     """Name of the entry; a rate is softened by the name of its input."""
     return f"{name} rate" if name in plant.inputs else name
+
+
+def _as_measured(name: str) -> str:
+    return f"{name} as measured"
 
 
 def _violation(value: Expression, lower: float, upper: float) -> Expression:

@@ -27,6 +27,8 @@ class Horizon(Checked):
         margins: by name of a state, the distances by which a plan stays inside the state's limits after stages 1 ... N, in the
             state's unit: room for what the model does not predict (`tightened` computes them). The problem's limits stay as they
             are for the run and its metrics.
+        measured: names of states whose limits hold for the measured state: for the plan's plus the distance of the measured one
+            from the plan's start. Controllers fill it in where a plan starts elsewhere, see `fpirhc.horizon.consistent_state`.
 
     Raises:
         InvalidValue: fewer than one stage, a step that is not positive, blocks that do not add up, or margins that are not one
@@ -42,6 +44,7 @@ class Horizon(Checked):
     margins: Mapping[str, Sequence[float]] = field(
         default_factory=dict, hash=False, metadata={"setting": "where given"}
     )
+    measured: tuple[str, ...] = field(default=(), kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
         if self.blocks and (sum(self.blocks) != self.stages or min(self.blocks) < 1):

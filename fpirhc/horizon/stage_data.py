@@ -18,11 +18,14 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
     """Layout of one stage's data.
 
     A terminal equality adds whether the stage is the last, and the reference after it; blocks add whether the inputs are free.
+    Limits that hold for the measured state add its distance from the plan's start.
     """
     free = (scalar("free"),) if horizon.blocks else ()
     units = dict(zip(plant.state.elements, plant.state.units, strict=True))
     names = tuple(horizon.margins)
     margin = (Signal("margin", names, tuple(units[e] for e in names)),) if names else ()
+    shown = horizon.measured
+    offset = (Signal("offset", shown, tuple(units[e] for e in shown)),) if shown else ()
     signals = (
         plant.time,
         Signal("reference", plant.output.elements, plant.output.units),
@@ -30,6 +33,7 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
         plant.parameter,
         *free,
         *margin,
+        *offset,
     )
     if not horizon.terminal:
         return Layout(signals)
@@ -61,7 +65,7 @@ def stage_data(
     zero = matrix.zeros(plant.input.size)
     needed = feedforward(plant, state, response, p) if cost.uses_feedforward else zero
     # The live rows come out of the same call where they follow these rows: joining tables would copy both.
-    joined = bool(live) and not (horizon.blocks or horizon.terminal or horizon.margins)
+    joined = bool(live) and not (horizon.blocks or horizon.terminal or horizon.margins or horizon.measured)
     rows = [matrix.sym("live", live)] if joined else []
     stage = ca.densify(ca.vertcat(t, state, needed, p, *rows))
     one = ca.Function("fpirhc_stage_data", [t, *motion, of_cycle, *rows], [stage])
@@ -80,6 +84,8 @@ def stage_data(
     if horizon.margins:
         margins = np.array([[*horizon.margins[e], 0.0] for e in horizon.margins], dtype=float)
         table = ca.vertcat(table, margins)
+    if horizon.measured:
+        table = ca.vertcat(table, np.zeros((len(horizon.measured), nodes)))
     if horizon.terminal:
         last, after = np.zeros((1, nodes)), [*range(1, nodes), nodes - 1]
         last[0, nodes - 2] = 1.0
@@ -115,3 +121,20 @@ def shifted_reference(plant: Plant, layout: Layout, nodes: int) -> ca.Function:
     data, arguments = ca.MX.sym("data", layout.size, nodes), [ca.MX.sym(name, size) for name, size in sizes.items()]
     repeated = [ca.repmat(v, 1, nodes) for v in arguments]
     return ca.Function("fpirhc_shifted_reference", [data, *arguments], [one.map(nodes)(data, *repeated)])
+
+
+def offset_limits(plant: Plant, horizon: Horizon, layout: Layout) -> ca.Function:
+    """Function (data, state from which the plan starts, measured state) -> data with the distance of the measured state.
+
+    Args:
+        plant: the model.
+        horizon: of the plan, with states whose limits hold for the measured one.
+        layout: of one stage's data.
+    """
+    nodes, rows = horizon.stages + 1, layout.slice("offset")
+    places = [plant.state.elements.index(name) for name in horizon.measured]
+    data = ca.MX.sym("data", layout.size, nodes)
+    start, state = (ca.MX.sym(name, plant.state.size) for name in ("start", "state"))
+    offset = ca.repmat(state[places] - start[places], 1, nodes)
+    table = ca.vertcat(data[: rows.start, :], offset, data[rows.stop :, :])
+    return ca.Function("fpirhc_offset_limits", [data, start, state], [table])

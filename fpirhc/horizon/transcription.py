@@ -16,6 +16,7 @@ from fpirhc.horizon.constraint_states import (
     ends,
     hard,
     hard_state_bounds,
+    measured,
     narrowed,
     paths,
     rates,
@@ -88,7 +89,7 @@ def transcribe(
     _check_finite(tuple(stage.terms), stage_cost, terminal_cost, nodes, cost)
     functions: dict[object, ca.Function] = {}
     along = expand_along(dynamics, stage_cost, terminal_cost, nodes, functions)
-    lower, upper = hard_state_bounds(limits, plant, horizon.margins)
+    lower, upper = hard_state_bounds(limits, plant, {*horizon.margins, *horizon.measured})
     state = _stage_state(plant, bool(free), binding)
     ocp = OptimalControl(
         stages=horizon.stages,
@@ -152,7 +153,7 @@ def _stage_expressions(
         advance = _advance(plant, horizon)
         x_next = advance(x, applied, view.parameters.vector)
         written = _written(plant, horizon, limits, view, x_next, data)
-        soft = softened(written, limits, plant, x)
+        soft = softened(written, limits, plant, _seen(plant, horizon, x, data))
         terms = {**_scalar_terms(cost.stage(view)), **soft}
         if horizon.blocks:
             # Inputs that have no effect are drawn to those that are held, so that a plan states what is applied.
@@ -237,12 +238,21 @@ def _written(
     for entry in entries:
         if ca.SX(entry.expression).numel() != 1:
             raise InvalidProblem(f"limits: path '{entry.name}' must be one scalar, got {entry.expression.shape}")
+    seen_next = _seen(plant, horizon, x_next, data)
     if horizon.margins:
         margin = dict(zip(horizon.margins, ca.vertsplit(data["margin"]), strict=True))
-        entries += narrowed(limits, plant, x_next, margin)
+        entries += narrowed(limits, plant, seen_next, margin)
+    hard_ones = [name for name in horizon.measured if name not in {*limits.soft, *horizon.margins}]
+    entries += measured(hard_ones, limits, plant, seen_next)
     if horizon.terminal:
         entries += ends(horizon.terminal, plant, x_next, data["target"], data["last"])
     return entries
+
+
+def _seen(plant: Plant, horizon: Horizon, x: Expression, data: Mapping[str, Expression]) -> Expression:
+    """The state as it will be measured: that of the plan, plus the distance of the measured state from the plan's start."""
+    offset = dict(zip(horizon.measured, ca.vertsplit(data["offset"]), strict=True)) if horizon.measured else {}
+    return ca.vertcat(*(x[k] + offset[e] if e in offset else x[k] for k, e in enumerate(plant.state.elements)))
 
 
 def _view(

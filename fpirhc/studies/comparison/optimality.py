@@ -12,7 +12,7 @@ from fpirhc.controllers.own_reference import own_signals
 from fpirhc.errors import FpirhcError
 from fpirhc.horizon.consistent_state import consistent_state
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.stage_data import shifted_reference, stage_data
+from fpirhc.horizon.stage_data import offset_limits, shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.simulation.run import Run
@@ -77,6 +77,7 @@ def measure_optimality(
         return None
     data_of = stage_data(planned.plant, planned.reference, planned.horizon, planned.cost, signals=ahead)
     of_measured = shifted_reference(planned.plant, ocp.data, ocp.stages + 1) if planned.plant.outputs else None
+    offset = offset_limits(planned.plant, planned.horizon, ocp.data) if planned.horizon.measured else None
     begin = consistent_state(planned.plant) if planner.starts_consistent(planned.plant) else None
     stride = cycles_per_stage(problem.horizon, problem.period)
     plans = np.arange(stride, run.cycles, stride)
@@ -92,6 +93,8 @@ def measure_optimality(
         data = np.asarray(data_of(times[row], parameters[row]).full())
         if of_measured is not None:
             data = np.asarray(of_measured(data, state, seen[row], parameters[row]).full())
+        if offset is not None:
+            data = np.asarray(offset(data, state, states[row]).full())
         best = solve(first, data, ocp.input_lower - shift, ocp.input_upper - shift)
         cost_of_plan = run["solve.cost"][row]
         if best is not None and run["status"][row] <= Status.NOT_CONVERGED:
