@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import reduce
 
 import casadi as ca
@@ -148,7 +149,7 @@ def fed(block: Block, name: str, source: Signal) -> Block:
     def step(s: Signals) -> Mapping[str, Value]:
         return block.step(Signals({**vars(s), name: getattr(s, source.name)}))
 
-    return Block(block.name, Layout(reads), block.writes, step, block.memory, block.opaque, block.derived)
+    return replace(block, reads=Layout(reads), step=step)
 
 
 def reference_block(problem: Problem) -> Block:

@@ -8,6 +8,8 @@ remember with multiples of it, so that one absurd but finite sample does not sta
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -19,18 +21,41 @@ from fpirhc.task.problem import Problem
 _SAMPLES = 100  # instants at which the reference is looked at
 
 
-@lru_cache(maxsize=8)  # several blocks of one loop ask for it, and every controller of a comparison
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """How large responses are.
+
+    Args:
+        largest: L of every controlled coordinate; infinite where an input has no finite limits.
+        slope: largest change of a response per change of an input, shape (n, nu).
+    """
+
+    largest: tuple[float, ...]
+    slope: np.ndarray
+
+    def of(self, places: Sequence[int]) -> Scale:
+        """Return the scale of some responses."""
+        return Scale(tuple(self.largest[k] for k in places), self.slope[list(places)])
+
+
 def largest_response(problem: Problem) -> tuple[float, ...]:
     """Return L of every controlled coordinate, by the limits of the build; infinite where an input has no finite limits.
 
     For outputs it is infinite too: the states that belong to their reference are not known before a run.
     """
+    free = (float("inf"),) * len(problem.plant.controlled_names)
+    return free if problem.plant.outputs else response_scale(problem).largest
+
+
+@lru_cache(maxsize=8)  # several blocks of one loop ask for it, and every controller of a comparison
+def response_scale(problem: Problem) -> Scale:
+    """Return the scale of every controlled response, by the limits of the build; of outputs along the model's nominal run."""
     task = nominal(problem)
     plant = task.plant
     lower, upper = task.limits.input_bounds(plant)
-    free = (float("inf"),) * len(plant.controlled_names)
-    if plant.outputs or not np.isfinite(upper - lower).all():
-        return free
+    size, inputs = len(plant.controlled_names), len(plant.inputs)
+    if not np.isfinite(upper - lower).all():
+        return Scale((float("inf"),) * size, np.zeros((size, inputs)))
     states, middle = _states(task), (lower + upper) / 2
     corners = [middle] + [_with(middle, k, v) for k in range(middle.size) for v in (lower[k], upper[k])]
     at_middle, *at_limits = (_responses(task, states, corner) for corner in corners)
@@ -40,8 +65,10 @@ def largest_response(problem: Problem) -> tuple[float, ...]:
             for low, high in zip(at_limits[::2], at_limits[1::2], strict=True)
         ]
         sizes = abs(at_middle) + sum(reach)
+        halves = np.maximum((upper - lower) / 2, 1e-300)
+        slopes = [np.where(np.isfinite(r), r, 0.0).max(axis=1) / h for r, h in zip(reach, halves, strict=True)]
     finite = np.where(np.isfinite(sizes), sizes, 0.0).max(axis=1)
-    return tuple(float(v) if v > 0 else float("inf") for v in finite)
+    return Scale(tuple(float(v) if v > 0 else float("inf") for v in finite), np.array(slopes).T)
 
 
 def _states(task: Problem) -> np.ndarray:

@@ -3,10 +3,23 @@
 For a controlled coordinate the range follows from the values that the problem itself names, v = (reference over the run, start,
 limits of the state),
 
-    centre +- 10 R,      R = max((max v - min v) / 2, |v| / 2),
+    centre +- D,      D = 10 max((max v - min v) / 2, |v| / 2).
 
-and for its k-th derivative +- 10 R (2 / period)^k: the whole range in half a cycle. Where all v are zero there is no scale and no
-range. Coordinates that are not controlled have none, because they may drift.
+Its response, the n-th derivative, is what the model has within these limits,
+
+    +- A,             A = max(10 L, 3 max |f(x, u)|),
+
+L the largest response along the reference and f over the limits of the inputs and the plausible states; and what has |q| <= D and
+|q^(n)| <= A cannot have a larger k-th derivative than
+
+    |q^(k)| <= C D^(1 - k/n) A^(k/n)                                                      (Landau and Kolmogorov),
+
+with C <= 6 for n <= 4. Where the model states no A, because an input has no limits, the whole range in half a cycle is the bound,
+D (2 / period)^k. States behind outputs have the range centre +- D of the values along the model's nominal run. Where all v are zero
+there is no scale and no range. Coordinates that are not controlled have none, because they may drift.
+
+Reference: I. J. Schoenberg, The elementary cases of Landau's problem of inequalities between derivatives, Amer. Math. Monthly 80,
+1973: the constants on the half line.
 """
 
 from __future__ import annotations
@@ -15,13 +28,18 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from fpirhc.controllers.seeing import raw_signal
+from fpirhc.controllers.largest_response import response_scale
+from fpirhc.controllers.reference_states import reference_states
+from fpirhc.controllers.seeing import given_states, raw_signal
 from fpirhc.errors import Mistakes
 from fpirhc.sensing.base import response_names
+from fpirhc.symbolic.live import nominal
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
-_MARGIN = 10.0
+_MARGIN, _OVER_STATES = 10.0, 3.0
+_LANDAU = 6.0  # the largest constant of all derivatives below an order of four
+_DRAWN = 200  # plausible states at which the model is asked
 _SAMPLES = 200  # instants at which the reference is looked at
 
 
@@ -37,30 +55,96 @@ def plausible_range(problem: Problem, own: Mapping[str, Interval] | None = None)
     Raises:
         InvalidProblem: a name that is unknown or not measured, or an interval that is none.
     """
-    plant, ranges = problem.plant.face, {}
-    columns = _columns(problem)
+    plant, columns = problem.plant.face, _columns(problem)
     _check(own or {}, columns)
-    values = _values(problem)
+    ranges = _behind_outputs(problem)
+    responses = _largest_responses(problem)
     for k in plant.controlled_indices:
-        name = plant.names[k]
-        seen = values[name]
-        size = max(np.ptp(seen) / 2, np.abs(seen).max() / 2)
-        middle = (seen.max() + seen.min()) / 2
-        for power in range(plant.orders[k] + 1):
-            reach = float(_MARGIN * size * (2 / problem.period) ** power)
-            column = columns.get(name + "'" * power)
-            if column is not None and 0 < reach < np.inf:
-                centre = float(middle) if power == 0 else 0.0
-                ranges[column] = (centre - reach, centre + reach)
-    return ranges | {columns[name]: interval for name, interval in (own or {}).items()}
+        name, order = plant.names[k], plant.orders[k]
+        middle, reach = _about(_values(problem)[name])
+        limit = responses[plant.controlled_names.index(name)]
+        for power in range(order + 1):
+            half = _derivative(reach, limit, power, order, problem.period)
+            if 0 < half < np.inf:
+                centre = middle if power == 0 else 0.0
+                ranges[name + "'" * power] = (centre - half, centre + half)
+    shown = {columns[name]: interval for name, interval in ranges.items() if name in columns}
+    return shown | {columns[name]: interval for name, interval in (own or {}).items()}
+
+
+def _about(values: np.ndarray) -> tuple[float, float]:
+    """Centre and half width of the range about some values; 0 where they give no scale."""
+    if not values.size:
+        return 0.0, 0.0
+    size = max(np.ptp(values) / 2, np.abs(values).max() / 2)
+    return float((values.max() + values.min()) / 2), float(_MARGIN * size)
+
+
+def _derivative(reach: float, limit: float, power: int, order: int, period: float) -> float:
+    """Half width of the range of a derivative: of the coordinate's range, and of the largest response or else the period."""
+    in_half_a_cycle = reach * (2 / period) ** power
+    if power == 0 or not np.isfinite(limit):
+        return in_half_a_cycle
+    share = power / order
+    return min(in_half_a_cycle, limit if power == order else _LANDAU * reach ** (1 - share) * limit**share)
+
+
+def _largest_responses(problem: Problem) -> tuple[float, ...]:
+    """A of every controlled coordinate; infinite where an input has no limits."""
+    task = nominal(problem)
+    plant = task.plant
+    along = _MARGIN * np.array(response_scale(problem).largest)
+    lower, upper = task.limits.input_bounds(plant)
+    if plant.outputs or plant.step is not None or not np.isfinite(upper - lower).all() or not np.isfinite(along).all():
+        return tuple(along)
+    generator = np.random.default_rng(0)
+    states = _plausible_states(task, along, generator)
+    corners = np.where(generator.random((lower.size, _DRAWN)) < 0.5, lower[:, None], upper[:, None])
+    parameters = np.repeat(plant.approximate[:, None], _DRAWN, axis=1)
+    found = np.abs(plant.controlled_response_function.map(_DRAWN)(states, corners, parameters).full())
+    over = _OVER_STATES * np.where(np.isfinite(found), found, 0.0).max(axis=1)
+    return tuple(float(v) for v in np.maximum(along, over))
+
+
+def _plausible_states(task: Problem, along: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Drawn states of the model, shape (nx, _DRAWN): controlled coordinates in their ranges, the others along the reference."""
+    plant = task.plant
+    states, values = reference_states(task, _DRAWN).copy(), _values(task)
+    for name, limit in zip(plant.controlled_names, along, strict=True):
+        order = plant.orders[plant.names.index(name)]
+        middle, reach = _about(values[name])
+        for power in range(order):
+            at = plant.state.elements.index(name + "'" * power)
+            half = _derivative(reach, limit, power, order, task.period)
+            drawn = (middle if power == 0 else 0.0) + half * generator.choice([-1.0, 1.0], _DRAWN)
+            low, high = plant.ranges.get(plant.state.elements[at], (-np.inf, np.inf))
+            states[at] = np.clip(drawn, low, high)
+    return states
+
+
+def _behind_outputs(problem: Problem) -> dict[str, Interval]:
+    """Intervals of the states of a plant with outputs, by name."""
+    plant, ranges = problem.plant, {}
+    if not plant.outputs:
+        return {}
+    along = reference_states(nominal(problem), _SAMPLES)
+    for k, name in enumerate(plant.state.elements):
+        ends = [*problem.limits.states.get(name, ()), *plant.ranges.get(name, ())]
+        seen = np.array([*along[k], problem.start_state[k], *ends], dtype=float)
+        middle, reach = _about(seen[np.isfinite(seen)])
+        if reach > 0:
+            ranges[name] = (middle - reach, middle + reach)
+    return ranges
 
 
 def _columns(problem: Problem) -> dict[str, str]:
     """Column of the sample by the name of the measured quantity."""
     plant, raw = problem.plant, raw_signal(problem)
+    given = given_states(problem) if raw is not None else (plant.state,) if plant.outputs else ()
+    beside = {e: f"{signal.name}.{e}" for signal in given for e in signal.elements}
     if raw is not None:
-        return dict(zip(raw.elements, raw.columns, strict=True))
-    columns = {e: f"{plant.output.name}.{e}" for e in plant.output.elements}
+        return beside | dict(zip(raw.elements, raw.columns, strict=True))
+    columns = beside | {e: f"{plant.output.name}.{e}" for e in plant.output.elements}
     return columns | {
         n: f"realised.{c}" for n, c in zip(response_names(plant.face), plant.controlled_names, strict=True)
     }

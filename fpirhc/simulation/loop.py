@@ -20,6 +20,7 @@ from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.own_reference import given_signals, own_signals
 from fpirhc.controllers.plausible import plausible_range
+from fpirhc.controllers.response_jumps import response_jumps
 from fpirhc.controllers.seeing import compose_seeing, first_estimates, first_shown, seeing_blocks
 from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.instant import response_orders
@@ -68,7 +69,9 @@ def _closed(problem: Problem, controller: Controller, live: LiveSettings | None)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
     seeing = [block for block in seeing if block not in judging]
     clock, actuating = _clock_block(problem.plant.time, problem.period), _actuate(problem, disturbed)
-    around = [clock, *outside_blocks(problem, ready), *seeing, acting.block(), *judging, *actuating]
+    jumps = response_jumps(task, acting.reads) if problem.foreign is not None else None
+    gated = [acting.block()] if jumps is None else jumps.around(acting.block())
+    around = [clock, *outside_blocks(problem, ready), *seeing, *gated, *judging, *actuating]
     constants = live.held(around) if live is not None else []
     reads = Layout((*disturbed, *problem.sensing.drawn, *given_signals(problem), *foreign_signals(problem)))
     sent = () if problem.foreign is None else (SENT,)

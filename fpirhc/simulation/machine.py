@@ -14,6 +14,7 @@ import casadi as ca
 from fpirhc.controllers.base import fed
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.gate import Gate
+from fpirhc.controllers.response_jumps import response_jumps
 from fpirhc.controllers.step_outcome import was_skipped
 from fpirhc.controllers.watch import watch_block
 from fpirhc.describe import describe
@@ -22,6 +23,7 @@ from fpirhc.symbolic.block import Block, Composite, compose
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.finite import FINITE
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem
 
 FINGERPRINT = "fingerprint"  # first entry of the memory
@@ -55,8 +57,10 @@ def machine_step(problem: Problem, controller: Controller, gate: Gate, watch: Wa
     longest = round(watch.saturated_after / problem.period)
     watched = watch_block(problem, controller, _STATUS, longest=longest, window=watch.window)
     own = _identity_block(fingerprint(problem, controller, block.memory))
-    timed = fed(block, "time", Signal(CLOCK)), clock_status_block(problem, _GATED, _STATUS)
-    blocks = [own, clock_block(problem), *timed, watched, _count_block()]
+    block, jumps = fed(block, "time", Signal(CLOCK)), response_jumps(nominal(problem), gate.reads)
+    gated = [block] if jumps is None else jumps.around(block)
+    judged = clock_status_block(problem, _GATED, _STATUS)
+    blocks = [own, clock_block(problem), *gated, judged, watched, _count_block()]
     return compose("controller", gate.reads, blocks, outputs=("command",))
 
 
