@@ -62,15 +62,16 @@ def cycles(name: str) -> Work:
 
 
 def steps(name: str) -> Work:
-    """Process time of steps by hand with the first sample, the memory handed on."""
+    """Process time of steps by hand with the first sample, a period apart, the memory handed on."""
     stepper = fp.Stepper(TASK.problem, TASK.controllers[name])
     state, realised = TASK.problem.start_state, np.zeros(len(TASK.problem.plant.inputs))
+    times = [k * TASK.problem.period for k in range(STEPS)]
 
     def work() -> float:
         memory = stepper.start()
         begin = time.process_time()
-        for _ in range(STEPS):
-            _, memory = stepper.step(0.0, state, realised, memory)
+        for t in times:
+            _, memory = stepper.step(t, state, realised, memory)
         return time.process_time() - begin
 
     return work

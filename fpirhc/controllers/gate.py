@@ -26,7 +26,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import clip
-from fpirhc.controllers.step_outcome import FAILED, counted, is_fine, is_trial, kept
+from fpirhc.controllers.step_outcome import FAILED, counted, is_trial, outcome
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, Derived, Values
 from fpirhc.symbolic.expression import Signals, expression
@@ -209,9 +209,8 @@ class Gate:
         """(memory, trace, command, whether the step is fine) of scalar code: it is evaluated, and its results are selected."""
         remembered = ca.if_else(usable, memory, ca.DM(self.inner.memory.start()))
         memory_next, trace, command = self.inner.function(remembered, *sample)
-        fine = is_fine(memory_next, command, trace, self.inner.trace, opaque=False)
-        keeps = ca.logic_and(fits, fine)
-        return kept(keeps, memory_next, memory, opaque=False), trace, kept(keeps, command, held, opaque=False), fine
+        after, fine = outcome(memory_next, memory, command, trace, self.inner.trace, fits, opaque=False)
+        return after, trace, ca.if_else(ca.logic_and(fits, fine), command, held), fine
 
     def _switched(
         self, fits: Expression, usable: Expression, memory: Expression, sample: Sequence[Expression], held: Expression
@@ -229,6 +228,5 @@ class Gate:
         )
         choice = ca.Function.conditional("fpirhc_gate_choice", [skipped, running], restarted)
         memory_next, trace, command = choice(ca.if_else(fits, 2 - usable, 0), memory, *sample, held)
-        fine = is_fine(memory_next, command, trace, self.inner.trace, opaque=True)
-        keeps = ca.logic_or(ca.logic_not(fits), fine)  # a skipped cycle has its memory and its command already
-        return kept(keeps, memory_next, memory, opaque=True), trace, ca.if_else(keeps, command, held), fine
+        after, fine = outcome(memory_next, memory, command, trace, self.inner.trace, fits, opaque=True)
+        return after, trace, ca.if_else(ca.logic_and(fits, fine), command, held), fine

@@ -4,7 +4,7 @@
 
 in every controlled coordinate, with the change s that is usual of late: noise, the motion itself, and what the own command causes,
 which is no surprise. A sample beyond it is passed on as NaN, so its cycle is skipped. It is believed when the next one is as near
-to it as samples usually are. While samples are doubted s doubles, so that nothing is doubted for long. It begins with L / 4.
+to it as samples usually are. While samples are doubted s doubles, so that nothing is doubted for long. It begins with L / 2.
 
 L is the largest response of the limits and df/du the largest slope, by the model along the reference. A response of which neither
 is known is not doubted. A spike that is believed is therefore worth four usual changes, whatever its size.
@@ -71,7 +71,7 @@ class Jumps:
     def block(self) -> Block:
         """Block (signal, last command) -> the signal that is believed."""
         entries = [f"{what}.{k}" for what in ("last", "doubted", "usual") for k in self.places]
-        starts = [0.0] * (2 * len(self.places)) + [float(v) / _USUAL for v in self.scale.largest]
+        starts = [0.0] * (2 * len(self.places)) + [float(v) / 2 for v in self.scale.largest]
         before = [float(v) for v in self.problem.inputs_before]
         elements = (*entries, *(f"before.{name}" for name in self._inputs), "begun", "doubts")
         memory = Layout((Signal(JUMPS, elements, start=(*starts, *before, 0.0, 0.0)),))

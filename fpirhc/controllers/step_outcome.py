@@ -13,37 +13,42 @@ from __future__ import annotations
 import casadi as ca
 
 from fpirhc.status import Status
-from fpirhc.symbolic.expression import Expression
-from fpirhc.symbolic.finite import finite
+from fpirhc.symbolic.expression import Expression, expression
+from fpirhc.symbolic.finite import FINITE, every_finite, kept_if_finite
 from fpirhc.symbolic.layout import Layout
 
 FAILED = "not_finite"  # in the memory: steps in a row that were not finite, of samples that fit
 PATIENCE = 10  # such steps before one is tried with the memory of the start
 
 
-def is_fine(memory: Expression, command: Expression, trace: Expression, layout: Layout, *, opaque: bool) -> Expression:
-    """Return whether a step may be kept: memory and command are finite, and its status does not say that something was not.
+def outcome(
+    memory_next: Expression,
+    memory: Expression,
+    command: Expression,
+    trace: Expression,
+    layout: Layout,
+    ran: Expression,
+    *,
+    opaque: bool,
+) -> tuple[Expression, Expression]:
+    """Return (memory to keep, whether the step is fine): memory and command are finite, and no status says that something was not.
 
     Args:
-        memory: of the next cycle.
-        command: of this one.
-        trace: of this one.
+        memory_next: of the next cycle.
+        memory: as it was.
+        command: of this cycle.
+        trace: of this cycle.
         layout: of the trace.
+        ran: whether the results are to be kept where they are fine.
         opaque: whether the step is a graph of calls.
     """
-    fine = finite(ca.vertcat(memory, command), opaque=opaque)
-    if "status" not in layout:
-        return fine
-    return ca.logic_and(fine, trace[layout.slice("status")] != int(Status.NON_FINITE))
-
-
-def kept(fine: Expression, new: Expression, old: Expression, *, opaque: bool) -> Expression:
-    """Return `new` where it is fine, else `old`; a graph copies one of the two whole, because its columns are long."""
+    said = expression(1.0) if "status" not in layout else trace[layout.slice("status")] != int(Status.NON_FINITE)
     if not opaque:
-        return ca.if_else(fine, new, old)
-    one, other = ca.MX.sym("new", new.numel()), ca.MX.sym("old", new.numel())
-    take = ca.Function("fpirhc_take_new", [one, other], [one]), ca.Function("fpirhc_take_old", [one, other], [other])
-    return ca.Function.if_else("fpirhc_kept", *take)(fine, new, old)
+        fine = ca.logic_and(every_finite(ca.vertcat(memory_next, command)), said)
+        return ca.if_else(ca.logic_and(ran, fine), memory_next, memory), fine
+    good = ca.logic_and(ca.mmin(ca.fabs(command) <= FINITE), said)
+    kept, finite = kept_if_finite(memory_next, memory, ca.logic_and(ran, good))
+    return kept, ca.logic_and(finite, good)
 
 
 def counted(failed: Expression, fits: Expression, fine: Expression) -> Expression:

@@ -31,6 +31,23 @@ int ENTRY{SIGNATURE} {{
 }}
 """
 
+_KEPT = f"""
+int ENTRY{SIGNATURE} {{
+  double sums[8] = {{0, 0, 0, 0, 0, 0, 0, 0}}, total = 0;
+  const double *x = arg[0], *old = arg[1];
+  double* kept = res[0];
+  int k = 0, j;
+  for (; k + 8 <= SIZE; k += 8)
+    for (j = 0; j < 8; ++j) {{ kept[k + j] = x[k + j]; sums[j] += x[k + j] * 134217728. - x[k + j] * 134217728.; }}
+  for (; k < SIZE; ++k) {{ kept[k] = x[k]; total += x[k] * 134217728. - x[k] * 134217728.; }}
+  for (j = 0; j < 8; ++j) total += sums[j];
+  if (res[1]) res[1][0] = total == 0;
+  if (!(total == 0 && arg[2][0]))
+    for (k = 0; k < SIZE; ++k) kept[k] = old[k];
+  return 0;
+}}
+"""
+
 
 def finite(column: Expression, *, opaque: bool) -> Expression:
     """Return 1 where every entry of the column is finite, else 0; `opaque` is that of the block."""
@@ -44,6 +61,21 @@ def every_finite(column: Expression) -> Expression:
         pairs = [a + b for a, b in zip(parts[::2], parts[1::2], strict=False)]
         parts = [*pairs, parts[-1]] if len(parts) % 2 else pairs
     return ca.fabs(parts[0]) <= FINITE
+
+
+def kept_if_finite(new: Expression, old: Expression, good: Expression) -> tuple[Expression, Expression]:
+    """Return (new where it is good and finite, else old; whether new is finite) of columns of a graph; C passes over them once."""
+    kept, fine = _kept(graph(new).numel())(new, old, good)
+    return kept, fine
+
+
+@cache
+def _kept(size: int) -> ca.Function:
+    new, old, good = ca.MX.sym("new", size), ca.MX.sym("old", size), ca.MX.sym("good")
+    driver = Driver(_KEPT, {}, {"SIZE": size})
+    fine = ca.mmin(ca.fabs(new) <= FINITE)
+    kept = ca.if_else(ca.logic_and(good, fine), new, old)
+    return with_driver("fpirhc_kept", driver, lambda name: ca.Function(name, [new, old, good], [kept, fine]))
 
 
 @cache

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.conformance.controller import two_masses
+from fpirhc.conformance.loops import two_masses
 from fpirhc.errors import InvalidValue
 from fpirhc.status import Status
 from fpirhc.symbolic.native import find_compiler

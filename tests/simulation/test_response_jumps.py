@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.conformance.controller import two_masses
+from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.contract import Controller, checked
 from fpirhc.controllers.response_jumps import JUMPS, response_jumps
 from fpirhc.simulation.loop import _own_response
