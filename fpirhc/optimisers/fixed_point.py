@@ -92,7 +92,7 @@ class FixedPoint(Optimiser):
     hessian: HessianModel | None = None
     damping: float = 0.0
     feasible: float = 1e-8
-    most_iterations: Count = 50
+    most_iterations: Count = 100
 
     def __post_init__(self) -> None:
         require_settings("FixedPoint", self.iterations, self.tolerance)
