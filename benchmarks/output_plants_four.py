@@ -5,6 +5,8 @@ See `output_plants` for orders 1 and 2, and for what is chosen here.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 from foreign import known
 from output_plants import SMOOTH
@@ -99,6 +101,11 @@ def four_tanks() -> fp.Problem:
         cost=fp.Quadratic(outputs={"h4": 1.0}, rate={"pump": 1e-5}),
         input_before={"pump": 3.3},
     )
+
+
+def four_tanks_steep() -> fp.Problem:
+    """Order 4 of 4. The same with a reference that begins with a slope, for which the pump goes from one limit to the other."""
+    return replace(four_tanks(), reference=fp.Trajectory(lambda t: {"h4": 12 + 2 * ca.sin(t / 150)}))
 
 
 def quadrotor() -> fp.Problem:
