@@ -1,7 +1,8 @@
 """Mutation testing: how many small faults in a module the tests notice. Called by scripts/mutate, in the tool's environment.
 
-Cosmic Ray makes the faults, in a copy of the checkout. A sample of them is tried: the seed shuffles the places of a module, and
-one fault of every place is taken in turn until there are enough, so that a line with many operators does not fill the sample.
+The faults are made in a copy of the checkout, in Python by Cosmic Ray and in C by `mutation_c`. A sample of them is tried: the
+seed shuffles the places of a module, and one fault of every place is taken in turn until there are enough, so that a line with many
+operators does not fill the sample.
 """
 
 from __future__ import annotations
@@ -19,24 +20,39 @@ import sys
 import tempfile
 import tomllib
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from difflib import unified_diff
 from itertools import chain, zip_longest
 from pathlib import Path
 from subprocess import PIPE
-from typing import Any
+from typing import Any, Protocol
 
-from cosmic_ray.commands.init import init
-from cosmic_ray.mutating import use_mutation
-from cosmic_ray.plugins import get_operator
-from cosmic_ray.work_db import use_db
-from cosmic_ray.work_item import WorkItem
+import mutation_c
+import mutation_python
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE, SURVIVORS = ROOT / "docs/mutation.md", ROOT / "results/mutation"
 SPARE, FACTOR = 20.0, 4.0  # s, and times the time without a fault: from which the tests are taken to hang
+NOT_COMPILED = "CompileError"  # in the output of tests whose C was refused by the compiler: the fault was never run
+# Numbers are the same without optimising, and a library is there in a quarter of the time. The pragma would ask for it again.
+COMPILER = """#!/bin/sh
+for file in "$@"; do case $file in *.c) sed -i '/pragma GCC optimize/d' "$file" ;; esac; done
+exec cc "$@" -O0
+"""
 BEGIN, END = "<!-- table: written by scripts/mutate -->", "<!-- end of the table -->"
 HEAD = "| module | faults there | tried | killed | survived | score | seed | tests |\n|---|--:|--:|--:|--:|--:|--:|---|"
+
+
+class Fault(Protocol):
+    """A small change of a file."""
+
+    @property
+    def place(self) -> Any:
+        """Where it is; faults of one place are alternatives."""
+
+    def made(self) -> AbstractContextManager[tuple[str, str]]:
+        """The file with the fault, while the context lasts: its text before and after."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +85,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         _copy_checkout(Path(folder))
         os.chdir(folder)
-        os.environ |= {"PYTHONPATH": folder, "PYTHONDONTWRITEBYTECODE": "1"}
+        os.environ |= {"PYTHONPATH": folder, "PYTHONDONTWRITEBYTECODE": "1", **_compiling(Path(folder))}
         # A changed file has a new time, so that its compiled form is not used.
         subprocess.run([options.python, "-m", "compileall", "-q", "fpirhc"], check=True)
         worker = Worker(options.python)
@@ -81,10 +97,22 @@ def main() -> int:
     return 0
 
 
+def _compiling(folder: Path) -> dict[str, str]:
+    """Settings with which libraries are compiled quickly, in a cache of their own."""
+    if shutil.which("cc") is None:
+        return {}
+    compiler, cache = folder / "quick_cc", folder / ".libraries"
+    compiler.write_text(COMPILER, encoding="utf-8")
+    compiler.chmod(0o700)
+    cache.mkdir(mode=0o700)
+    return {"FPIRHC_CC": str(compiler), "FPIRHC_CACHE": str(cache)}
+
+
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="scripts/mutate", description="Count the small faults that the tests notice.")
     parser.add_argument("words", nargs="*", metavar="WORD", help="try the modules whose path has one of these words")
     parser.add_argument("--sample", type=int, default=15, metavar="N", help="most faults of a module (15)")
+    parser.add_argument("--show", action="store_true", help="print every fault that survives")
     parser.add_argument("--seed", type=int, default=0, help="of the sample (0)")
     parser.add_argument("--python", default=str(ROOT / ".venv/bin/python"), help="interpreter that runs the tests")
     return parser.parse_args()
@@ -95,8 +123,13 @@ def _targets() -> Iterator[tuple[str, str]]:
     for target in tomllib.loads((ROOT / "scripts/mutation.toml").read_text(encoding="utf-8"))["target"]:
         paths = sorted(path for pattern in target["modules"] for path in ROOT.glob(pattern))
         for path in paths:
-            if len(ast.parse(path.read_text(encoding="utf-8")).body) > 1:
-                yield path.relative_to(ROOT).as_posix(), " ".join(target["tests"])
+            if path.suffix == ".c" or len(ast.parse(path.read_text(encoding="utf-8")).body) > 1:
+                yield path.relative_to(ROOT).as_posix(), " ".join([*_lane(target), *target["tests"]])
+
+
+def _lane(target: dict[str, Any]) -> list[str]:
+    """Arguments that choose the lane of a target: the quick one unless it says 'all'."""
+    return [] if target.get("lane") == "all" else ["--lane", "quick"]
 
 
 def _copy_checkout(folder: Path) -> None:
@@ -110,29 +143,29 @@ def _copy_checkout(folder: Path) -> None:
 
 
 def _try_module(module: str, tests: str, options: argparse.Namespace, worker: Worker) -> Row:
-    arguments = ["-x", "-q", "-p", "no:xdist", "-p", "no:cacheprovider", "--lane", "quick", *shlex.split(tests)]
+    arguments = ["-x", "-q", "-p", "no:xdist", "-p", "no:cacheprovider", *shlex.split(tests)]
     sound = worker.run(arguments, 600.0)
     if not sound["passed"]:  # else every fault would count as noticed
         raise SystemExit(f"the tests fail without a fault: pytest {shlex.join(arguments)}\n{sound['output']}")
-    faults = _faults(module)
-    sample = _sample(faults, options.sample, random.Random(f"{options.seed} {module}"))
-    limit = SPARE + FACTOR * sound["seconds"]
-    survivors = [diff for diff in (_survivor(item, arguments, limit, worker) for item in sample) if diff]
+    faults, limit, tried, survivors = _faults(module), SPARE + FACTOR * sound["seconds"], 0, []
+    for fault in _sample(faults, random.Random(f"{options.seed} {module}")):
+        if tried == options.sample:
+            break
+        with fault.made() as (before, after):
+            answer = worker.run(arguments, limit)
+        if NOT_COMPILED in answer["output"]:
+            continue  # it was never run
+        tried += 1
+        if answer["passed"]:
+            survivors.append(_difference(module, before, after))
+            if options.show:
+                print(survivors[-1], flush=True)
     report = SURVIVORS / (module.removesuffix(".py").replace("/", ".") + ".diff")
     report.write_text("\n".join(survivors), encoding="utf-8")
-    return Row(module, len(faults), len(sample), len(sample) - len(survivors), options.seed, tests)
+    return Row(module, len(faults), tried, tried - len(survivors), options.seed, tests)
 
 
-def _survivor(item: WorkItem, arguments: Sequence[str], limit: float, worker: Worker) -> str:
-    """The fault as a difference of texts where the tests pass all the same; empty where one of them fails."""
-    [fault] = item.mutations
-    operator = get_operator(fault.operator_name)(**fault.operator_args)
-    with use_mutation(fault.module_path, operator, fault.occurrence) as (before, after):
-        if after is None:
-            raise SystemExit(f"{fault.module_path}: {fault.operator_name} {fault.occurrence} cannot be made")
-        if not worker.run(arguments, limit)["passed"]:
-            return ""
-    path = fault.module_path.as_posix()
+def _difference(path: str, before: str, after: str) -> str:
     return "\n".join(unified_diff(before.splitlines(), after.splitlines(), path, path, n=0, lineterm=""))
 
 
@@ -161,38 +194,22 @@ class Worker:
         self._process = subprocess.Popen(self._command, stdin=PIPE, stdout=PIPE, text=True)
 
 
-def _faults(module: str) -> list[WorkItem]:
-    """Every fault that the tool knows for a module, but for those of type hints, which nothing reads at run time."""
-    with tempfile.TemporaryDirectory() as folder, use_db(str(Path(folder, "faults.sqlite"))) as database:
-        init([Path(module)], database, {})
-        items = database.work_items
-    hints = list(_hints(ast.parse(Path(module).read_text(encoding="utf-8"))))
-    return [
-        i for i in items if not any(a <= i.mutations[0].start_pos and i.mutations[0].end_pos <= b for a, b in hints)
-    ]
+def _faults(module: str) -> Sequence[Fault]:
+    """Every fault that is known for a file."""
+    path = Path(module)
+    return mutation_c.faults(path) if path.suffix == ".c" else mutation_python.faults(path)
 
 
-def _hints(tree: ast.Module) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
-    """Begin and end of annotations and of what stands under `if TYPE_CHECKING`."""
-    for node in ast.walk(tree):
-        for part in (getattr(node, "annotation", None), getattr(node, "returns", None)):
-            if part is not None:
-                yield (part.lineno, part.col_offset), (part.end_lineno, part.end_col_offset)
-        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
-            last = node.body[-1]
-            yield (node.lineno, node.col_offset), (last.end_lineno or last.lineno, last.end_col_offset or 0)
-
-
-def _sample(faults: Sequence[WorkItem], size: int, generator: random.Random) -> list[WorkItem]:
+def _sample(faults: Sequence[Fault], generator: random.Random) -> Iterator[Fault]:
     """One fault of every place in turn, places and faults shuffled."""
-    places: dict[tuple[object, object], list[WorkItem]] = {}
-    for item in sorted(faults, key=lambda i: (i.mutations[0].operator_name, i.mutations[0].occurrence)):
-        places.setdefault((item.mutations[0].start_pos, item.mutations[0].end_pos), []).append(item)
+    places: dict[Any, list[Fault]] = {}
+    for fault in faults:
+        places.setdefault(fault.place, []).append(fault)
     shuffled = [places[key] for key in sorted(places)]
     generator.shuffle(shuffled)
     for one in shuffled:
         generator.shuffle(one)
-    return [item for item in chain.from_iterable(zip_longest(*shuffled)) if item is not None][:size]
+    return (fault for fault in chain.from_iterable(zip_longest(*shuffled)) if fault is not None)
 
 
 def _write(row: Row) -> None:

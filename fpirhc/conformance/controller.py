@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from fpirhc.conformance.controller_facts import FACTS
 from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
-from fpirhc.conformance.loops import Trial, anything, two_masses
+from fpirhc.conformance.loops import Trial, anything
+from fpirhc.conformance.loops import two_masses as two_masses
 from fpirhc.controllers.base import Controller, compose_controller
 from fpirhc.controllers.contract import checked, resolved
 from fpirhc.describe import describe

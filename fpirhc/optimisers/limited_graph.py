@@ -98,7 +98,7 @@ def _first_state(call: Call, memory: ca.MX) -> State:
         "delta": remembered["plan_damping"],
         **fixed(phase=PURE, place_of=BEGINS, fresh=1, slacks=WARM, use_exact=not call.settings.plain_first, start=-1),
     }
-    has_guess = ca.norm_inf(ca.vec(memory[: nu * n])) <= FINITE
+    has_guess = is_finite(memory[: nu * n])
     guess = ca.if_else(has_guess, ca.reshape(memory[: nu * n], nu, n), 0)
     inputs = ca.if_else(ca.norm_inf(ca.vec(guess)) > 0, guess, guesses(ocp)(call.data)[1][:, :n])
     known = ca.logic_and(usable, remembered["plan_barrier"] > 0)

@@ -1,0 +1,112 @@
+"""Horizons on which the loops in C are compared with the graphs that define them, call by call and number by number."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import casadi as ca
+import numpy as np
+
+import fpirhc as fp
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
+from fpirhc.symbolic.native import native
+
+REST = fp.Trajectory(lambda t: {"a": 0.3 * ca.sin(t), "b": 0 * t})
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A composed graph and the same Function as compiled loops.
+
+    Args:
+        ocp: the horizon.
+        data: of its stages.
+        graph: in the virtual machine.
+        loops: in C.
+    """
+
+    ocp: OptimalControl
+    data: np.ndarray
+    graph: ca.Function
+    loops: ca.Function
+
+    @property
+    def size(self) -> int:
+        """Of the memory."""
+        return int(self.graph.size1_in(4))
+
+    def both(self, *arguments) -> Iterator[list[np.ndarray]]:
+        """Plan, diagnostics and memory by the graph, and by the loops."""
+        for function in (self.graph, self.loops):
+            yield [np.asarray(v.full()) for v in function(*arguments)]
+
+
+def coupled_plant() -> fp.Plant:
+    """A pendulum and a lagging disc with two motors that both feel both: three states, and nothing symmetric or zero."""
+    return fp.Plant(
+        coordinates={"a": "rad", "b": "rad"},
+        inputs={"Ma": "N m", "Mb": "N m"},
+        order={"a": 2, "b": 1},
+        parameters={"k": fp.Parameter(1.3, 1.3, "1/s^2")},
+        response=lambda q, v, u, p: {
+            "a": u.Ma - 0.003 * u.Mb + 2.0 * ca.sin(q.a) - p.k * (q.a - q.b) - 0.1 * v.a,
+            "b": 0.008 * u.Mb + 0.2 * u.Ma * ca.cos(q.b) + 0.6 * q.b**2 + p.k * (q.a - q.b) + 0.4 * v.a,
+        },
+    )
+
+
+def _terms(v):
+    error = v.state.a - v.reference.a
+    return {
+        "error": 60.0 * error**2 + 2.0 * v.state.b**2 + 6.0 * v.state["a'"] ** 2 + 4.0 * error**4,
+        "effort": 1.5 * (v.input.Ma - v.feedforward.Ma) ** 2 + 4e-4 * v.input.Mb**2 + 0.2 * v.input.Ma**4,
+        "both": 0.02 * v.input.Ma * v.input.Mb + 0.3 * v.state.b * v.input.Ma,
+    }
+
+
+def _bent(v):
+    return {**_terms(v), "bent": -18.0 * v.state.b**2}
+
+
+def _terminal(v):
+    return 90.0 * (v.state.a - v.reference.a) ** 2 + 40.0 * v.state.b**2 + 9.0 * v.state["a'"] ** 2
+
+
+@cache
+def coupled(
+    limits: fp.Limits | None = None, stages: int = 4, *, convex: bool = True
+) -> tuple[OptimalControl, np.ndarray]:
+    """The horizon of these two with a cost whose curvature changes with states and inputs, and couples them."""
+    cost = fp.CustomCost(terms=_terms if convex else _bent, terminal=_terminal, feedforward=True)
+    horizon, plant = fp.Horizon(stages=stages, step=0.15), coupled_plant()
+    ocp = transcribe(plant, REST, horizon, cost, limits or fp.Limits())
+    return ocp, np.asarray(stage_data(plant, REST, horizon, cost)(0.3, plant.approximate).full())
+
+
+@cache
+def pair(
+    kind: str, optimiser: fp.FixedPoint, limits: fp.Limits | None = None, stages: int = 4, *, convex: bool = True
+) -> Pair:
+    """Graph and loops of `step` or `converging`."""
+    ocp, data = coupled(limits, stages, convex=convex)
+    graph = getattr(optimiser, kind)(ocp)
+    compiled = native(graph, required=True)
+    assert compiled.compiled, compiled.reason
+    return Pair(ocp, data, graph, compiled.function)
+
+
+def within_its_arrays(pair_of: Pair, calls: Iterator[tuple[np.ndarray, ...]]) -> bool:
+    """Whether the loops stay inside their arrays: compiled so that they end their process where they do not."""
+    flags = ("-fsanitize=bounds", "-fsanitize-undefined-trap-on-error")
+    function = native(pair_of.graph, flags, required=True).function
+    child = os.fork()
+    if not child:
+        for arguments in calls:
+            function(*arguments)
+        os._exit(0)
+    return os.waitpid(child, 0)[1] == 0

@@ -1,0 +1,223 @@
+"""The loops in C with limits of states are the composed graph: plan, numbers and memory, after a few turns and at the end.
+
+Calls that are cut off after some turns show what each turn does: a pure step, a barrier, a filter, another first plan, a descent.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+from loops_in_c import Pair, pair, within_its_arrays
+
+import fpirhc as fp
+from fpirhc.status import Status
+from fpirhc.symbolic.native import find_compiler
+
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
+LIMITS = fp.Limits(inputs={"Ma": (-2.0, 2.5), "Mb": (-150.0, 120.0)}, states={"a": (-0.5, 0.6), "a'": (-np.inf, 1.2)})
+END = 60  # more turns than any of these horizons needs
+
+
+def loops(turns: int, kind: str = "step") -> Pair:
+    """Loops that are cut off after so many turns."""
+    return pair(kind, fp.FixedPoint(iterations=1, tolerance=1e-7, most_iterations=turns), LIMITS, 3)
+
+
+def same(one: list[np.ndarray], other: list[np.ndarray], allowed: float = 1e-7) -> None:
+    """Equal entries to rounding: barriers make large numbers, of which the same digits count."""
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_allclose(a, b, rtol=allowed, atol=allowed)
+
+
+def called(both: Pair, first: np.ndarray, memory: np.ndarray, bounds=None, data=None) -> tuple[np.ndarray, ...]:
+    """What the loops give, compared with the graph."""
+    lower, upper = bounds or (both.ocp.input_lower, both.ocp.input_upper)
+    one, other = both.both(first, both.data if data is None else data, lower, upper, memory)
+    same(one[:2], other[:2])
+    same(one[2:], other[2:], 1e-5)  # rounding is multiplied in what is only remembered
+    plan, diagnostics, after = other
+    return plan, diagnostics[:, 0], after
+
+
+def calls_one_after_the_other(turns: int) -> set[int]:
+    """Statuses from nothing, and from what was remembered of a state nearby, of one far away, and of one outside its limits."""
+    both, random, statuses = loops(turns), np.random.default_rng(0), set()
+    for size in (0.1, 0.4, 1.0, 2.5):
+        memory = np.zeros(both.size)
+        for _ in range(3):
+            _, diagnostics, memory = called(both, size * random.normal(size=3), memory)
+            statuses.add(int(diagnostics[4]))
+    return statuses
+
+
+def test_one_turn_in_every_call():
+    """The plan is never solved, and goes on where it was."""
+    assert Status.NOT_CONVERGED in calls_one_after_the_other(1)
+
+
+def test_three_turns_in_every_call():
+    """Pure steps, and the first ones with a barrier."""
+    assert Status.NOT_CONVERGED in calls_one_after_the_other(3)
+
+
+def test_eight_turns_in_every_call():
+    """Some calls are cut off, and some end."""
+    assert {Status.NOT_CONVERGED, Status.OK} <= calls_one_after_the_other(8)
+
+
+def test_remembered_plans_that_their_limits_block():
+    """The state has moved to a limit, again and again: the barrier of the remembered plan is raised until a step is possible."""
+    both, memory = loops(END), np.zeros(loops(END).size)
+    for k in range(8):
+        _, _, memory = called(both, np.array([0.1 + 0.06 * k, 0.2, (-1.0) ** k * (0.4 + 0.1 * k)]), memory)
+
+
+def test_a_solution_stays():
+    """Called again with what it remembers a call ends before its first turn, and remembers the same."""
+    both, first = loops(END), np.array([0.3, 0.2, -0.3])
+    memory = np.zeros(both.size)
+    for _ in range(3):
+        _, diagnostics, memory = called(both, first, memory)
+    plan, diagnostics, after = called(both, first, memory)
+    assert (diagnostics[3], diagnostics[4]) == (0, Status.OK)
+    np.testing.assert_allclose(after, memory, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(plan.ravel(order="F"), memory[:6, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("turns", [2, 4, 5, 6, 7, 9, 12, 16])
+def test_cut_off_after_every_turn(turns):
+    """What differs in a turn is seen before later ones have made up for it."""
+    both, random = loops(turns), np.random.default_rng(7)
+    for size in (0.3, 0.6, 1.0, 1.5):
+        memory = np.zeros(both.size)
+        for _ in range(2):
+            _, _, memory = called(both, size * random.normal(size=3), memory)
+
+
+def test_to_the_end():
+    """All turns that a horizon needs: solved ones, and those whose limits nothing can keep."""
+    both, random, statuses = loops(END), np.random.default_rng(3), []
+    for size in (0.2, 0.5, 0.8, 1.2, 2.0):
+        memory = np.zeros(both.size)
+        for _ in range(4):
+            _, diagnostics, memory = called(both, size * random.normal(size=3), memory)
+            statuses.append(int(diagnostics[4]))
+    assert {Status.OK, Status.INFEASIBLE} <= set(statuses)
+
+
+@pytest.mark.parametrize("turns", [3, 8])
+def test_any_memory(turns):
+    """Barriers, dampings and multipliers of any size, what no run would remember, and inputs alone as a guess."""
+    both, random = loops(turns), np.random.default_rng(1)
+    for barrier in (1e-4, 1e-2, 1.0, 0.0, -1.0):
+        for damping in (0.0, 1e-3, 10.0):
+            memory = 0.3 * random.normal(size=both.size)
+            memory[-2:] = barrier, damping
+            memory[45:54:4] = 0.0  # of the limit that is not there
+            called(both, 0.3 * random.normal(size=3), memory)
+    guess = np.zeros(both.size)
+    guess[:6] = random.normal(size=6)
+    called(both, 0.3 * random.normal(size=3), guess)
+
+
+def test_bounds_of_the_call_count():
+    """Narrower bounds than the problem's, none at all on one side, and an empty box."""
+    both = loops(END)
+    first, inf = np.array([0.2, -0.1, 0.3]), np.inf
+    for low, high in (
+        ([-0.3, -20.0], [0.4, 10.0]),
+        ([-inf, -50.0], [1.0, inf]),
+        ([-inf, -inf], [inf, inf]),
+        ([0.4, -100.0], [0.4, 100.0]),
+    ):
+        plan, _, _ = called(both, first, np.zeros(both.size), (np.array(low), np.array(high)))
+        assert (plan >= np.array(low)[:, None] - 1e-12).all()
+        assert (plan <= np.array(high)[:, None] + 1e-12).all()
+    for k in range(2):
+        lower, upper = np.array([-1.0, -1.0]), np.array([1.0, 1.0])
+        lower[k], upper[k] = 0.5, 0.4
+        _, diagnostics, _ = called(both, first, np.zeros(both.size), (lower, upper))
+        assert int(diagnostics[4]) == Status.INFEASIBLE
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e301])
+def test_what_is_not_finite(bad):
+    """A state or data that are no numbers are told and leave a memory alone; a memory that is none is forgotten."""
+    both = loops(END)
+    memory = called(both, np.array([0.2, 0.1, -0.2]), np.zeros(both.size))[2]
+    for entry in range(3):
+        first = np.array([0.2, 0.1, -0.2])
+        first[entry] = bad
+        plan, diagnostics, after = called(both, first, memory)
+        assert int(diagnostics[4]) == Status.NON_FINITE
+        assert np.isfinite(plan).all()
+        np.testing.assert_array_equal(after, memory)
+    for place in (0, both.data.size // 2, both.data.size - 1):
+        data = both.data.copy()
+        data.flat[place] = bad
+        _, diagnostics, after = called(both, np.array([0.2, 0.1, -0.2]), memory, data=data)
+        assert int(diagnostics[4]) == Status.NON_FINITE
+        np.testing.assert_array_equal(after, memory)
+    plan, _, _ = called(both, np.full(3, bad), np.full(both.size, bad))
+    np.testing.assert_array_equal(plan, np.zeros((2, 3)))
+    for place in (0, both.size // 2, both.size - 1):
+        broken = memory.copy()
+        broken[place] = bad
+        _, diagnostics, after = called(both, np.array([0.35, -0.1, 0.3]), broken)
+        assert int(diagnostics[4]) == Status.OK
+        assert np.isfinite(after).all()
+
+
+def test_a_model_that_overflows():
+    """First states, and remembered plans, under which nothing is finite: another first plan, or NON_FINITE and zeros."""
+    both = loops(END)
+    for first in (np.array([0.1, 1e200, 0.1]), np.array([1e160, 0.0, 0.0])):
+        called(both, first, np.zeros(both.size))
+    memory = called(both, np.array([0.2, 0.1, -0.2]), np.zeros(both.size))[2]
+    memory[6:9] = 1e200
+    _, diagnostics, after = called(both, np.array([0.2, 0.1, -0.2]), memory)
+    assert np.isfinite(after).all()
+    assert int(diagnostics[4]) != Status.NON_FINITE
+
+
+def test_a_plan_that_leaves_a_limit_is_never_called_ok():
+    """What the loops call OK keeps the limits when it is simulated, and is stationary; what leaves them is not OK."""
+    both, random = loops(END), np.random.default_rng(5)
+    verdicts = set()
+    for _ in range(12):
+        first = np.array([0.5, 0.4, 1.0]) * random.normal(size=3)
+        plan, diagnostics, _ = called(both, first, np.zeros(both.size))
+        state, worst = first, 0.0
+        for k in range(both.ocp.stages):
+            state = np.asarray(both.ocp.dynamics(state, plan[:, k], both.data[:, k]).full())[:, 0]
+            broken = np.maximum(both.ocp.state_lower - state, state - both.ocp.state_upper).max()
+            worst = max(worst, float(broken))
+        assert diagnostics[2] == pytest.approx(max(worst, 0.0), abs=1e-9)
+        verdicts.add((int(diagnostics[4]) == Status.OK, worst <= 1e-6))
+    assert verdicts == {(True, True), (False, False)}
+
+
+def test_a_cost_that_bends_downwards():
+    """Where neither quadratic model is convex the step is damped."""
+    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-7, most_iterations=12, hessian=fp.ExactHessian())
+    both, random = pair("step", optimiser, LIMITS, 3, convex=False), np.random.default_rng(6)
+    for size in (0.2, 0.6, 1.0):
+        memory = np.zeros(both.size)
+        for _ in range(2):
+            _, _, memory = called(both, size * random.normal(size=3), memory)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it needs the traps of GCC or Clang on Linux")
+def test_no_loop_leaves_its_arrays():
+    """One turn too many of a loop reads and writes what belongs to others, and need not change a number."""
+    both, random = loops(END), np.random.default_rng(4)
+    solved = called(both, np.array([0.2, 0.1, -0.2]), np.zeros(both.size))[2]
+    bounds = both.ocp.input_lower, both.ocp.input_upper
+    calls = (
+        (size * random.normal(size=3), both.data, *bounds, memory)
+        for size in (0.2, 0.8, 2.5)
+        for memory in (np.zeros(both.size), solved, np.full(both.size, np.nan))
+    )
+    assert within_its_arrays(both, calls)

@@ -1,0 +1,215 @@
+"""What a call of a stepper takes and gives, on a small loop: nothing in it is shared, lost or left locked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.errors import FpirhcError, InvalidShape, InvalidValue
+from fpirhc.status import Status
+
+PLANT = fp.Plant(
+    coordinates={"y": "m"},
+    inputs={"u": "N"},
+    parameters={"m": fp.Parameter(1.2, 1.0, "kg")},
+    response=lambda q, v, u, p: {"y": u.u / p.m - 2.0 * q.y},
+)
+PROBLEM = fp.Problem(
+    plant=PLANT,
+    reference=fp.Trajectory(lambda t: {"y": 0.2 + 0 * t}),
+    start={"y": 0.1},
+    period=0.01,
+    duration=0.2,
+    limits=fp.Limits(inputs={"u": (-20.0, 20.0)}),
+)
+CONTROLLER = fp.ComputedTorque(fp.Exponential(rate=4.0), fp.Affine(gain=-0.6))
+SAMPLE = 0.0, np.array([0.1, 0.3]), np.array([0.7])
+
+
+def stepper(problem=PROBLEM, controller=CONTROLLER, **settings) -> fp.Stepper:
+    """In the virtual machine."""
+    return fp.Stepper(problem, controller, compiled=False, **settings)
+
+
+@cache
+def plain() -> fp.Stepper:
+    """One for tests that leave it as it is."""
+    return stepper()
+
+
+def status(one: fp.Stepper) -> Status:
+    return Status(int(one.trace()["status"][0]))
+
+
+def test_it_says_what_it_is():
+    """Of what, and how it runs."""
+    one = plain()
+    assert one.compiled is False
+    assert repr(one) == f"Stepper({PROBLEM.name}, ComputedTorque, virtual machine)"
+    assert one.why_failed == one.why_refused == ""
+    assert one.refused == 0
+    assert one.deadline is None
+    assert "command" in one.signals
+    assert repr(stepper(controller=CONTROLLER.named_in_task("mine"))).startswith(f"Stepper({PROBLEM.name}, mine, ")
+
+
+def test_results_are_nobody_elses():
+    """Neither the next call nor a change of the results changes what was given before."""
+    one = plain()
+    command, memory = one.step(*SAMPLE, one.start())
+    kept = command.copy(), memory.copy()
+    shown = one.trace()
+    shown["command"][:] = 99.0
+    assert one.trace()["command"] == pytest.approx(kept[0])
+    one.step(0.01, np.array([0.5, -1.0]), np.array([3.0]), memory)
+    np.testing.assert_array_equal(command, kept[0])
+    np.testing.assert_array_equal(memory, kept[1])
+    memory[:] = 5.0
+    np.testing.assert_array_equal(one.step(*SAMPLE, one.start())[0], kept[0])
+
+
+def test_the_command_is_that_of_the_law():
+    """The law is q'' = w^2 e - 2 w q', the command u = m (q'' + 2 q), clipped at its limits."""
+    law = fp.Exponential(rate=4.0, integral=False)
+    anything = {"y": (-99.0, 99.0), "y'": (-99.0, 99.0)}
+    one = stepper(controller=fp.ComputedTorque(law), plausible=anything)
+    command, memory = one.step(*SAMPLE, one.start())
+    wanted = 16.0 * (0.2 - 0.1) - 8.0 * 0.3
+    assert command == pytest.approx([1.2 * (wanted + 2.0 * 0.1)])
+    far, _ = one.step(0.01, np.array([1.6, 0.3]), SAMPLE[2], memory)
+    assert far == pytest.approx([-20.0])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        (True, *SAMPLE[1:]),
+        (np.bool_(False), *SAMPLE[1:]),
+        ("0", *SAMPLE[1:]),
+        (0.0, np.zeros(3), SAMPLE[2]),
+        (0.0, np.ma.masked_array([0.1, 0.3], [True, False]), SAMPLE[2]),
+        (0.0, SAMPLE[1], np.array(["a"])),
+    ],
+    ids=["true", "false", "text", "shape", "masked", "no number"],
+)
+def test_a_wrong_argument_is_refused_and_the_stepper_stays_usable(wrong):
+    """Its only token is back: the next call is not taken for another thread's."""
+    one = plain()
+    expected = one.step(*SAMPLE, one.start())[0]
+    with pytest.raises(FpirhcError):
+        one.step(wrong[0], wrong[1], wrong[2], one.start())
+    np.testing.assert_array_equal(one.step(*SAMPLE, one.start())[0], expected)
+    one.trace()
+
+
+def test_other_forms_of_numbers_are_the_same():
+    """Lists, rows of 32 bits and whole numbers, by way of the same step."""
+    one = plain()
+    expected = one.step(0.0, np.array([1.0, 2.0]), np.array([3.0]), one.start())[0]
+    for state, realised in (([1, 2], [3]), (np.array([1, 2]), np.array([3.0], dtype=np.float32))):
+        np.testing.assert_array_equal(one.step(0, state, realised, list(one.start()))[0], expected)  # type: ignore[arg-type]
+
+
+def test_the_memory_of_another_controller_is_refused():
+    """Also where it has the same size."""
+    one, other = plain(), stepper(controller=fp.ComputedTorque(fp.Exponential(rate=5.0), fp.Affine(gain=-0.6)))
+    assert one.memory.size == other.memory.size
+    with pytest.raises(InvalidValue, match="memory"):
+        one.step(*SAMPLE, other.start())
+    with pytest.raises(InvalidShape):
+        one.step(*SAMPLE, np.zeros(one.memory.size - 1))
+
+
+def test_a_solver_that_fails_holds_the_command():
+    """One that raises, and one that ends without having written a command."""
+    one = stepper()
+    command, memory = one.step(*SAMPLE, one.start())
+
+    def raising():
+        raise RuntimeError("no convergence")
+
+    one._evaluate = raising
+    held, after = one.step(0.01, *SAMPLE[1:], memory)
+    np.testing.assert_array_equal(held, command)
+    assert status(one) == Status.SOLVER_FAILED
+    assert one.why_failed == "no convergence"
+    changed = [one.memory.columns[k] for k in np.flatnonzero(after != memory)]
+    assert changed == ["skipped_before"]
+    one._may_fail, one._evaluate = True, lambda: None
+    held, _ = one.step(0.02, *SAMPLE[1:], after)
+    np.testing.assert_array_equal(held, command)
+    assert one.why_failed == "the compiled solver failed"
+    assert one.trace()["skipped"] == 2
+
+
+def test_raw_measurements_are_given_in_their_order():
+    """States and then responses where nothing is estimated; with estimators what the sensors show."""
+    one = plain()
+    assert one.measures == ("y", "y'", "y''")
+    assert not one.estimates
+    expected = one.step(*SAMPLE, one.start())[0]
+    np.testing.assert_array_equal(one.step_measured(0.0, np.array([0.1, 0.3, 0.7]), one.start())[0], expected)
+    with pytest.raises(InvalidShape):
+        one.step_measured(0.0, np.array([0.1, 0.3]), one.start())
+    estimating = stepper(replace(PROBLEM, sensing=fp.Sensing({}, fp.PositionDifference())))
+    assert estimating.measures == ("y",)
+    assert estimating.estimates
+    memory = estimating.start()
+    for k in range(3):
+        _, memory = estimating.step_measured(0.01 * k, np.array([0.1 + 0.02 * k]), memory)
+    assert estimating.trace()["state"] == pytest.approx([0.14, 2.0])
+
+
+def test_settings_and_set_points_of_a_call():
+    """They hold from that step on; what is refused is counted and named, and the old ones stay."""
+    one = stepper(live=["deformation.gain"])
+    assert one.numbers == {"deformation.gain": -0.6}
+    memory = one.step(*SAMPLE, one.start())[1]
+    again = 0.01, np.array([0.2, 0.1]), np.array([0.4])
+    before = one.step(*again, memory)[0]
+    changed = one.step(*again, memory, settings={"deformation.gain": -0.3})[0]
+    assert changed != before
+    assert one.numbers == {"deformation.gain": -0.3}
+    assert one.step(*again, memory)[0] == changed
+    one.step(*again, memory, settings={"deformation.gain": 0.0})
+    assert (one.refused, one.numbers) == (1, {"deformation.gain": -0.3})
+    assert one.why_refused
+    assert one.change({"deformation.gain": -0.6})
+    assert one.step(*again, memory)[0] == before
+    assert one.stale() is not None
+
+
+def test_time_stamps_are_read_where_their_age_counts():
+    """`taken` is the time where it is not given; an old sample is a bad one."""
+    one = stepper(max_age=0.05)
+    _, memory = one.step(*SAMPLE, one.start())
+    one.step(0.1, *SAMPLE[1:], memory, taken=0.02)
+    assert status(one) == Status.BAD_SAMPLE
+    one.step(0.01, *SAMPLE[1:], memory, taken=0.005)
+    assert status(one) == Status.OK
+    one.step(0.01, *SAMPLE[1:], memory)
+    assert status(one) == Status.OK
+
+
+def test_ranges_of_a_user_replace_the_automatic_ones():
+    """A sample outside of them skips the cycle."""
+    one = stepper(plausible={"y": (-0.2, 0.2)})
+    one.step(0.0, np.array([0.21, 0.0]), SAMPLE[2], one.start())
+    assert status(one) == Status.BAD_SAMPLE
+    plain().step(0.0, np.array([0.21, 0.0]), SAMPLE[2], plain().start())
+    assert status(plain()) == Status.OK
+
+
+def test_steps_are_timed_where_there_is_a_deadline():
+    """By the clock that is given: the second step of three is late, and the text says so."""
+    times = iter([0.0, 1e-4, 1.0, 1.5, 2.0, 2.0001])
+    one = stepper(deadline=1e-3, clock=lambda: next(times))
+    for _ in range(3):
+        one.step(*SAMPLE, one.start())
+    assert one.deadline is not None
+    assert (one.deadline.cycles, one.deadline.late, one.deadline.worst) == (3, 1, 0.5)
+    assert str(one.deadline) in repr(one)
