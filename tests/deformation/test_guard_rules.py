@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.deformation.wrappers.guarded import EVENTS
 
-LARGEST, SHOWN = 50.0, ("factor", "event", "pause", "clean", "trips", "fallback")
+LARGEST = 50.0
+SHOWN = (
+    *("factor", "event", "pause", "clean", "trips", "fallback"),
+    *("sign", "oscillating", "growing", "error", "fast", "slow"),
+)
 AFFINE, SATURATING = fp.Affine(gain=-1.6), fp.Sigmoid(gain=-1.2, scale=0.02)
 
 
@@ -24,7 +29,7 @@ class Rules:
     error: float = 0.0
     fast: float = 0.0
     slow: float = 0.0
-    at_limit: int = 0
+    oscillating: int = 0
     growing: int = 0
     pause: int = 0
     clean: int = 0
@@ -43,7 +48,7 @@ class Rules:
         fast, slow = self.fast + (abs(error) - self.fast) / 20, self.slow + (abs(error) - self.slow) / 200
         limit = self.factor * self.map.largest_step()
         stuck = np.isfinite(limit) and abs(candidate - request) >= 0.5 * limit
-        at_limit = self.at_limit + 1 if mean < -0.8 and stuck else 0
+        at_limit = self.oscillating + 1 if mean < -0.8 and stuck else 0
         growing = self.growing + 1 if mean < -0.8 and fast > 4 * slow and fast > 1e-3 * LARGEST else 0
         event = (
             4
@@ -71,9 +76,9 @@ class Rules:
         self.pause = 10 if trip else max(self.pause - 1, 0)
         if active and not trip:
             self.sign, self.error, self.fast, self.slow = mean, error, fast, slow
-            self.at_limit, self.growing = at_limit, growing
+            self.oscillating, self.growing = at_limit, growing
             return candidate
-        self.sign = self.error = self.fast = self.slow = self.at_limit = self.growing = 0
+        self.sign = self.error = self.fast = self.slow = self.oscillating = self.growing = 0
         return desired
 
 
@@ -141,3 +146,9 @@ def test_alternating_errors_that_stay_small_trip_nothing():
     """Below a thousandth of the largest deformation growth is noise."""
     rules = compared(AFFINE, lambda k, r: 0.9 * r + 1e-4 * (-1.05) ** min(k, 60), 300)
     assert not any(rules.events)
+
+
+def test_every_event_has_a_description():
+    """Six numbers, each with words of its own."""
+    assert sorted(EVENTS) == [1, 2, 3, 4, 5, 6]
+    assert len(set(EVENTS.values())) == 6
