@@ -85,6 +85,8 @@ def show_run(run: Run, metrics: Metrics, saved: Path) -> None:
         say(console, f"{column.heading}: {column.text(column.number(metrics), missing='-', none='none')}")
     if run.stop:
         say(console, f"ended early: {run.stop}")
+    if run.depends_on_rounding:
+        say(console, run.depends_on_rounding)
     say(console, f"saved: {saved}", wrap=False)
 
 

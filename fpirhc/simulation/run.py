@@ -12,12 +12,15 @@ import numpy as np
 from fpirhc.errors import InvalidName, nearest
 from fpirhc.fields.checked_call import checked_call
 from fpirhc.status import Status
-from fpirhc.summary import line, number, table
+from fpirhc.summary import in_percent, line, number, table
 from fpirhc.symbolic.layout import Layout
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
+
+
+_FEW = 0.01  # share of the cycles without a converged plan that says nothing about a run
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +70,8 @@ class Run:
         how = "compiled C" if self.compiled else "virtual machine"
         ended = f"ended early: {self.stop}" if self.stop else "complete"
         about = f"{self.cycles} cycles of {self.period:g} {self.time_unit}", f"seed {self.seed}", how, ended
-        return *about, *self._faults()
+        doubt = (self.depends_on_rounding,) if self.depends_on_rounding else ()
+        return *about, *self._faults(), *doubt
 
     def _faults(self) -> tuple[str, ...]:
         """What was worse in some cycles than a plan that had not converged, with the first time."""
@@ -80,6 +84,19 @@ class Run:
                 first = f"{at[0] * self.period:g} {self.time_unit}"
                 faults.append(f"{status.name} in {at.size} cycles, first at {first}")
         return tuple(faults)
+
+    @property
+    def depends_on_rounding(self) -> str:
+        """Why the same run may be another one elsewhere: a sentence where plans did not converge in 1 % of the cycles or more."""
+        if "status" not in self.layout or not self.cycles:
+            return ""
+        share = float(np.mean(self["status"] == Status.NOT_CONVERGED))
+        if share < _FEW:
+            return ""
+        return (
+            f"plans did not converge in {in_percent(share)} of the cycles; such plans depend on rounding, so compiled C, the "
+            f"virtual machine and another computer may give other runs: allow more iterations, or loosen the tolerance"
+        )
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name in self.layout:

@@ -314,6 +314,10 @@ def _entries(
     return entries, skipped
 
 
+def _told_of_run(view: LyapunovView | None, run: Run) -> tuple[str, ...]:
+    return (*([view.text] if view else []), *([run.depends_on_rounding] if run.depends_on_rounding else []))
+
+
 def _entry(
     task: Task,
     controllers: Mapping[str, Controller],
@@ -359,7 +363,7 @@ def _entry(
         notes=(
             *_notes(controller, ready),
             *ready.notes(problem),
-            *([view.text] if view else []),
+            *_told_of_run(view, run),
             *broken,
             *metrics.broken,
         ),
