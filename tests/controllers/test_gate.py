@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 
 import fpirhc as fp
 from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.gate import Gate
+from fpirhc.controllers.step_outcome import was_skipped
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Derived, compose
 from fpirhc.symbolic.layout import Layout, Signal, scalar
@@ -149,6 +151,9 @@ def test_after_ten_such_steps_one_is_tried_from_the_start(opaque):
     gated.memory["not_finite"] = np.array([10.0])
     assert gated(1.0) == ([8.0, 0.0], Status.RESTARTED)
     assert gated.own == [1.0, 8.0]
+    gated.memory["not_finite"] = np.array([11.0])  # no count that there is
+    gated(np.nan)
+    assert gated.memory["not_finite"].tolist() == [0.0]
     gated.memory["not_finite"] = np.array([9.0])
     assert gated(1.0) == ([9.0, -1.0], Status.NOT_CONVERGED)
 
@@ -197,6 +202,9 @@ def test_an_implausible_sample_is_doubted_for_twenty_cycles(opaque):
     assert gated.memory["doubted"].tolist() == [1.0]
     gated.memory["doubted"] = np.array([np.nan])
     assert gated(0.5)[1] == Status.NOT_CONVERGED
+    gated.memory["doubted"] = np.array([np.nan])
+    assert gated(middle - 1.01 * half)[1] == Status.BAD_SAMPLE
+    assert gated.memory["doubted"].tolist() == [1.0]
 
 
 @both
@@ -204,6 +212,7 @@ def test_ranges_that_are_open_on_one_side(opaque):
     """Every number on the open side fits, none beyond the other one, and twenty doubts make no half interval wider."""
     gated = Gated(opaque, plausible=PLAUSIBLE)
     assert gated(b=-1e9)[1] == Status.NOT_CONVERGED
+    assert gated(realised=-1e9)[1] == Status.NOT_CONVERGED  # no range is named
     assert gated(b=5.0)[1] == Status.NOT_CONVERGED
     assert gated(state=[0.5, 1.0, 1e9, 0.0])[1] == Status.NOT_CONVERGED
     assert gated(state=[0.5, 1.0, -4.0, 0.0])[1] == Status.NOT_CONVERGED
@@ -292,3 +301,10 @@ def test_a_step_without_a_status_passes_too():
     block = Gate(PROBLEM, inner(False, with_status=False)).block()
     assert "status" not in block.writes
     assert isinstance(block.writes["command"], Signal)
+
+
+@pytest.mark.parametrize("status", Status)
+def test_cycles_that_were_skipped(status):
+    """Those of a bad sample, of a bad time, and of a step that was not finite."""
+    bad = status in {Status.BAD_SAMPLE, Status.BAD_TIME, Status.NON_FINITE}
+    assert bool(was_skipped(ca.DM(int(status)))) == bad
