@@ -58,8 +58,8 @@ def counted(failed: Expression, fits: Expression, fine: Expression) -> Expressio
 
 
 def is_trial(failed: Expression) -> Expression:
-    """Return whether this cycle is tried with the memory of the start."""
-    return failed > PATIENCE - 0.5
+    """Return whether this cycle is tried with the memory of the start; a count that cannot be, after a flipped bit, is none."""
+    return ca.fabs(failed - PATIENCE) < 0.5
 
 
 def was_skipped(status: Expression) -> Expression:

@@ -6,7 +6,8 @@ the model's response to it is none.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -18,11 +19,14 @@ import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.step_outcome import FAILED, PATIENCE
 from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.wrappers.base import Wrapper, of_map
 from fpirhc.members import Example, examples
 from fpirhc.simulation.dropped_steps import Dropped
 from fpirhc.simulation.loop import close_loop
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.status import Status
+from fpirhc.symbolic.expression import Expression
+from fpirhc.symbolic.layout import Layout, scalar
 from fpirhc.symbolic.native import find_compiler
 
 SHAPE = fp.Sigmoid(gain=-0.5, scale=2.0)
@@ -244,3 +248,55 @@ def test_algebraic_states_without_a_solution(controller):
     one, _ = stepper.step_measured(times[BAD + 1], rows[BAD + 1], after)
     other, _ = stepper.step_measured(times[BAD + 1], rows[BAD + 1], memory)
     assert np.array_equal(one, other)
+
+
+# Memories that have become absurd
+
+
+@pytest.mark.parametrize("name", ["Sigmoid", "Filtered", "Fractional", "plan"])
+def test_absurd_memory_does_not_stay(name):
+    """A number of the memory as a flipped bit leaves it, finite and beyond all sense: good samples bring every controller back."""
+    own = {**CONTROLLERS, "Fractional": fp.ComputedTorque(fp.Fractional(rate=3.0, order=0.8, memory=1.0), SHAPE)}
+    stepper = fp.Stepper(TANK, own[next(n for n in own if n.startswith(name))], compiled=False)
+    times, rows = measurements()
+    _, memory = before_the_fault(stepper)
+    places = [k for k, c in enumerate(stepper.memory.columns) if not c.startswith(("fingerprint", "clock.", "jumps."))]
+    for place in places[:: max(1, len(places) // 12)]:
+        absurd = memory.copy()
+        absurd[place] = 1e290
+        statuses = []
+        for k in range(BAD, BAD + 3 * PATIENCE):
+            command, absurd = stepper.step_measured(times[k], rows[k], absurd)
+            assert np.isfinite(command).all()
+            statuses.append(status(stepper))
+        assert not {Status.NON_FINITE, Status.RESTARTED} & set(statuses), stepper.memory.columns[place]
+
+
+@dataclass(frozen=True)
+class Rooted(Wrapper):
+    """A map that has no number for a negative number of its memory."""
+
+    def memory(self, elements: tuple[str, ...]) -> Layout:
+        """The number, and the memory of the map."""
+        return Layout((scalar("rooted", start=1.0),)) + self.map.memory(elements)
+
+    def step(
+        self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+    ) -> tuple[Expression, dict[str, Expression]]:
+        """The map's request, times the root of one."""
+        following, own = self.map.step(request, response, desired, of_map(self, memory, request.numel()))
+        return following * ca.sqrt(memory["rooted"]), {"rooted": memory["rooted"], **own}
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
+def test_memory_with_which_nothing_is_finite_is_forgotten(compiled):
+    """After ten such cycles one is tried with the memory of the start, is finite, and is the first one of a run."""
+    stepper = fp.Stepper(TANK, fp.ComputedTorque(TRACK, Rooted(SHAPE)), compiled=compiled)
+    times, rows = measurements()
+    _, memory = before_the_fault(stepper)
+    memory[stepper.memory.slice("rooted")] *= -1
+    statuses = []
+    for k in range(BAD, BAD + PATIENCE + 5):
+        _, memory = stepper.step_measured(times[k], rows[k], memory)
+        statuses.append(status(stepper))
+    assert statuses == [Status.NON_FINITE] * PATIENCE + [Status.RESTARTED] + [Status.OK] * 4
