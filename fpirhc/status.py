@@ -18,6 +18,8 @@ class Status(IntEnum):
     SOLVER_FAILED = 7
     SATURATED = 8
     NOT_CONTRACTING = 9
+    BRIDGED = 10
+    SETTLING = 11
     BAD_TIME = 12
 
     @property
@@ -34,6 +36,8 @@ class Status(IntEnum):
 _BEST_TO_WORST = (
     Status.OK,
     Status.NOT_CONVERGED,
+    Status.BRIDGED,
+    Status.SETTLING,
     Status.BAD_SAMPLE,
     Status.BAD_TIME,
     Status.SATURATED,
@@ -65,4 +69,8 @@ _REMEDIES = {
     "actuator, the sign of its gain, and whether the limits allow the task.",
     Status.NOT_CONTRACTING: "the measured response errors grow from cycle to cycle: the gain is too large or has the wrong sign "
     "for this plant; lower it, or put Guarded(...) around the map.",
+    Status.BRIDGED: "cycles without a sample came before this one, lost or not called: estimators and queues were moved over the "
+    "gap; look at the sensor's connection, or at what delays the cycles.",
+    Status.SETTLING: "more cycles than are bridged went by without a sample: estimators began anew, and what was learned is held "
+    "until their windows are full again; look at the sensor's connection, or at what delays the cycles.",
 }

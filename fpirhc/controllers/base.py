@@ -23,6 +23,7 @@ from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.face import measured_signals
+from fpirhc.controllers.held_deformation import with_held_deformation
 from fpirhc.controllers.largest_response import largest_response
 from fpirhc.controllers.mirror import measured_reads, mirror_blocks, with_measured_state
 from fpirhc.controllers.outside_block import ACTED, NOW, Told
@@ -129,6 +130,7 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
         remembered = {f"{m}_next": v for m, v in composite.memory.split(next_memory).items()}
         return {**composite.trace.split(trace), **remembered}
 
+    lossy = composite.bridged_if_any
     return Block(
         name,
         Layout(reads),
@@ -137,7 +139,16 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
         composite.memory,
         opaque=composite.opaque,
         derived=composite.derived_if_any,
+        waits=None if composite.waits is None else fed_by(composite.waits, feeds),
+        bridged=None if lossy is None else lambda: embedded(name, lossy(), feeds),
     )
+
+
+def fed_by(block: Block, feeds: Mapping[str, Signal]) -> Block:
+    """Return the block with other signals in place of those that `feeds` names."""
+    for name, source in feeds.items():
+        block = fed(block, name, source)
+    return block
 
 
 def fed(block: Block, name: str, source: Signal) -> Block:
@@ -149,7 +160,14 @@ def fed(block: Block, name: str, source: Signal) -> Block:
     def step(s: Signals) -> Mapping[str, Value]:
         return block.step(Signals({**vars(s), name: getattr(s, source.name)}))
 
-    return replace(block, reads=Layout(reads), step=step)
+    waits, lossy = block.waits, block.bridged
+    return replace(
+        block,
+        reads=Layout(reads),
+        step=step,
+        waits=None if waits is None else fed(waits, name, source),
+        bridged=None if lossy is None else lambda: fed(lossy(), name, source),
+    )
 
 
 def reference_block(problem: Problem) -> Block:
@@ -195,7 +213,12 @@ def closing_blocks(
     largest = largest_response(problem)
     blocks = [
         *mirrors,
-        deform_block(plant, deformation, problem.warm_up_cycles, largest),
+        with_held_deformation(
+            plant,
+            deformation,
+            deform_block(plant, deformation, problem.warm_up_cycles, largest),
+            settles=problem.sensing.estimates,
+        ),
         invert_block(plant),
         *closing,
     ]

@@ -22,8 +22,9 @@ from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import values_of
 from fpirhc.sensing.belief import Belief, Evidence, Model
-from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.block import Block, Delay, bridged, call
+from fpirhc.symbolic.expression import Signals, expression
+from fpirhc.symbolic.gap import GAP
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
 
@@ -36,20 +37,26 @@ class Believing:
         problem: whose sensing has a belief.
         raw: signal of the raw measurements.
         shown: first state, or outputs, that the sensors see; the estimator begins there.
+        lost: whether samples may be lost.
     """
 
     problem: Problem
     raw: Signal
     shown: np.ndarray
+    lost: bool = False
 
     @property
     def block(self) -> Block:
         """Block (raw measurements, parameters, last command) -> (state, [output], realised)."""
         plant = self.problem.plant
-        reads = Layout((self.raw, *self._time.reads))
+        reads = Layout((self.raw, *self._time.reads, *((GAP,) if self.lost else ())))
         writes = Layout((*measured_signals(plant), plant.response_signal("realised")))
-        own = Layout((*self._time.memory, *self.belief.memory(self.model).signals))
-        return Block("believe", reads, writes, self._step, own + self._estimator.memory, opaque=self.belief.opaque)
+        own = Layout((*self._time.memory, *self.belief.memory(self.model).signals)) + self._estimator.memory
+        opaque, lossy = self.belief.opaque, None if self.lost else lambda: replace(self, lost=True).block
+        waits = Block("believe_waits", Layout((*self._time.reads, GAP)), Layout(), self._wait, own, opaque=opaque)
+        return Block(
+            "believe", reads, writes, self._step, own, opaque, waits=waits if self.lost else None, bridged=lossy
+        )
 
     @property
     def delay(self) -> Delay:
@@ -78,11 +85,13 @@ class Believing:
     def _estimator(self) -> Block:
         face, sensing = self.problem.plant.face, self.problem.sensing
         completed = Signal("_completed", sensing.estimator.measures(face))
-        return sensing.estimator.block(face, self.problem.period, self.shown, completed)
+        block = sensing.estimator.block(face, self.problem.period, self.shown, completed)
+        return bridged(block) if self.lost else block
 
     def _step(self, s: Signals) -> dict[str, Expression]:
         plant, sensing, elements = self.problem.plant, self.problem.sensing, self.problem.plant.state.elements
-        evidence, results = self._evidence(s)
+        shown_now = dict(zip(self.raw.elements, ca.vertsplit(getattr(s, self.raw.name)), strict=True))
+        evidence, results = self._evidence(s, shown_now)
         memory = {m: getattr(s, m) for m in self.belief.memory(self.model).names}
         predicted = self.belief.predict(self.model)(evidence, memory)
         expected = values_of(plant, predicted, evidence.command, evidence.parameters)
@@ -105,9 +114,21 @@ class Believing:
         pairs = zip(plant.state.elements, plant.known_by_outputs, strict=True)
         return {**measured, **{e: entries[place] for e, place in pairs if place >= 0}}
 
-    def _evidence(self, s: Signals) -> tuple[Evidence, dict[str, Expression]]:
+    def _wait(self, s: Signals) -> dict[str, Expression]:
+        """Memory after a cycle without a sample: the prediction with nothing to correct it."""
+        evidence, results = self._evidence(s, dict.fromkeys(self.raw.elements, expression(0.0)))
+        memory = {m: getattr(s, m) for m in self.belief.memory(self.model).names}
+        predicted = self.belief.predict(self.model)(evidence, memory)
+        _, next_memory = self.belief.correct(self.model)(replace(evidence, counts=expression(0.0)), memory, predicted)
+        results |= {f"{m}_next": v for m, v in next_memory.items()}
+        remembered = {m: getattr(s, m) for m in self._estimator.memory.names}
+        waits = self._estimator.waits
+        if waits is not None:
+            call(waits, dict(vars(s)), remembered)
+        return results | {f"{m}_next": v for m, v in remembered.items()}
+
+    def _evidence(self, s: Signals, shown: Mapping[str, Expression]) -> tuple[Evidence, dict[str, Expression]]:
         """What the belief is told, with no state known yet, and what is remembered for the next cycle."""
-        shown = dict(zip(self.raw.elements, ca.vertsplit(getattr(s, self.raw.name)), strict=True))
         (command, commands), (parameters, signals) = self._time.command(s), self._time.parameters(s)
         evidence = Evidence(shown, {}, command, parameters, self._time.moves(s), self._time.counts(s))
         return evidence, {**commands, **signals}
@@ -116,7 +137,8 @@ class Believing:
         """State or outputs, response, and memory of the estimator."""
         names = self.problem.sensing.estimator.measures(self.problem.plant.face)
         completed = ca.vertcat(*(seen[n] for n in names))
-        results = self._estimator.function(completed, *(getattr(s, m) for m in self._estimator.memory.names))
+        gap = [s.gap] if self.lost and GAP.name in self._estimator.reads else []
+        results = self._estimator.function(completed, *gap, *(getattr(s, m) for m in self._estimator.memory.names))
         return tuple(results)
 
 

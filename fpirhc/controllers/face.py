@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.block import Block, bridged
 from fpirhc.symbolic.expression import Signals, Value
 from fpirhc.symbolic.layout import Layout, Signal
 
@@ -37,4 +37,5 @@ def on_face(plant: Plant, block: Block) -> Block:
         seen = Signals({**vars(s), own: getattr(s, name)} if own in block.reads else vars(s))
         return {name if key == own else key: value for key, value in block.step(seen).items()}
 
-    return replace(block, reads=renamed(block.reads), writes=renamed(block.writes), step=step)
+    lossy = None if block.bridged is None else lambda: on_face(plant, bridged(block))
+    return replace(block, reads=renamed(block.reads), writes=renamed(block.writes), step=step, bridged=lossy)

@@ -14,6 +14,9 @@ controller is given what is measured, up to 100 times the range. What is not fin
 Before the first good sample nothing has begun: the command is the one before the run, and the memory is that of the start. A memory
 that is not finite is forgotten, and the controller begins anew. So is one with which no step is finite (`step_outcome`).
 
+A memory of the passing time does not stay as it was: queues, filters and observers go on, and are moved over the gap by the next
+sample (`gap`).
+
 The gate is built once, around the composed step. Loop, stepper, virtual machine and C have it alike.
 """
 
@@ -26,11 +29,13 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import clip
+from fpirhc.controllers.gap import Gap
 from fpirhc.controllers.step_outcome import FAILED, counted, is_trial, outcome
 from fpirhc.status import Status
-from fpirhc.symbolic.block import Block, Composite, Derived, Values
-from fpirhc.symbolic.expression import Signals, expression
+from fpirhc.symbolic.block import Block, Composite, Derived, Values, call
+from fpirhc.symbolic.expression import Signals, expression, kind
 from fpirhc.symbolic.finite import FINITE, every_finite, finite
+from fpirhc.symbolic.gap import GAPS
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
@@ -56,6 +61,7 @@ class Gate:
             there is none.
         max_age: s; where given, the step also reads 'taken', the time stamp of the sample, which must be later than the last one's,
             not later than the time, and not older than this. None: time stamps are not looked at.
+        gap: counts missing cycles; None: no sample can be lost.
     """
 
     problem: Problem
@@ -63,11 +69,13 @@ class Gate:
     trusted: Sequence[str] = ()
     plausible: Mapping[str, Interval] = field(default_factory=dict)
     max_age: float | None = None
+    gap: Gap | None = None
 
     @property
     def reads(self) -> Layout:
         """What the step reads: as the controller, and the time stamp of the sample where its age counts."""
-        return self.inner.reads if self.max_age is None else self.inner.reads + Layout((scalar(TAKEN, "s"),))
+        own = Layout(tuple(s for s in self.inner.reads.signals if s not in GAPS))
+        return own if self.max_age is None else own + Layout((scalar(TAKEN, "s"),))
 
     @property
     def sample(self) -> Layout:
@@ -91,7 +99,8 @@ class Gate:
         good = [replace(s, name=f"good_{s.name}", start=starts.get(s.name, s.start)) for s in self.stored.signals]
         doubted = [scalar(DOUBTED)] if self.plausible else []
         failed = [] if "memory" in self.trusted else [scalar(FAILED)]
-        return Layout((held, *good, *doubted, *failed)) + self.controller_memory
+        counts = self.gap.memory if self.gap is not None else ()
+        return Layout((held, *good, *doubted, *failed, *counts)) + self.controller_memory
 
     @property
     def controller_memory(self) -> Layout:
@@ -120,14 +129,20 @@ class Gate:
             fits, held, good_next, doubted = entry(ca.vertcat(*now), getattr(s, HELD), ca.vertcat(*good), before)
             last_good = self.stored.split(good_next)
             seen = last_good if self.inner.opaque else {}
-            sample = [seen.get(r, getattr(s, r)) for r in self.inner.reads.names]
+            gap, counts = self.gap, {} if self.gap is None else self.gap.counts(s, trusted="memory" in self.trusted)
+            told = gap.seen(counts) if gap is not None else {}
+            seen = {**seen, **told}
+            sample = [seen[r] if r in seen else getattr(s, r) for r in self.inner.reads.names]
             memory = self.controller_memory.join({m: getattr(s, m) for m in self.controller_memory.names})
             usable, failed = expression(1.0), None
             if "memory" not in self.trusted:
                 failed = getattr(s, FAILED)
                 usable = ca.logic_and(finite(memory, opaque=self.inner.opaque), ca.logic_not(is_trial(failed)))
-            memory_next, shown, command, fine = choose(fits, usable, memory, sample, held)
+            passes = gap.passes(counts, s.time) if gap is not None else None
+            memory_next, shown, command, fine = choose(fits, usable, memory, sample, held, passes)
             values = trace.split(shown)
+            if gap is not None and "status" in trace:
+                values["status"] = gap.status(values["status"], told)
             if "status" in trace:
                 status = ca.if_else(usable, values["status"], int(Status.RESTARTED))
                 status = ca.if_else(fine, status, int(Status.NON_FINITE))
@@ -136,6 +151,8 @@ class Gate:
             remembered |= {FAILED: counted(failed, fits, fine)} if failed is not None else {}
             remembered |= {f"good_{n}": ca.if_else(fine, v, getattr(s, f"good_{n}")) for n, v in last_good.items()}
             remembered |= {DOUBTED: doubted} if self.plausible else {}
+            if gap is not None and passes is not None:
+                remembered |= gap.remembered(ca.logic_and(fits, fine), passes, counts, told)
             return {**values, "command": command, **{f"{m}_next": v for m, v in remembered.items()}}
 
         derived = self._derived if self.inner.derived_if_any else None
@@ -204,21 +221,35 @@ class Gate:
         return inside
 
     def _selected(
-        self, fits: Expression, usable: Expression, memory: Expression, sample: Sequence[Expression], held: Expression
+        self,
+        fits: Expression,
+        usable: Expression,
+        memory: Expression,
+        sample: Sequence[Expression],
+        held: Expression,
+        passes: Expression | None,
     ) -> tuple[Expression, Expression, Expression, Expression]:
         """(memory, trace, command, whether the step is fine) of scalar code: it is evaluated, and its results are selected."""
         remembered = ca.if_else(usable, memory, ca.DM(self.inner.memory.start()))
         memory_next, trace, command = self.inner.function(remembered, *sample)
-        after, fine = outcome(memory_next, memory, command, trace, self.inner.trace, fits, opaque=False)
+        skipped = self._waited(memory, sample, passes)
+        after, fine = outcome(memory_next, skipped, command, trace, self.inner.trace, fits, opaque=False)
         return after, trace, ca.if_else(ca.logic_and(fits, fine), command, held), fine
 
     def _switched(
-        self, fits: Expression, usable: Expression, memory: Expression, sample: Sequence[Expression], held: Expression
+        self,
+        fits: Expression,
+        usable: Expression,
+        memory: Expression,
+        sample: Sequence[Expression],
+        held: Expression,
+        passes: Expression | None,
     ) -> tuple[Expression, Expression, Expression, Expression]:
         """The same of a graph: one of three branches is evaluated, so that a long memory is not selected entry by entry."""
         step = self.inner.function
-        symbols = [ca.MX.sym(step.name_in(k), step.size1_in(k)) for k in range(step.n_in())]
-        last = ca.MX.sym("held", held.numel())
+        names = [(step.name_in(k), step.size1_in(k)) for k in range(step.n_in())]
+        symbols = [kind(opaque=True).sym(name, size) for name, size in names]
+        last = kind(opaque=True).sym("held", held.numel())
         skip = (symbols[0], step(*symbols)[1], last)
         run = step.call(symbols, True, False)
         restart = step(ca.DM(self.inner.memory.start()), *symbols[1:])
@@ -229,4 +260,21 @@ class Gate:
         choice = ca.Function.conditional("fpirhc_gate_choice", [skipped, running], restarted)
         memory_next, trace, command = choice(ca.if_else(fits, 2 - usable, 0), memory, *sample, held)
         after, fine = outcome(memory_next, memory, command, trace, self.inner.trace, fits, opaque=True)
-        return after, trace, ca.if_else(ca.logic_and(fits, fine), command, held), fine
+        ran = ca.logic_and(fits, fine)
+        if passes is not None and self.inner.waits is not None:
+            new, started = (kind(opaque=True).sym(n, k) for n, k in (("new", memory.numel()), ("passes", 1)))
+            arguments = [new, started, *symbols]
+            takes = ca.Function("fpirhc_gate_takes", arguments, [new])
+            waits = ca.Function("fpirhc_gate_waits", arguments, [self._waited(symbols[0], symbols[1:], started)])
+            after = ca.Function.if_else("fpirhc_gate_kept", takes, waits)(ran, after, passes, memory, *sample)
+        return after, trace, ca.if_else(ran, command, held), fine
+
+    def _waited(self, memory: Expression, sample: Sequence[Expression], passes: Expression | None) -> Expression:
+        """The controller's memory after a cycle without a sample: as it was, but for what is a memory of the passing time."""
+        waits = self.inner.waits
+        if passes is None or waits is None:
+            return memory
+        known = {**self.inner.memory.split(memory), **dict(zip(self.inner.reads.names, sample, strict=True))}
+        following: dict[str, Expression] = {}
+        call(waits, known, following)
+        return ca.if_else(passes, self.inner.memory.join(following), memory)

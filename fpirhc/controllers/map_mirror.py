@@ -10,18 +10,26 @@ There is no twin that could drift, because a map has no motion between two measu
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 
 from fpirhc.controllers.mirror_path import MEASURED, Path
-from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.block import Block, unseen
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.gap import GAP, straightened
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 _BEFORE, _ANSWERS = "mirror_state_before", "mirror_answers"
 
 
-def map_mirror(path: Path) -> Block:
-    """Return the block (measured state, last command, parameters) -> the model's response that is measured in this cycle."""
+def map_mirror(path: Path, *, lost: bool = False) -> Block:
+    """Return the block (measured state, last command, parameters) -> the model's response that is measured in this cycle.
+
+    Args:
+        path: of the commands to the model.
+        lost: whether samples may be lost; the state of the last cycle is then on the line over the gap.
+    """
     plant, face = path.problem.plant, path.problem.plant.face
     orders = [face.orders[k] for k in face.controlled_indices]
     start = tuple(map(float, path.problem.start_state))
@@ -32,8 +40,10 @@ def map_mirror(path: Path) -> Block:
 
     def step(s: Signals) -> dict[str, Expression]:
         acting, _, remembered = path.acted(s)
+        last = getattr(s, _BEFORE)
+        last = straightened(last, getattr(s, MEASURED), s.gap) if lost else last
         parameters, signals = path.told.acted(s, path.late)
-        answers = ca.vertsplit(plant.controlled_response_function(getattr(s, _BEFORE), acting, parameters))
+        answers = ca.vertsplit(plant.controlled_response_function(last, acting, parameters))
         past = ca.vertsplit(getattr(s, _ANSWERS)) if waiting else []
         modelled, later, at = [], [], 0
         for answer, order in zip(answers, orders, strict=True):
@@ -47,4 +57,8 @@ def map_mirror(path: Path) -> Block:
         return {"_modelled": ca.vertcat(*modelled), **remembered}
 
     writes, memory = Layout((plant.response_signal("_modelled"),)), Layout((*path.memory, before, *queues))
-    return Block("mirror", Layout(path.reads), writes, step, memory)
+    if not lost:
+        return Block("mirror", Layout(path.reads), writes, step, memory, bridged=lambda: map_mirror(path, lost=True))
+    waits = unseen(map_mirror(path), (MEASURED,))
+    held = replace(waits, step=lambda s: {**waits.step(s), f"{_BEFORE}_next": getattr(s, _BEFORE)})
+    return Block("mirror", Layout((*path.reads, GAP)), writes, step, memory, waits=held)

@@ -28,7 +28,7 @@ from fpirhc.controllers.twin_of_outputs import twin_of_outputs
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.queue import every
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.block import Block, Delay, unseen
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
@@ -93,4 +93,5 @@ def _instant_block(path: Path) -> Block:
         return {"_modelled": response(getattr(s, MEASURED), end, parameters), **remembered, **signals}
 
     writes = Layout((plant.response_signal("_modelled"),))
-    return Block("mirror", Layout(path.reads), writes, step, Layout(path.memory))
+    block = Block("mirror", Layout(path.reads), writes, step, Layout(path.memory))
+    return replace(block, waits=unseen(block, (MEASURED,))) if path.memory else block

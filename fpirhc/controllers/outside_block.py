@@ -9,7 +9,7 @@ compares it with the model's response at the signals of the last cycle, `_signal
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -100,4 +100,5 @@ class Told:
         parameter, opaque = self.plant.parameter, not values.is_a("SXFunction")
         writes = Layout((Signal(NOW, parameter.elements, parameter.units), *((acted,) if remembers else ())))
         memory = Layout((last,)) if remembers else Layout()
-        return Block("signals", Layout((self.plant.time, parameter)), writes, step, memory, opaque)
+        block = Block("signals", Layout((self.plant.time, parameter)), writes, step, memory, opaque)
+        return replace(block, waits=block)  # time goes on

@@ -18,6 +18,7 @@ import casadi as ca
 from fpirhc.controllers.mirror_path import MEASURED, measured_output, measured_state
 from fpirhc.deformation.queue import Queue
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.gap import straightened
 from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.problem import Problem
@@ -77,6 +78,28 @@ class ResponsePairs:
             return (*states, *commands)
         first = problem.start_output.tolist()
         return (*states, *commands, *_past(_OUTPUTS, problem.plant.output.elements, first, self._states.length))
+
+    @property
+    def gaps(self) -> bool:
+        """Whether past states or outputs wait, which a gap moves."""
+        return self._states.length > 1
+
+    def moved(self, s: Signals) -> Signals:
+        """Return the signals of a cycle after a gap: past states and outputs on the line from the last ones to these."""
+        if not self.gaps:
+            return s
+        now = {_STATES: getattr(s, self.state.name)}
+        now |= {_OUTPUTS: getattr(s, self.seen.name)} if self.outputs else {}
+        return Signals({**vars(s), **{n: straightened(getattr(s, n), value, s.gap) for n, value in now.items()}})
+
+    def waited(self, s: Signals, newest: Expression) -> tuple[Expression, dict[str, Expression]]:
+        """Return the command of the response in a cycle without a sample, and what is remembered: the last state once more."""
+        command, remembered = _queued(s, _COMMANDS, self._commands, newest)
+        plant = self.problem.plant
+        for name, size in ((_STATES, plant.state.size), (_OUTPUTS, plant.output.size)):
+            if self.gaps and (name == _STATES or self.outputs):
+                remembered |= _queued(s, name, self._states, getattr(s, name)[:size])[1]
+        return command, remembered
 
     def pair(self, s: Signals, newest: Expression) -> tuple[Expression, Expression, dict[str, Expression]]:
         """Return state and command of the response, and what is remembered.

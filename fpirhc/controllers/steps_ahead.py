@@ -18,8 +18,9 @@ from dataclasses import replace
 import casadi as ca
 
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.block import Block, bridged
 from fpirhc.symbolic.expression import Signals, Value
+from fpirhc.symbolic.gap import GAP, straightened
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 _MEASURED, _PAST, _COUNT = "_differences", "outputs_expected", "outputs_measured"
@@ -40,11 +41,15 @@ def with_steps_ahead(plant: Plant, estimate: Block) -> list[Block]:
         return {_MEASURED if name == plant.output.name else name: value for name, value in estimate.step(s).items()}
 
     writes = Layout(tuple(measured if w.name == plant.output.name else w for w in estimate.writes.signals))
-    return [replace(estimate, step=step, writes=writes), _ahead_block(plant, measured)]
+    lossy = None if estimate.bridged is None else lambda: with_steps_ahead(plant, bridged(estimate))[0]
+    return [replace(estimate, step=step, writes=writes, bridged=lossy), _ahead_block(plant, measured)]
 
 
-def _ahead_block(plant: Plant, measured: Signal) -> Block:
-    """Block (differences of the last cycles, state, parameters) -> outputs and their differences at this cycle."""
+def _ahead_block(plant: Plant, measured: Signal, *, lost: bool = False) -> Block:
+    """Block (differences of the last cycles, state, parameters) -> outputs and their differences at this cycle.
+
+    Over a gap the expected outputs of the last cycles are on the line from the last ones to those of now.
+    """
     elements = plant.output.elements
     powers = [e.count("'") for e in elements]
     x, u, p = plant.symbols()
@@ -58,7 +63,10 @@ def _ahead_block(plant: Plant, measured: Signal) -> Block:
         before, count, at = getattr(s, _PAST), getattr(s, _COUNT), 0
         outputs, remembered = [], []
         for k, power in enumerate(powers):
-            queue = [now[k], *(before[at + i] for i in range(power))]
+            past_outputs = [before[at + i] for i in range(power)]
+            if lost and power:
+                past_outputs = ca.vertsplit(straightened(ca.vertcat(*past_outputs), now[k], s.gap))
+            queue = [now[k], *past_outputs]
             at += power
             brought = now[k] + ca.if_else(count > power - 0.5, arrived[k] - queue[-1], 0)
             outputs.append(brought if power else arrived[k])
@@ -70,4 +78,17 @@ def _ahead_block(plant: Plant, measured: Signal) -> Block:
         }
 
     reads = Layout((measured, plant.state, plant.parameter))
-    return Block("steps_ahead", reads, Layout((plant.output,)), step, Layout((past, counted)))
+    writes, memory = Layout((plant.output,)), Layout((past, counted))
+    if not lost:
+        lossy = lambda: _ahead_block(plant, measured, lost=True)  # noqa: E731
+        return Block("steps_ahead", reads, writes, step, memory, bridged=lossy)
+
+    def wait(s: Signals) -> dict[str, Expression]:
+        before, at, again = getattr(s, _PAST), 0, list[Expression]()
+        for power in powers:
+            again += [before[at + max(i - 1, 0)] for i in range(power)]
+            at += power
+        return {f"{_PAST}_next": ca.vertcat(*again), f"{_COUNT}_next": getattr(s, _COUNT)}
+
+    waits = Block("steps_wait", Layout(), Layout(), wait, memory)
+    return Block("steps_ahead", reads + Layout((GAP,)), writes, step, memory, waits=waits)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -20,7 +21,7 @@ import numpy as np
 from fpirhc.controllers.mirror_path import MEASURED, Path
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
-from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.block import Block, unseen
 from fpirhc.symbolic.expression import Signals, expression, is_finite, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
@@ -68,7 +69,8 @@ def twin_block(path: Path) -> Block:
         Layout((*path.memory, past.memory, twin, *late, *own)),
     )
     reads = Layout((*path.reads, plant.response_signal(BEFORE)))
-    return Block("mirror", reads, writes, step, memory, opaque=problem.integrator.opaque)
+    block = Block("mirror", reads, writes, step, memory, opaque=problem.integrator.opaque)
+    return replace(block, waits=unseen(block, (MEASURED,)))
 
 
 class _Deformations:

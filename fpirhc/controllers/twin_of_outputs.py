@@ -12,13 +12,15 @@ y^(r): the twin's response remains the model's. What the estimator remembers is 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.mirror_path import MEASURED, MEASURED_OUTPUT, Path, measured_output
 from fpirhc.controllers.twin import drift, memory_moves
 from fpirhc.sensing.base import values_of
-from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.block import Block, unseen
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
@@ -60,7 +62,8 @@ def twin_of_outputs(path: Path) -> Block:
 
     memory = Layout((*path.memory, *_starts(problem), *own))
     reads, writes = Layout((*path.reads, measured_output(plant))), Layout((plant.response_signal("_modelled"),))
-    return Block("mirror", reads, writes, step, memory, opaque=problem.integrator.opaque)
+    block = Block("mirror", reads, writes, step, memory, opaque=problem.integrator.opaque)
+    return replace(block, waits=unseen(block, (MEASURED, MEASURED_OUTPUT)))
 
 
 def _starts(problem: Problem) -> tuple[Signal, Signal]:

@@ -27,6 +27,7 @@ from fpirhc.sensing.base import (
 )
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.gap import GAP, ahead, continued, is_long, shares
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 LONGEST = 1001  # samples: the memory has a fixed size
@@ -65,7 +66,13 @@ class _Finite(DerivativeEstimator):
         return int(self.coefficients(order).shape[1]) - 1
 
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
-        """Block (positions) -> (state, response)."""
+        """Block (positions) -> (state, response).
+
+        Over a gap the positions go on by the polynomial of the plant's order through the last ones.
+        """
+        return self._block(plant, period, start, seen, lost=False)
+
+    def _block(self, plant: Plant, period: float, start: Array, seen: Signal, *, lost: bool) -> Block:
         rows = [self.coefficients(r) / period ** np.arange(r + 1)[:, None] for r in plant.orders]
         queue = _queue(plant, period, start, [row.shape[1] - 1 for row in rows])
         realised = plant.response_signal("realised")
@@ -77,7 +84,8 @@ class _Finite(DerivativeEstimator):
             responses: list[Expression] = []
             for k, (name, row) in enumerate(zip(plant.names, rows, strict=True)):
                 count = row.shape[1] - 1
-                samples = [newest[k], *(past[at + i] for i in range(count))]
+                older = [past[at + i] for i in range(count)]
+                samples = [newest[k], *(_moved(older, newest[k], plant.orders[k], s.gap) if lost else older)]
                 at += count
                 past_next += samples[:count]
                 known |= {name + "'" * d: combine(row[d], samples) for d in range(plant.orders[k])}
@@ -86,7 +94,37 @@ class _Finite(DerivativeEstimator):
             realised = ca.vertcat(*(responses[k] for k in plant.controlled_indices))
             return {"state": state, "realised": realised, "estimate_past_next": ca.vertcat(*past_next)}
 
-        return Block("estimate", Layout((seen,)), Layout((plant.state, realised)), step, Layout((queue,)))
+        reads, writes, memory = (
+            Layout((seen, GAP) if lost else (seen,)),
+            Layout((plant.state, realised)),
+            Layout((queue,)),
+        )
+        if lost:
+            return Block("estimate", reads, writes, step, memory, waits=_waiting(plant, rows, memory))
+        return Block(
+            "estimate", reads, writes, step, memory, bridged=lambda: self._block(plant, period, start, seen, lost=True)
+        )
+
+
+def _moved(older: list[Expression], newest: Expression, order: int, gap: Expression) -> list[Expression]:
+    """Positions of the past on the polynomial that ends in the newest one; without a gap as they are."""
+    away = newest - continued(ahead(len(older), order), older)
+    return [q + share * away for q, share in zip(older, shares(gap, len(older), order), strict=True)]
+
+
+def _waiting(plant: Plant, rows: Sequence[Array], memory: Layout) -> Block:
+    """Block that goes on by the polynomial through the past positions; a gap that is not bridged keeps them."""
+
+    def step(s: Signals) -> dict[str, Expression]:
+        past, at, past_next = s.estimate_past, 0, list[Expression]()
+        for row, order in zip(rows, plant.orders, strict=True):
+            count = row.shape[1] - 1
+            older = [past[at + i] for i in range(count)]
+            at += count
+            past_next += [continued(ahead(count, order), older), *older[:-1]]
+        return {"estimate_past_next": ca.if_else(is_long(s.gap), past, ca.vertcat(*past_next))}
+
+    return Block("estimate_waits", Layout((GAP,)), Layout(), step, memory)
 
 
 def _queue(plant: Plant, period: float, start: Array, counts: list[int]) -> Signal:

@@ -21,9 +21,11 @@ from fpirhc.fields.real_number import finite_number
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, known_by_positions, spline_weights
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals, total
+from fpirhc.symbolic.expression import Signals, expression, total
+from fpirhc.symbolic.gap import GAP, is_long
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
+_STAGES, _INPUTS = "filter_stages", "filter_inputs"
 _TAIL = 1e-16  # share of a low-pass's weights that is left out
 
 
@@ -86,35 +88,96 @@ class StateVariableFilter(DerivativeEstimator):
         return 1
 
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
-        """Block (positions) -> (state, response)."""
-        keep, new = self._coefficients(period)
-        memory = tuple(self._memory(plant, period, start, kind) for kind in ("filter_stages", "filter_inputs"))
+        """Block (positions) -> (state, response); over a gap the positions are on a straight line."""
+        return self._block(plant, period, start, seen, lost=False)
+
+    def _block(self, plant: Plant, period: float, start: Array, seen: Signal, *, lost: bool) -> Block:
+        memory = tuple(self._memory(plant, period, start, kind) for kind in (_STAGES, _INPUTS))
+        ramps = tuple(Signal(f"{m.name}_of_ramp", m.elements) for m in memory) if lost else ()
 
         def step(s: Signals) -> dict[str, Expression]:
-            positions, at = getattr(s, seen.name), 0
+            positions = ca.vertsplit(getattr(s, seen.name))
+            before = [s.filter_stages, s.filter_inputs]
+            if lost:
+                before = self._moved(
+                    plant, period, positions, before, (s.filter_stages_of_ramp, s.filter_inputs_of_ramp), s.gap
+                )
+            chains = self._chains(plant, period, positions, *before)
             known: dict[str, Expression] = {}
-            stages: list[Expression] = []
-            inputs: list[Expression] = []
             responses: list[Expression] = []
-            for k, (name, order) in enumerate(zip(plant.names, plant.orders, strict=True)):
-                chain = [positions[k]]
-                for j in range(order):
-                    inputs.append(chain[j])
-                    chain.append(keep * s.filter_stages[at] + new * (chain[j] + s.filter_inputs[at]))
-                    at += 1
-                stages += chain[1:]
+            for name, order, chain in zip(plant.names, plant.orders, chains, strict=True):
                 known[name] = chain[0]
                 known |= {name + "'" * d: self._derivative(chain, order, d) for d in range(1, order)}
                 responses.append(self._derivative(chain, order, order))
             return {
                 "state": ca.vertcat(*(known[e] for e in plant.state.elements)),
                 "realised": ca.vertcat(*(responses[k] for k in plant.controlled_indices)),
-                "filter_stages_next": ca.vertcat(*stages),
-                "filter_inputs_next": ca.vertcat(*inputs),
+                **_remembered(chains, memory),
+                **{f"{m.name}_next": expression(ca.DM.zeros(m.size)) for m in ramps},
             }
 
-        writes = Layout((plant.state, plant.response_signal("realised")))
-        return Block("estimate", Layout((seen,)), writes, step, Layout(memory))
+        reads, writes = (
+            Layout((seen, GAP) if lost else (seen,)),
+            Layout((plant.state, plant.response_signal("realised"))),
+        )
+        own = Layout((*memory, *ramps))
+        if lost:
+            return Block("estimate", reads, writes, step, own, waits=self._waiting(plant, period, memory, ramps))
+        return Block(
+            "estimate", reads, writes, step, own, bridged=lambda: self._block(plant, period, start, seen, lost=True)
+        )
+
+    def _chains(
+        self, plant: Plant, period: float, positions: Sequence[Expression], stages: Expression, inputs: Expression
+    ) -> list[list[Expression]]:
+        """Position and low-passes of every coordinate, one cycle later."""
+        keep, new = self._coefficients(period)
+        chains, at = [], 0
+        for position, order in zip(positions, plant.orders, strict=True):
+            chain = [position]
+            for j in range(order):
+                chain.append(keep * stages[at] + new * (chain[j] + inputs[at]))
+                at += 1
+            chains.append(chain)
+        return chains
+
+    def _ahead(self, plant: Plant, period: float, stages: Expression, inputs: Expression) -> list[Expression]:
+        """Positions one cycle after the last ones, at the filter's speed; of a coordinate of order one the last ones."""
+        positions, at = [], 0
+        for order in plant.orders:
+            chain = [inputs[at], *(stages[at + j] for j in range(order))]
+            positions.append(chain[0] + period * self._derivative(chain, order, 1) if order > 1 else chain[0])
+            at += order
+        return positions
+
+    def _moved(
+        self,
+        plant: Plant,
+        period: float,
+        positions: Sequence[Expression],
+        before: Sequence[Expression],
+        ramps: Sequence[Expression],
+        gap: Expression,
+    ) -> list[Expression]:
+        """Memory of the last cycle, had the positions been on a line: what the filter answers to a ramp is added."""
+        expected = self._ahead(plant, period, *before)
+        away = ca.vertcat(*(y - h for y, h, n in zip(positions, expected, plant.orders, strict=True) for _ in range(n)))
+        share = [ca.if_else(is_long(gap), 1, ramp / (gap + 1)) for ramp in ramps]
+        return [value + w * away for value, w in zip(before, share, strict=True)]
+
+    def _waiting(self, plant: Plant, period: float, memory: Sequence[Signal], ramps: Sequence[Signal]) -> Block:
+        """Block of a cycle without a sample: positions go on at their speed, and beside them a ramp of one per cycle from zero."""
+
+        def step(s: Signals) -> dict[str, Expression]:
+            firsts = [sum(plant.orders[:k]) for k in range(len(plant.orders))]
+            filtered = s.filter_stages, s.filter_inputs
+            later = _remembered(self._chains(plant, period, self._ahead(plant, period, *filtered), *filtered), memory)
+            ramp = [s.filter_inputs_of_ramp[k] + 1 for k in firsts]
+            rising = self._chains(plant, period, ramp, s.filter_stages_of_ramp, s.filter_inputs_of_ramp)
+            later |= _remembered(rising, ramps)
+            return {k: ca.if_else(is_long(s.gap), getattr(s, k.removesuffix("_next")), v) for k, v in later.items()}
+
+        return Block("estimate_waits", Layout((GAP,)), Layout(), step, Layout((*memory, *ramps)))
 
     def _coefficients(self, period: float) -> tuple[float, float]:
         """Coefficients (keep, new) of y_j(k) = keep y_j(k-1) + new (y_{j-1}(k) + y_{j-1}(k-1))."""
@@ -131,10 +194,17 @@ class StateVariableFilter(DerivativeEstimator):
         for name, order in zip(plant.names, plant.orders, strict=True):
             place = start[plant.state.elements.index(name)]
             speed = start[plant.state.elements.index(name + "'")] if order > 1 else 0.0
-            late = 1 if kind == "filter_stages" else 0
+            late = 1 if kind == _STAGES else 0
             names += [f"{name}@{j + 1}" for j in range(order)]
             values += [float(place - speed * (period + (j + late) / self.bandwidth)) for j in range(order)]
         return Signal(kind, tuple(names), start=tuple(values))
+
+
+def _remembered(chains: Sequence[Sequence[Expression]], memory: Sequence[Signal]) -> dict[str, Expression]:
+    """Stages and inputs of every low-pass, under the names of these signals."""
+    stages = ca.vertcat(*(value for chain in chains for value in chain[1:]))
+    inputs = ca.vertcat(*(value for chain in chains for value in chain[:-1]))
+    return {f"{m.name}_next": value for m, value in zip(memory, (stages, inputs), strict=True)}
 
 
 EXAMPLES = (StateVariableFilter(bandwidth=100.0),)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import casadi as ca
 
+from fpirhc.controllers.gap import AGAIN
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
@@ -24,7 +25,7 @@ from fpirhc.task.problem import Problem
 # In the memory: the last time that was believed, or is expected; the last one that was given; and times in a row that are a period
 # apart but do not follow the believed one.
 MEMORY = Signal("clock", ("before", "heard", "regular"), start=(-FINITE, -FINITE, 0.0))
-CLOCK = "_clock"  # signal of the believed time; NaN where it is none
+CLOCK = "_clock"  # signal of the believed time; NaN where it is none, and AGAIN where it repeats
 LONGEST = 1e5  # periods between two steps
 _RESOLVED = 2.0**42  # periods from zero within which a period is resolved to a thousandth
 _PATIENCE = 20
@@ -44,9 +45,10 @@ def clock_block(problem: Problem) -> Block:
         count = ca.if_else(apart, regular + 1, 0)
         believed = ca.logic_and(resolved, ca.logic_or(ca.logic_or(first, follows), count > _PATIENCE - 0.5))
         repeats = ca.fabs(passed) < period / 2
+        again = ca.logic_and(repeats, ca.logic_not(believed))
         expected = ca.if_else(ca.logic_or(first, repeats), before, before + period)
         return {
-            CLOCK: time + nan_where(ca.logic_not(believed)),
+            CLOCK: ca.if_else(again, AGAIN, time) + nan_where(ca.logic_not(ca.logic_or(believed, again))),
             f"{MEMORY.name}_next": ca.vertcat(
                 ca.if_else(believed, time, ca.if_else(expected > -FINITE, expected, -FINITE)),
                 ca.if_else(ca.fabs(time) <= FINITE, time, -FINITE),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.gap import across_gaps, gap_of
 from fpirhc.controllers.gate import Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.seeing import compose_seeing, given_states, raw_signal
@@ -18,7 +19,12 @@ from fpirhc.task.problem import Problem
 
 
 def composed_step(
-    live: LiveSettings, ready: Controller, plausible: Mapping[str, Interval], max_age: float | None, watch: Watch
+    live: LiveSettings,
+    ready: Controller,
+    plausible: Mapping[str, Interval],
+    max_age: float | None,
+    watch: Watch,
+    bridged: int,
 ) -> tuple[Composite, Layout]:
     """Return the step behind its gate, and the layout of its memory.
 
@@ -27,8 +33,9 @@ def composed_step(
     gates: list[Gate] = []
 
     def compose(problem: Problem, controller: Controller) -> Composite:
-        inner = compose_seeing(problem, controller)
-        gates.append(Gate(live.problem, inner, plausible=plausible, max_age=max_age))
+        gap = gap_of(live.problem, bridged)
+        inner = across_gaps(compose_seeing(problem, controller))
+        gates.append(Gate(live.problem, inner, plausible=plausible, max_age=max_age, gap=gap))
         return machine_step(live.problem, ready, gates[-1], watch)
 
     composite = live.composed(compose) if live.paths else compose(live.problem, ready)

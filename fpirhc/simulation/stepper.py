@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import isnan
+from math import isnan, nan
 from time import perf_counter
 from typing import NoReturn
 
@@ -11,13 +11,16 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
+from fpirhc.controllers.gap import BRIDGED
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import Numbers, live_settings
 from fpirhc.controllers.plausible import plausible_range
 from fpirhc.errors import ConcurrentUse
 from fpirhc.fields.checked import Checked
+from fpirhc.simulation.clock import MEMORY as CLOCK
 from fpirhc.simulation.deadline import Clock, Deadline
-from fpirhc.simulation.machine import FINGERPRINT, Watch
+from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, Watch
+from fpirhc.simulation.missed import missed_cycles, most_missed
 from fpirhc.simulation.numbers_now import NumbersNow
 from fpirhc.simulation.sample import numbers as numbers_of
 from fpirhc.simulation.sample import one_number
@@ -30,6 +33,8 @@ from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
 _TRUTHS = (bool, np.bool_)
+
+_NOT_SOLVED = "the compiled solver failed"
 
 
 class Stepper(Checked):
@@ -49,12 +54,15 @@ class Stepper(Checked):
     Where the outputs of a plant are estimated, its state stands before them, unless it is believed.
 
     A bad sample skips the cycle: one that is not finite, outside its plausible range, or (with `max_age`) out of date. The command
-    is the last one, every memory stays as it was, the status is BAD_SAMPLE, and the signal 'skipped' counts. Before the first good
-    sample the command is the one before the run. A sample for which the model has no number skips the cycle too, as NON_FINITE.
-    So does a time that cannot follow the last one, as BAD_TIME (`fpirhc.simulation.clock`). A memory that is not finite is
-    forgotten, and so is one with which good samples give nothing finite: the controller begins anew, with the status RESTARTED.
-    Where a solver raises, the cycle is skipped with the status SOLVER_FAILED; `why_failed` has its words. Commands at a limit for
-    long and an iteration that does not contract have the statuses SATURATED and NOT_CONTRACTING.
+    is the last one, the status is BAD_SAMPLE, and the signal 'skipped' counts. What is remembered stays as it was, but for what
+    goes on with the time: queues, filters and observers. The next good sample moves estimators and queues over the gap, with the
+    status BRIDGED. After more than `bridged` cycles they begin anew, and deformations are held until their windows are full, with
+    the status SETTLING. Cycles that the caller missed, by the times of two steps, are gaps too. Before the first good sample the
+    command is the one before the run. A sample for which the model has no number skips the cycle too, as NON_FINITE. So does a time
+    that cannot follow the last one, as BAD_TIME (`fpirhc.simulation.clock`). A memory that is not finite is forgotten, and so is
+    one with which good samples give nothing finite: the controller begins anew, with the status RESTARTED. Where a solver raises,
+    the cycle is skipped with the status SOLVER_FAILED; `why_failed` has its words. Commands at a limit for long and an iteration
+    that does not contract have the statuses SATURATED and NOT_CONTRACTING.
 
     A step that takes longer than `Stepper(..., deadline=1e-3)` is late: `stepper.deadline` has the number of late steps, whether
     the last one was late, the worst one, and the 99.9th percentile, and so has the stepper's text.
@@ -81,6 +89,7 @@ class Stepper(Checked):
         live: Sequence[str] = (),
         deadline: float | None = None,
         clock: Clock = perf_counter,
+        bridged: int = BRIDGED,
     ) -> None:
         """Compose the controller's Function, and compile it where `compiled` is set and there is a compiler.
 
@@ -96,6 +105,7 @@ class Stepper(Checked):
             live: paths of the live settings.
             deadline: longest time of a step, s; longer ones are counted, see `deadline`. None: no step is timed.
             clock: function that returns the time for that, s.
+            bridged: number of missing cycles up to which estimators and queues are moved over a gap.
 
         Raises:
             InvalidProblem: an unknown name or a wrong interval in `plausible`.
@@ -112,7 +122,7 @@ class Stepper(Checked):
         if bounded:
             refuse_unbounded(ready)
         ranges = plausible_range(problem, plausible)
-        self._composite, self.memory = composed_step(settings, ready, ranges, max_age, watch or Watch())
+        self._composite, self.memory = composed_step(settings, ready, ranges, max_age, watch or Watch(), bridged)
         backend = native(self._composite.function, required=bool(live)) if compiled else None
         self.compiled = bool(backend and backend.compiled)
         self.signals: Layout = self._composite.trace
@@ -133,6 +143,9 @@ class Stepper(Checked):
         self._memory, self._command = arguments.memory, arguments.command
         self._new_command, self._new_memory = arguments.command_next.copy, arguments.memory_next.copy
         self._more = arguments.ages or bool(arguments.beside)
+        self._before, self._period = self.memory.slice(CLOCK.name).start, float(problem.period)
+        self._skipped = self.memory.slice(f"{SKIPPED}_before").start
+        self._late, self._most = 1.5 * self._period, most_missed(problem, bridged)
 
     def __repr__(self) -> str:
         """What it is of, how it runs, and how it keeps its deadline."""
@@ -200,15 +213,8 @@ class Stepper(Checked):
                 self._arguments.refuse_foreign_memory()
             if self._more:
                 self._arguments.take_more(time, taken, output)
-            if self._may_fail:
-                self._command[0] = NOT_WRITTEN
-            try:
-                self._evaluate()
-            except RuntimeError as error:
-                return self._failed(str(error))
-            if self._may_fail and isnan(self._command[0]):
-                return self._failed("the compiled solver failed")
-            return self._new_command(), self._new_memory()
+            failure = self._run()
+            return self._failed(failure) if failure else (self._new_command(), self._new_memory())
         finally:
             self._tokens.append(token)
 
@@ -319,6 +325,30 @@ class Stepper(Checked):
             self.aim(setpoints)
         if isinstance(time, _TRUTHS):
             one_number("time", time)
+
+    def _run(self) -> str:
+        """Evaluate the step, and before it those of missed cycles; return why it failed, empty where it did not."""
+        try:
+            if self._time[0] - self._memory[self._before] > self._late:
+                self._wait(self._time[0], self._memory[self._before])
+            if self._may_fail:
+                self._command[0] = NOT_WRITTEN
+            self._evaluate()
+        except RuntimeError as error:
+            return str(error) or "a solver raised"
+        return _NOT_SOLVED if self._may_fail and isnan(self._command[0]) else ""
+
+    def _wait(self, time: float, before: float) -> None:
+        """Step over the cycles that the caller missed, each without a sample."""
+        missed, sample = missed_cycles(time, before, self._period), self._state[0]
+        for k in range(max(missed - self._most, 0), missed):
+            self._time[0], self._state[0], self._command[0] = before + (k + 1) * self._period, nan, NOT_WRITTEN
+            self._evaluate()
+            if isnan(self._command[0]):
+                raise RuntimeError(_NOT_SOLVED)
+            self._arguments.memory_before[:] = self._arguments.memory_next
+        self._memory[self._skipped] += max(missed - self._most, 0)
+        self._time[0], self._state[0] = time, sample
 
     def _failed(self, why: str) -> tuple[np.ndarray, np.ndarray]:
         """The last command and the memory as it was, after a solver that raised or failed."""

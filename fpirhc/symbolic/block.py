@@ -6,6 +6,9 @@ whose Function maps (memory, reads) to (memory, trace). A `Delay` carries a sign
 an early block reads what a late block (the actuator, say) wrote one cycle earlier. Signals whose name
 begins with '_' are wires between blocks and stay out of the trace.
 
+In a cycle without a sample a step does not run, and its memory stays as it is. A block whose memory is one of the passing time, a
+queue or an observer, says in `waits` what becomes of it then. `bridged` is the block in a step whose samples may be lost.
+
 Live numbers in a step (see `live`) are signals too, named 'setting.PATH'. A block reads them without declaring them, and a
 composite reads those of all its blocks. Numbers that Python computes from settings are signals 'setting.derived.NAME', declared as
 reads by the block that needs them; its `derived` computes them.
@@ -14,7 +17,7 @@ reads by the block that needs them; its `derived` computes them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
 from typing import cast
@@ -23,12 +26,14 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
-from fpirhc.symbolic.expression import Expression, Signals, Value, kind
+from fpirhc.symbolic.expression import Expression, Matrix, Signals, Value, expression, kind
+from fpirhc.symbolic.gap import GAPS
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX as SETTING
 
 Step = Callable[[Signals], Mapping[str, Value]]
 Values = Mapping[str, float]
+_NO_SAMPLE = 1e305  # beyond the finite numbers, and no NaN, which is the mark of a live setting that was lost
 PREFIX = "fpirhc_"  # keeps generated C names away from those of libc
 
 
@@ -64,6 +69,10 @@ class Block:
             the block is then built with MX.
         derived: function of the numbers of all settings, by path, that returns what follows from them; None: nothing does.
         inside: the composed step that the block runs, where it is nothing but the guard of one.
+        waits: block with the same memory that stands for this one in a cycle without a sample. It reads no sample; what it writes,
+            others read that wait. None: the memory stays as it is.
+        bridged: function that returns the block where samples may be lost, which may read the signals of `symbolic.gap`; None: the
+            same one.
     """
 
     name: str
@@ -74,6 +83,8 @@ class Block:
     opaque: bool = False
     derived: Callable[[Values], Derived] | None = None
     inside: Composite | None = None
+    waits: Block | None = None
+    bridged: Callable[[], Block] | None = None
 
     @property
     def function(self) -> ca.Function:
@@ -148,6 +159,7 @@ class Composite:
     memory: Layout
     trace: Layout
     function: ca.Function
+    outputs: tuple[str, ...] = ()
 
     @property
     def settings(self) -> Layout:
@@ -170,6 +182,41 @@ class Composite:
     def opaque(self) -> bool:
         """Whether some block holds operations that scalar expressions cannot."""
         return any(b.opaque for b in self.blocks)
+
+    @property
+    def bridged_if_any(self) -> Callable[[], Composite] | None:
+        """Function that returns the same step where samples may be lost; None where no block differs."""
+        return self._bridged if any(b.bridged is not None for b in self.blocks) else None
+
+    @cached_property
+    def waits(self) -> Block | None:
+        """The step in a cycle without a sample, as a block that writes nothing; None where every memory stays as it is."""
+        waiting = [b.waits for b in self.blocks if b.waits is not None]
+        if not any(b.memory.names for b in waiting):
+            return None
+        held = {*self.memory.names, *(w for b in waiting for w in b.writes.names)}
+        inputs = {s.name: s for b in waiting for s in b.inputs.signals if s.name not in held}
+        reads = Layout(tuple(inputs.values()))
+
+        def step(s: Signals) -> dict[str, Expression]:
+            known = dict(vars(s))
+            following = {m: known[m] for m in self.memory.names}
+            for block in waiting:
+                call(block, known, following)
+            return {f"{m}_next": value for m, value in following.items()}
+
+        opaque = any(b.opaque for b in waiting)
+        return Block(f"{self.name}_waits", reads, Layout(), step, self.memory, opaque=opaque)
+
+    def _bridged(self) -> Composite:
+        blocks = [bridged(b) for b in self.blocks]
+        gaps = (g for g in GAPS if g.name not in self.reads and any(g.name in b.reads for b in blocks))
+        return compose(self.name, self.reads + Layout(tuple(gaps)), blocks, self.delays, self.outputs)
+
+
+def bridged(block: Block) -> Block:
+    """Return the block as it is where samples may be lost."""
+    return block if block.bridged is None else block.bridged()
 
 
 def compose(
@@ -196,7 +243,7 @@ def compose(
     known: dict[str, ca.MX] = {**memory.split(remembered), **inputs}
     next_memory: dict[str, ca.MX] = {}
     for block in blocks:
-        _call(block, known, next_memory)
+        call(block, known, next_memory)
     trace = Layout(tuple(s for b in blocks for s in b.writes.signals if not s.name.startswith("_")))
     for delay in delays:
         next_memory[delay.now.name] = _lookup(f"delay '{delay.now.name}'", delay.now, delay.source, known)
@@ -210,7 +257,7 @@ def compose(
     )
     if not any(b.opaque for b in blocks):
         function = scalar_code(function)
-    return Composite(name, tuple(blocks), tuple(delays), reads, memory, trace, function)
+    return Composite(name, tuple(blocks), tuple(delays), reads, memory, trace, function, tuple(outputs))
 
 
 def scalar_code(function: ca.Function) -> ca.Function:
@@ -220,9 +267,48 @@ def scalar_code(function: ca.Function) -> ca.Function:
     return ca.Function(function.name(), inputs, shared, function.name_in(), function.name_out())
 
 
+def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix]) -> None:
+    """Evaluate a block: what it writes is added to the known signals, what it remembers to the next memory.
+
+    Raises:
+        InvalidName: a signal that it reads is not known, or one that it writes is.
+        InvalidShape: they disagree on a size.
+    """
+    reads = [_lookup(f"block '{block.name}'", s, s.name, known) for s in block.inputs.signals]
+    returned = block.function(*reads, *(known[m] for m in block.memory.names))
+    keys = [key for _, key in block._results()]
+    # A Function returns a tuple of several results, one bare result, and None for none.
+    values = returned if isinstance(returned, tuple) else (returned,) * len(keys)
+    results = cast(dict[str, Matrix], dict(zip(keys, values, strict=True)))
+    for name in block.writes.names:
+        if name in known:
+            raise InvalidName(f"block '{block.name}' writes '{name}', which is already written")
+        known[name] = results[name]
+    next_memory.update({m: results[f"{m}_next"] for m in block.memory.names})
+
+
 def open_settings(blocks: Sequence[Block]) -> Layout:
     """Return the signals of all settings and derived numbers that some blocks read."""
     return _settings(chain.from_iterable(b.inputs.signals for b in blocks))
+
+
+def unseen(block: Block, samples: Sequence[str]) -> Block:
+    """Return the block that runs a step in a cycle without a sample, for a step that passes over samples which are not finite.
+
+    Args:
+        block: whose memory goes on.
+        samples: names of the signals that are missing; it is given a number beyond the finite ones.
+    """
+    missing = {s.name: s.size for s in block.reads.signals if s.name in samples}
+
+    def step(s: Signals) -> dict[str, Expression]:
+        values = block.step(
+            Signals({**vars(s), **{n: expression(ca.DM.ones(k, 1) * _NO_SAMPLE) for n, k in missing.items()}})
+        )
+        return {f"{m}_next": expression(values[f"{m}_next"]) for m in block.memory.names}
+
+    reads = Layout(tuple(s for s in block.reads.signals if s.name not in missing))
+    return replace(block, name=f"{block.name}_waits", reads=reads, writes=Layout(), step=step)
 
 
 def every(block: Block, cycles: int) -> Block:
@@ -290,21 +376,7 @@ def _branches(block: Block, held: Layout) -> tuple[ca.Function, ca.Function]:
     return run, hold
 
 
-def _call(block: Block, known: dict[str, ca.MX], next_memory: dict[str, ca.MX]) -> None:
-    reads = [_lookup(f"block '{block.name}'", s, s.name, known) for s in block.inputs.signals]
-    returned = block.function(*reads, *(known[m] for m in block.memory.names))
-    keys = [key for _, key in block._results()]
-    # A Function returns a tuple of several results, one bare result, and None for none.
-    values = returned if isinstance(returned, tuple) else (returned,) * len(keys)
-    results = dict(zip(keys, values, strict=True))
-    for name in block.writes.names:
-        if name in known:
-            raise InvalidName(f"block '{block.name}' writes '{name}', which is already written")
-        known[name] = results[name]
-    next_memory.update({m: results[f"{m}_next"] for m in block.memory.names})
-
-
-def _lookup(reader: str, signal: Signal, source: str, known: Mapping[str, ca.MX]) -> ca.MX:
+def _lookup(reader: str, signal: Signal, source: str, known: Mapping[str, Matrix]) -> Matrix:
     if source not in known:
         raise InvalidName(f"{reader} reads '{source}', which no earlier block writes.{nearest(source, known)}")
     value = known[source]

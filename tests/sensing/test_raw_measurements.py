@@ -9,6 +9,7 @@ import abroad
 import casadi as ca
 import numpy as np
 import pytest
+from gaps import gone_on
 
 import fpirhc as fp
 from fpirhc.conformance.loops import two_masses
@@ -123,12 +124,22 @@ def test_compiled_step_estimates_alike():
 
 # Bad samples
 
+GO_ON = {"estimate_past", "filter_stages", "filter_inputs", "filter_stages_of_ramp", "filter_inputs_of_ramp", "sent"}
+GO_ON |= {
+    "mirror_state",
+    "mirror_cycles",
+    "mirror_commands",
+    "mirror_deformations",
+}  # of the twin, and its own estimator
+GO_ON |= {"mirror_estimate_past", "mirror_filter_stages", "mirror_filter_inputs", "mirror_estimate_before"}
+GO_ON |= {"mirror_estimate_smooth"}
+
 
 @by_estimator
 @by_name
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_bad_raw_sample_is_a_skipped_tick(number, name, bad):
-    """Filters and queues of samples keep what they had; afterwards the tick seems never to have been."""
+    """Nothing but filters and queues goes on, and afterwards everything is as if the tick had been missed."""
     stepper, run = case(number, name)
     measured, memory = raw_measurements(run), stepper.start()
     for k in range(12):
@@ -138,8 +149,7 @@ def test_bad_raw_sample_is_a_skipped_tick(number, name, bad):
     held, after = stepper.step_measured(float(run.time[12]), wrong, memory)
     assert Status(int(stepper.trace()["status"][0])) == Status.BAD_SAMPLE
     assert np.array_equal(held, command)
-    changed = np.flatnonzero(after != memory)
-    assert [stepper.memory.columns[k] for k in changed] == ["skipped_before"]
+    assert gone_on(stepper, memory, after) <= GO_ON
     for k in range(13, 25):
         with_fault, after = stepper.step_measured(float(run.time[k]), measured[k], after)
         without, memory = stepper.step_measured(float(run.time[k]), measured[k], memory)

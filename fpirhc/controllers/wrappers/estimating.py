@@ -23,6 +23,7 @@ from fpirhc.learning.estimators.base import Estimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, is_finite
+from fpirhc.symbolic.gap import GAP
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.problem import Problem
@@ -134,7 +135,13 @@ class Estimating(Controller):
 
 
 def _estimate_block(
-    pairs: ResponsePairs, modelled: Problem, estimator: Estimator, believed: Signal, acted: Signal
+    pairs: ResponsePairs,
+    modelled: Problem,
+    estimator: Estimator,
+    believed: Signal,
+    acted: Signal,
+    *,
+    lost: bool = False,
 ) -> Block:
     """Block (state, realised, parameters, command of the last cycle) -> (corrected parameters, the learned ones among them)."""
     plant, model = pairs.problem.plant, modelled.plant
@@ -147,6 +154,7 @@ def _estimate_block(
     own = memory + Layout((like(estimate, "estimate_change"), scalar("estimate_begun"), *pairs.memory))
 
     def step(s: Signals) -> dict[str, Value]:
+        s = pairs.moved(s) if lost else s
         parameters = ca.vertcat(s.parameters[:count], ca.DM(model.approximate[count:]))
         before = {m: getattr(s, m) for m in memory.names}
         state, command, waiting = pairs.pair(s, s._acted)
@@ -173,8 +181,39 @@ def _estimate_block(
 
     outputs = (pairs.seen,) if pairs.outputs else ()
     reads = Layout((pairs.state, *outputs, plant.response_signal("realised"), plant.parameter, acted))
-    block = Block("estimate", reads, Layout((believed, estimate)), step, own, opaque=True)
+    writes = Layout((believed, estimate))
+    if lost:
+        waits = _waiting(pairs, modelled, estimator, believed, acted, own)
+        reads = reads + Layout((GAP,)) if pairs.gaps else reads
+        block = Block("estimate", reads, writes, step, own, opaque=True, waits=waits)
+    else:
+        lossy = lambda: _estimate_block(pairs, modelled, estimator, believed, acted, lost=True)  # noqa: E731
+        block = Block("estimate", reads, writes, step, own, opaque=True, bridged=lossy)
     return block if followed is None else replace(block, reads=reads + followed.reads, derived=followed.derived)
+
+
+def _waiting(
+    pairs: ResponsePairs, modelled: Problem, estimator: Estimator, believed: Signal, acted: Signal, own: Layout
+) -> Block:
+    """Block of a cycle without a sample: (parameters, command of the last cycle) -> corrected parameters."""
+    model, count = modelled.plant, len(pairs.problem.plant.parameters)
+    places = [model.parameter.elements.index(n) for n in estimator.learned()]
+    wait, names = estimator.waiting(modelled), estimator.memory(modelled).names
+
+    def step(s: Signals) -> dict[str, Value]:
+        parameters = ca.vertcat(s.parameters[:count], ca.DM(model.approximate[count:]))
+        command, waiting = pairs.waited(s, getattr(s, acted.name))
+        before = {m: getattr(s, m) for m in names}
+        later = before if wait is None else wait(command, parameters, before)
+        begun = s.estimate_begun > pairs.cycles - 0.5
+        values = parameters + 0
+        values[places] += s.estimate_change
+        stays = {f"{m}_next": getattr(s, m) for m in own.names}
+        remembered = {f"{m}_next": ca.if_else(begun, later[m], before[m]) for m in names}
+        return {believed.name: values, **stays, **remembered, **waiting}
+
+    reads = Layout((pairs.problem.plant.parameter, acted))
+    return Block("estimate_waits", reads, Layout((believed,)), step, own, opaque=True)
 
 
 def examples(inner: Controller) -> tuple[Controller, ...]:

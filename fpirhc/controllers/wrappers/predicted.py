@@ -357,7 +357,13 @@ def _predict_block(problem: Problem, by: Predictor, lead: _Lead, before: Signal,
             memory_next["output_ahead"] = outputs_ahead(s.output, s.state, state, s.parameters, time)
         return {"time_ahead": s.time + lead.time, "state_ahead": state, **memory_next}
 
-    return Block("predict", Layout(reads), Layout(writes), step, Layout(own), opaque=True)
+    def wait(s: Signals) -> dict[str, Expression]:
+        """The value that is held was sent once more."""
+        later: dict[str, Expression] = {"sent_next": ca.vertcat(s._sent_before, s.sent[: size * cycles])}
+        return {**later, "residual_next": s.residual} if corrected else later
+
+    waits = Block("predict_waits", Layout((before,)), Layout(), wait, Layout(own))
+    return Block("predict", Layout(reads), Layout(writes), step, Layout(own), opaque=True, waits=waits)
 
 
 def _residual(plant: Plant, time: float, period: float) -> ca.Function:

@@ -63,6 +63,12 @@ def estimated(
     }
 
 
+def estimate_held(request: Expression, memory: Mapping[str, Expression]) -> dict[str, Expression]:
+    """Return what changes in a cycle whose request was held and whose response is not known: the past requests."""
+    past = ca.vertcat(request - memory["delay_mean_request"], memory["delay_past"])
+    return {"delay_past": past[: memory["delay_past"].numel()]}
+
+
 def _peak(weights: Expression, most: int) -> tuple[Expression, Expression]:
     """Place of the largest weight by size, and the sum of squares within one cycle of it."""
     sizes: list[Expression] = [w * w for w in ca.vertsplit(weights)]

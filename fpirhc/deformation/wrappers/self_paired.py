@@ -20,7 +20,7 @@ import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Pairing
 from fpirhc.deformation.wrappers.base import Wrapper, of_map
-from fpirhc.deformation.wrappers.delay_estimate import SIGNALS, estimate_memory, estimated
+from fpirhc.deformation.wrappers.delay_estimate import SIGNALS, estimate_held, estimate_memory, estimated
 from fpirhc.errors import InvalidValue
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
@@ -57,6 +57,10 @@ class DelayWatched(Wrapper):
     def shown(self) -> Mapping[str, str]:
         """The estimate, its confidence, and the signals of the map."""
         return {**SIGNALS, **self.map.shown()}
+
+    def held(self, request: Expression, memory: Mapping[str, Expression]) -> dict[str, Expression]:
+        """Return the past requests of the estimate with the held one once more."""
+        return {**estimate_held(request, memory), **self.map.held(request, memory)}
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
@@ -124,6 +128,16 @@ class SelfPaired(Wrapper):
         pair = {"pair_requests": requests, "pair_cycles": cycles, "pair_filled": filled}
         pair |= {"pair_stood": stood, "pair_candidate": candidate}
         return ca.if_else(valid, next_request, desired), {**pair, **estimate, **remembered}
+
+    def held(self, request: Expression, memory: Mapping[str, Expression]) -> dict[str, Expression]:
+        """Return the queues with the held request once more."""
+        requests: Expression = ca.vertcat(request, memory["pair_requests"])
+        return {
+            "pair_requests": requests[: request.numel() * (self.most + 1)],
+            "pair_filled": ca.fmin(memory["pair_filled"] + 1, self.most + 1),
+            **estimate_held(request, memory),
+            **self.map.held(request, memory),
+        }
 
     def _adopted(
         self, estimate: Mapping[str, Expression], memory: Mapping[str, Expression]

@@ -30,7 +30,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes, NotSupported
 from fpirhc.fields.kinds import Deviation
-from fpirhc.learning.estimators.base import Correct, Estimator, Seen
+from fpirhc.learning.estimators.base import Correct, Estimator, Seen, Wait
 from fpirhc.learning.estimators.disturbed import disturbance_name, disturbed
 from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Plant
@@ -196,6 +196,22 @@ class DisturbanceKalman(Estimator):
             return disturbance, {"observed_state": state, "observed_disturbance": disturbance}
 
         return correct
+
+    def waiting(self, problem: Problem) -> Wait:
+        """Prediction by the model alone; the disturbances stay."""
+        model = problem.plant
+        advance, no_forcing = RungeKutta4().step(model, problem.period), ca.DM.zeros(len(model.names))
+        places = [model.parameter.elements.index(n) for n in self.learned()]
+
+        def wait(
+            command: Expression, parameters: Expression, memory: Mapping[str, Expression]
+        ) -> dict[str, Expression]:
+            disturbed_parameters = parameters + 0
+            disturbed_parameters[places] += memory["observed_disturbance"]
+            later = advance(memory["observed_state"], command, disturbed_parameters, no_forcing)
+            return {**memory, "observed_state": later}
+
+        return wait
 
     def _responses(self, plant: Plant) -> tuple[str, ...]:
         """Names of the measured responses."""

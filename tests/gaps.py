@@ -1,0 +1,24 @@
+"""What a cycle without a sample does to the memory of a stepper."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import fpirhc as fp
+from fpirhc.simulation.clock import MEMORY as CLOCK
+
+COUNTS = {"missing_cycles", "skipped_before", CLOCK.name}  # in every stepper
+
+
+def gone_on(stepper: fp.Stepper, before: np.ndarray, after: np.ndarray) -> set[str]:
+    """Names of the signals of a memory that a cycle without a sample changed, beside its counts."""
+    changed = {s.name for s in stepper.memory.signals if np.any((after != before)[stepper.memory.slice(s.name)])}
+    assert changed >= COUNTS, changed
+    return changed - COUNTS - {"jumps"}
+
+
+def later(stepper: fp.Stepper, memory: np.ndarray, time: float) -> np.ndarray:
+    """The memory of a controller that knows nothing of the cycles until this time."""
+    result = memory.copy()
+    result[stepper.memory.slice(CLOCK.name)] = time, time, 0.0
+    return result
