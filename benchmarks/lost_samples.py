@@ -1,6 +1,6 @@
 """How far lost samples take the command from the run without faults.
 
-    python benchmarks/lost_samples.py            prints a table; --write puts it into docs/reliability.md
+    python benchmarks/lost_samples.py            prints a table
 
 A stepper in a loop with the plant loses 1, 5, 20 or 50 samples at three instants. The figure is the largest deviation of the
 command from that of the run without faults, in units of the command, over the gap and all later cycles, and the largest of the
@@ -23,7 +23,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from lossy import Lossy
 from table import write_table
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "reliability.md"
 GAPS = (1, 5, 20, 50)
 INSTANTS = (300, 600, 1000)  # cycles
 AFTER = 150
@@ -68,7 +67,7 @@ def main() -> None:
     """Measure and print."""
     rows = [row(name, own) for name, own in loops().items()]
     heads = ("loop", "normal movement", *(f"{g} lost" for g in GAPS), *(f"{g} interpolated" for g in GAPS))
-    write_table("lost samples", heads, rows, PAGE)
+    write_table("lost samples", heads, rows)
 
 
 if __name__ == "__main__":

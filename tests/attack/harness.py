@@ -42,6 +42,7 @@ class Outcome:
         outside: number of commands that were not finite or outside the limits.
         frozen: whether the controller still skipped its cycles, or held its command, at the end of the run.
         differs: for a single bad sample, whether something differs from the tick left out.
+        deviation: largest deviation of the command from the run without faults, in normal movements of the command per cycle.
         statuses: that occurred.
     """
 
@@ -49,6 +50,7 @@ class Outcome:
     outside: int = 0
     frozen: bool = False
     differs: bool = False
+    deviation: float = 0.0
     statuses: set[Status] = field(default_factory=set)
 
     @property
@@ -77,6 +79,9 @@ class Bench:
         self._calm = np.zeros(len(plant.names))
         self.lost = False  # whether the plant itself left its domain, such as a tank below its bottom
         self.clean = self._run(None)[0]
+        moves = np.abs(np.diff(self.clean, axis=0))
+        # An input that rests has the movement of the others, or of one part in a million of its size.
+        self.movement = np.maximum(np.median(moves, axis=0), 1e-6 * np.abs(self.clean).max() + 1e-12)
 
     def outcome(self, fault: Fault) -> Outcome:
         """Run the loop with the fault and judge it."""
@@ -93,6 +98,7 @@ class Bench:
         lower, upper = self.limits
         result.outside = int((~np.isfinite(commands) | (commands < lower) | (commands > upper)).any(axis=1).sum())
         result.statuses = set(statuses)
+        result.deviation = float((np.abs(commands - self.clean) / self.movement).max())
         late = range(CYCLES - LATE, CYCLES)
         # A command at a limit stays there for good reason; one that is held between its limits does not move again.
         still = bool((np.ptp(commands[-LATE:], axis=0) == 0).all()) and bool(

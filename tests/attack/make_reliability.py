@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import statistics
 import sys
 import tempfile
 import warnings
@@ -29,6 +30,7 @@ def loop() -> str:
     from attack.harness import PROBLEMS, Bench, shipped
 
     tried, raw, outside, frozen, differs = (Counter[str]() for _ in range(5))
+    away: dict[str, list[float]] = {fault.name: [] for fault in FAULTS}
     wrong, controllers, lost = [], 0, 0
     for label, problem, controller in shipped():
         bench, controllers = Bench(problem, controller), controllers + 1
@@ -40,22 +42,26 @@ def loop() -> str:
             frozen[fault.name] += outcome.frozen
             differs[fault.name] += outcome.differs
             lost += bench.lost
+            away[fault.name].append(outcome.deviation)
             if outcome.wrong:
                 wrong.append(f"{label}, {fault.name}: {outcome.wrong}")
         print(label, flush=True)
     counters = (tried, raw, outside, frozen, differs)
     rows = [["attack", "tried", "raw errors", "commands not finite or outside limits", "controllers frozen"]]
-    rows[0].append("not equal to the tick left out")
+    rows[0] += ["not equal to the tick left out", "deviation, median", "deviation, worst tenth"]
     for fault in FAULTS:
         rows.append([fault.name, *(str(c[fault.name]) for c in counters[:4])])
         rows[-1].append(str(differs[fault.name]) if fault.single else "–")
-    rows.append(["**all**", *(f"**{sum(c.values())}**" for c in counters)])
+        rows[-1] += [f"{q:.2g}" for q in statistics.quantiles(away[fault.name], n=10)[4::4]]
+    rows.append(["**all**", *(f"**{sum(c.values())}**" for c in counters), "", ""])
     return f"""{_table(rows)}
 
 {controllers} shipped controllers of {len(PROBLEMS)} problems, each through a `Stepper`, for 80 cycles and the faults of
 `tests/attack/faults.py`. A controller is frozen when it still skips every cycle, or does not move its command, long
 after the fault has ended. A single bad sample must give the same commands, bit for bit, as the tick left out. After
 {lost} faults the simulated plant itself has left its domain (a tank below its bottom); these are not judged for freezing.
+The deviation is that of the command from the run without faults, in normal movements of the command per cycle: the median of the
+controllers, and what one in ten exceeds.
 
 {_what_went(wrong)}"""
 
