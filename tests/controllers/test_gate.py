@@ -170,9 +170,7 @@ def test_a_memory_that_is_not_finite_is_forgotten(opaque):
             gated.memory[name] = np.full_like(gated.memory[name], bad)
             own = name in gated.gate.controller_memory.names
             command, status = gated(1.0)
-            assert status == (
-                Status.RESTARTED if own or (name == "not_finite" and bad == np.inf) else Status.NOT_CONVERGED
-            )
+            assert status == (Status.RESTARTED if own else Status.NOT_CONVERGED)  # a count that cannot be is none
             assert command == ([8.0, 0.0] if status == Status.RESTARTED else [9.5, -3.0])
             assert all(np.isfinite(v).all() for v in gated.memory.values()), name
     gated = Gated(opaque)
@@ -307,4 +305,4 @@ def test_a_step_without_a_status_passes_too():
 def test_cycles_that_were_skipped(status):
     """Those of a bad sample, of a bad time, and of a step that was not finite."""
     bad = status in {Status.BAD_SAMPLE, Status.BAD_TIME, Status.NON_FINITE}
-    assert bool(was_skipped(ca.DM(int(status)))) == bad
+    assert bool(ca.evalf(was_skipped(ca.SX(int(status))))) == bad
