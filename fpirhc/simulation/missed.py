@@ -11,6 +11,8 @@ from fpirhc.simulation.clock import LONGEST
 from fpirhc.symbolic.finite import FINITE
 from fpirhc.task.problem import Problem
 
+_STEPS = 500
+
 
 def missed_cycles(time: float, before: float, period: float) -> int:
     """Return how many cycles lie between two steps; 0 where the later one is the next cycle, or cannot follow the other.
@@ -25,7 +27,9 @@ def missed_cycles(time: float, before: float, period: float) -> int:
 
 
 def most_missed(problem: Problem, bridged: int) -> int:
-    """Return the number of missed cycles beyond which a further one changes nothing.
+    """Return the number of missed cycles that are stepped over, so that the time of a step has a bound.
+
+    Beyond it estimators begin anew, and queues hold nothing but the held command; an observer is predicted no further.
 
     Args:
         problem: of the step.
@@ -33,4 +37,4 @@ def most_missed(problem: Problem, bridged: int) -> int:
     """
     late = problem.dead_time
     longest = max((*late.inputs.values(), *late.longest.values()), default=0.0)
-    return bridged + 1 + math.ceil((longest + late.measurement) / problem.period)
+    return max(_STEPS, bridged + 1) + math.ceil((longest + late.measurement) / problem.period)
