@@ -45,7 +45,7 @@ def adaptive():
 
 
 def test_columns_of_a_report(adaptive):
-    """Errors, settling, effort, clipping, cost, contraction, solves: from what users ask first to what explains it."""
+    """Errors, settling, effort, movement, limits, cost, contraction, solves: from what users ask first to what explains it."""
     task, result = adaptive
     solve = np.column_stack([np.arange(CYCLES)] * 5)
     made = run(0.0, cost=(Signal("cost", ("states",)), 1.0), solve=(Signal("solve", SOLVE), solve))
@@ -55,14 +55,15 @@ def test_columns_of_a_report(adaptive):
         "max error y [m]",
         "settled y [s]",
         "rms u [N]",
-        "clipped",
+        "moves u [N/s]",
+        "at limit",
         "cost",
         "contraction predicted",
         "contraction measured",
         "iterations",
         "worst residual",
     ]
-    assert [c.short for c in columns(metrics, headline=True)] == ["rms y [m]", "clipped", "factor"]
+    assert [c.short for c in columns(metrics, headline=True)] == ["rms y [m]", "moves u [N/s]", "at limit", "factor"]
 
 
 def test_order_of_a_file():
@@ -94,7 +95,7 @@ def test_which_numbers_a_finished_run_must_have():
 
 def test_smallest_steps():
     """A share counts cycles, a settling time counts periods; a factor below 1e-4 is rounding."""
-    share, settling = (BY_NAME[name].step for name in ("clipped_share", "settling"))
+    share, settling = (BY_NAME[name].step for name in ("at_limit", "settling"))
     assert share is not None
     assert settling is not None
     assert (share(0.5, 200), settling(0.5, 200)) == (0.005, 0.5)
@@ -108,7 +109,7 @@ def test_numbers_as_texts():
     assert residual(0.00123) == "1e-03"
     assert BY_NAME["solve.median_iterations"].text is BY_NAME["solve.worst_iterations"].text is iterations
     assert BY_NAME["solve.median_stationarity"].text is residual
-    assert BY_NAME["clipped_share"].text(0.125) == "12.5 %"
+    assert BY_NAME["at_limit"].text(0.125) == "12.5 %"
 
 
 # The ends of definitions
@@ -118,7 +119,7 @@ def test_a_run_that_ended_at_once_has_no_numbers():
     """Without a cycle nothing is known but the end."""
     solve = (Signal("solve", SOLVE), np.ones((CYCLES, 5)))
     metrics = fp.measure(problem(), cut(run(1.0, stop="signal 'x' is not finite", solve=solve), 0))
-    assert np.isnan([metrics.clipped_share, metrics.settling["y"], metrics.effort["u"], metrics.rms_error["y"]]).all()
+    assert np.isnan([metrics.at_limit, metrics.settling["y"], metrics.effort["u"], metrics.rms_error["y"]]).all()
     assert metrics.solve == {}
     assert metrics.statuses == {"NON_FINITE": 1}
     assert metrics["cycles"] == {"": 0}

@@ -52,9 +52,27 @@ def test_settling_takes_the_first_error_where_the_reference_rests():
     assert fp.measure(problem(), run(0.01)).settling["y"] == 0.0
 
 
-def test_clipped_share_is_of_the_whole_run():
-    """Clipped in the first ten of a hundred cycles, before the measured part begins."""
-    assert fp.measure(problem(), run(0.0, clipped=step(1.0, 0.0, 10))).clipped_share == pytest.approx(0.1)
+def test_at_limit_is_where_a_command_stands_and_of_the_measured_part():
+    """At 2 N, clipped or planned there, for 20 of the 50 measured cycles; what came before does not count."""
+    limited = problem(limits=fp.Limits(inputs={"u": (-1.0, 2.0)}))
+
+    def share(after: float, given: fp.Problem = limited) -> float:
+        return fp.measure(given, run(0.0, command=step(2.0, after, 70))).at_limit
+
+    assert share(0.0) == pytest.approx(0.4)
+    assert share(-1.0) == share(2.0 - 2e-9) == 1.0
+    assert share(2.0 - 4e-9) == pytest.approx(0.4)  # 1e-9 of the range of 3 N is at the limit
+    assert share(2.0, problem()) == 0.0  # nothing limits it
+    assert share(0.0, problem(limits=fp.Limits(inputs={"u": (0.0, float("inf"))}))) == pytest.approx(0.6)
+
+
+def test_total_variation_is_movement_per_second():
+    """2 N up and 2 N down in turn, every 0.1 s, from t = 5 s on: 20 N/s. The movement before does not count."""
+    command = np.where(np.arange(CYCLES) < 50, 100.0 * np.arange(CYCLES), np.arange(CYCLES) % 2 * 2.0)
+    metrics = fp.measure(problem(), run(0.0, command=command))
+    assert metrics.total_variation["u"] == pytest.approx(20.0)
+    assert metrics.units["total_variation"]["u"] == "N/s"
+    assert fp.measure(problem(), run(0.0, command=3.0)).total_variation["u"] == 0.0
 
 
 def test_effort_is_of_the_measured_part():
@@ -169,7 +187,7 @@ def test_a_metric_is_one_value():
     metrics = fp.measure(problem(), run(np.linspace(1.0, -0.25, CYCLES)), with_own_metrics([OVERSHOOT]))
     assert metrics["overshoot"] == {"y": 0.25}
     headings = [c.heading for c in columns([metrics], headline=True)]
-    assert headings == ["rms error y [m]", "overshoot y [m]", "clipped"]
+    assert headings == ["rms error y [m]", "overshoot y [m]", "moves u [N/s]", "at limit"]
     assert metrics.text("overshoot", "y") == "0.25"
     with pytest.raises(InvalidName, match="Did you mean 'overshoot'"):
         metrics["overshot"]

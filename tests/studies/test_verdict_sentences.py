@@ -209,6 +209,29 @@ def test_an_error_beyond_the_range_of_the_reference_is_a_failure_of_both():
     assert first(plain, entry("FPI", "RHC", errors={"y": 1.9}), ranges={"y": 2.0}).outcome is Outcome.BETTER
 
 
+def moving(before: float, after: float) -> Finding:
+    """The verdict on half the error, with these movements of the command."""
+    facts = [{"total_variation": {"u": v}, "effort": {"u": 1.0}} for v in (before, after)]
+    return first(entry("RHC", measured=facts[0]), entry("FPI", "RHC", errors={"y": 0.5}, measured=facts[1]))
+
+
+def test_movement_of_the_command_is_stated_and_chatter_is_a_reason():
+    """Twice as much is stated, ten times as much makes a smaller error doubtful; rounding is no movement."""
+    lower = "FPI lowers the rms error of y from 1 to 0.5 m (2 times less)."
+    assert moving(0.15, 0.29) == first(entry("RHC"), entry("FPI", "RHC", errors={"y": 0.5}))
+    three = moving(0.15, 0.45)
+    assert three.outcome is Outcome.BETTER
+    assert three.text == f"{lower} Its command moves 3 times as much as that of RHC (u 0.45 against 0.15)."
+    chatter = moving(0.15, 12.0)
+    assert chatter.outcome is Outcome.DOUBTFUL
+    assert chatter.text == (
+        "Its command moves 80 times as much as that of RHC (u 12 against 0.15): it chatters, or carries the noise. "
+        + lower
+    )
+    assert "moves and not that of RHC (u 0.2 against 0)" in moving(0.0, 0.2).text
+    assert moving(0.0, 1e-10).text == lower
+
+
 def test_reasons_stand_before_a_positive_verdict():
     """Plans that did not converge and commands at their limits make it doubtful."""
     unsolved = {"status": {"NOT_CONVERGED": 0.42 * CYCLES}}
@@ -326,14 +349,14 @@ def test_plans_that_did_not_converge_are_a_cause_from_a_twentieth_of_the_cycles_
         " Its plans did not converge in 42 % of the cycles (those of RHC in 34 %), so this is not the optimum of its cost: give "
         "the optimiser more iterations, then compare."
     )
-    swinging = {"status": {"NOT_CONVERGED": 0.41 * CYCLES}, "clipped_share": {"": 0.4}}
+    swinging = {"status": {"NOT_CONVERGED": 0.41 * CYCLES}, "at_limit": {"": 0.4}}
     assert no_difference(measured=swinging).startswith(" Its command stands at a limit in 40 % of the cycles")
 
 
 def test_commands_at_their_limits_are_a_cause_from_a_fifth_of_the_cycles_on():
     def with_limits(share: float, before: float = 0.0) -> str:
-        plain = entry("RHC", measured={"clipped_share": {"": before}})
-        return no_difference(plain=plain, measured={"clipped_share": {"": share}})
+        plain = entry("RHC", measured={"at_limit": {"": before}})
+        return no_difference(plain=plain, measured={"at_limit": {"": share}})
 
     assert with_limits(0.19) == ""
     head = " Its command stands at a limit in 90 % of the cycles (that of RHC in "

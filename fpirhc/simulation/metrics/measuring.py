@@ -20,7 +20,7 @@ from fpirhc.task.problem import Problem
 class Metrics:
     """The metrics of one run.
 
-        metrics["overshoot"]["q1"], metrics["clipped_share"][""], metrics.rms_error["q1"]
+        metrics["overshoot"]["q1"], metrics["at_limit"][""], metrics.rms_error["q1"]
 
     Args:
         values: numbers by metric and element; a single number has the element ''. Metrics that the run does not have are left out.
@@ -75,9 +75,14 @@ class Metrics:
         return self["effort"]
 
     @property
-    def clipped_share(self) -> float:
-        """Share of the cycles with a clipped command."""
-        return self["clipped_share"][""]
+    def total_variation(self) -> Mapping[str, float]:
+        """Movement of the command per unit of time, by input."""
+        return self["total_variation"]
+
+    @property
+    def at_limit(self) -> float:
+        """Share of the cycles with a command at a limit."""
+        return self["at_limit"][""]
 
     @property
     def cost(self) -> Mapping[str, float]:

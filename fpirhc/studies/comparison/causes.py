@@ -1,17 +1,20 @@
 """Known reasons why adaptation does not help in a run, in sentences.
 
 They are the response Jacobian's eigenvalues, a step limit below the slew of the desired response, a cost that weighs absolute
-effort, plans that did not converge, and commands that stand at their limits. The last two are facts of the runs, where the share of
-the cycles is no start or single event.
+effort, plans that did not converge, commands that stand at their limits, and commands that move far more than those of the pair.
+The last three are facts of the runs, where the share of the cycles is no start or single event.
 """
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fpirhc.plant.units import with_space
 from fpirhc.status import Status
+from fpirhc.studies.comparison.changes import times
 from fpirhc.summary import in_percent
 
 if TYPE_CHECKING:
@@ -19,6 +22,9 @@ if TYPE_CHECKING:
 
 MANY_CYCLES = 3  # of a run from which the slew of its desired response is judged
 _MANY_PLANS = 0.05  # share of the cycles from which plans that did not converge are a reason
+_MORE = 2.0  # times the pair's movement of the command, from which it is stated
+_CHATTER = 10.0  # times, from which it is a reason
+_STILL = 1e-9  # of the rms command per unit of time: what moves less stands still
 _OFTEN = 0.2  # share of the cycles from which commands at their limits are a reason
 
 
@@ -30,6 +36,7 @@ def causes(plain: Entry, adaptive: Entry) -> str:
         _effort_cause(adaptive),
         plan_cause(plain, adaptive),
         limit_cause(plain, adaptive),
+        chatter_cause(plain, adaptive),
     )
     return "".join(f" {sentence}" for sentence in sentences if sentence)
 
@@ -68,9 +75,7 @@ def _effort_cause(entry: Entry) -> str:
 def plan_cause(plain: Entry, adaptive: Entry) -> str:
     """Return a sentence where plans that did not converge are a reason; else nothing."""
     before, after = (_share(e, "status", Status.NOT_CONVERGED.name) / max(1, e.run.cycles) for e in (plain, adaptive))
-    swings = (
-        before < 0.5 * after and _share(adaptive, "clipped_share", "") >= _OFTEN
-    )  # plans of a run that swings are hard
+    swings = before < 0.5 * after and _share(adaptive, "at_limit", "") >= _OFTEN  # plans of a run that swings are hard
     if after < _MANY_PLANS or swings:
         return ""
     return (
@@ -81,13 +86,50 @@ def plan_cause(plain: Entry, adaptive: Entry) -> str:
 
 def limit_cause(plain: Entry, adaptive: Entry) -> str:
     """Return a sentence where commands at their limits are a reason; else nothing."""
-    before, after = (_share(e, "clipped_share", "") for e in (plain, adaptive))
+    before, after = (_share(e, "at_limit", "") for e in (plain, adaptive))
     if after < _OFTEN:
         return ""
     fact = f"Its command stands at a limit in {in_percent(after)} of the cycles (that of {plain.name} in {in_percent(before)})"
     if before >= _OFTEN:
         return f"{fact}, where no adaptation can act: widen the limits, or slow the reference down."
     return f"{fact}, where no adaptation can act: it asks for too much, or oscillates; the command in the report shows which."
+
+
+def chatter_cause(plain: Entry, adaptive: Entry) -> str:
+    """Return a sentence where the command moves far more than that of the pair; else nothing."""
+    more = _movement(plain, adaptive)
+    return (
+        f"{more}: it chatters, or carries the noise." if more and _times_moved(plain, adaptive)[0] >= _CHATTER else ""
+    )
+
+
+def movement(plain: Entry, adaptive: Entry) -> str:
+    """Return a sentence on how much more the command moves, where it is more and no chatter; else nothing."""
+    more = _movement(plain, adaptive)
+    return f"{more}." if more and _times_moved(plain, adaptive)[0] < _CHATTER else ""
+
+
+def _movement(plain: Entry, adaptive: Entry) -> str:
+    ratio, name = _times_moved(plain, adaptive)
+    if ratio < _MORE:
+        return ""
+    before, after = (entry.metrics.values["total_variation"][name] for entry in (plain, adaptive))
+    unit = with_space(adaptive.metrics.units.get("total_variation", {}).get(name, "1"))
+    much = f"{times(ratio)} as much as" if math.isfinite(ratio) else "and not"
+    return f"Its command moves {much} that of {plain.name} ({name} {after:.3g} against {before:.3g}{unit})"
+
+
+def _times_moved(plain: Entry, adaptive: Entry) -> tuple[float, str]:
+    """How many times as much the command of an input moves, and the name of the input where this is the most."""
+    before, after = (entry.metrics.values.get("total_variation", {}) for entry in (plain, adaptive))
+    still = {n: _STILL * adaptive.metrics.values.get("effort", {}).get(n, 0.0) for n in after}
+    ratios = {
+        n: after[n] / before[n] if before[n] > still[n] else math.inf
+        for n in after
+        if n in before and after[n] > still[n]
+    }
+    name = max(ratios, key=lambda n: ratios[n], default="")
+    return ratios.get(name, 0.0), name
 
 
 def _share(entry: Entry, metric: str, by: str) -> float:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from fpirhc.plant.units import with_space
-from fpirhc.studies.comparison.causes import limit_cause, plan_cause
+from fpirhc.studies.comparison.causes import chatter_cause, limit_cause, plan_cause
 
 if TYPE_CHECKING:
     from fpirhc.studies.comparison.compare import Entry
@@ -54,6 +54,7 @@ def caveats(plain: Entry, adaptive: Entry, names: list[str], yardstick: Yardstic
         left_alone_is_better(plain, adaptive, names, yardstick),
         plan_cause(plain, adaptive),
         limit_cause(plain, adaptive),
+        chatter_cause(plain, adaptive),
     )
     return " ".join(sentence for sentence in sentences if sentence)
 

@@ -21,14 +21,18 @@ import numpy as np
 
 from fpirhc.plant.units import with_space
 from fpirhc.simulation.common_columns import judged_motion
+from fpirhc.simulation.metrics.entries.commands import at_limit
 from fpirhc.simulation.metrics.window import by_name
+from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.studies.comparison.changes import ROUNDING, Change, major, outcome_of
 from fpirhc.studies.comparison.outcome import Outcome
+from fpirhc.summary import in_percent
 from fpirhc.task.outside import as_told
 from fpirhc.task.problem import Problem
 
 CYCLES = 2000  # measured cycles of a run at most
+_MOSTLY = 0.5  # share of the cycles at a limit from which nothing is shown
 _LARGER = (Outcome.WORSE, Outcome.MIXED)
 
 
@@ -90,7 +94,14 @@ def null_test(
     if problem.reality is not None or problem.signals:  # the loops of the comparison have the real plant and signals
         without, adapting = (simulator(own, one.controller, compiled=one.compiled) for one in loops)
         loops = without, adapting
-    before, after = (_errors(loop, null, seed) for loop in loops)
+    runs = tuple(loop.run(seed=seed, variant=null, disturbed=False) for loop in loops)
+    before, after = (_errors(run, null) for run in runs)
+    stuck = {n: at_limit(null, run) for n, run in zip(names, runs, strict=True)}
+    if max(stuck.values()) >= _MOSTLY:
+        text = _not_informative(stuck)
+        return NullTest(
+            names, before, after, Outcome.NOT_COMPARABLE, False, text, null.cycles, time.perf_counter() - begin
+        )
     changes = {n: Change(n, before[n], after[n], scales.get(n, 1.0)) for n in before if weighed is None or n in weighed}
     outcome = _outcome(changes)
     harmful = _harmful(outcome, changes, cured)
@@ -105,9 +116,13 @@ def _null_problem(problem: Problem) -> Problem:
     )
 
 
-def _errors(loop: Simulator, null: Problem, seed: int) -> dict[str, float]:
+def _not_informative(stuck: Mapping[str, float]) -> str:
+    names = ", ".join(f"that of {name} in {in_percent(share)}" for name, share in stuck.items())
+    return f"Null test: not informative, the command stands at a limit in most cycles ({names}), where no adaptation can act."
+
+
+def _errors(run: Run, null: Problem) -> dict[str, float]:
     """Rms error of the plant's own state, or outputs, over the measured cycles."""
-    run = loop.run(seed=seed, variant=null, disturbed=False)
     states = run[judged_motion(run.layout)]
     names = null.judged_names
     measured = run.time >= null.measure_from - 0.5 * null.period

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from fpirhc.plant.units import with_space
-from fpirhc.studies.comparison.causes import causes
+from fpirhc.studies.comparison.causes import causes, movement
 from fpirhc.studies.comparison.caveats import Yardstick, caveats, left_alone_is_better, not_followed
 from fpirhc.studies.comparison.changes import Change, major, outcome_of, times
 from fpirhc.studies.comparison.other_rows import remarks
@@ -78,7 +78,8 @@ def judge(plain: Entry, adaptive: Entry, yardstick: Yardstick) -> Finding:
     if outcome is not Outcome.BETTER:
         worse = left_alone_is_better(plain, adaptive, list(counted), yardstick)
         return Finding(text + (f" {worse}" if worse else "") + causes(plain, adaptive), outcome, pair, ratios)
-    against = caveats(plain, adaptive, list(counted), yardstick)
+    against, moves = caveats(plain, adaptive, list(counted), yardstick), movement(plain, adaptive)
+    text += f" {moves}" if moves else ""
     return Finding(f"{against} {text}" if against else text, Outcome.DOUBTFUL if against else outcome, pair, ratios)
 
 

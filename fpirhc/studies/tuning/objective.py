@@ -69,7 +69,7 @@ class Objective:
 
 
 def objective(name: str | None, metrics: Sequence[Metric]) -> Objective:
-    """Return the objective by the name of a number: None for the relative error, else 'clipped_share' or 'overshoot.q1'.
+    """Return the objective by the name of a number: None for the relative error, else 'at_limit' or 'overshoot.q1'.
 
     Raises:
         InvalidName: an unknown metric.

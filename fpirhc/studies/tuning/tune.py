@@ -135,7 +135,7 @@ def tune(
         controllers: names of controllers; None: all that the task's tuning has.
         count: number of scenarios in a trial.
         percent: range of the exact parameters' draws, percent.
-        metric: number that is the cost, for example 'settling.q1' or 'clipped_share'; the cost has the opposite sign
+        metric: number that is the cost, for example 'settling.q1' or 'at_limit'; the cost has the opposite sign
             where larger is better. None: the relative error.
         compiled: whether runs use compiled C. None: where all settings of the search can be live, so that one compiled loop
             serves all trials; other settings are other C code, and compiling pays only where runs last longer than the compiler.
