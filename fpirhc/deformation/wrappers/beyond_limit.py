@@ -9,8 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from fpirhc.deformation.affine import Affine
-from fpirhc.deformation.sigmoid import Sigmoid
+from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.wrappers.base import Wrapper
 from fpirhc.symbolic.layout import Expression, Layout
 
@@ -41,5 +40,6 @@ class BeyondLimit(Wrapper):
         return self.map.step(request, response, desired, memory)
 
 
-EXAMPLES = (BeyondLimit(Sigmoid(gain=-1.5, shift=0.0, scale=20.0)), BeyondLimit(Affine(gain=-1.2)))
-"""Values on which the laws of maps are tried."""
+def examples(inner: Deformation) -> tuple[Deformation, ...]:
+    """Values for the laws, around any map."""
+    return (BeyondLimit(inner),)
