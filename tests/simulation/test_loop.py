@@ -119,7 +119,7 @@ def test_anti_windup_settles_where_windup_would_not():
 
 def test_over_gained_iteration_stays_bounded():
     """Beyond the sector bound eq (6) ends in a bounded oscillation, not in an explosion."""
-    result = run(line(1.0, 1.0, duration=1.0), fp.Sigmoid(gain=-6.0, scale=1.0))
+    result = run(line(1.0, 1.0, duration=1.0), fp.BeyondLimit(fp.Sigmoid(gain=-6.0, scale=1.0)))
     assert result.stop is None
     late = np.diff(result["deformed.y"][-50:])
     assert 0.01 < np.abs(late).max() <= 2 * fp.Sigmoid(gain=-6.0, scale=1.0).largest_step()

@@ -106,7 +106,14 @@ class Metric(Checked):
         Raises:
             InvalidValue: the function did not return numbers, or not in the form that `by` announces.
         """
-        result = self.function(problem, run)
+        return self.numbers(self.function(problem, run))
+
+    def numbers(self, result: object) -> dict[str, float]:
+        """Return a result of the function as numbers by element; see `values`.
+
+        Raises:
+            InvalidValue: no numbers, or not in the form that `by` announces.
+        """
         if result is None:
             return {}
         if isinstance(result, Mapping) != (self.by is not None):

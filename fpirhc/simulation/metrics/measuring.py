@@ -134,7 +134,7 @@ def measure(problem: Problem, run: Run, metrics: Sequence[Metric] | None = None)
     """
     entries = known_metrics() if metrics is None else metrics
     broken: list[str] = []
-    measured = {m.name: attempted(f"metric '{m.name}'", m.values, problem, run, broken=broken) for m in entries}
-    values = {name: numbers for name, numbers in measured.items() if numbers}
+    results = {m: attempted(f"metric '{m.name}'", m.function, problem, run, broken=broken) for m in entries}
+    values = {m.name: numbers for m, result in results.items() if (numbers := m.numbers(result))}
     units = {m.name: {e: m.unit_of(problem, e) for e in values[m.name]} for m in entries if m.name in values}
     return Metrics(values, units, {m.name: m for m in entries}, tuple(broken))
