@@ -29,6 +29,11 @@ typedef struct {
 static const casadi_real scale[NU] = SCALE;
 #endif
 
+/* The middle of the limits of an input; 0 without one of them. */
+INLINE casadi_real middle(casadi_real low, casadi_real high) {
+  return fabs(low) <= FINITE && fabs(high) <= FINITE ? 0.5 * (low + high) : 0;
+}
+
 /* Roll out the next plan, with its cost and gradient; 0 when something is not finite. The partial derivatives stay, for the
    Jacobians of a plan that is accepted. */
 INLINE int try_next(Search* s, const Plan* best, Plan* plan, In s0, In data, In lower, In upper) {
@@ -314,7 +319,7 @@ INLINE int run(const casadi_real** arg, casadi_real** res) {
   }
   if (res[2]) {
     if (posed && evaluated) remember(&s, best, res[2]);
-    else for (i = 0; i < MEMORY; ++i) res[2][i] = posed ? 0 : memory[i];
+    else for (i = 0; i < MEMORY; ++i) res[2][i] = !posed ? memory[i] : i < N * NU ? middle(lower[i % NU], upper[i % NU]) : 0;
   }
   return 0;
 }

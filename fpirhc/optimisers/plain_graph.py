@@ -10,7 +10,7 @@ from fpirhc.optimisers.base import clip, sane, stationarity, status_of
 from fpirhc.optimisers.plain_settings import MOST_PLAIN, PlainSettings, plain_memory
 from fpirhc.optimisers.search import Search, first_gamma
 from fpirhc.status import Status
-from fpirhc.symbolic.expression import is_finite
+from fpirhc.symbolic.expression import FINITE, is_finite
 
 
 def plain_graph(ocp: OptimalControl, settings: PlainSettings, name: str) -> ca.Function:
@@ -113,5 +113,14 @@ def _results(
         }
     )
     # A remembered plan under which a well-posed problem overflows is given up, so that the next call can succeed.
-    next_memory = ca.if_else(finite, solved, ca.if_else(posed, ca.MX.zeros(solved.shape), memory))
+    next_memory = ca.if_else(finite, solved, ca.if_else(posed, _afresh(ocp, arguments), memory))
     return [anchor.inputs, ca.vertcat(numbers, 0, iterations, status), next_memory]
+
+
+def _afresh(ocp: OptimalControl, arguments: Arguments) -> ca.MX:
+    """The memory of a plan in the middle of the limits: without any input a plant may run empty."""
+    lower, upper = arguments.lower, arguments.upper
+    both = ca.logic_and(ca.fabs(lower) <= FINITE, ca.fabs(upper) <= FINITE)
+    middle = ca.if_else(both, 0.5 * (lower + upper), 0)
+    rest = plain_memory(ocp).size - ocp.stages * ocp.input.size
+    return ca.vertcat(ca.repmat(middle, ocp.stages, 1), ca.MX.zeros(rest))

@@ -372,6 +372,34 @@ def test_overflowing_models_are_told_and_survived():
     assert int(diagnostics.ravel()[4]) == fp.Status.OK
 
 
+@pytest.mark.parametrize("compiled", [False, True], ids=["virtual machine", "C"])
+def test_a_plan_is_begun_anew_where_no_input_leaves_the_model(compiled):
+    """Y' = u - 2 sqrt(y) from 0.2 m: without inflow the plan is empty in 0.45 s, and no number comes back from there.
+
+    A remembered plan without inflow is NON_FINITE once; the next call begins in the middle of the limits and is solved.
+    """
+    plant = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "m/s"},
+        order=1,
+        response=lambda q, u, p: {"y": p.gain * u.u - 2 * ca.sqrt(q.y)},
+        parameters={"gain": fp.Parameter(1.0, 1.0, "1")},
+    )
+    reference = fp.Trajectory(lambda t: {"y": 0.3 + 0 * t})
+    cost, horizon = fp.Quadratic(states={"y": 1.0}, effort={"u": 0.01}), fp.Horizon(stages=20, step=0.05)
+    ocp = transcribe(plant, reference, horizon, cost, fp.Limits(inputs={"u": (0.0, 3.0)}))
+    data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate).full()
+    optimiser = fp.FixedPoint(iterations=20, tolerance=1e-6)
+    step = optimiser.step(ocp)
+    step = native(step).function if compiled else step
+    memory, statuses = np.zeros(optimiser.memory(ocp).size), []
+    for _ in range(3):
+        _, diagnostics, memory = step(np.array([0.2]), data, ocp.input_lower, ocp.input_upper, memory)
+        statuses.append(fp.Status(int(diagnostics.full().ravel()[4])))
+    assert statuses[0] == fp.Status.NON_FINITE
+    assert statuses[-1] == fp.Status.OK
+
+
 def test_feedback_keeps_unstable_plants_together():
     """An unstable plant over a long horizon, warm-started from a disturbed state: without the remembered feedback it overflows."""
     plant = fp.Plant(
