@@ -331,11 +331,11 @@ def test_an_error_inside_is_one_line_with_a_code_of_its_own(tmp_path, monkeypatc
     assert "Traceback" in capsys.readouterr().err
 
 
-def compared_with_own_metric(code: str) -> ExitCode:
+def compared_with_own_metric(code: str) -> int:
     """The exit code of a comparison whose file has a metric with this body."""
     metric = f'metrics = (fp.Metric("mine", lambda problem, run: {code}),)\n'
     Path("mine.py").write_text(SOURCE + metric, encoding="utf-8")
-    return ExitCode(main(["compare", "mine.py", "--no-compile", "--controllers", "CTC"]))
+    return main(["compare", "mine.py", "--no-compile", "--controllers", "CTC"])
 
 
 def test_a_files_own_metric_that_breaks_leaves_the_rest_alone(tmp_path, monkeypatch, capsys):
