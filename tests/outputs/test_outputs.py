@@ -540,7 +540,8 @@ def test_the_linear_loop_of_an_output_is_that_of_the_plant_whose_coordinate_it_i
 
 @pytest.mark.parametrize(("gain", "verdict"), [(-1.5, "yes"), (-6.0, "no")])
 def test_the_verdict_on_an_output_is_what_a_run_does(gain: float, verdict: str) -> None:
-    problem, controller = sedated(hill(5.5)), fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Affine(gain))
+    problem = sedated(hill(5.5))
+    controller = fp.ComputedTorque(fp.Exponential(rate=1.0), fp.BeyondLimit(fp.Affine(gain)))
     answers = {a.question: a for a in fp.review(problem, {"one": controller}, mismatch=0.0, seed=0).controllers["one"]}
     assert str(answers["Does the deformation converge?"].verdict) == verdict
     chatter = np.ptp(np.diff(simulated(problem, controller)["command.u"][600:]))

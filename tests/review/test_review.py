@@ -33,7 +33,9 @@ def predicted(seeds: range) -> tuple[int, int, int]:
     counts = {"right": 0, "wrong": 0, "unknown": 0}
     for seed in seeds:
         case = random_case(seed)
-        verdict = predict(case.problem, case.controller).verdict
+        with pytest.MonkeyPatch.context() as patch:  # a gain beyond its limit, refused otherwise, has a verdict too
+            patch.setattr(contract, "check_gain_size", lambda *_: None)
+            verdict = predict(case.problem, case.controller).verdict
         if verdict == "unknown":
             counts["unknown"] += 1
         else:

@@ -51,7 +51,7 @@ def answer(problem: fp.Problem, controller: Controller, words: str) -> fp.Answer
         (-32.9, LAW, "yes", "stable: while the reference is followed they decay at 32.9 1/s"),
         (309.0, LAW, "no", "unstable: while the reference is followed they grow at up to 309 1/s"),
         (-32.9, PLAN, "yes", "stable: while the reference is followed they decay at 32.9 1/s"),
-        (309.0, PLAN, "no", "unstable: while the reference is followed they grow at up to 309 1/s"),
+        (19.0, PLAN, "no", "unstable: while the reference is followed they grow at up to 19 1/s"),
         (0.0, LAW, "yes", "they neither grow nor decay"),
         (0.0, PLAN, "yes", "they neither grow nor decay"),
     ],
@@ -63,7 +63,7 @@ def test_zero_dynamics_have_a_rate_and_a_sign(rate, controller, verdict, begin):
     assert one.numbers["rate"] == pytest.approx(rate, abs=1e-9)
 
 
-@pytest.mark.parametrize("rate", [309.0, -32.9])
+@pytest.mark.parametrize("rate", [19.0, -32.9])
 def test_a_plan_without_a_linear_loop_has_the_sign_too(rate):
     """A plan that is restarted and tracked has no linear loop: stable is yes, unstable is unknown with its rate."""
     tracked = replace(PLAN, replanning=fp.FromMeasurementTracked(fp.Exponential(rate=2.0)))

@@ -107,7 +107,7 @@ def test_processes_may_compile_at_once(cache):
     """Eight compilations of four models in four processes: every process gets its own model's numbers."""
     factors = [1.5, 2.5, 3.5, 4.5] * 2
     with multiprocessing.get_context("spawn").Pool(4) as pool:
-        results = pool.map(_work, [(f, str(cache)) for f in factors], chunksize=1)
+        results = pool.map(_work, [(f, str(cache.parent)) for f in factors], chunksize=1)
     for factor, (compiled, values) in zip(factors, results, strict=True):
         assert compiled
         assert values == pytest.approx((factor * np.sin(np.ones(3)) + 1).tolist(), rel=1e-15)
