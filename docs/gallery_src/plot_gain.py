@@ -24,7 +24,9 @@ errors = []
 for gain in gains:
     run = fp.simulate(
         task.problem,
-        fp.ComputedTorque(tracking, fp.Sigmoid(gain=gain, shift=0.3, scale=1.0)),
+        fp.ComputedTorque(
+            tracking, fp.BeyondLimit(fp.Sigmoid(gain=gain, shift=0.3, scale=1.0))
+        ),
         seed=0,
     )
     settled = slice(3000, None)

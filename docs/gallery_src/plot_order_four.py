@@ -35,7 +35,8 @@ for name in ("CTC", "CTC+FPI", "RHC", "RHC+FPI", "RHC offset-free"):
 figure, axis = plt.subplots(figsize=(8, 3), layout="constrained")
 for gain in (3e-7, 5e-7, 6.4e-7, 1e-6):
     law = fp.ComputedTorque(
-        fp.Exponential(rate=3.0), fp.RFPT(offset=1e6, sign=-1.0, gain=gain)
+        fp.Exponential(rate=3.0),
+        fp.BeyondLimit(fp.RFPT(offset=1e6, sign=-1.0, gain=gain)),
     )
     run = fp.simulate(replace(problem, duration=0.1, measure_from=0.0), law, seed=0)
     error = np.abs(run["realised.q"][1:] - run["desired.q"][:-1])

@@ -16,7 +16,7 @@ Task: x = 50 mm sin 2 t, which reverses twice in pi s; the error counts from 4 s
     CTC 1.79    CTC+FPI 0.0047    RHC 1.23    RHC+FPI 0.0069    offset-free 0.025    exact model 0.015
 
 The exact model's bristles move at 1 000 per second: a stage of 10 ms in one explicit step is unstable, the exact model's plan
-diverges (40 mm), and `fpirhc review` says so. The stages below have 8 sub-steps each, which cures it. Every state is told to
+has no digits, and is refused. The stages below have 8 sub-steps each, which cures it. Every state is told to
 the controllers; the deflection z, which nobody can measure, serves the exact model alone: without it the filter is as good.
 
 `fpirhc tune stick_slip --trials 20 --seeds 2 --mismatch 10`, relative errors: CTC+FPI from 1.4e-4 to 2.2e-5 (gain 1.2e-4),
