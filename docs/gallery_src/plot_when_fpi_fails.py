@@ -66,9 +66,7 @@ except fp.FpirhcError as reason:
 # Beyond the limit the loop chatters, bounded by the saturation of the map. `fpirhc
 # review` says so beforehand.
 
-large = fp.ComputedTorque(
-    tracking, fp.BeyondLimit(fp.Sigmoid(gain=-4.0, scale=5.0))
-)
+large = fp.ComputedTorque(tracking, fp.BeyondLimit(fp.Sigmoid(gain=-4.0, scale=5.0)))
 [answer] = [
     a
     for a in fp.review(problem, {"large": large}, mismatch=0.0, seed=0).answers
