@@ -1,6 +1,6 @@
 """How far lost samples take the command from the run without faults.
 
-    python benchmarks/lost_samples.py            prints a table
+    python benchmarks/lost_samples.py            prints a table; --write puts it into docs/performance.md
 
 A stepper in a loop with the plant loses 1, 5, 20 or 50 samples at three instants. The figure is the largest deviation of the
 command from that of the run without faults, in units of the command, over the gap and all later cycles, and the largest of the
