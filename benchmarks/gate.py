@@ -18,11 +18,11 @@ from unittest.mock import patch
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.controllers.gate import Gate
+from fpirhc.controllers.gate import HELD, Gate
 from fpirhc.simulation.simulate import simulator
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Layout
+from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from in_turns import Work, compared, loop_time
@@ -39,8 +39,9 @@ class Open(Gate):
 
     @property
     def memory(self) -> Layout:
-        """The controller's memory alone."""
-        return self.controller_memory
+        """The controller's memory, and the last command, which the check of jumps in front of a gate reads."""
+        plant = self.problem.plant
+        return Layout((Signal(HELD, plant.input.elements, plant.input.units),)) + self.controller_memory
 
     def block(self) -> Block:
         """The controller's step as one block."""
@@ -51,9 +52,9 @@ class Open(Gate):
             sample = [getattr(s, r) for r in self.inner.reads.names]
             memory_next, shown, command = self.inner.function(memory, *sample)
             following = {f"{m}_next": v for m, v in own.split(memory_next).items()}
-            return {**trace.split(shown), "command": command, **following}
+            return {**trace.split(shown), "command": command, **following, f"{HELD}_next": command}
 
-        return Block("open", self.reads, trace, step, own, opaque=self.inner.opaque, inside=self.inner)
+        return Block("open", self.reads, trace, step, self.memory, opaque=self.inner.opaque, inside=self.inner)
 
 
 def cycles(name: str) -> Work:
