@@ -60,8 +60,8 @@ def loop() -> str:
 `tests/attack/faults.py`. A controller is frozen when it still skips every cycle, or does not move its command, long
 after the fault has ended. A single bad sample must give the same commands, bit for bit, as the tick left out. After
 {lost} faults the simulated plant itself has left its domain (a tank below its bottom); these are not judged for freezing.
-The deviation is that of the command from the run without faults, in normal movements of the command per cycle: the median of the
-controllers, and what one in ten exceeds.
+The deviation is that of the command from the run without faults, in normal movements of the command per cycle (the larger of their
+median and their mean in that run): the median of the controllers, and what one in ten exceeds.
 
 {_what_went(wrong)}"""
 
