@@ -106,18 +106,19 @@ class StepArguments:
         if self.beside:
             self.output[:] = numbers_of("output", output, self.beside)
 
-    def hold(self, layout: Layout, signals: Layout) -> np.ndarray:
+    def hold(self, layout: Layout, signals: Layout, missing: int) -> np.ndarray:
         """Return the memory of a skipped cycle, and write status, command and count of it into the trace.
 
         Args:
             layout: of the memory.
             signals: of the trace.
+            missing: number of cycles that the next step will count as skipped; 0: this cycle is counted now.
         """
         memory = np.where(np.isfinite(self.memory_before), self.memory_before, layout.start())
         self.trace[signals.slice("status")] = int(Status.SOLVER_FAILED)
         self.trace[signals.slice("command")] = memory[layout.slice(HELD)]
-        memory[layout.slice(f"{SKIPPED}_before")] += 1
-        self.trace[signals.slice(SKIPPED)] = memory[layout.slice(f"{SKIPPED}_before")]
+        memory[layout.slice(f"{SKIPPED}_before")] += not missing
+        self.trace[signals.slice(SKIPPED)] = memory[layout.slice(f"{SKIPPED}_before")] + missing
         return memory
 
     def refuse_foreign_memory(self) -> None:

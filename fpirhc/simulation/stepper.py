@@ -341,19 +341,25 @@ class Stepper(Checked):
     def _wait(self, time: float, before: float) -> None:
         """Step over the cycles that the caller missed, each without a sample."""
         missed, sample = missed_cycles(time, before, self._period), self._state[0]
-        for k in range(max(missed - self._most, 0), missed):
-            self._time[0], self._state[0], self._command[0] = before + (k + 1) * self._period, nan, NOT_WRITTEN
-            self._evaluate()
-            if isnan(self._command[0]):
-                raise RuntimeError(_NOT_SOLVED)
-            self._arguments.memory_before[:] = self._arguments.memory_next
-        self._memory[self._skipped] += max(missed - self._most, 0)
-        self._time[0], self._state[0] = time, sample
+        try:
+            for k in range(max(missed - self._most, 0), missed):
+                self._time[0], self._state[0], self._command[0] = before + (k + 1) * self._period, nan, NOT_WRITTEN
+                self._evaluate()
+                if isnan(self._command[0]):
+                    raise RuntimeError(_NOT_SOLVED)
+                self._arguments.memory_before[:] = self._arguments.memory_next
+            self._memory[self._skipped] += max(missed - self._most, 0)
+        finally:
+            self._time[0], self._state[0] = time, sample
 
     def _failed(self, why: str) -> tuple[np.ndarray, np.ndarray]:
-        """The last command and the memory as it was, after a solver that raised or failed."""
+        """The last command and the memory as it was, after a solver that raised or failed.
+
+        The next step finds the times of this cycle and of those before it that failed missing, steps over them, and counts them.
+        """
         self.why_failed = why
-        memory = self._arguments.hold(self.memory, self.signals)
+        missing = missed_cycles(self._time[0] + self._period, self._memory[self._before], self._period)
+        memory = self._arguments.hold(self.memory, self.signals, missing)
         return memory[self.memory.slice(HELD)].copy(), memory
 
 

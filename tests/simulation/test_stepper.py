@@ -322,7 +322,7 @@ def test_one_stepper_per_thread():
 
 
 def test_solver_that_raises_is_a_skipped_tick():
-    """The last command, the memory as it was, a status, and the solver's words."""
+    """The last command, the memory as it was, a status, and the solver's words; it is counted once, here and by the next step."""
     stepper, run = case("plan")
     command, memory = stepper.step(*sample(run, 0), stepper.start())
     evaluate = stepper._evaluate
@@ -338,8 +338,37 @@ def test_solver_that_raises_is_a_skipped_tick():
     assert np.array_equal(held, command)
     assert status(stepper) == Status.SOLVER_FAILED
     assert stepper.why_failed == "OSQP failed"
-    assert [stepper.memory.columns[k] for k in np.flatnonzero(after != memory)] == ["skipped_before"]
-    assert np.array_equal(stepper.step(*sample(run, 2), after)[0], stepper.step(*sample(run, 2), memory)[0])
+    assert np.array_equal(after, memory)
+    assert stepper.trace()["skipped"] == 1
+    stepper.step(*sample(run, 2), after)
+    assert status(stepper) == Status.BRIDGED
+    assert stepper.trace()["skipped"] == 1
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_every_cycle_that_a_solver_fails_is_counted_once(first):
+    """At the start of a run, where no time is known yet, and within it; in a row and after a step."""
+    stepper, run = case("plan")
+    memory, at = stepper.start(), 0
+    if not first:
+        _, memory = stepper.step(*sample(run, 0), memory)
+        at = 1
+    evaluate, solving = stepper._evaluate, "ffsfsssffs"
+
+    def broken() -> object:
+        if np.isnan(stepper._state[0]):  # a cycle that is stepped over has no sample, and needs no solver
+            return evaluate()
+        raise RuntimeError("OSQP failed")
+
+    counts = []
+    try:
+        for k, how in enumerate(solving):
+            stepper._evaluate = broken if how == "f" else evaluate
+            _, memory = stepper.step(*sample(run, at + k), memory)
+            counts.append(int(stepper.trace()["skipped"][0]))
+    finally:
+        stepper._evaluate = evaluate
+    assert counts == [solving[: k + 1].count("f") for k in range(len(solving))]
 
 
 def test_failure_of_compiled_code_is_noticed():

@@ -137,8 +137,7 @@ def test_a_solver_that_fails_holds_the_command():
     np.testing.assert_array_equal(held, command)
     assert status(one) == Status.SOLVER_FAILED
     assert one.why_failed == "no convergence"
-    changed = [one.memory.columns[k] for k in np.flatnonzero(after != memory)]
-    assert changed == ["skipped_before"]
+    np.testing.assert_array_equal(after, memory)
     one._may_fail, one._evaluate = True, lambda: None
     held, _ = one.step(0.02, *SAMPLE[1:], after)
     np.testing.assert_array_equal(held, command)
