@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from fpirhc.review.answer import Answer, Verdict
@@ -16,8 +18,7 @@ def commands_inside(grid: ReviewGrid) -> Answer:
     lower, upper = grid.problem.limits.input_bounds(plant)
     # Inner states begin at the problem's start, and not where the reference would have led them before.
     commands = grid.commands[:, 1:] if grid.inner else grid.commands
-    ranges = [f"{i} {low:.3g} to {high:.3g}" for i, low, high in zip(plant.inputs, *_range(commands[0]), strict=True)]
-    text = "needed: " + ", ".join(ranges)
+    text = "needed: " + _named_ranges(plant.inputs, commands[0])
     used = _used(commands, lower, upper)
     if not np.isfinite(used).any():
         return Answer(QUESTION, Verdict.UNKNOWN, "no finite command is known", "See whether the problem is well posed.")
@@ -26,10 +27,17 @@ def commands_inside(grid: ReviewGrid) -> Answer:
     if not np.isfinite(np.concatenate([lower, upper])).any():
         return Answer(QUESTION, Verdict.YES, f"{text}; no input has limits", "", numbers)
     text += f"; {100 * own:.3g} % of the limits, {100 * widest:.3g} % over the box"
-    change = f"Slow the reference down, or widen the limits {max(own, widest):.2g} times."
+    held = _named_ranges(plant.inputs, commands, np.nan_to_num(used).max(axis=(0, 1)) > 1)
+    change = f"Slow the reference down or ask for less; limits that are a choice must hold {held}."
     if own > 1:
         return Answer(QUESTION, Verdict.NO, text, change, numbers)
     return Answer(QUESTION, Verdict.UNKNOWN if widest > 1 else Verdict.YES, text, change if widest > 1 else "", numbers)
+
+
+def _named_ranges(names: Iterable[str], commands: np.ndarray, chosen: np.ndarray | None = None) -> str:
+    """The ranges of the inputs in words, or of the chosen ones."""
+    low, high = _range(commands.reshape(-1, commands.shape[-1]))
+    return ", ".join(f"{n} {low[k]:.3g} to {high[k]:.3g}" for k, n in enumerate(names) if chosen is None or chosen[k])
 
 
 def _range(commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ import numpy as np
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.stages import advice, first_place, step_poles
+from fpirhc.review.stages import HORIZON, advice, first_place, step_poles
 
 QUESTION = "Does the discretisation of the horizon follow the plant?"
 
@@ -26,7 +26,7 @@ def stage_follows(grid: ReviewGrid, believed: np.ndarray, question: str) -> Answ
     place = first_place(grid, believed)
     try:
         poles = step_poles(plant, discretisation, h, place)
-        change = "" if poles.follows else f"Use Horizon(discretisation={advice(plant, discretisation, h, place)})."
+        change = "" if poles.follows else advice(HORIZON, plant, discretisation, h, place)
     except (FpirhcError, np.linalg.LinAlgError) as error:
         return Answer(question, Verdict.UNKNOWN, f"the poles are not known: {error}")
     text = f"stage of {h:g} {problem.time_unit}, fastest mode {poles.fastest:.3g} {problem.rate_unit}"

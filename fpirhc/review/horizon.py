@@ -15,6 +15,7 @@ from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.linear import response_slopes
 from fpirhc.review.plan_feedback import PlanGain, longer
 from fpirhc.review.plan_of_outputs import gains_at
+from fpirhc.review.stages import stiff_advice
 from fpirhc.review.state_matrix import state_matrices
 from fpirhc.summary import in_percent
 
@@ -45,7 +46,8 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
     numbers = {"reach": reach, "change": change, "slowest_time_constant": slowest, "growth": grows}
     if grows > 0:
         text += f"; the model under the plan's feedback diverges at {grows:.3g} {problem.rate_unit}"
-        return Answer(QUESTION, Verdict.NO, text, "Lengthen the horizon, or weigh its end (LQRTerminal).", numbers)
+        stiff = stiff_advice(grid, plant.approximate, planned=True)
+        return Answer(QUESTION, Verdict.NO, text, stiff or "Lengthen the horizon, or weigh its end (LQRTerminal).", numbers)
     if change > _SAME:
         return Answer(
             QUESTION, Verdict.UNKNOWN, text, "A longer horizon, or a weight of its end, plans differently.", numbers

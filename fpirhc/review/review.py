@@ -62,7 +62,7 @@ def review(problem: Problem, controllers: Mapping[str, Controller], *, mismatch:
     grid = review_grid(problem, mismatch, seed)
     if controls_order_zero(grid):
         return review_of_order_zero(grid, controllers)
-    first = (well_posed, relative_orders, inverse_exists, commands_inside, horizon_long_enough, discretisation_follows)
+    first = (well_posed, relative_orders, inverse_exists, commands_inside, discretisation_follows, horizon_long_enough)
     general = _answers((*first, *(question.ask for question in known_questions(ProblemQuestion))), grid)
     runs = NominalRuns(grid.problem)
     answers = {name: _of(grid, one, general, runs) for name, one in controllers.items()}

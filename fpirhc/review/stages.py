@@ -80,14 +80,21 @@ def step_poles(plant: Plant, integrator: Integrator, step: float, place: Place) 
     )
 
 
-def advice(plant: Plant, integrator: Integrator, step: float, place: Place) -> str:
-    """Return the integrator that follows the plant: that in use or the usual one with few sub-steps, else an implicit one."""
+HORIZON, CYCLE = "Horizon(discretisation={})", "Problem(integrator={})"
+
+
+def advice(setting: str, plant: Plant, integrator: Integrator, step: float, place: Place) -> str:
+    """Return in a sentence the integrator that follows the plant: that in use with few sub-steps, the usual one, or an implicit one.
+
+    `setting` is where it is set, such as `HORIZON`.
+    """
+    implicit = setting.format("RadauIIA()")
     for method in (integrator, Horizon(stages=1, step=step).discretisation):
         for times in _FINER:
             finer = method.finer(times)
             if finer is not None and step_poles(plant, finer, step, place).follows:
-                return f"{finer!r}, which follows every mode, or RadauIIA() for modes that need not be followed"
-    return f"RadauIIA(): no number of sub-steps up to {_FINER[-1]} times that in use follows it"
+                return f"Use {setting.format(finer)}, which follows every mode, or {implicit} for modes that need not be followed."
+    return f"Use {implicit}; no number of explicit sub-steps up to {_FINER[-1]} times that in use follows every mode."
 
 
 def stiff_advice(grid: ReviewGrid, believed: np.ndarray, *, planned: bool) -> str:
@@ -98,10 +105,10 @@ def stiff_advice(grid: ReviewGrid, believed: np.ndarray, *, planned: bool) -> st
     try:
         place, horizon, cycle = first_place(grid, believed), problem.horizon, problem.integrator
         if planned and horizon is not None and step_poles(plant, horizon.discretisation, horizon.step, place).unstable:
-            cure = advice(plant, horizon.discretisation, horizon.step, place)
-            return f"Its discretisation grows: use Horizon(discretisation={cure})."
+            cure = advice(HORIZON, plant, horizon.discretisation, horizon.step, place)
+            return f"Its discretisation grows. {cure}"
         if not cycle.opaque and step_poles(plant, cycle, problem.period, place).unstable:
-            return f"The integrator of the plant grows: use Problem(integrator={advice(plant, cycle, problem.period, place)})."
+            return f"The integrator of the plant grows. {advice(CYCLE, plant, cycle, problem.period, place)}"
     except (FpirhcError, np.linalg.LinAlgError):
         return ""
     return ""

@@ -99,6 +99,28 @@ def test_a_stiff_discretisation_is_not_the_fault_of_the_rate():
         assert "ower" not in one.change
 
 
+def test_the_discretisation_is_the_cause_before_the_horizon():
+    """A stage that grows by itself makes the plan diverge: no longer horizon is advised, and the cause stands first."""
+    stiff = replace(PROBLEM, integrator=fp.RungeKutta4(8), horizon=replace(HORIZON, discretisation=STIFF))
+    every = answers(stiff, fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3)))
+    names = list(every)
+    long_enough, follows = "Is the horizon long enough?", "Does the discretisation of the horizon follow the plant?"
+    assert names.index(follows) < names.index(long_enough)
+    assert every[long_enough].verdict == Verdict.NO
+    assert every[long_enough].change == f"Its discretisation grows. {every[follows].change}"
+    assert every[follows].change.startswith("Use Horizon(discretisation=RungeKutta4(substeps=")
+
+
+def test_advice_on_a_mode_that_no_sub_step_follows_is_a_sentence():
+    """A mode of 1e4 1/s under a stage of 0.1 s: the implicit method alone."""
+    fast = replace(PLANT, parameters={"rate": fp.Parameter(1e4, 1e4, "1/s")})
+    problem = replace(PROBLEM, plant=fast, integrator=fp.Cvodes(), horizon=replace(HORIZON, discretisation=STIFF))
+    one = answers(problem, fp.ComputedTorque(fp.Exponential(1.0)))
+    assert one["Does the discretisation of the horizon follow the plant?"].change == (
+        "Use Horizon(discretisation=RadauIIA()); no number of explicit sub-steps up to 64 times that in use follows every mode."
+    )
+
+
 def test_a_controller_with_the_exact_model_has_a_discretisation_of_its_own():
     """The model is slow and the plant is fast: the exact model's plan is asked about by itself."""
     slow = replace(PLANT, parameters={"rate": fp.Parameter(4.0, 40.0, "1/s")})

@@ -336,7 +336,8 @@ def test_share_of_the_limits(rows, limits, verdict, own, widest):
     assert one.verdict == verdict
     assert one.numbers == pytest.approx({"share_of_limits": own, "share_over_box": widest})
     assert one.evidence.endswith(f"; {100 * own:.3g} % of the limits, {100 * widest:.3g} % over the box")
-    change = f"Slow the reference down, or widen the limits {widest:.2g} times."
+    held = f"u {np.nanmin(rows):.3g} to {np.nanmax(rows):.3g}"
+    change = f"Slow the reference down or ask for less; limits that are a choice must hold {held}."
     assert one.change == ("" if verdict == "yes" else change)
 
 

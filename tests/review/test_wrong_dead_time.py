@@ -173,6 +173,15 @@ def test_no_question_without_dead_time():
     assert not [q for q in answers if "wrong by a cycle" in q]
 
 
+def test_no_question_about_an_increment_without_dead_time():
+    """Its pairing is with the last request: on a yearly map nobody asks about a dead time of a year."""
+    problem = replace(mass(20), dead_time=fp.DeadTime())
+    answers = asked(problem, fp.ComputedTorque(fp.Exponential(rate=RATE), fp.Increment(MAP, cycles=0)))
+    assert not [q for q in answers if "wrong by a cycle" in q]
+    believed = asked(problem, fp.ComputedTorque(fp.Exponential(rate=RATE), fp.Increment(MAP, cycles=2)))
+    assert [q for q in believed if "wrong by a cycle" in q]
+
+
 def test_scenarios_draw_the_dead_time():
     """With 5 % of 20 cycles the plant has 19, 20 or 21, and the controllers believe in 20: a sharp pairing fails in two thirds."""
     problem = replace(mass(20), duration=1.5, measure_from=0.5)

@@ -37,7 +37,7 @@ def entry(name: str, pair: str | None = None, *, micro: float | None = 5.0, erro
     numbers = {"rms_error": errors or {"y": 1.0}, **changes.get("measured", {})}
     metrics = Metrics(numbers, {}, {m.name: m for m in known_metrics()})
     factor = changes.get("factor")
-    report = SimpleNamespace(predicted=factor, report=SimpleNamespace(text="Lower the gain."))
+    report = SimpleNamespace(predicted=factor, report=SimpleNamespace(text=changes.get("advice", "Lower the gain.")))
     cycle = None if micro is None else CycleTime(micro, micro, micro, micro, micro)
     contraction = cast(Any, None if factor is None else report)
     return Entry(name, made, metrics, cycle, pair is not None, pair, contraction, **changes.get("facts", {}))
@@ -337,6 +337,12 @@ def test_a_cost_of_absolute_effort_is_a_cause():
     assert worse.endswith("2 m (2 times more). Its iteration is no contraction (predicted factor 2): Lower the gain.")
 
 
+def test_a_full_stop_stands_between_causes():
+    """Advice on a gain may come without one."""
+    both = no_difference(factor=2.0, advice="Lower the gain", settings={"weighs_effort": True})
+    assert both == " Its iteration is no contraction (predicted factor 2): Lower the gain." + EFFORT
+
+
 def test_plans_that_did_not_converge_are_a_cause_from_a_twentieth_of_the_cycles_on():
     """On a stirred tank reactor 3 iterations made RHC+FPI 1.8 times worse than RHC, and 40 iterations 8.6 times better."""
 
@@ -364,5 +370,5 @@ def test_commands_at_their_limits_are_a_cause_from_a_fifth_of_the_cycles_on():
         f"{head}1 %), where no adaptation can act: it asks for too much, or oscillates; the command in the report shows which."
     )
     assert with_limits(0.9, 0.5) == (
-        f"{head}50 %), where no adaptation can act: widen the limits, or slow the reference down."
+        f"{head}50 %), where no adaptation can act: slow the reference down or ask for less, or widen limits that are a choice."
     )

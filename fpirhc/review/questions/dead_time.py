@@ -26,8 +26,9 @@ _CHANGE = (
 
 
 def bears_wrong_dead_time(case: Case) -> Answer | None:
-    """Return by how many cycles the dead time may be wrong; None where there is no dead time."""
-    if not is_late(case.problem) and case.controller.deformation.pairing is None:
+    """Return by how many cycles the dead time may be wrong; None where there is none and none is believed."""
+    pairing = case.controller.deformation.pairing
+    if not is_late(case.problem) and (pairing is None or pairing.cycles == 0):
         return None
     if not case.loops.loops:
         return Answer(TEXT, Verdict.UNKNOWN, f"no linear loop: {case.loops.reason}")

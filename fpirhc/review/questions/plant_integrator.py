@@ -8,7 +8,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.question import ProblemQuestion
-from fpirhc.review.stages import Place, advice, step_poles
+from fpirhc.review.stages import CYCLE, Place, advice, step_poles
 
 TEXT = "Does the integrator follow the simulated plant?"
 _POINTS = 5  # of the reference
@@ -35,7 +35,7 @@ def integrator_follows(grid: ReviewGrid) -> Answer | None:
     numbers = {"apart": one.apart, "fastest_mode": one.fastest, "largest_pole": one.largest}
     if one.follows:
         return Answer(TEXT, Verdict.YES, text, "", numbers)
-    change = f"Use Problem(integrator={advice(plant, problem.integrator, problem.period, places[worst])})."
+    change = advice(CYCLE, plant, problem.integrator, problem.period, places[worst])
     return Answer(TEXT, Verdict.NO if one.unstable else Verdict.UNKNOWN, text, change, numbers)
 
 

@@ -44,7 +44,8 @@ def causes(plain: Entry, adaptive: Entry) -> str:
 def _gain_cause(entry: Entry) -> str:
     if entry.contraction is None or entry.contraction.predicted < 1:
         return ""
-    return f"Its iteration is no contraction (predicted factor {entry.contraction.predicted:.3g}): {entry.contraction.report.text}"
+    advice = entry.contraction.report.text.rstrip(".")
+    return f"Its iteration is no contraction (predicted factor {entry.contraction.predicted:.3g}): {advice}."
 
 
 def _slew_cause(plain: Entry, adaptive: Entry) -> str:
@@ -91,7 +92,7 @@ def limit_cause(plain: Entry, adaptive: Entry) -> str:
         return ""
     fact = f"Its command stands at a limit in {in_percent(after)} of the cycles (that of {plain.name} in {in_percent(before)})"
     if before >= _OFTEN:
-        return f"{fact}, where no adaptation can act: widen the limits, or slow the reference down."
+        return f"{fact}, where no adaptation can act: slow the reference down or ask for less, or widen limits that are a choice."
     return f"{fact}, where no adaptation can act: it asks for too much, or oscillates; the command in the report shows which."
 
 
