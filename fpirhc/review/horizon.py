@@ -47,7 +47,9 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
     if grows > 0:
         text += f"; the model under the plan's feedback diverges at {grows:.3g} {problem.rate_unit}"
         stiff = stiff_advice(grid, plant.approximate, planned=True)
-        return Answer(QUESTION, Verdict.NO, text, stiff or "Lengthen the horizon, or weigh its end (LQRTerminal).", numbers)
+        return Answer(
+            QUESTION, Verdict.NO, text, stiff or "Lengthen the horizon, or weigh its end (LQRTerminal).", numbers
+        )
     if change > _SAME:
         return Answer(
             QUESTION, Verdict.UNKNOWN, text, "A longer horizon, or a weight of its end, plans differently.", numbers

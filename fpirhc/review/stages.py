@@ -84,7 +84,7 @@ HORIZON, CYCLE = "Horizon(discretisation={})", "Problem(integrator={})"
 
 
 def advice(setting: str, plant: Plant, integrator: Integrator, step: float, place: Place) -> str:
-    """Return in a sentence the integrator that follows the plant: that in use with few sub-steps, the usual one, or an implicit one.
+    """Return, in a sentence, the integrator that follows the plant: explicit with few sub-steps, else implicit.
 
     `setting` is where it is set, such as `HORIZON`.
     """
