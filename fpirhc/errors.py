@@ -97,7 +97,7 @@ class WorkerDied(FpirhcError, RuntimeError):
 
 def nearest(name: object, valid: Iterable[str]) -> str:
     """Return ' Did you mean ...? Valid: ...', the end of a message about an unknown `name`, which may be no text."""
-    names = [str(one) for one in valid]
+    names = [str(one) or "''" for one in valid]
     if not names:
         return " No names are valid here."
     close = get_close_matches(name, names, n=1, cutoff=0.5) if isinstance(name, str) else []

@@ -12,6 +12,7 @@ from abc import ABCMeta
 from collections.abc import Callable, Iterator
 from functools import cache
 
+from fpirhc.by_name import find_by_name
 from fpirhc.errors import InvalidField
 from fpirhc.fields.arguments import Arguments, arguments_of, read_annotation
 from fpirhc.fields.expected import Expected, Number
@@ -28,11 +29,12 @@ class _CheckedWhenCalled(ABCMeta):
             mistakes = tuple(value.lacks())
         if mistakes:
             raise InvalidField(mistakes, users_place())
+        find_by_name(value)
         return value
 
 
 class Checked(metaclass=_CheckedWhenCalled):
-    """A value whose arguments are checked when it is made.
+    """A value whose arguments are checked when it is made; dictionaries in its fields are found by name.
 
     Raises:
         InvalidField: all wrong arguments together: unknown or missing names, wrong types, numbers out of the range of their kind;

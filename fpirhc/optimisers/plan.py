@@ -9,6 +9,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from fpirhc.by_name import ByName
 from fpirhc.fields.checked_call import checked_call
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
@@ -125,7 +126,7 @@ class Plan:
             row = self.states[k, 1:]
             beyond = np.maximum(row - ocp.state_upper[k], 0) + np.maximum(ocp.state_lower[k] - row, 0)
             prices[ocp.state.elements[k]] = float(ocp.state_price[k] * beyond.sum())
-        return prices
+        return ByName(prices, "Plan.slacks()")
 
     def verify(self) -> tuple[float, float, float]:
         """Return (cost, stationarity, feasibility), recomputed from the problem's own functions."""

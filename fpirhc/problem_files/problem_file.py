@@ -16,6 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import ClassVar
 
+from fpirhc.by_name import FoundByName
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, Mistakes, ProblemFileError
 from fpirhc.fields.checked_call import checked_call
@@ -32,7 +33,7 @@ from fpirhc.task.problem_view import problem_facts
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class Task(FoundByName):
     """A loaded problem file.
 
     Args:
@@ -67,6 +68,7 @@ class Task:
             object.__setattr__(self, "problem", replace(self.problem, name=self.name))
         named = {name: controller.named_in_task(name) for name, controller in self.controllers.items()}
         object.__setattr__(self, "controllers", named)
+        super().__post_init__()
 
     def __repr__(self) -> str:
         return line(self, self.name, self.title, f"{len(self.controllers)} controllers")

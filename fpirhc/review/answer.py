@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from fpirhc.by_name import FoundByName
 from fpirhc.summary import line, table
 
 
@@ -18,7 +19,7 @@ class Verdict(StrEnum):
 
 
 @dataclass(frozen=True)
-class Answer:
+class Answer(FoundByName):
     """The answer to one question.
 
     Args:
@@ -37,7 +38,7 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Review:
+class Review(FoundByName):
     """All answers about a problem and its controllers.
 
     Args:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fpirhc.by_name import ByName
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import NotSupported
@@ -55,15 +56,16 @@ class Prediction:
         names = self.nominal.problem.plant.controlled_names
         with np.errstate(over="ignore", invalid="ignore"):
             squares = np.mean(self._judged(errors) ** 2, axis=0)
-        return dict(zip(names, map(float, np.sqrt(squares)), strict=True))
+        return ByName(zip(names, map(float, np.sqrt(squares)), strict=True), "Prediction.rms(...)")
 
     @property
     def half_width(self) -> Mapping[str, float]:
         """Largest half-width of the tube by state, from `measure_from` on; empty without a tube."""
         if self.tube is None:
-            return {}
+            return ByName({}, "Prediction.half_width")
         widest = self.tube[self._first :].max(axis=0)
-        return dict(zip(self.nominal.problem.plant.state.elements, map(float, widest), strict=True))
+        names = self.nominal.problem.plant.state.elements
+        return ByName(zip(names, map(float, widest), strict=True), "Prediction.half_width")
 
     @property
     def _first(self) -> int:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
+from fpirhc.by_name import FoundByName
 from fpirhc.contraction import filter_pole
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
@@ -36,7 +37,7 @@ _SMALLEST = 1e-6  # of the deadbeat gain
 
 
 @dataclass(frozen=True, eq=False)
-class Suggestion:
+class Suggestion(FoundByName):
     """Gain and pole, and what noise does with them.
 
     Parameters:

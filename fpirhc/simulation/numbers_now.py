@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from fpirhc.by_name import ByName
 from fpirhc.controllers.live_settings import LiveSettings, Numbers
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue
 from fpirhc.fields.named_entries import named_entries
@@ -89,15 +90,14 @@ class NumbersNow:
         """The set-points in force, by coordinate or output; where they are announced, one per node of the horizon."""
         names = self._live.problem.plant.face.names
         rows = self._setpoints.reshape(-1, len(names)).T
-        return {
-            name: row.tolist() if row.size > 1 else float(row[0])
-            for name, row in zip(names, rows, strict=True)
-            if row.size
+        values = {
+            n: row.tolist() if row.size > 1 else float(row[0]) for n, row in zip(names, rows, strict=True) if row.size
         }
+        return ByName(values, "Stepper.setpoints")
 
     def stale(self) -> dict[str, str]:
         """Return what follows from live settings by way of Python, and what becomes of a device that keeps the old number."""
-        return dict(self._composite.derived(self.numbers).stale) if self.numbers else {}
+        return ByName(self._composite.derived(self.numbers).stale if self.numbers else {}, "Stepper.stale()")
 
     def _write(self, numbers: Mapping[str, float]) -> None:
         """Write the settings and what follows from them into the arguments; nothing is written where something is refused."""

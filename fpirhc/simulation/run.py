@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, cast
 
 import numpy as np
 
+from fpirhc.by_name import ByName, FoundByName
 from fpirhc.errors import InvalidName, nearest
 from fpirhc.fields.checked_call import checked_call
 from fpirhc.status import Status
@@ -24,7 +25,7 @@ _FEW = 0.01  # share of the cycles without a converged plan that says nothing ab
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class Run(FoundByName):
     """The log of one closed-loop run.
 
     `run["desired"]` has shape (cycles, entries); `run["desired.q1"]` has shape (cycles,).
@@ -119,7 +120,7 @@ class Run:
     def in_force(self) -> tuple[tuple[float, Mapping[str, float]], ...]:
         """Times from which numbers of live settings were in force, with the numbers by path; empty without live settings."""
         record = cast(Sequence[tuple[float, Mapping[str, float]]], self.settings.get("live", ()))
-        return tuple((float(time), numbers) for time, numbers in record)
+        return tuple((float(time), ByName(numbers, "Run.in_force")) for time, numbers in record)
 
     @property
     def cycles(self) -> int:

@@ -9,6 +9,7 @@ from typing import NoReturn
 
 import numpy as np
 
+from fpirhc.by_name import ByName
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.gap import BRIDGED
@@ -275,7 +276,7 @@ class Stepper(Checked):
     @property
     def numbers(self) -> dict[str, float]:
         """The live settings in force, by path."""
-        return self._now.numbers
+        return ByName(self._now.numbers, "Stepper.numbers")
 
     @property
     def setpoints(self) -> dict[str, float | list[float]]:
@@ -313,7 +314,8 @@ class Stepper(Checked):
         except IndexError:
             _refuse_thread()
         try:
-            return {name: value.copy() for name, value in self.signals.unpack(self._arguments.trace).items()}
+            trace = self.signals.unpack(self._arguments.trace)
+            return ByName({name: value.copy() for name, value in trace.items()}, "Stepper.trace()")
         finally:
             self._tokens.append(token)
 

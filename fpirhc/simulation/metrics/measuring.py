@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from fpirhc.broken import attempted
+from fpirhc.by_name import ByName, FoundByName
 from fpirhc.errors import InvalidName, nearest
 from fpirhc.fields.checked_call import checked_call
 from fpirhc.simulation.metrics.base import Metric
@@ -17,7 +18,7 @@ from fpirhc.task.problem import Problem
 
 
 @dataclass(frozen=True)
-class Metrics:
+class Metrics(FoundByName):
     """The metrics of one run.
 
         metrics["overshoot"]["q1"], metrics["at_limit"][""], metrics.rms_error["q1"]
@@ -36,7 +37,7 @@ class Metrics:
 
     def __getitem__(self, name: str) -> Mapping[str, float]:
         if isinstance(name, str) and name in self.entries:
-            return self.values.get(name, {})
+            return self.values.get(name) or ByName({}, f"Metrics[{name!r}]")
         raise InvalidName(f"metric '{name}' is unknown.{nearest(name, self.entries)}")
 
     def __iter__(self) -> Iterator[tuple[Metric, str, float]]:
@@ -93,12 +94,12 @@ class Metrics:
     def solve(self) -> Mapping[str, float]:
         """Median and worst values of iterations, stationarity and feasibility, and number of plans; empty without an optimiser."""
         group = {n.partition(".")[2]: v[""] for n, v in self.values.items() if n.startswith("solve.")}
-        return {**group, "plans": self["plans"][""]} if group else {}
+        return ByName({**group, "plans": self["plans"][""]} if group else {}, "Metrics.solve")
 
     @property
     def statuses(self) -> Mapping[str, int]:
         """Number of cycles by status, of the statuses that occurred."""
-        return {name: int(count) for name, count in self["status"].items() if count}
+        return ByName({name: int(count) for name, count in self["status"].items() if count}, "Metrics.statuses")
 
     @property
     def worst_status(self) -> str:

@@ -10,6 +10,7 @@ from importlib.metadata import version
 from typing import Any, cast
 
 from fpirhc.broken import attempted
+from fpirhc.by_name import FoundByName
 from fpirhc.contraction import ContractionReport, Spectrum, assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked, resolved
@@ -110,7 +111,7 @@ class Entry:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class Comparison(FoundByName):
     """The result of `compare`.
 
     Args:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from fpirhc.by_name import FoundByName
 from fpirhc.plant.units import with_space
 from fpirhc.simulation.common_columns import judged_motion
 from fpirhc.simulation.metrics.entries.commands import at_limit
@@ -37,7 +38,7 @@ _LARGER = (Outcome.WORSE, Outcome.MIXED)
 
 
 @dataclass(frozen=True)
-class NullTest:
+class NullTest(FoundByName):
     """The result of a null test.
 
     Args:

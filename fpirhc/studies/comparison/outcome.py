@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from fpirhc.by_name import FoundByName
+
 
 class Outcome(StrEnum):
     """The effect of adaptation on one pair of controllers; words and colours of every output follow from it."""
@@ -19,7 +21,7 @@ class Outcome(StrEnum):
 
 
 @dataclass(frozen=True)
-class Finding:
+class Finding(FoundByName):
     """One sentence of a verdict.
 
     Args:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from fpirhc.by_name import FoundByName
 from fpirhc.simulation.metrics import Metric, known_metrics
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.studies.scenarios.bootstrap import ConfidenceInterval, median_interval, middle
@@ -18,7 +19,7 @@ Record = Mapping[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
-class Summary:
+class Summary(FoundByName):
     """One controller over all scenarios; errors are relative (see `score`), infinite for runs that ended early.
 
     Args:

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from fpirhc.by_name import FoundByName
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked_call import checked_call
@@ -31,7 +32,7 @@ Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
-class ScenarioComparison:
+class ScenarioComparison(FoundByName):
     """The result of `compare_scenarios`.
 
     Args:

@@ -21,6 +21,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from fpirhc.by_name import FoundByName
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.checked_call import checked_call
@@ -41,7 +42,7 @@ Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
-class TunedController:
+class TunedController(FoundByName):
     """One controller's settings before and after tuning, with their costs.
 
     Args:

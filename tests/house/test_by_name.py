@@ -1,0 +1,154 @@
+"""Whatever has names as keys and a user reaches: a name that is not there is one clear error with the nearest valid one."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import re
+from collections.abc import Iterator, Mapping
+from copy import deepcopy
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.by_name import ByName
+from fpirhc.errors import InvalidName
+from fpirhc.problem_files.problem_file import load_problem
+
+TASK = load_problem("two_mass")
+SHORT = replace(TASK, problem=replace(TASK.problem, duration=0.05, measure_from=0.0))
+HEADLINE = TASK.headline or ("", "")
+
+
+def mappings(value: Any, path: str, seen: set[int]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Every mapping in public fields of a value of this library, and of the values in them, with its path."""
+    if id(value) in seen:
+        return
+    seen.add(id(value))
+    inner: list[tuple[str, Any]] = []
+    if isinstance(value, Mapping):
+        if all(isinstance(key, str) for key in value):
+            yield path, value
+        inner = [(f"{path}[{key!r}]", content) for key, content in value.items()]
+    elif isinstance(value, tuple):
+        inner = [(f"{path}[{k}]", content) for k, content in enumerate(value)]
+    elif is_dataclass(value) and type(value).__module__.startswith("fpirhc"):
+        names = [f.name for f in fields(value) if not f.name.startswith("_")]
+        inner = [(f"{path}.{name}", getattr(value, name)) for name in names]
+    for where, content in inner:
+        yield from mappings(content, where, seen)
+
+
+def measured() -> Any:
+    """A run and its metrics."""
+    run = fp.simulate(SHORT.problem, SHORT.controllers[HEADLINE[1]], seed=0, compiled=False)
+    found = fp.measure(SHORT.problem, run)
+    return run, found, found.solve, found.statuses, found.cost, found["plans"]
+
+
+def stepped() -> Any:
+    """What a stepper tells, with live settings."""
+    stepper = fp.Stepper(TASK.problem, TASK.controllers[HEADLINE[1]], live=["deformation.gain"], compiled=False)
+    stepper.step_measured(0.0, np.zeros(len(stepper.measures)), stepper.start())
+    return stepper.trace(), stepper.numbers, stepper.setpoints, stepper.stale()
+
+
+def compared() -> Any:
+    """A comparison with its null test and its prediction."""
+    comparison = fp.compare(SHORT, controllers=list(HEADLINE), seed=0, compiled=False)
+    prediction = fp.predict_response(SHORT.problem, SHORT.controllers[HEADLINE[1]], mismatch=5.0, compiled=False)
+    return comparison, prediction.half_width, prediction.rms(prediction.without)
+
+
+def reviewed() -> Any:
+    """A review."""
+    return fp.review(SHORT.problem, {HEADLINE[1]: SHORT.controllers[HEADLINE[1]]}, mismatch=5.0, seed=0)
+
+
+def studied(folder: Path) -> Any:
+    """Scenarios and tuning."""
+    names = [HEADLINE[1]]
+    study = fp.compare_scenarios(
+        SHORT, count=1, percent=5.0, seed=0, folder=folder / "one", controllers=names, compiled=False
+    )
+    return study, fp.tune(SHORT, trials=1, seed=0, folder=folder / "two", controllers=names, compiled=False)
+
+
+def test_every_mapping_of_a_problem_file_has_one_error_for_a_missing_name():
+    """The problem, its plant and limits, the controllers and the ranges of the tuning."""
+    holds(TASK, least=12)
+
+
+@pytest.mark.parametrize(("made", "least"), [(measured, 20), (stepped, 4), (compared, 30), (reviewed, 10)])
+def test_every_mapping_of_a_result_has_one_error_for_a_missing_name(made, least):
+    """Nested ones too, and empty ones."""
+    holds(made(), least)
+
+
+def test_every_mapping_of_a_study_has_one_error_for_a_missing_name(tmp_path):
+    """Records are those of the file."""
+    holds(studied(tmp_path), 20)
+
+
+def holds(value: Any, least: int) -> None:
+    found = list(mappings(value, type(value).__name__, set()))
+    assert len(found) >= least
+    assert [
+        path for path, mapping in found if not all(tells(mapping, n) for n in ("no such name", 3, ["a list"]))
+    ] == []
+
+
+def tells(mapping: Mapping[str, Any], name: Any) -> bool:
+    """Whether a missing name has the one error, with the name."""
+    try:
+        mapping[name]
+    except InvalidName as error:
+        return str(name) in str(error)
+    except (KeyError, TypeError):
+        return False
+    return False
+
+
+def test_the_nearest_name_is_offered():
+    """With the place where it was looked for."""
+    name = HEADLINE[1]
+    with pytest.raises(
+        InvalidName, match=rf"^Task\.controllers has no '{re.escape(name[:-1])}'\. Did you mean '{re.escape(name)}'"
+    ):
+        TASK.controllers[name[:-1]]
+    with pytest.raises(InvalidName, match=r"^Plant\.parameters has no"):
+        TASK.problem.plant.parameters["mm"]
+    with pytest.raises(KeyError):
+        TASK.controllers["nothing like it"]
+
+
+def test_what_is_found_by_name_is_a_dictionary():
+    """Equal to one, copied, pickled, taken apart and merged as one; what is asked for with a default has it."""
+
+    @dataclass(frozen=True)
+    class Holder:
+        entries: Mapping[str, Any]
+
+    plain = {"a": 1.0, "b": {"c": 2.0}}
+    named = ByName(plain, "here")
+    forms: tuple[Any, ...] = (
+        named,
+        deepcopy(named),
+        pickle.loads(pickle.dumps(named)),
+        asdict(Holder(named))["entries"],
+    )
+    for same in forms:
+        assert same == plain
+        assert json.loads(json.dumps(same)) == plain
+        with pytest.raises(InvalidName):
+            same["c"]
+        with pytest.raises(InvalidName, match=r"has no 'a'\. Valid: c"):
+            same["b"]["a"]
+        assert same.get("c") is None
+    assert {**named, "d": 0} == named | {"d": 0} == {**plain, "d": 0}
+    plain["a"] = 5.0
+    assert named["a"] == 1.0
