@@ -24,6 +24,7 @@ def to_json(comparison: Comparison) -> str:
         "information": list(comparison.information),
         "findings": [_finding(f) for f in comparison.findings],
         "null_test": None if comparison.null is None else _null_test(comparison.null),
+        "null_tests": [_null_test(test) for test in comparison.nulls],
         "controllers": {e.name: _entry(e) for e in comparison.entries},
         "skipped": dict(comparison.skipped),
     }

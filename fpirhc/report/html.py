@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fpirhc.report.figures import contraction_figure, lyapunov_figure, pair_figures
-from fpirhc.report.outcomes import css_class, sentences
+from fpirhc.report.outcomes import css_class
 from fpirhc.report.page import asset as _asset
 from fpirhc.report.page import page, wide_table, write_page
 from fpirhc.report.page import picture as _picture
@@ -67,7 +67,7 @@ def render(comparison: Comparison) -> str:
 
 
 def _verdict(comparison: Comparison) -> str:
-    (first, outcome), *others = sentences(comparison)
+    (first, outcome), *others = comparison.sentences
     rest = "".join(f"<li class='{css_class(one)}'>{_text(s)}</li>" for s, one in others)
     about = f"<p class='about'>{_text(comparison.description)}</p>" if comparison.description else ""
     return f"<section id='verdict'><p class='headline {css_class(outcome)}'>{_text(first)}</p><ul>{rest}</ul>{about}</section>"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from fpirhc.studies.comparison.compare import Comparison
     from fpirhc.studies.comparison.outcome import Outcome
 
 _STYLES = {
@@ -26,10 +25,3 @@ def terminal_style(outcome: Outcome | None) -> str:
 def css_class(outcome: Outcome | None) -> str:
     """Return the class of a sentence in HTML."""
     return "remark" if outcome is None else f"outcome-{outcome.value.replace(' ', '-')}"
-
-
-def sentences(comparison: Comparison) -> list[tuple[str, Outcome | None]]:
-    """Return the sentences of the verdict with their outcomes, and the null test after them."""
-    pairs = [(finding.text, finding.outcome) for finding in comparison.findings]
-    null = comparison.null
-    return pairs if null is None else [*pairs, (null.text, null.outcome if null.harmful else None)]

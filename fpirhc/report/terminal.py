@@ -13,12 +13,13 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.text import Text
 
 from fpirhc.report.folding import Column, Folding
-from fpirhc.report.outcomes import sentences, terminal_style
+from fpirhc.report.outcomes import terminal_style
 from fpirhc.simulation.metrics.columns import Column as Metric
 from fpirhc.simulation.metrics.columns import columns
 from fpirhc.simulation.simulate import SWITCHED_OFF
 from fpirhc.status import Status
 from fpirhc.studies.comparison.optimality import gap
+from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.summary import in_percent, printable
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def show(comparison: Comparison, report: Path) -> None:
     """Print the verdict, the table and the path of the report."""
     console = Console()
     say(console, comparison.title, style="bold")
-    for sentence, outcome in sentences(comparison):
+    for sentence, outcome in comparison.sentences:
         say(console, f"- {sentence}", style=terminal_style(outcome))
     _table(comparison).show(console)
     if sum(e.optimality is not None for e in comparison.entries) > 1:
@@ -76,9 +77,10 @@ def show(comparison: Comparison, report: Path) -> None:
     say(console, f"report: {report}", wrap=False)
 
 
-def show_run(run: Run, metrics: Metrics, saved: Path) -> None:
-    """Print one run's metrics and the path of its file."""
+def show_run(run: Run, metrics: Metrics, harm: Sequence[str], saved: Path) -> None:
+    """Print what speaks against its adaptation, one run's metrics and the path of its file."""
     console = Console()
+    show_harm(console, harm)
     for text in (*settings_in_force(run), *set_points_in_force(run)):
         say(console, text)
     for column in columns([metrics]):
@@ -88,6 +90,12 @@ def show_run(run: Run, metrics: Metrics, saved: Path) -> None:
     if run.depends_on_rounding:
         say(console, run.depends_on_rounding)
     say(console, f"saved: {saved}", wrap=False)
+
+
+def show_harm(console: Console, harm: Iterable[str]) -> None:
+    """Print what speaks against a controller's adaptation, in red."""
+    for sentence in harm:
+        say(console, f"- {sentence}", style=terminal_style(Outcome.WORSE))
 
 
 def settings_in_force(run: Run) -> list[str]:

@@ -14,7 +14,7 @@ import fpirhc as fp
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.simulate import simulator
 from fpirhc.studies.comparison.compare import compare
-from fpirhc.studies.comparison.null_test import CYCLES, null_test
+from fpirhc.studies.comparison.null_test import CYCLES, ModelAsPlant, null_test
 from fpirhc.studies.comparison.outcome import Outcome
 
 PLAIN = fp.ComputedTorque(fp.Exponential(rate=6.0))
@@ -38,7 +38,7 @@ def null_of(adaptive: fp.ComputedTorque, cured: float = 1.0, **changes):
     """The null test of this controller beside the one without adaptation."""
     task = problem(**changes)
     plain, adapting = (simulator(task, c, compiled=False) for c in (PLAIN, adaptive))
-    return null_test(task, (plain, adapting), ("CTC", "CTC+FPI"), ONE, cured={"y": cured}, seed=0)
+    return null_test(ModelAsPlant(task, seed=0), (plain, adapting), ("CTC", "CTC+FPI"), ONE, cured={"y": cured})
 
 
 def rms(plant: fp.Plant, controller: fp.ComputedTorque) -> float:
@@ -86,11 +86,12 @@ def test_what_does_not_finish():
     good = fp.ComputedTorque(PLAIN.tracking, SIGMOID)
     task = problem(duration=2.0, measure_from=0.1)
     loops = [simulator(task, c, compiled=False) for c in (good, wild)]
-    lost = null_test(task, (loops[0], loops[1]), ("CTC", "CTC+FPI"), ONE, cured=ONE, seed=0)
+    model = ModelAsPlant(task, seed=0)
+    lost = null_test(model, (loops[0], loops[1]), ("CTC", "CTC+FPI"), ONE, cured=ONE)
     assert np.isnan(lost.after["y"])
     assert lost.harmful
     assert "failed, CTC+FPI does not finish where CTC does" in lost.text
-    back = null_test(task, (loops[1], loops[0]), ("CTC", "CTC+FPI"), ONE, cured=ONE, seed=0)
+    back = null_test(model, (loops[1], loops[0]), ("CTC", "CTC+FPI"), ONE, cured=ONE)
     assert back.outcome is Outcome.NOT_COMPARABLE
     assert not back.harmful
 

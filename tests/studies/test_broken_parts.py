@@ -13,6 +13,7 @@ from fpirhc.review import review as reviewing
 from fpirhc.review.answer import Verdict
 from fpirhc.simulation import run_signals
 from fpirhc.studies.comparison import compare as comparing
+from fpirhc.studies.comparison import side_by_side
 
 TASK = fp.load_problem("two_mass")
 CONTROLLERS = {name: TASK.controllers[name] for name in ("CTC", "CTC+FPI (eq 6)")}
@@ -69,7 +70,7 @@ def test_a_part_of_a_comparison_that_breaks_loses_no_run(part, name, monkeypatch
 
 def test_a_null_test_that_breaks_loses_no_comparison(monkeypatch):
     """It stands with the sentences about what is known."""
-    monkeypatch.setattr(comparing, "null_of_pair", breaks)
+    monkeypatch.setattr(side_by_side, "null_test", breaks)
     result = fp.compare(task(), seed=0, compiled=False)
     assert result.null is None
     assert any(s.startswith("the null test could not be computed (LinAlgError") for s in result.information)

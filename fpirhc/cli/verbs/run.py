@@ -37,12 +37,13 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.report.terminal import announce_backend, progress_bars, show_run
     from fpirhc.simulation.metrics import measure
     from fpirhc.studies.comparison.compare import select
+    from fpirhc.studies.comparison.harm import harm_of_adaptation
 
     task, name = load_problem(options.problem), options.controller
     controller = select(task, [name])[name]
     folder = results_folder(options.out, task.name)
     with progress_bars() as progress:
-        problem, run = _simulated(
+        problem, changed, run = _simulated(
             task.problem,
             controller,
             *by_kind(numbers(options.settings)),
@@ -55,7 +56,9 @@ def _run(options: argparse.Namespace) -> ExitCode:
     run.save(folder / f"{stem}.npz")
     save_figure(run.plot(), folder / f"{stem}.png")
     announce_backend([run])
-    show_run(run, measure(problem, run, task.metrics), folder / f"{stem}.npz")
+    facts = {"seed": options.seed, "compiled": not options.no_compile, "metrics": task.metrics}
+    harm = harm_of_adaptation(problem, name, changed, **facts)
+    show_run(run, measure(problem, run, task.metrics), harm, folder / f"{stem}.npz")
     return ExitCode.FINISHED if run.stop is None else ExitCode.ENDED_EARLY
 
 
@@ -105,8 +108,8 @@ def _simulated(
     settings: Mapping[str, float | tuple[float, ...]],
     setpoints: Mapping[str, float] | None,
     **run: Any,
-) -> tuple[Problem, Run]:
-    """The problem and a run of it with these settings: live ones where they can be, so that other numbers need no compiler."""
+) -> tuple[Problem, Controller, Run]:
+    """Problem and controller with these settings, and their run; live ones, which need no compiler, where they can be."""
     from fpirhc.controllers.live_settings import live_settings
     from fpirhc.errors import NotSupported
     from fpirhc.problem_files.settings import is_whole, with_settings
@@ -114,17 +117,18 @@ def _simulated(
 
     run["setpoints"] = setpoints
     if not settings:
-        return problem, simulate(problem, controller, **run)
+        return problem, controller, simulate(problem, controller, **run)
     try:
         live = simulate(problem, controller, settings=settings, **run)
-        return live_settings(problem, controller, list(settings)).changed(settings)[0], live
+        changed, ready, _ = live_settings(problem, controller, list(settings)).changed(settings)
+        return changed, ready, live
     except NotSupported:
         values: dict[str, Any] = {
             p: v if isinstance(v, tuple) or v % 1 or not is_whole(controller, p) else int(v)
             for p, v in settings.items()
         }
         rebuilt = with_settings(controller, values)
-        return problem, simulate(problem, rebuilt, **run)
+        return problem, rebuilt, simulate(problem, rebuilt, **run)
 
 
 def _named(progress: Progress, name: str) -> Callable[[int, int], None]:

@@ -65,12 +65,14 @@ def _show(tuning: Tuning, saved: Path) -> None:
     from rich.console import Console
 
     from fpirhc.report.folding import Column, Folding
-    from fpirhc.report.terminal import say
+    from fpirhc.report.terminal import say, show_harm
 
     console = Console()
     title = (
         f"{tuning.problem}: {tuning.trials} trials each, seed {tuning.seed}, {tuning.conditions}, cost: {tuning.metric}"
     )
+    for entry in tuning.entries:
+        show_harm(console, entry.harm)
     table = Folding(title, [Column(head) for head in ("controller, setting", "before", "after", "failed")])
     for entry in tuning.entries:
         table.add([f"{entry.name}: cost", f"{entry.cost_before:.4g}", f"{entry.cost:.4g}", str(entry.failed)])

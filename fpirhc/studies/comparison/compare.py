@@ -37,7 +37,7 @@ from fpirhc.studies.comparison.left_alone import error_left_alone
 from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import Optimality, measure_optimality
 from fpirhc.studies.comparison.outcome import Finding, Outcome
-from fpirhc.studies.comparison.side_by_side import beside_each_other, null_of_pair
+from fpirhc.studies.comparison.side_by_side import beside_each_other, null_tests
 from fpirhc.studies.comparison.timing import CycleTime, Price, measure_cycle
 from fpirhc.studies.comparison.verdict import findings
 from fpirhc.summary import line, number, table
@@ -128,7 +128,7 @@ class Comparison(FoundByName):
         settings: settings of the problem.
         elapsed: wall time of the comparison, s.
         pictures: pictures of the problem for the report.
-        null: what adaptation does where there is nothing to adapt, for the first pair; None without one.
+        nulls: what adaptation does where there is nothing to adapt, for every pair.
         time_unit: unit of time of the problem.
         steps: whether the plant is a map, which has no motion between two cycles.
         information: what the controllers are given, what each uses, and when each acts, in sentences.
@@ -147,7 +147,7 @@ class Comparison(FoundByName):
     settings: Mapping[str, Any]
     elapsed: float
     pictures: tuple[Picture, ...] = ()
-    null: NullTest | None = None
+    nulls: tuple[NullTest, ...] = ()
     time_unit: str = "s"
     steps: bool = False
     information: tuple[str, ...] = ()
@@ -161,6 +161,18 @@ class Comparison(FoundByName):
     def outcome(self) -> Outcome:
         """What the first sentence states."""
         return self.findings[0].outcome or Outcome.NOT_COMPARABLE
+
+    @property
+    def null(self) -> NullTest | None:
+        """The null test of the pair that the first sentence is about; None without one."""
+        return next((test for test in self.nulls if test.pair == self.findings[0].pair), None)
+
+    @property
+    def sentences(self) -> tuple[tuple[str, Outcome | None], ...]:
+        """The verdict with outcomes: the findings, the null test of the first pair, and every other one that shows harm."""
+        shown = (test for test in self.nulls if test is self.null or test.harmful)
+        tests = ((test.text, Outcome.WORSE if test.harmful else None) for test in shown)
+        return (*((finding.text, finding.outcome) for finding in self.findings), *tests)
 
     def __repr__(self) -> str:
         counts = f"{len(self.entries)} controllers" + (f", {len(self.skipped)} skipped" if self.skipped else "")
@@ -179,7 +191,7 @@ class Comparison(FoundByName):
             for e in self.entries
         ]
         head = ("controller", *(c.heading for c in shown), "cycle [us]", "worst status")
-        notes = (*self.verdict, *(() if self.null is None else (self.null.text,)), *self.information)
+        notes = (*(text for text, _ in self.sentences), *self.information)
         return table(self.title, head, rows, notes)
 
     def __getitem__(self, name: str) -> Entry:
@@ -245,8 +257,8 @@ def compare(
     broken: list[str] = []
     yardstick = Yardstick(sizes, ranges(task.problem), error_left_alone(task.problem, seed=seed))
     judged = findings(entries, skipped, task.headline, yardstick)
-    pair = judged[0].pair
-    null = attempted("the null test", null_of_pair, task.problem, pair, entries, loops, sizes, seed=seed, broken=broken)
+    pairs = [finding.pair for finding in judged if finding.pair]
+    nulls = null_tests(task.problem, pairs, entries, loops, sizes, seed=seed, broken=broken)
     return Comparison(
         problem=task.name,
         title=task.title,
@@ -261,7 +273,7 @@ def compare(
         settings=describe(task.problem),
         elapsed=time.perf_counter() - begin,
         pictures=task.pictures,
-        null=null,
+        nulls=nulls,
         time_unit=task.problem.time_unit,
         steps=task.problem.real_plant.step is not None,
         information=(*sentences(task.problem, {e.name: e.information for e in entries if e.information}), *broken),

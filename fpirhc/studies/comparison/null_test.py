@@ -6,8 +6,9 @@ that is not paired, the noise of a sensor. Disturbances are left out, because th
 The plain form passes on the changes of the desired response a little late, so some error of its own is usual. It is harmful where
 it is larger than the error that the wrong model causes without adaptation, which adaptation is there to remove.
 
-The loops of the comparison run once more with other exact parameters, so nothing is composed or compiled again. A run is the
-original one, cut to `CYCLES` cycles after `measure_from`; a test costs two such runs.
+The loops of the comparison run once more with other exact parameters, so nothing is composed or compiled again; where the plant is
+no instance of the model they are composed around the model. A run is the original one, cut to `CYCLES` cycles after `measure_from`.
+A test costs two such runs, and pairs with the same controller without adaptation share its run.
 """
 
 from __future__ import annotations
@@ -67,35 +68,48 @@ class NullTest(FoundByName):
         return self.outcome in (Outcome.BETTER, Outcome.NO_DIFFERENCE)
 
 
+class ModelAsPlant:
+    """The approximate model as plant of a comparison's loops, without disturbances; every loop runs once."""
+
+    def __init__(self, problem: Problem, *, seed: int) -> None:
+        """Take the problem of the comparison, and the seed of the sensors' noise."""
+        own = problem.of_model
+        self._own = replace(own, signals=as_told(own.plant, own.signals)) if own.signals else own
+        # The loops of the comparison have the real plant and signals.
+        self._foreign = problem.reality is not None or bool(problem.signals)
+        self._seed = seed
+        self._runs: dict[Simulator, Run] = {}
+        self.problem = _null_problem(self._own)
+
+    def run(self, loop: Simulator) -> Run:
+        """Return the run of a loop on the model."""
+        if loop not in self._runs:
+            own = simulator(self._own, loop.controller, compiled=False) if self._foreign else loop
+            self._runs[loop] = own.run(seed=self._seed, variant=self.problem, disturbed=False)
+        return self._runs[loop]
+
+
 def null_test(
-    problem: Problem,
+    model: ModelAsPlant,
     loops: tuple[Simulator, Simulator],
     names: tuple[str, str],
     scales: Mapping[str, float],
     weighed: frozenset[str] | None = None,
     *,
     cured: Mapping[str, float],
-    seed: int,
 ) -> NullTest:
     """Return what adaptation does on the approximate model as plant.
 
     Args:
-        problem: of the comparison.
+        model: as plant.
         loops: without and with adaptation.
         names: of both controllers.
         scales: by which errors are judged, by coordinate.
         weighed: coordinates that are judged; None: all.
         cured: rms error on the plant itself without adaptation, by judged coordinate.
-        seed: of the sensors' noise.
     """
-    begin = time.perf_counter()
-    own = problem.of_model
-    own = replace(own, signals=as_told(own.plant, own.signals)) if own.signals else own
-    null = _null_problem(own)
-    if problem.reality is not None or problem.signals:  # the loops of the comparison have the real plant and signals
-        without, adapting = (simulator(own, one.controller, compiled=one.compiled) for one in loops)
-        loops = without, adapting
-    runs = tuple(loop.run(seed=seed, variant=null, disturbed=False) for loop in loops)
+    begin, null = time.perf_counter(), model.problem
+    runs = tuple(model.run(loop) for loop in loops)
     before, after = (_errors(run, null) for run in runs)
     stuck = {n: at_limit(null, run) for n, run in zip(names, runs, strict=True)}
     if stuck[names[0]] >= _MOSTLY:

@@ -1,4 +1,4 @@
-"""What needs several finished loops of a comparison: prices, why an exact model is no bound, and the null test.
+"""What needs several finished loops of a comparison: prices, why an exact model is no bound, and the null tests.
 
 Ctrl-C leaves out what is missing here; the finished runs are kept.
 """
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from fpirhc.broken import attempted
 from fpirhc.simulation.simulate import Simulator
 from fpirhc.studies.comparison.entry_facts import no_bound_because
-from fpirhc.studies.comparison.null_test import NullTest, null_test
+from fpirhc.studies.comparison.null_test import ModelAsPlant, NullTest, null_test
 from fpirhc.studies.comparison.other_rows import beaten_by
 from fpirhc.studies.comparison.timing import measure_price
 from fpirhc.task.problem import Problem
@@ -47,33 +47,38 @@ def beside_each_other(
     return shown
 
 
-def null_of_pair(
+def null_tests(
     problem: Problem,
-    pair: tuple[str, str] | None,
+    pairs: Sequence[tuple[str, str]],
     entries: Sequence[Entry],
     loops: Mapping[str, Simulator],
     scales: Mapping[str, float],
     *,
     seed: int,
-) -> NullTest | None:
-    """Return the null test of a pair (without adaptation, with it); None without one.
+    broken: list[str],
+) -> tuple[NullTest, ...]:
+    """Return the null tests of all pairs (without adaptation, with it), in their order.
 
     Args:
         problem: of the comparison.
-        pair: names of the controllers.
+        pairs: names of the controllers.
         entries: the controllers that ran.
         loops: their loops, by name.
         scales: by which errors are judged, by coordinate.
         seed: of the sensors' noise.
+        broken: takes a sentence for every test that could not be made.
     """
-    if pair is None:
-        return None
-    plain, adaptive = (next(e for e in entries if e.name == name) for name in pair)
-    both, cured = (loops[plain.name], loops[adaptive.name]), plain.metrics.rms_error
+    by_name, tests = {e.name: e for e in entries}, []
+    model = ModelAsPlant(problem, seed=seed)
     try:
-        return null_test(problem, both, pair, scales, adaptive.weighed, cured=cured, seed=seed)
+        for pair in pairs:
+            plain, adaptive = (by_name[name] for name in pair)
+            facts = model, (loops[plain.name], loops[adaptive.name]), pair, scales, adaptive.weighed
+            test = attempted("the null test", null_test, *facts, cured=plain.metrics.rms_error, broken=broken)
+            tests += [] if test is None else [test]
     except KeyboardInterrupt:
-        return None
+        pass
+    return tuple(tests)
 
 
 def _beside(

@@ -30,6 +30,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import current_setting, is_whole, with_settings
 from fpirhc.problem_files.tuning_spans import TuningSpans
 from fpirhc.studies.comparison.compare import select
+from fpirhc.studies.comparison.harm import harm_of_adaptation
 from fpirhc.studies.scenarios.bench import Bench, Conditions, fingerprint
 from fpirhc.studies.scenarios.draws import TUNING
 from fpirhc.studies.scenarios.ledger import Ledger
@@ -52,6 +53,7 @@ class TunedController(FoundByName):
         cost_before: cost of the settings before.
         cost: cost of the best settings.
         failed: number of trials with a failure in some scenario.
+        harm: what speaks against its adaptation with the best settings, in the run of the problem file; see `harm_of_adaptation`.
     """
 
     name: str
@@ -60,6 +62,7 @@ class TunedController(FoundByName):
     cost_before: float
     cost: float
     failed: int
+    harm: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +101,7 @@ class Tuning:
                 "cost": e.cost,
                 "cost_before": e.cost_before,
                 "failed_trials": e.failed,
+                "harm": list(e.harm),
             }
             for e in self.entries
         }
@@ -235,7 +239,10 @@ def _tuned(
     tried = [known[n] for n in range(_PRESENT, trials)]
     best = min(tried, key=lambda r: (r["cost"], r["trial"]))
     failed = sum(bool(r["failures"]) for r in tried[1:])
-    return TunedController(name, before, best["settings"], tried[0]["cost"], best["cost"], failed)
+    changed = with_settings(task.controllers[name], best["settings"])
+    compiled = bool(conditions.compiled)
+    harm = harm_of_adaptation(task.problem, name, changed, seed=conditions.seed, compiled=compiled)
+    return TunedController(name, before, best["settings"], tried[0]["cost"], best["cost"], failed, harm)
 
 
 def _proposal(optuna: ModuleType, study: Any, ranges: Mapping[str, Any], seed: int, number: int) -> Any:
