@@ -159,9 +159,9 @@ def law_is_what_it_does(trial: Trial, generator: np.random.Generator) -> None:  
 
 
 def outputs_are_controlled(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """If `outputs_unusable` is empty, the same plant given by states, with the coordinates as outputs, gets the same commands."""
+    """The same plant given by states, with the coordinates as outputs, gets the same commands, or is refused by `check`."""
     spelled = spelled_by_states(trial.problem)
-    if spelled is None or trial.controller.outputs_unusable(spelled):
+    if spelled is None:
         return
     trials = [_moved(replace(p, duration=_SHORT * p.period, measure_from=0.0), trial) for p in (trial.exact, spelled)]
     if None in trials:
@@ -171,8 +171,8 @@ def outputs_are_controlled(trial: Trial, generator: np.random.Generator) -> None
     missed = float(np.abs(one - other).max()) if one.shape == other.shape else np.inf
     hold(
         within(missed, _ALIKE * size),
-        f"outputs_unusable() is empty, but where the coordinates are outputs of states in another order its commands differ by "
-        f"{missed:.3g}, of {size:.3g}; read plant.output and not plant.state, or give the reason why it cannot",
+        f"where the coordinates are outputs of states in another order its commands differ by {missed:.3g}, of {size:.3g}; read "
+        "plant.output and not plant.state for what follows the reference, or raise NotSupported in check() with the reason",
     )
 
 

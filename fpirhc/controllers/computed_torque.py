@@ -30,11 +30,6 @@ class ComputedTorque(Controller):
     tracking: Tracking
     deformation: Deformation = field(default_factory=Identity)
 
-    def outputs_unusable(self, problem: Problem) -> str:
-        """Return nothing: the law tracks outputs as it tracks coordinates."""
-        del problem
-        return ""
-
     def maps_unusable(self, problem: Problem) -> str:
         """Return nothing: in a map's cycles its law has differences in place of derivatives."""
         del problem

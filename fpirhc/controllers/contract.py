@@ -289,13 +289,6 @@ class Controller(Checked, ABC):
         """Return why a model-referenced deformation with this mirror cannot be used on this problem; empty where it can."""
         return "" if self.inner is None else self.inner.unusable(self.inner_problem(problem), mirror)
 
-    def outputs_unusable(self, problem: Problem) -> str:  # noqa: ARG002
-        """Return why the controller cannot control a plant with outputs; empty where it can.
-
-        By default it cannot: a controller that takes the state for what follows the reference would follow the wrong one.
-        """
-        return "it takes the plant's state for what follows the reference"
-
     @property
     def covers_order_zero(self) -> bool:
         """Whether it controls outputs of order 0, which the command moves at once and no tracking law follows."""

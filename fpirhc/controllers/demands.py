@@ -56,11 +56,14 @@ def plan_demand(problem: Problem) -> Demand:
 
 def command_demand(problem: Problem, parameters: np.ndarray) -> Demand:
     """Return the change period max|dQ/dt| of the command Q that the model with these parameters needs along the reference."""
-    reference, inverse = problem.reference.function(problem.plant), problem.plant.inverse_function
-    t, p = ca.MX.sym("t"), ca.DM(parameters)
-    state, response = reference(t)
-    command = ca.Function("c", [t], [inverse(state, response[list(problem.plant.controlled_indices)], p)])
-    return Demand(problem.period * _slew(command, problem.duration), sudden=False)
+    plant, times = problem.plant, np.linspace(0.0, problem.duration, _SAMPLES)
+    responses = np.asarray(problem.reference.function(plant).map(_SAMPLES)(times[None, :])[1].full())
+    values = plant.inverse_function.map(_SAMPLES)(
+        reference_states(problem, _SAMPLES),
+        responses[list(plant.face.controlled_indices)],
+        np.repeat(parameters[:, None], _SAMPLES, axis=1),
+    )
+    return Demand(problem.period * _steepest(np.asarray(values.full()), times), sudden=False)
 
 
 def _recovery(problem: Problem, law: Tracking | None) -> float:
@@ -96,5 +99,9 @@ def _largest_change(function: ca.Function, problem: Problem) -> float:
 def _slew(function: ca.Function, duration: float) -> float:
     """Largest |d/dt| of a Function of time over the run, sampled."""
     times = np.linspace(0.0, duration, _SAMPLES)
-    values = np.asarray(function.map(_SAMPLES)(times[None, :]).full())
+    return _steepest(np.asarray(function.map(_SAMPLES)(times[None, :]).full()), times)
+
+
+def _steepest(values: np.ndarray, times: np.ndarray) -> float:
+    """Largest |difference| of neighbours, per unit of time."""
     return float(np.max(np.linalg.norm(np.diff(values, axis=1), axis=0)) / (times[1] - times[0]))

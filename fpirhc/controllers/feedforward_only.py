@@ -14,7 +14,7 @@ import casadi as ca
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
-from fpirhc.errors import NotInvertible
+from fpirhc.errors import NotInvertible, NotSupported
 from fpirhc.horizon.nominal import known_on_reference, reference_state
 from fpirhc.members import Example
 from fpirhc.plant.instant import response_orders
@@ -36,15 +36,6 @@ class FeedforwardOnly(Controller):
         """Identity(): no request is iterated."""
         return Identity()
 
-    def outputs_unusable(self, problem: Problem) -> str:
-        """Return why not: a derivative of an output without feedback would drift where states have no reference."""
-        plant = problem.plant
-        orders = response_orders(plant)
-        if known_on_reference(plant) or not any(orders.values()):
-            return ""
-        slow = ", ".join(name for name, order in orders.items() if order)
-        return f"without feedback the error of {slow} would add up; use a controller with a tracking law"
-
     @property
     def covers_order_zero(self) -> bool:
         """Yes."""
@@ -56,13 +47,21 @@ class FeedforwardOnly(Controller):
         return ""
 
     def check(self, problem: Problem) -> None:
-        """Raise if the model has no inverse.
+        """Raise if the model has no inverse, or a derivative is prescribed where states have no reference.
 
         Raises:
             NotInvertible: inputs and controlled coordinates differ in number.
+            NotSupported: without feedback an output would drift.
         """
-        if len(problem.plant.controlled_names) != len(problem.plant.inputs):
+        plant = problem.plant
+        if len(plant.controlled_names) != len(plant.inputs):
             raise NotInvertible("FeedforwardOnly needs as many controlled coordinates as inputs")
+        slow = ", ".join(name for name, order in response_orders(plant).items() if order)
+        if slow and not known_on_reference(plant):
+            raise NotSupported(
+                f"FeedforwardOnly does not cover outputs that are expressions of the state ({slow}): without feedback their "
+                "errors would add up; use a controller with a tracking law"
+            )
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, feedforward, limit, judge, running."""

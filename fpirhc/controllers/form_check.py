@@ -20,8 +20,6 @@ class _Controller(Protocol):
 
     def unusable(self, problem: Problem, mirror: Mirror) -> str: ...
 
-    def outputs_unusable(self, problem: Problem) -> str: ...
-
     @property
     def covers_order_zero(self) -> bool: ...
 
@@ -32,26 +30,20 @@ class _Controller(Protocol):
 
 
 def check_outputs(problem: Problem, controller: _Controller) -> None:
-    """Raise if the problem's plant has outputs and the controller, or its deformation, does not cover them.
+    """Raise if the problem's plant has outputs that the deformation does not cover, or outputs of order 0.
 
     Raises:
         NotSupported: with the reason.
     """
-    if not problem.plant.outputs:
-        return
     _check_order_zero(problem, controller)
-    name, mirror = type(controller).__name__, controller.deformation.mirror
-    reason = controller.outputs_unusable(problem)
-    fraction = mirror is not None and mirror.measurement % 1 > NONE
-    if not reason and mirror is not None and (fraction or (problem.plant.step and mirror.measurement)):
-        name = type(controller.deformation).__name__
-        reason = (
-            f"its twin moves from the state that is given with the samples, and these are late by {mirror.measurement:g} cycles; "
-            "believe in whole cycles, and for a map in none"
+    plant, mirror = problem.plant, controller.deformation.mirror
+    late = 0.0 if mirror is None else mirror.measurement
+    if plant.outputs and (late % 1 > NONE or (plant.step and late)):
+        raise NotSupported(
+            f"{type(controller.deformation).__name__} does not cover outputs that are expressions of the state "
+            f"({', '.join(plant.outputs)}): its twin moves from the state that is given with the samples, and these are late by "
+            f"{late:g} cycles; believe in whole cycles, and for a map in none"
         )
-    if reason:
-        what = ", ".join(problem.plant.outputs)
-        raise NotSupported(f"{name} does not cover outputs that are expressions of the state ({what}): {reason}")
 
 
 def check_maps(problem: Problem, controller: _Controller) -> None:

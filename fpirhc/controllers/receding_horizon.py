@@ -39,6 +39,7 @@ from fpirhc.horizon.stage_data import offset_limits, shifted_reference, stage_da
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.optimisers.fixed_point import FixedPoint
+from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, Derived, every
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
@@ -95,16 +96,6 @@ class RecedingHorizon(Controller):
         """Return the controller with another optimiser."""
         return replace(self, optimiser=optimiser)
 
-    def outputs_unusable(self, problem: Problem) -> str:
-        """Return why this way of replanning, or of failing, needs references of all states; empty where it does not."""
-        if self.replanning.law is not None:
-            return (
-                f"{type(self.replanning).__name__} tracks the planned motion of the model's states; use FromMeasurement"
-            )
-        if self.on_failure.uses_feedforward and not known_on_reference(problem.plant):
-            return f"{type(self.on_failure).__name__} needs references of states that no output gives; use HoldPlan"
-        return ""
-
     def maps_unusable(self, problem: Problem) -> str:
         """Return nothing: a stage of a map is a whole number of its steps."""
         del problem
@@ -115,8 +106,9 @@ class RecedingHorizon(Controller):
 
         Raises:
             InvalidProblem: horizon or cost missing.
-            NotSupported: the optimiser cannot keep the problem's bounds.
+            NotSupported: the optimiser cannot keep the problem's bounds; references of states are needed that no output gives.
         """
+        _check_states_of_plans(problem.plant, self.replanning, self.on_failure)
         if problem.horizon is None:
             raise InvalidProblem("RecedingHorizon needs Problem(horizon=...), which this problem does not have")
         if self.cost is None and problem.cost is None:
@@ -154,6 +146,20 @@ class RecedingHorizon(Controller):
         blocks.append(_command_shift_block(problem, self.deformation))
         delays.append(Delay(like(plant.input, "_command_shift_last"), "command_shift"))
         return blocks, delays
+
+
+def _check_states_of_plans(plant: Plant, replanning: Replanning, on_failure: OnFailure) -> None:
+    """Raise where a way of replanning, or of failing, needs states that the outputs do not give."""
+    reason = ""
+    if plant.outputs and replanning.law is not None:
+        reason = f"{type(replanning).__name__} tracks the planned motion of the model's states; use FromMeasurement"
+    elif on_failure.uses_feedforward and not known_on_reference(plant):
+        reason = f"{type(on_failure).__name__} needs references of states that no output gives; use HoldPlan"
+    if reason:
+        what = ", ".join(plant.outputs)
+        raise NotSupported(
+            f"RecedingHorizon does not cover outputs that are expressions of the state ({what}): {reason}"
+        )
 
 
 def _optimal_control(problem: Problem, optimiser: Optimiser) -> OptimalControl:

@@ -16,6 +16,7 @@ from functools import cached_property
 import casadi as ca
 
 from fpirhc.errors import InvalidName, NotInvertible, NotSupported, nearest
+from fpirhc.plant.outputs import output_expression
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.structural_order import structural_order
 
@@ -69,7 +70,8 @@ def output_chain(plant: Plant, coordinate: str, input_name: str | None = None) -
     w = ca.SX.sym("w", len(plant.names))
     rate = plant.forced_derivative_function(x, u, p, w)
     command = u[plant.input.elements.index(name)]
-    derivatives = [x[plant.state.elements.index(coordinate)]]
+    first = [x[plant.state.elements.index(coordinate)]] if coordinate in plant.coordinates else []
+    derivatives = first or [output_expression(plant, coordinate, x, u, p)]
     for order in range(1, plant.state.size + 1):
         derivative = ca.jtimes(derivatives[-1], x, rate)
         if ca.jacobian_sparsity(derivative, command).nnz():
@@ -88,8 +90,9 @@ def output_chain(plant: Plant, coordinate: str, input_name: str | None = None) -
 
 
 def _input(plant: Plant, coordinate: str, name: str | None) -> str:
-    if coordinate not in plant.coordinates:
-        raise InvalidName(f"coordinate '{coordinate}' is unknown.{nearest(coordinate, plant.coordinates)}")
+    followed = plant.face.coordinates
+    if coordinate not in followed:
+        raise InvalidName(f"coordinate '{coordinate}' is unknown.{nearest(coordinate, followed)}")
     if name is None:
         if len(plant.inputs) > 1:
             raise InvalidName(f"'{coordinate}' needs the name of its input. Valid: {', '.join(plant.inputs)}.")
@@ -108,16 +111,16 @@ def _chain(
     symbols: tuple[ca.SX, ca.SX, ca.SX, ca.SX],
 ) -> OutputChain:
     x, u, p, w = symbols
-    place = plant.input.elements.index(name)
+    place, unit = plant.input.elements.index(name), plant.face.coordinates[coordinate]
     # A model gives y ... y^(r-1) and the gain without disturbances.
     undisturbed = [ca.densify(ca.substitute(v, w, ca.SX.zeros(*w.shape))) for v in (ca.vertcat(*derivatives), response)]
     gain = ca.densify(ca.jacobian(undisturbed[1], u[place]))
     return OutputChain(
         coordinate,
         name,
-        plant.coordinates[coordinate],
+        unit,
         len(derivatives),
-        plant.derivative_unit(plant.coordinates[coordinate], len(derivatives)),
+        plant.derivative_unit(unit, len(derivatives)),
         ca.Function("fpirhc_chain", [x, p], [undisturbed[0]]),
         ca.Function("fpirhc_chain_response", [x, u, p, w], [ca.densify(response)]),
         ca.Function("fpirhc_chain_gain", [x, u, p], [gain]),

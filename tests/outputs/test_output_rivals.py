@@ -10,6 +10,7 @@ from test_outputs import SHORT, arm, circle, hill, on_outputs, sedated, simulate
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
+from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidProblem, NotSupported
 
 RIVALS: dict[str, Controller] = {
@@ -18,6 +19,8 @@ RIVALS: dict[str, Controller] = {
     "rate": fp.ResolvedAccelerationRate(rate=6.0),
     "feedback": fp.AccelerationFeedback(fp.Exponential(rate=6.0), gain=0.5, time_constant=0.01),
     "backstepping": fp.BacksteppingMRAC(6.0, (5.0, 5.0), fp.Affine(-0.5)),
+    "force": fp.ForceMRAC(fp.Exponential(rate=6.0), fp.Affine(-0.5)),
+    "Lyapunov": fp.LyapunovMRAC(rate=6.0, adaptation=1.0),
 }
 
 
@@ -40,6 +43,8 @@ ON_DEPTH: dict[str, tuple[Controller, float]] = {
     "rate": (fp.ResolvedAccelerationRate(rate=1.0), 0.1),
     "feedback": (fp.AccelerationFeedback(fp.Exponential(rate=1.0), gain=2.0, time_constant=0.2), 0.1),
     "backstepping": (fp.BacksteppingMRAC(1.0, (1.0, 1.0), fp.Affine(-1.5)), 0.1),
+    "force": (fp.ForceMRAC(fp.Exponential(rate=1.0), fp.Affine(-0.5)), 0.02),
+    "Lyapunov": (fp.LyapunovMRAC(rate=1.0, adaptation=0.1), 0.03),
 }
 
 
@@ -67,20 +72,32 @@ def test_an_increment_by_hand_on_the_hand_of_an_arm() -> None:
     assert np.allclose(run["command"][k], plant.inverse_function(x, request, p).full().ravel(), atol=1e-6)
 
 
-REFUSED = ("AdaptiveInverseDynamics", "SlotineLi", "ForceMRAC", "LyapunovMRAC", "Slotted")
+@pytest.mark.parametrize("deformation", [fp.Identity(), fp.Affine(-1.0)])
+def test_one_slot_for_the_whole_run_is_computed_torque(deformation: Deformation) -> None:
+    """A slot follows the measured output, so the model's curve has no part in its error."""
+    problem, law = sedated(hill(5.5), input_before={"u": 1.5}), fp.Exponential(rate=1.0, integral=False)
+    slot = fp.Slot("depth", law, deformation)
+    slots = fp.Slotted((slot,), fp.FixedSchedule([("depth", 0.0, problem.duration)]), blend=0.0)
+    one, other = (simulated(problem, c)["command"] for c in (slots, fp.ComputedTorque(law, deformation)))
+    assert np.allclose(one, other, atol=1e-9)
 
 
-@pytest.fixture(scope="module")
-def members() -> dict[str, Controller]:
-    """One controller of every class among some shipped problems."""
-    tasks = (fp.load_problem(name) for name in ("mrac_pendulum", "crane_slots", "planar_arm"))
-    return {type(one).__name__: one for task in tasks for one in task.controllers.values()}
+@pytest.mark.parametrize("name", ["AID+FPI", "Slotine-Li+FPI"])
+def test_learning_inverse_dynamics_controls_coordinates_that_are_outputs(name: str) -> None:
+    task = fp.load_problem("planar_arm")
+    short = replace(task.problem, duration=0.1, measure_from=0.0)
+    units = short.plant.coordinates
+    outputs = {c: fp.Output(unit, lambda q, v, p, c=c: q[c]) for c, unit in units.items()}
+    spelled = replace(short, plant=replace(short.plant, outputs=outputs))
+    plain, run = (simulated(p, task.controllers[name]) for p in (short, spelled))
+    for signal in ("state", "command", "estimate"):
+        assert np.array_equal(plain[signal], run[signal]), signal
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_a_rival_that_needs_coordinates_says_so(name: str, members: dict[str, Controller]) -> None:
-    with pytest.raises(NotSupported, match=rf"{name} does not cover outputs .*\(depth\): "):
-        simulated(sedated(hill(5.5)), members[name])
+@pytest.mark.parametrize("name", ["AID", "Slotine-Li"])
+def test_learning_inverse_dynamics_of_other_outputs_says_why_not(name: str) -> None:
+    with pytest.raises(NotSupported, match=r"mechanics in its own coordinates.* x, y are other functions of the state"):
+        simulated(circle(arm()), fp.load_problem("planar_arm").controllers[name])
 
 
 def test_gains_are_named_by_outputs() -> None:

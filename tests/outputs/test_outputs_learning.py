@@ -205,21 +205,7 @@ def test_an_inverse_of_the_user_has_the_disturbance_of_the_response() -> None:
         disturbed(by_user, ("C",))
 
 
-class Foreigner(fp.RecursiveLeastSquares):
-    """An estimator that does not say that it covers outputs."""
-
-    @property
-    def covers_outputs(self) -> bool:
-        """Nothing is said."""
-        return False
-
-
 WRONG: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
-    "a stranger": (
-        lambda: simulated(sedated(hill(5.5)), fp.Estimating(LAW, Foreigner({"half": fp.Uncertain(1, 9, 1)}, {"depth": 1.0}, 5.0))),
-        NotSupported,
-        "Foreigner is written for responses of coordinates",
-    ),
     "a name": (lambda: disturbed(hill(5.5), ("deep",)), InvalidProblem, "mean 'depth'"),
     "a measured name": (
         lambda: simulated(sedated(hill(5.5)), fp.Estimating(LAW, fp.DisturbanceKalman({"C": 1.0}, {"depth'''": 1.0}))),

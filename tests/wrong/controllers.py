@@ -25,19 +25,23 @@ class Gentle(Controller):
 
     def blocks(self, problem):
         """Return reference, law and the closing blocks."""
-        plant = problem.plant
-        size = len(plant.names)
+        plant, motion = problem.plant, self.motion(problem.plant)
+        size = len(plant.face.names)
 
         def step(s):
-            error = s.reference - s.state
+            error = s.reference - getattr(s, motion.name)
             wanted = self.rate**2 * error[:size] + 2 * self.rate * error[size:]
             nominal = s._reference_response
             return {"nominal": nominal, "desired": nominal + self.limit * ca.tanh(wanted / self.limit)}
 
-        reads = Layout((plant.state, like(plant.state, "reference"), plant.response_signal("_reference_response")))
+        reads = Layout((motion, like(plant.output, "reference"), plant.response_signal("_reference_response")))
         writes = Layout((plant.response_signal("nominal"), plant.response_signal("desired")))
         closing, delays = closing_blocks(problem, self.deformation)
         return [reference_block(problem), Block("law", reads, writes, step), *closing], delays
+
+    def motion(self, plant):
+        """What it feeds back: the measured outputs."""
+        return plant.output
 
     def changed(self, problem, name, change):
         """Return its blocks with the step of one of them wrapped: change(step, signals)."""
@@ -124,12 +128,12 @@ class AlwaysOk(Gentle):
         return self.changed(problem, "judge", lambda step, s: {"status": 0 * s._held})
 
 
-class SaysItControlsOutputs(Gentle):
-    """Takes the state for the output."""
+class TakesTheStateForTheOutput(Gentle):
+    """Feeds back the state, whatever the outputs are."""
 
-    def outputs_unusable(self, problem):
+    def motion(self, plant):
         """Wrong."""
-        return ""
+        return plant.state
 
 
 class IgnoresItsDeformation(Gentle):

@@ -13,7 +13,7 @@ CONTROLLERS = {
     controllers.TellsAnotherModel: ("model is of the plant", r"the exact 'm' is 1\.1, the plant has 1:"),
     controllers.IsGivenTheExactParameters: ("exact parameters are unknown", "its command of cycle 0 is"),
     controllers.AlwaysOk: ("bad measurement never acts", "'a' measured as nan.*status of that cycle is OK"),
-    controllers.SaysItControlsOutputs: ("outputs are controlled", "it can control a plant with outputs, but"),
+    controllers.TakesTheStateForTheOutput: ("outputs are controlled", "read plant.output and not plant.state"),
     controllers.IgnoresItsDeformation: ("deformation acts", "half of the effective gain 0.198"),
     controllers.NamesAnotherLaw: ("law is what it does", "fed back with 36, its law Exponential says 3600"),
     controllers.SaysItControlsMaps: ("maps are controlled", "it can control a map, but"),

@@ -78,11 +78,6 @@ class AccelerationFeedback(Controller):
         """Return the stability limit (1 + p) / (1 - p) of kappa lambda_max(J) for control cycles of that period, s."""
         return (1 + self.pole(period)) / (1 - self.pole(period))
 
-    def outputs_unusable(self, problem: Problem) -> str:
-        """Return nothing: law and measured response are those of the outputs."""
-        del problem
-        return ""
-
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, tracking, feedback, invert, limit, judge, running, tracking update."""
         plant = problem.plant

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, closing_blocks, fed, like
+from fpirhc.controllers.face import on_face
 from fpirhc.controllers.mirror import MEASURED_TIME
 from fpirhc.controllers.own_reference import own_signals
 from fpirhc.controllers.response_pairs import ResponsePairs
@@ -94,9 +95,9 @@ class AdaptiveInverseDynamics(Controller):
             *desired_blocks(problem, self.tracking),
             self._learn_block(problem),
             *(fed(block, "parameters", believed) for block in closing),
-            bounded(problem, self.tracking).update(plant, problem.period),
+            on_face(plant, bounded(problem, self.tracking).update(plant.face, problem.period)),
         ]
-        return blocks, [*delays, *learning_delays(), *self.tracking.delays(plant)]
+        return blocks, [*delays, *learning_delays(), *self.tracking.delays(plant.face)]
 
     @property
     def _learning(self) -> Learning:
@@ -116,14 +117,14 @@ class AdaptiveInverseDynamics(Controller):
         def gradient(s: Signals, then: Expression, estimate: Expression) -> Pair:
             state = then if paired else s.state
             matrix, _ = equation(state, s.realised, s._command_before, estimate, s.parameters)
-            chains = error_chains(plant, target(s) - state)
+            chains = error_chains(plant.face, target(s) - state)
             if self.tracking.integral:
                 chains = [[s._integral_used[k], *chain] for k, chain in enumerate(chains)]
             weights = fixed if rows is None else ca.vertsplit(getattr(s, rows.signal.name))
             along = [sum(w * e for w, e in zip(weights, chain, strict=True)) for chain in chains]
             return matrix, ca.vertcat(*along)
 
-        reads = (*reads, integral_signal(plant, "_integral_used"))
+        reads = (*reads, integral_signal(plant.face, "_integral_used"))
         if rows is None:
             return learning.block(problem, reads, gradient)
         return replace(learning.block(problem, (*reads, *rows.reads.signals), gradient), derived=rows.derived)
@@ -132,7 +133,7 @@ class AdaptiveInverseDynamics(Controller):
         """The reference when the response was realised, and what it reads; no sample is older than the start."""
         plant, pairs = problem.plant, ResponsePairs(problem, problem.dead_time)
         if not _late(problem) or own_signals(problem):
-            return lambda s: s._target, (like(plant.state, "_target"),)
+            return lambda s: s._target, (like(plant.output, "_target"),)
         reference = problem.reference.function(plant)
 
         def then(s: Signals) -> Expression:

@@ -59,11 +59,6 @@ class BacksteppingMRAC(Controller):
                 f"BacksteppingMRAC(model_rate={self.model_rate!r}, rates={self.rates!r}): expected positive numbers, 1/s"
             )
 
-    def outputs_unusable(self, problem: Problem) -> str:
-        """Return nothing: the reference model and the nested errors are those of the outputs."""
-        del problem
-        return ""
-
     def check(self, problem: Problem) -> None:
         """Raise if the rates do not fit the relative orders.
 

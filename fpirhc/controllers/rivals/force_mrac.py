@@ -25,6 +25,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like
 from fpirhc.controllers.demands import command_demand
+from fpirhc.controllers.face import on_face
 from fpirhc.controllers.tracked import bounded, desired_blocks
 from fpirhc.deformation.base import Deformation, Demand, Mirror
 from fpirhc.errors import Mistakes
@@ -96,9 +97,9 @@ class ForceMRAC(Controller):
             *desired_blocks(problem, self.tracking),
             self._force_block(plant, problem.warm_up_cycles),
             *closing,
-            bounded(problem, self.tracking).update(plant, problem.period),
+            on_face(plant, bounded(problem, self.tracking).update(plant.face, problem.period)),
         ]
-        return blocks, [*delays, *self.tracking.delays(plant)]
+        return blocks, [*delays, *self.tracking.delays(plant.face)]
 
     def _force_block(self, plant: Plant, warm_up_cycles: float) -> Block:
         """Block (state, desired, realised, last command) -> Q^Des, Q^Rec, Q^Def, and the model's response to it."""

@@ -62,7 +62,7 @@ class Learning:
             InvalidValue: parameters enter nonlinearly, a first estimate is outside its bounds, or the bounds admit a mass matrix
                 that is not positive definite where the controller inverts it.
         """
-        _check_order(problem)
+        _check_coordinates(problem)
         regressor = self.regressor(problem)
         self.rule.check(self.bounds)
         _check_bounds(regressor, self.bounds)
@@ -136,7 +136,14 @@ def equation_function(regressor: Regressor) -> ca.Function:
     return ca.Function("fpirhc_equation", [x, r, u, theta, p], [both[:, :-1], both[:, -1]])
 
 
-def _check_order(problem: Problem) -> None:
+def _check_coordinates(problem: Problem) -> None:
+    """Raise unless the coordinates of mechanics, of order 2, are what follows the reference."""
+    plant = problem.plant
+    if plant.known_by_outputs != tuple(range(plant.state.size)):
+        raise NotSupported(
+            f"learning inverse dynamics is for mechanics in its own coordinates, whose inertia matrix it learns; "
+            f"{', '.join(plant.controlled_names)} are other functions of the state; use ComputedTorque with a deformation"
+        )
     odd = [f"'{n}' of order {r}" for n, r in zip(problem.plant.names, problem.plant.orders, strict=True) if r != 2]
     if odd:
         raise NotSupported(

@@ -34,6 +34,7 @@ import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
+from fpirhc.controllers.face import measured_signals, on_face
 from fpirhc.controllers.rivals.reference_model import companion, decay_gains, model_block
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
@@ -93,8 +94,9 @@ class LyapunovMRAC(Controller):
             InvalidProblem: not fully actuated, or the inputs' effect on the response is not of one sign at the start.
         """
         plant, mistakes = problem.plant, Mistakes("LyapunovMRAC")
-        if len(plant.controlled_names) != len(plant.names):
-            free = [c for c in plant.names if c not in plant.controlled_names]
+        followed = plant.face.names
+        if len(plant.controlled_names) != len(followed):
+            free = [c for c in followed if c not in plant.controlled_names]
             mistakes.add(f"the plant is not fully actuated: '{free[0]}' has no input of its own; use ComputedTorque")
         elif _sign(problem) == 0:
             mistakes.add(
@@ -109,7 +111,7 @@ class LyapunovMRAC(Controller):
         closing, delays = commanding_blocks(problem)
         blocks = [
             reference_block(problem),
-            model_block(plant, self.rate, problem.period),
+            on_face(plant, model_block(plant.face, self.rate, problem.period)),
             self._law_block(plant),
             *closing,
             self._adapt_block(plant, problem.period, _sign(problem)),
@@ -119,14 +121,16 @@ class LyapunovMRAC(Controller):
 
     def _law_block(self, plant: Plant) -> Block:
         """Block (state, model, reference, gains) -> command, regressor, p z, and the gains in use."""
-        rows = [self.weights(plant.orders[k])[-1] for k in plant.controlled_indices]
+        face, seen = plant.face, plant.output
+        rows = [self.weights(face.orders[k])[-1] for k in face.controlled_indices]
         start, response, rate = _start_gains(plant), plant.controlled_response_function, self.rate
 
         def pull(row: np.ndarray, chain: list[Expression]) -> Expression:
             return sum(w * power(rate, len(chain) - 1 - j) * e for j, (w, e) in enumerate(zip(row, chain, strict=True)))
 
         def step(s: Signals) -> dict[str, Expression]:
-            errors = error_chains(plant, s.reference - s.state)
+            motion = getattr(s, seen.name)
+            errors = error_chains(face, s.reference - motion)
             feedback = [ca.dot(numbers(decay_gains(rate, len(c))), ca.vertcat(*c)) for c in errors]
             desired = s._reference_response + ca.vertcat(*feedback)
             begun = start(s.state, desired, s.parameters)
@@ -134,7 +138,7 @@ class LyapunovMRAC(Controller):
             gains = ca.if_else(s.warm_up > 0.5, s._gains_before, begun)
             regressor = ca.vertcat(s.state, desired, 1)
             command = ca.mtimes(ca.reshape(gains, desired.numel(), regressor.numel()), regressor)
-            chains = error_chains(plant, s.model - s.state)
+            chains = error_chains(face, s.model - motion)
             return {
                 "desired": desired,
                 "command_unclipped": command,
@@ -146,8 +150,14 @@ class LyapunovMRAC(Controller):
             }
 
         before = [_gains(plant, n) for n in ("_gains_before", "_gains_first_before")]
-        states = [like(plant.state, n) for n in ("model", "reference")]
-        reads = (plant.state, *states, plant.response_signal("_reference_response"), plant.parameter, scalar("warm_up"))
+        motions = [like(seen, n) for n in ("model", "reference")]
+        reads = (
+            *measured_signals(plant),
+            *motions,
+            plant.response_signal("_reference_response"),
+            plant.parameter,
+            scalar("warm_up"),
+        )
         writes = (
             plant.response_signal("desired"),
             like(plant.input, "command_unclipped"),

@@ -107,11 +107,6 @@ class PID(Controller):
                 )
         mistakes.raise_if_any()
 
-    def outputs_unusable(self, problem: Problem) -> str:
-        """Return nothing: the error is that of the outputs."""
-        del problem
-        return ""
-
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, pid, limit, judge, running, integral."""
         plant = problem.plant

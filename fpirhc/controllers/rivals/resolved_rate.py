@@ -75,11 +75,6 @@ class ResolvedAccelerationRate(Controller):
         """Return the coefficients of (d/dt + rate)^degree below the highest, lowest derivative first."""
         return decay_gains(self.rate, degree)
 
-    def outputs_unusable(self, problem: Problem) -> str:
-        """Return nothing: the error is that of the outputs, and increments of their response give the command's."""
-        del problem
-        return ""
-
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, rate, increment, invert, limit, judge, running."""
         plant = problem.plant

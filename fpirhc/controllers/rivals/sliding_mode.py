@@ -80,11 +80,6 @@ class SlidingMode(Controller):
             )
         mistakes.raise_if_any()
 
-    def outputs_unusable(self, problem: Problem) -> str:
-        """Return nothing: the surface is that of the outputs' errors."""
-        del problem
-        return ""
-
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, surface, deform, invert, limit, judge, running."""
         response = problem.plant.response_signal("_reference_response")

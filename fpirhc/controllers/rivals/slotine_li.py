@@ -106,15 +106,17 @@ class SlotineLi(Controller):
         """Block (state, reference) -> (sliding rho, v, v'); v' is also 'desired' where nothing is deformed."""
         plant = problem.plant
         at, moving = list(plant.indices(0)), list(plant.indices(1))
-        reads = (plant.state, like(plant.state, "reference"), plant.response_signal("_reference_response"))
+        seen = plant.output
+        reads = (seen, like(seen, "reference"), plant.response_signal("_reference_response"))
         slope = plant.response_signal("_velocity_slope" if self._deforms else "desired")
         writes = (_rates(problem, "sliding"), _rates(problem, "_velocity"), slope, plant.response_signal("nominal"))
 
         def step(s: Signals) -> dict[str, Expression]:
-            error = s.reference - s.state
+            motion = getattr(s, seen.name)
+            error = s.reference - motion
             velocity = s.reference[moving] + self.rate * error[at]
             return {
-                "sliding": velocity - s.state[moving],
+                "sliding": velocity - motion[moving],
                 "_velocity": velocity,
                 slope.name: s._reference_response + self.rate * error[moving],
                 "nominal": s._reference_response,

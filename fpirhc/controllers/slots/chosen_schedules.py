@@ -22,6 +22,7 @@ from fpirhc.controllers.slots.slot import Channel
 from fpirhc.controllers.slots.slot_modes import linear_modes
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.real_number import finite_number
+from fpirhc.horizon.nominal import reference_state
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -121,7 +122,7 @@ class ByLookAhead(Schedule):
         forms = [phi.T @ weight @ phi for phi in transitions]
 
         def score(s: Signals) -> list[Expression]:
-            away = s.state - s.reference
+            away = s.state - reference_state(problem.plant, s.reference)
             return [-ca.bilin(ca.DM(form), away, away) for form in forms]
 
         return _chosen(problem, channels, score, self.dwell, self.hysteresis)
@@ -144,7 +145,7 @@ def _chosen(problem: Problem, channels: Sequence[Channel], score: Scores, dwell:
     reads = (
         error_signal(problem, "error"),
         plant.state,
-        like(plant.state, "reference"),
+        like(plant.output, "reference"),
         scalar("_slot_before"),
         scalar("_age_before"),
         scalar("warm_up"),

@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 import casadi as ca
 
 from fpirhc.controllers.base import clip, error_signal, like
+from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.own_reference import motion_of, own_signals, own_values, stages_of
 from fpirhc.controllers.slots.slot import Channel, First
 from fpirhc.status import Status
@@ -34,23 +35,27 @@ def by_slot(channels: Sequence[Channel], name: str) -> Signal:
 
 
 def reference_block(problem: Problem) -> Block:
-    """Block (time, state) -> (reference state, error of the judged coordinates)."""
-    plant, function = problem.plant, motion_of(problem)
-    places = [plant.state.elements.index(c) for c in problem.judged_names]
+    """Block (time, outputs) -> (reference of the outputs, error of the judged ones)."""
+    plant, seen, function = problem.plant, problem.plant.output, motion_of(problem)
+    places = [seen.elements.index(c) for c in problem.judged_names]
 
     def step(s: Signals) -> dict[str, Expression]:
         reference = function(s.time, *own_values(problem, s))[0]
-        return {"reference": reference, "error": reference[places] - s.state[places]}
+        return {"reference": reference, "error": reference[places] - getattr(s, seen.name)[places]}
 
-    writes = Layout((like(plant.state, "reference"), error_signal(problem, "error")))
-    reads = Layout((plant.time, plant.state, *own_signals(problem)))
+    writes = Layout((like(seen, "reference"), error_signal(problem, "error")))
+    reads = Layout((plant.time, seen, *own_signals(problem)))
     return Block("reference", reads, writes, step, opaque=problem.reference.opaque)
 
 
 def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
-    """Block -> the slot's chain, its target, y^(r),N, alpha and beta of the model, and whether beta is large enough."""
-    plant, chain = problem.plant, one.chain
-    derivatives = problem.reference.chain(plant, stages_of(problem), chain.coordinate, chain.order)
+    """Block -> the slot's chain, its target, y^(r),N, alpha and beta of the model, and whether beta is large enough.
+
+    What is measured of the chain is the measured value; the rest is the model's.
+    """
+    plant, chain, seen = problem.plant, one.chain, problem.plant.output
+    elements = one.plant.state.elements
+    derivatives = problem.reference.chain(plant.face, stages_of(problem), chain.coordinate, chain.order)
     place = plant.input.elements.index(chain.input)
     smallest = smallest_gain * abs(one.start_gain)
 
@@ -58,9 +63,11 @@ def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
         nominal = derivatives(s.time, *own_values(problem, s))
         others = ca.vertcat(*(0 if k == place else s._command_before[k] for k in range(plant.input.size)))
         gain = chain.gain(s.state, others, s.parameters)
+        measured = dict(zip(seen.elements, ca.vertsplit(getattr(s, seen.name)), strict=True))
+        modelled = ca.vertsplit(chain.states(s.state, s.parameters))
         good = ca.fabs(gain) >= smallest
         values = {
-            "state": chain.states(s.state, s.parameters),
+            "state": ca.vertcat(*(measured.get(e, own) for e, own in zip(elements, modelled, strict=True))),
             "target": nominal[: chain.order] if chain.order > 1 else nominal[0],
             "nominal": nominal[chain.order],
             "free": chain.response(s.state, others, s.parameters, ca.DM.zeros(len(plant.names))),
@@ -71,10 +78,10 @@ def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
         }
         return {one.wire(name): value for name, value in values.items()}
 
-    elements = one.plant.state.elements
     writes = [one.signal(n, elements) for n in ("state", "target")]
     writes += [one.signal(n) for n in ("nominal", "free", "gain", "good", "divisor")]
-    reads = (plant.time, plant.state, plant.parameter, like(plant.input, "_command_before"), *own_signals(problem))
+    motion, before = measured_signals(plant), like(plant.input, "_command_before")
+    reads = (plant.time, *motion, plant.parameter, before, *own_signals(problem))
     return Block(
         f"slot_state_{one.number}", Layout(reads), Layout(tuple(writes)), step, opaque=problem.reference.opaque
     )

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from fpirhc.controllers.reference_states import reference_states
 from fpirhc.controllers.slots.slot import Channel
 from fpirhc.task.problem import Problem
 
@@ -93,10 +94,11 @@ def linear_modes(
 def _set_point(problem: Problem, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray] | str:
     plant = problem.plant
     reference_end = problem.reference.function(plant)(problem.duration)
-    state, response = (np.asarray(v.full()).ravel() for v in reference_end)
-    moving = [abs(v) for e, v in zip(plant.state.elements, state, strict=True) if "'" in e]
+    motion, response = (np.asarray(v.full()).ravel() for v in reference_end)
+    moving = [abs(v) for e, v in zip(plant.output.elements, motion, strict=True) if "'" in e]
     if max([*moving, *np.abs(response)]) > _STILL:
         return f"the reference still moves at its end, t = {problem.duration:g} {problem.time_unit}"
+    state = reference_states(problem, 2)[:, -1]
     x, u, p = plant.symbols()
     rate = plant.derivative_function(x, u, p)
     function = ca.Function("fpirhc_rate", [x, u, p], [rate, ca.densify(ca.jacobian(rate, u))])

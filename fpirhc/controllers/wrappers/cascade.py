@@ -92,10 +92,6 @@ class Cascade(Controller):
         del problem, mirror
         return "`paired` already compares with the model; use the map itself"
 
-    def outputs_unusable(self, problem: Problem) -> str:
-        """Return the reason of the inner controller: the shift itself is one of the measured outputs."""
-        return self.controller.outputs_unusable(self.inner_problem(problem))
-
     def demand(self, problem: Problem) -> Demand:
         """Return the size of the reference's controlled quantities, which the shift may have to make up for at once."""
         plant, function = problem.plant, problem.reference.function(problem.plant)

@@ -89,12 +89,6 @@ class Estimating(Controller):
         """Return the inner controller: near the reference the parameters are those of the start."""
         return inner
 
-    def outputs_unusable(self, problem: Problem) -> str:
-        """Return why the estimator or the wrapped controller does not cover outputs; empty where both do."""
-        if not self.estimator.covers_outputs:
-            return f"{type(self.estimator).__name__} is written for responses of coordinates"
-        return self.controller.outputs_unusable(self.inner_problem(problem))
-
     def check(self, problem: Problem) -> None:
         """Raise if the estimator or the wrapped controller does not fit the problem.
 

@@ -63,10 +63,6 @@ class ExactModel(Controller):
             problem.symbolic_reality.check_as_model(problem.plant)
         return problem.real_plant
 
-    def outputs_unusable(self, problem: Problem) -> str:
-        """Return the reason of the wrapped controller."""
-        return self.controller.outputs_unusable(self.inner_problem(problem))
-
     def linear_around(self, inner: Controller) -> Controller:
         """Return the inner controller: `parameters` already gives the exact ones."""
         return inner

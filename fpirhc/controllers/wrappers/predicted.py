@@ -55,11 +55,6 @@ class Predictor(Checked, ABC):
         """Time constant of the low-passed model residual that `advance` is given, s; None: the residual is zero."""
         return None
 
-    @property
-    def predicts_state(self) -> bool:
-        """Whether the whole state follows from what is queued, also where outputs are controlled; True by default."""
-        return True
-
     @abstractmethod
     def check(self, plant: Plant) -> None:
         """Raise if the predictor does not support the plant.
@@ -124,17 +119,17 @@ class ByModel(Predictor):
 class ByDesired(Predictor):
     """Integrate the queued desired responses."""
 
-    @property
-    def predicts_state(self) -> bool:
-        """False: desired responses of outputs say nothing of inner states."""
-        return False
-
     def check(self, plant: Plant) -> None:
-        """Raise if some coordinate is not controlled.
+        """Raise if some state does not follow from the desired responses.
 
         Raises:
-            NotSupported: the motion of a coordinate that is not controlled needs a model.
+            NotSupported: the motion of a coordinate that is not controlled, or of states behind outputs, needs a model.
         """
+        if plant.outputs:
+            raise NotSupported(
+                f"ByDesired() does not cover outputs that are expressions of the state ({', '.join(plant.outputs)}): it predicts "
+                "what is desired of the outputs, and the inverse needs the state; use by=ByModel()"
+            )
         if len(plant.controlled_names) != len(plant.names):
             raise NotSupported("ByDesired() needs every coordinate to be controlled; use ByModel()")
 
@@ -208,14 +203,6 @@ class Predicted(Controller):
         """Time, state and outputs ahead in place of those of now."""
         ahead = {"time": "time_ahead", "state": "state_ahead", "output": "output_ahead"}
         return {**ahead, **self.controller.feeds}
-
-    def outputs_unusable(self, problem: Problem) -> str:
-        """Return why the predictor or the wrapped controller does not cover outputs; empty where both do."""
-        if not self.by.predicts_state:
-            return (
-                f"{self.by} predicts what is desired of the outputs, and the inverse needs the state; use by=ByModel()"
-            )
-        return self.controller.outputs_unusable(problem)
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
         """Return the notes of the wrapped controller; with set-points, that they are followed late by the dead time."""

@@ -61,11 +61,6 @@ class Estimator(Checked, ABC):
         """Whether what it learns changes the command in every cycle, also between plans; False by default."""
         return False
 
-    @property
-    def covers_outputs(self) -> bool:
-        """Whether it serves a plant whose response is that of outputs; False by default, so that nothing is wrong in silence."""
-        return False
-
     def reads_outputs(self, plant: Plant) -> bool:  # noqa: ARG002
         """Whether it learns from the measured outputs of this plant below their responses; False by default."""
         return False

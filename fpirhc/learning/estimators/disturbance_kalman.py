@@ -87,11 +87,6 @@ class DisturbanceKalman(Estimator):
         """Whether all disturbances are those of outputs' responses, which plans do not have and the inverse has."""
         return all("'" in name for name in self.drift)
 
-    @property
-    def covers_outputs(self) -> bool:
-        """True: outputs are disturbed and measured by name."""
-        return True
-
     def reads_outputs(self, plant: Plant) -> bool:
         """Whether some output, or a derivative below its response, is measured."""
         return bool(plant.outputs) and any(n in plant.output.elements for n in self.measured)

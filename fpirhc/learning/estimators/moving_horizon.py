@@ -73,11 +73,6 @@ class MovingHorizon(Estimator):
             if not isinstance(value, int) or not 1 <= value <= most:
                 raise InvalidValue(f"MovingHorizon({name}={value!r}): expected a whole number from 1 to {most}")
 
-    @property
-    def covers_outputs(self) -> bool:
-        """True: the response of an output depends on the parameters as that of a coordinate does."""
-        return True
-
     def learned(self) -> tuple[str, ...]:
         """The named parameters."""
         return tuple(self.parameters)

@@ -63,11 +63,6 @@ class RecursiveLeastSquares(Estimator):
                 f"RecursiveLeastSquares(time={self.time!r}): expected a positive number of seconds, or math.inf"
             )
 
-    @property
-    def covers_outputs(self) -> bool:
-        """True: the response of an output depends on the parameters as that of a coordinate does."""
-        return True
-
     def learned(self) -> tuple[str, ...]:
         """The named parameters."""
         return tuple(self.parameters)

@@ -55,11 +55,6 @@ class _HeldInput(Controller):
         """Yes: it follows nothing."""
         return True
 
-    def outputs_unusable(self, problem: Problem) -> str:
-        """Return nothing: it reads no error."""
-        del problem
-        return ""
-
     def maps_unusable(self, problem: Problem) -> str:
         """Return nothing: it has no law."""
         del problem
