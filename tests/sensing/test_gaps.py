@@ -165,6 +165,10 @@ LOOPS: dict[str, tuple[fp.Problem, Controller]] = {
             fp.RecursiveLeastSquares({"m": Uncertain(0.5, 3.0, 0.5)}, noise={"a": 0.1, "b": 0.1}, time=1.0),
         ),
     ),
+    "cascade": (
+        replace(two_masses(), sensing=fp.Sensing(estimator=fp.PositionDifference())),
+        fp.Cascade(fp.ComputedTorque(TRACK), GENTLE, fp.ThroughModel(lag=0.01)),
+    ),
     **{f"{type(e).__name__}": (estimated(k), fp.ComputedTorque(TRACK, GENTLE)) for k, e in enumerate(ESTIMATORS)},
 }
 

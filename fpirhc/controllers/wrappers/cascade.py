@@ -184,7 +184,9 @@ def _renamed(inner: Composite, written: set[str]) -> Block:
         renamed = {other: values[name] for name, other in shown.items()}
         return {**renamed, **{f"{m}_next": values[f"{m}_next"] for m in block.memory.names}}
 
-    return replace(block, writes=writes, step=step)
+    lossy = inner.bridged_if_any
+    bridged = None if lossy is None else lambda: _renamed(lossy(), written)
+    return replace(block, writes=writes, step=step, bridged=bridged)
 
 
 # What is left is the dead time of the problem.
