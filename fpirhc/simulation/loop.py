@@ -16,6 +16,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller, Response, error_signal, like, rename
 from fpirhc.controllers.contract import checked
 from fpirhc.controllers.face import measured_signals, on_face
+from fpirhc.controllers.gap import BRIDGED, across_gaps, gap_of
 from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.own_reference import given_signals, own_signals
@@ -63,7 +64,8 @@ def _closed(problem: Problem, controller: Controller, live: LiveSettings | None)
     task = nominal(problem)
     # What a body outside measures may be wrong; what the loop computes itself is a result, however far it goes.
     plausible = plausible_range(task) if problem.foreign is not None else {}
-    acting = Gate(task, compose_seeing(problem, ready), trusted=("time", "memory"), plausible=plausible)
+    inner, gap = across_gaps(compose_seeing(problem, ready)), gap_of(task, BRIDGED)
+    acting = Gate(task, inner, trusted=("time", "memory"), plausible=plausible, gap=gap)
     disturbed = disturbance_signals(problem)
     seeing = _sense_blocks(problem, ready.response(problem), predicts="state_ahead" in acting.inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had

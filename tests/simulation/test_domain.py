@@ -175,9 +175,31 @@ def test_loop_goes_on_and_equals_the_stepper(name):
     for k in range(run.cycles):
         command, memory = stepper.step_measured(run.time[k], shown[k], memory)
         assert np.array_equal(command, run["command"][k])
-        tells = k > 0 and below[k - 1] and run["status"][k] == Status.OK  # a stepper tells the gap
-        assert status(stepper) == (Status.BRIDGED if tells else run["status"][k])
+        assert status(stepper) == run["status"][k]
     assert fp.measure(NOISY, run)["status"]["NON_FINITE"] == below.sum()
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
+@pytest.mark.parametrize(
+    "estimator", [fp.PositionDifference(), fp.SavitzkyGolay(window=5, degree=1), fp.StateVariableFilter(bandwidth=60.0)]
+)
+def test_estimators_of_a_loop_go_over_a_step_that_is_not_finite(estimator, compiled):
+    """As those of a stepper, which is given the same samples: commands to the last bit, and statuses."""
+    noisy = fp.Sensing(sensors={"h": fp.Sensor(noise=fp.Noise(0.1))}, estimator=estimator)
+    problem, controller = replace(TANK, sensing=noisy), fp.ComputedTorque(TRACK, fp.Affine(gain=-0.02))
+    run = fp.simulate(problem, controller, seed=3, compiled=compiled)
+    shown = raw_measurements(run)
+    assert run.stop is None
+    assert min((run["status"] == s).sum() for s in (Status.NON_FINITE, Status.BRIDGED)) >= 2
+    stepper = fp.Stepper(problem, controller, compiled=compiled, plausible={"h": (-10.0, 10.0)})
+    memory = stepper.start()
+    for k in range(run.cycles):
+        command, memory = stepper.step_measured(run.time[k], shown[k], memory)
+        if compiled:
+            np.testing.assert_allclose(command, run["command"][k], rtol=1e-9, atol=1e-9)
+        else:
+            assert np.array_equal(command, run["command"][k])
+        assert status(stepper) == run["status"][k]
 
 
 @needs_compiler
