@@ -50,7 +50,7 @@ from .deformation.wrappers.filtered import Filtered
 from .deformation.wrappers.guarded import Guarded
 from .deformation.wrappers.self_paired import DelayWatched, SelfPaired
 from .deformation.wrappers.tuned import Tuned
-from .errors import FpirhcError
+from .errors import FpirhcError, HarmfulAdaptation
 from .horizon.cost import CustomCost, LQRTerminal, Quadratic
 from .horizon.hessian_models import ExactHessian, GaussNewton
 from .horizon.horizon import Horizon
@@ -185,6 +185,7 @@ __all__ = [
     "GaussNewton",
     "GradientFixedPoint",
     "Guarded",
+    "HarmfulAdaptation",
     "HoldPlan",
     "Horizon",
     "Identity",

@@ -14,6 +14,10 @@ class FpirhcError(Exception):
     """Base of all errors that fpirhc raises on purpose."""
 
 
+class HarmfulAdaptation(UserWarning):
+    """A controller runs better without its adaptation; no error, because what is built runs as it was asked for."""
+
+
 class InvalidName(FpirhcError, AttributeError, KeyError):
     """A name that does not exist; the nearest valid one is offered."""
 

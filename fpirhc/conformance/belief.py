@@ -20,6 +20,7 @@ from fpirhc.sensing.measured import Measured
 from fpirhc.sensing.observability import unobservable
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.sensing.sensor import Sensor
+from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.simulation.simulate import simulate
@@ -132,6 +133,7 @@ def finite_under_noise(trial: _Trial, generator: np.random.Generator) -> None:  
     hold(run.stop is None and finite, "under noise a believed state is not finite")
 
 
+@without_warning()
 def one_step_with_the_controller(trial: _Trial, generator: np.random.Generator) -> None:
     """Raw measurements of a run give its states bit by bit; a bad sample leaves finite numbers, and no correction."""
     run = trial.noisy_run

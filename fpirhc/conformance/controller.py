@@ -15,6 +15,7 @@ from fpirhc.conformance.loops import two_masses as two_masses
 from fpirhc.controllers.base import Controller, compose_controller
 from fpirhc.controllers.contract import checked, resolved
 from fpirhc.describe import describe
+from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.simulation.stepper import Stepper
@@ -108,6 +109,7 @@ def exact_model_tracks(trial: Trial, generator: np.random.Generator) -> None:  #
         )
 
 
+@without_warning()
 def same_command_everywhere(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """The loop, a Stepper, a second Stepper and compiled C give the same command for the same measurements."""
     run, scale = trial.run, 1 + float(np.abs(trial.run["command"]).max())

@@ -19,6 +19,7 @@ from fpirhc.plant.outputs import Output
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing
+from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
 from fpirhc.simulation.stepper import Stepper
@@ -101,6 +102,7 @@ class Trial:
         return simulate(problem, self.controller, seed=self.seed, compiled=False)
 
     @cached_property
+    @without_warning()
     def stepper(self) -> Stepper:
         """The controller alone, in CasADi's virtual machine."""
         return Stepper(

@@ -12,12 +12,22 @@ _PROBLEMS = str(Path(_PACKAGE) / "_problems")  # shipped problems of an installe
 
 def users_place() -> str:
     """Return "file.py, line 12" of the innermost call from outside the package; empty where there is none."""
-    frame: FrameType | None = sys._getframe(1)
-    while frame is not None:
-        if is_users(frame.f_code.co_filename):
-            return f"{Path(frame.f_code.co_filename).name}, line {frame.f_lineno}"
-        frame = frame.f_back
-    return ""
+    _, frame = _users_frame(sys._getframe(1))
+    return f"{Path(frame.f_code.co_filename).name}, line {frame.f_lineno}" if frame else ""
+
+
+def users_level() -> int:
+    """Return the `stacklevel` with which a warning by the caller of this function stands at the user's line."""
+    depth, frame = _users_frame(sys._getframe(1))
+    return depth + 1 if frame else 1
+
+
+def _users_frame(frame: FrameType | None) -> tuple[int, FrameType | None]:
+    """The innermost frame of a user's code from this one on, and how many calls it is away."""
+    depth = 0
+    while frame is not None and not is_users(frame.f_code.co_filename):
+        frame, depth = frame.f_back, depth + 1
+    return depth, frame
 
 
 def is_users(filename: str) -> bool:

@@ -9,6 +9,7 @@ from fpirhc.controllers.contract import resolved, without_deformation
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError
 from fpirhc.review.prediction import NominalRun, nominal_run
+from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.task.problem import Problem
 
 CYCLES = 2000  # of a run
@@ -42,11 +43,3 @@ class NominalRuns:
             return nominal_run(shortened(self.problem, CYCLES), controller, compiled=False)
         except FpirhcError as error:
             return str(error)
-
-
-def shortened(problem: Problem, cycles: int) -> Problem:
-    """Return the problem with at most so many cycles; where it is shortened, errors count from its middle on at the latest."""
-    if problem.cycles <= cycles:
-        return problem
-    duration = cycles * problem.period
-    return replace(problem, duration=duration, measure_from=min(problem.measure_from, 0.5 * duration))

@@ -6,76 +6,25 @@ estimator of the response are those of the problem.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved, without_deformation
 from fpirhc.review.grid import each
-from fpirhc.review.nominal_runs import CYCLES, shortened
+from fpirhc.review.nominal_runs import CYCLES
 from fpirhc.review.prediction import NominalRun, exactly
+from fpirhc.simulation.error_pair import ErrorPair
+from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.simulation.simulate import simulate
 from fpirhc.task.outside import as_told
 from fpirhc.task.problem import Problem
 
-WORSE, MUCH_WORSE, FAR_WORSE = 1.2, 2.0, 10.0  # ratio of the errors
 _ROUNDING = 1e-9  # of the reference's size
-SLIGHT, CLEAR = 1e-3, 1e-2  # added error as a share of the coordinate's range
 
 
-@dataclass(frozen=True, eq=False)
-class NullRuns:
-    """Errors of the two runs on the right model.
-
-    Args:
-        without: rms tracking error by judged coordinate without adaptation, in the unit of the coordinate.
-        adapted: the same with the deformation; infinite where the run ended early.
-        ranges: range of the reference, or the largest error without adaptation where that is larger, by coordinate.
-    """
-
-    without: Mapping[str, float]
-    adapted: Mapping[str, float]
-    ranges: Mapping[str, float]
-
-    @property
-    def worst(self) -> str:
-        """The coordinate to which adaptation adds the largest share of its range."""
-        return max(self.without, key=self.added)
-
-    def added(self, name: str) -> float:
-        """The error that adaptation adds, as a share of the range of the coordinate."""
-        return (self.adapted[name] - self.without[name]) / max(self.ranges[name], 1e-300)
-
-    def ratio(self, name: str) -> float:
-        """The error with adaptation over the error without."""
-        return self.adapted[name] / max(self.without[name], 1e-300)
-
-    @property
-    def text(self) -> str:
-        """Both errors of the worst coordinate in a sentence."""
-        name = self.worst
-        return (
-            f"run on its own model, rms error of {name} {self.without[name]:.3g} without adaptation and {self.adapted[name]:.3g} "
-            f"with it, {100 * self.added(name):+.2g} % of its range"
-        )
-
-    @property
-    def passes(self) -> bool:
-        """Whether adaptation makes no coordinate worse by more than a fifth and by a thousandth of its range."""
-        return not self._beyond(WORSE, SLIGHT)
-
-    @property
-    def fails(self) -> bool:
-        """Whether it makes one worse by a factor of two and a hundredth of its range, or by ten times and a thousandth."""
-        return self._beyond(MUCH_WORSE, CLEAR) or self._beyond(FAR_WORSE, SLIGHT)
-
-    def _beyond(self, ratio: float, share: float) -> bool:
-        return any(not (self.ratio(n) <= ratio or self.added(n) <= share) for n in self.without)
-
-
-def null_runs(problem: Problem, controller: Controller, nominal: NominalRun | None = None) -> NullRuns:
+def null_runs(problem: Problem, controller: Controller, nominal: NominalRun | None = None) -> ErrorPair:
     """Return the errors of the controller on its own model, with and without adaptation, over at most `CYCLES` cycles.
 
     Args:
@@ -94,10 +43,10 @@ def null_runs(problem: Problem, controller: Controller, nominal: NominalRun | No
     else:
         states = nominal.states[:-1]
     without, ranges = _errors_along(model, states), _ranges(model, states)
-    return with_form(NullRuns(without, without, ranges), model, controller)
+    return with_form(ErrorPair(without, without, ranges), model, controller)
 
 
-def with_form(runs: NullRuns, model: Problem, controller: Controller) -> NullRuns:
+def with_form(runs: ErrorPair, model: Problem, controller: Controller) -> ErrorPair:
     """Return the runs with the errors of another controller in place of the adapted one; `model` is the null problem.
 
     Raises:

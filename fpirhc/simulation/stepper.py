@@ -20,6 +20,7 @@ from fpirhc.errors import ConcurrentUse
 from fpirhc.fields.checked import Checked
 from fpirhc.simulation.clock import MEMORY as CLOCK
 from fpirhc.simulation.deadline import Clock, Deadline
+from fpirhc.simulation.harm_warning import warn_of_harm
 from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, Watch
 from fpirhc.simulation.missed import missed_cycles, most_missed
 from fpirhc.simulation.numbers_now import NumbersNow
@@ -75,6 +76,9 @@ class Stepper(Checked):
     does not accept are refused: the old ones stay, `refused` counts, and `why_refused` states the last reason. Restarts begin with
     the memory of the build, and SATURATED is judged by the limits of the build. Set-points of the reference change in the same way,
     `stepper.step(..., setpoints={"q1": 2.5})`, and need no live setting; `setpoints` are in force.
+
+    A controller that does better without its adaptation is warned of once, `HarmfulAdaptation`, after four runs of 300 cycles on
+    the problem's plant and on its own model. `warnings.simplefilter("ignore", fpirhc.HarmfulAdaptation)` spares these runs.
     """
 
     def __init__(
@@ -147,6 +151,7 @@ class Stepper(Checked):
         self._before, self._period = self.memory.slice(CLOCK.name).start, float(problem.period)
         self._skipped = self.memory.slice(f"{SKIPPED}_before").start
         self._late, self._most = 1.5 * self._period, most_missed(problem, bridged)
+        warn_of_harm(problem, controller)
 
     def __repr__(self) -> str:
         """What it is of, how it runs, and how it keeps its deadline."""

@@ -17,10 +17,11 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.forms import forms_of
-from fpirhc.review.null_runs import SLIGHT, NullRuns, null_problem, null_runs, with_form
+from fpirhc.review.null_runs import null_problem, null_runs, with_form
 from fpirhc.review.pays import ROUNDING, nominal_size, rms
 from fpirhc.review.prediction import NominalRun, errors_without_adaptation, response_errors
 from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.simulation.error_pair import SLIGHT, ErrorPair
 
 QUESTION_TEXT = "Does adaptation leave a right model alone?"
 _PRACTICAL = 100  # times, by which a period may be shortened in earnest
@@ -69,7 +70,7 @@ def _cures_more(nominal: NominalRun | None, predicted: float | None) -> bool:
     )
 
 
-def _remedy(case: Case, runs: NullRuns, predicted: float | None) -> tuple[str, dict[str, float]]:
+def _remedy(case: Case, runs: ErrorPair, predicted: float | None) -> tuple[str, dict[str, float]]:
     """Which form passes, by a run, and which period would do, by the prediction."""
     sentences, numbers = [], {}
     for name, form in reversed(forms_of(case.problem, case.controller.deformation).items()):
@@ -90,7 +91,7 @@ def _remedy(case: Case, runs: NullRuns, predicted: float | None) -> tuple[str, d
     return " ".join(sentences), numbers
 
 
-def _other(case: Case, form: Deformation, runs: NullRuns) -> NullRuns | None:
+def _other(case: Case, form: Deformation, runs: ErrorPair) -> ErrorPair | None:
     try:
         model = null_problem(case.problem, case.controller)
         return with_form(runs, model, case.controller.with_deformation(form))
@@ -98,7 +99,7 @@ def _other(case: Case, form: Deformation, runs: NullRuns) -> NullRuns | None:
         return None
 
 
-def _period(case: Case, runs: NullRuns, predicted: float) -> float | None:
+def _period(case: Case, runs: ErrorPair, predicted: float) -> float | None:
     """The period with which the predicted response error is as small as the null test asks for.
 
     The prediction leaves the outer loop out, and the error that adaptation adds to the coordinates is taken to be proportional to

@@ -7,7 +7,7 @@ The plain form passes on the changes of the desired response a little late, so s
 it is larger than the error that the wrong model causes without adaptation, which adaptation is there to remove.
 
 The loops of the comparison run once more with other exact parameters, so nothing is composed or compiled again; where the plant is
-no instance of the model they are composed around the model. A run is the original one, cut to `CYCLES` cycles after `measure_from`.
+no instance of the model they are composed around the model. A run is the original one, cut after 2000 measured cycles.
 A test costs two such runs, and pairs with the same controller without adaptation share its run.
 """
 
@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,15 +25,14 @@ from fpirhc.plant.units import with_space
 from fpirhc.simulation.common_columns import judged_motion
 from fpirhc.simulation.metrics.entries.commands import at_limit
 from fpirhc.simulation.metrics.window import by_name
+from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import Simulator, simulator
+from fpirhc.simulation.simulate import Simulator
 from fpirhc.studies.comparison.changes import ROUNDING, Change, major, outcome_of
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.summary import in_percent
-from fpirhc.task.outside import as_told
 from fpirhc.task.problem import Problem
 
-CYCLES = 2000  # measured cycles of a run at most
 _MOSTLY = 0.5  # share of the cycles at a limit from which nothing is shown
 _LARGER = (Outcome.WORSE, Outcome.MIXED)
 
@@ -66,27 +65,6 @@ class NullTest(FoundByName):
     def passed(self) -> bool:
         """Whether adaptation is not worse where there is nothing to adapt."""
         return self.outcome in (Outcome.BETTER, Outcome.NO_DIFFERENCE)
-
-
-class ModelAsPlant:
-    """The approximate model as plant of a comparison's loops, without disturbances; every loop runs once."""
-
-    def __init__(self, problem: Problem, *, seed: int) -> None:
-        """Take the problem of the comparison, and the seed of the sensors' noise."""
-        own = problem.of_model
-        self._own = replace(own, signals=as_told(own.plant, own.signals)) if own.signals else own
-        # The loops of the comparison have the real plant and signals.
-        self._foreign = problem.reality is not None or bool(problem.signals)
-        self._seed = seed
-        self._runs: dict[Simulator, Run] = {}
-        self.problem = _null_problem(self._own)
-
-    def run(self, loop: Simulator) -> Run:
-        """Return the run of a loop on the model."""
-        if loop not in self._runs:
-            own = simulator(self._own, loop.controller, compiled=False) if self._foreign else loop
-            self._runs[loop] = own.run(seed=self._seed, variant=self.problem, disturbed=False)
-        return self._runs[loop]
 
 
 def null_test(
@@ -122,13 +100,6 @@ def null_test(
     harmful = _harmful(outcome, changes, cured)
     text = _sentence(names, outcome, changes, null, cured if not harmful and outcome in _LARGER else None)
     return NullTest(names, before, after, outcome, harmful, text, null.cycles, time.perf_counter() - begin)
-
-
-def _null_problem(problem: Problem) -> Problem:
-    longest = problem.measure_from + CYCLES * problem.period
-    return replace(
-        problem, plant=problem.plant.with_exact(problem.plant.approximate), duration=min(problem.duration, longest)
-    )
 
 
 def _not_informative(stuck: Mapping[str, float]) -> str:

@@ -10,9 +10,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from fpirhc.broken import attempted
+from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.simulate import Simulator
 from fpirhc.studies.comparison.entry_facts import no_bound_because
-from fpirhc.studies.comparison.null_test import ModelAsPlant, NullTest, null_test
+from fpirhc.studies.comparison.null_test import NullTest, null_test
 from fpirhc.studies.comparison.other_rows import beaten_by
 from fpirhc.studies.comparison.timing import measure_price
 from fpirhc.task.problem import Problem

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fpirhc.controllers.base import Controller
+from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.simulation.stepper import Stepper
@@ -68,7 +69,8 @@ def measure_price(
     rounds = cycles // block
     if rounds < _FEWEST:
         return None
-    replays = [_Replay(Stepper(problem, c, compiled=compiled), run) for c, run in (plain, adaptive)]
+    with without_warning():
+        replays = [_Replay(Stepper(problem, c, compiled=compiled), run) for c, run in (plain, adaptive)]
     times = np.empty((rounds, 2))
     for number in range(rounds):
         for k in (0, 1) if number % 2 else (1, 0):
@@ -141,7 +143,8 @@ def measure_cycle(problem: Problem, controller: Controller, run: Run, *, compile
     cycles = min(run.cycles, REPLAYED)
     if cycles < 2:
         return None
-    stepper = Stepper(problem, controller, compiled=compiled, bounded=False)
+    with without_warning():
+        stepper = Stepper(problem, controller, compiled=compiled, bounded=False)
     memory = stepper.start()
     taken = np.empty(cycles)
     times, step = run.time[:cycles], _step_of(stepper)

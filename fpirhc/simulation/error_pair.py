@@ -1,0 +1,59 @@
+"""Errors of a controller without adaptation and with it, and whether adaptation does harm."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+WORSE, MUCH_WORSE, FAR_WORSE = 1.2, 2.0, 10.0  # ratio of the errors
+SLIGHT, CLEAR = 1e-3, 1e-2  # added error as a share of the coordinate's range
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorPair:
+    """Errors of two runs on the same plant.
+
+    Args:
+        without: rms tracking error by judged coordinate without adaptation, in the unit of the coordinate.
+        adapted: the same with the deformation; infinite where the run ended early.
+        ranges: range of the reference, or the largest error without adaptation where that is larger, by coordinate.
+    """
+
+    without: Mapping[str, float]
+    adapted: Mapping[str, float]
+    ranges: Mapping[str, float]
+
+    @property
+    def worst(self) -> str:
+        """The coordinate to which adaptation adds the largest share of its range."""
+        return max(self.without, key=self.added)
+
+    def added(self, name: str) -> float:
+        """The error that adaptation adds, as a share of the range of the coordinate."""
+        return (self.adapted[name] - self.without[name]) / max(self.ranges[name], 1e-300)
+
+    def ratio(self, name: str) -> float:
+        """The error with adaptation over the error without."""
+        return self.adapted[name] / max(self.without[name], 1e-300)
+
+    @property
+    def text(self) -> str:
+        """Both errors of the worst coordinate in a sentence."""
+        name = self.worst
+        return (
+            f"run on its own model, rms error of {name} {self.without[name]:.3g} without adaptation and {self.adapted[name]:.3g} "
+            f"with it, {100 * self.added(name):+.2g} % of its range"
+        )
+
+    @property
+    def passes(self) -> bool:
+        """Whether adaptation makes no coordinate worse by more than a fifth and by a thousandth of its range."""
+        return not self._beyond(WORSE, SLIGHT)
+
+    @property
+    def fails(self) -> bool:
+        """Whether it makes one worse by a factor of two and a hundredth of its range, or by ten times and a thousandth."""
+        return self._beyond(MUCH_WORSE, CLEAR) or self._beyond(FAR_WORSE, SLIGHT)
+
+    def _beyond(self, ratio: float, share: float) -> bool:
+        return any(not (self.ratio(n) <= ratio or self.added(n) <= share) for n in self.without)

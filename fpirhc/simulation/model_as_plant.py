@@ -1,0 +1,43 @@
+"""The controller's model as the plant: there is nothing to adapt, so every change by adaptation is harm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from fpirhc.simulation.run import Run
+from fpirhc.simulation.simulate import Simulator, simulator
+from fpirhc.task.outside import as_told
+from fpirhc.task.problem import Problem
+
+CYCLES = 2000  # measured cycles of a run at most
+
+
+class ModelAsPlant:
+    """The approximate model as plant of loops that are ready, without disturbances; every loop runs once."""
+
+    def __init__(self, problem: Problem, *, seed: int) -> None:
+        """Take the problem of the loops, and the seed of the sensors' noise."""
+        own = problem.of_model
+        self._own = replace(own, signals=as_told(own.plant, own.signals)) if own.signals else own
+        # The loops have the real plant and signals.
+        self._foreign = problem.reality is not None or bool(problem.signals)
+        self._seed = seed
+        self._runs: dict[Simulator, Run] = {}
+        plant, longest = self._own.plant, self._own.measure_from + CYCLES * self._own.period
+        own = replace(self._own, plant=plant.with_exact(plant.approximate))
+        self.problem = replace(own, duration=min(own.duration, longest))
+
+    def run(self, loop: Simulator) -> Run:
+        """Return the run of a loop on the model."""
+        if loop not in self._runs:
+            own = simulator(self._own, loop.controller, compiled=False) if self._foreign else loop
+            self._runs[loop] = own.run(seed=self._seed, variant=self.problem, disturbed=False)
+        return self._runs[loop]
+
+
+def shortened(problem: Problem, cycles: int) -> Problem:
+    """Return the problem with at most so many cycles; where it is shortened, errors count from its middle on at the latest."""
+    if problem.cycles <= cycles:
+        return problem
+    duration = cycles * problem.period
+    return replace(problem, duration=duration, measure_from=min(problem.measure_from, 0.5 * duration))

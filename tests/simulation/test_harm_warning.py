@@ -1,0 +1,90 @@
+"""A stepper of a controller that does better without its adaptation warns once; who ignores the warning pays nothing."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from dataclasses import replace
+
+import casadi as ca
+import pytest
+from plants import linear
+
+import fpirhc as fp
+from fpirhc.simulation import harm_warning
+from fpirhc.studies.comparison.timing import measure_cycle
+
+PROBLEM = fp.Problem(
+    plant=linear(1.02, 1.0),
+    reference=fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}),
+    start={"y": 0.0, "y'": 3.0},
+    period=5e-3,
+    duration=4.0,
+    measure_from=1.0,
+)
+GENTLE = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Affine(gain=-0.05))
+TEXT = (
+    r"ComputedTorque: adaptation does harm, by runs of 300 cycles: on the plant the rms error of y is (\S+) without adaptation, "
+    r"(\S+) with it; on its own model, with nothing to adapt the rms error of y is (\S+) without adaptation, (\S+) with it\. "
+)
+
+
+def told(problem: fp.Problem, controller) -> list[str]:
+    """Texts of the warnings of one stepper, which then steps."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        stepper = fp.Stepper(problem, controller, compiled=False)
+        memory = stepper.start()
+        for k in range(3):
+            _, memory = stepper.step(k * problem.period, problem.start_state, [0.0], memory)
+    assert all(one.category is fp.HarmfulAdaptation for one in caught)
+    assert all(one.filename == __file__ for one in caught)
+    return [str(one.message) for one in caught]
+
+
+def test_a_gentle_plain_form_is_warned_of_once_with_its_numbers():
+    """The numbers are those of runs of 300 cycles, half of which count."""
+    [text] = told(PROBLEM, GENTLE)
+    found = re.search(TEXT, text)
+    assert found
+    short = replace(PROBLEM, duration=1.5, measure_from=0.75)
+    own = replace(short, plant=linear(1.02, 1.02))
+    runs = [(p, c) for p in (short, own) for c in (GENTLE.unadapted(), GENTLE)]
+    rms = [fp.measure(p, fp.simulate(p, c, seed=0, compiled=False)).rms_error["y"] for p, c in runs]
+    assert [float(number) for number in found.groups()] == pytest.approx(rms, rel=6e-3)
+    assert rms[1] > 2 * rms[0]
+    assert rms[3] > rms[0]
+
+
+@pytest.mark.parametrize("map_", [fp.ModelReferenced(fp.Affine(gain=-0.05)), fp.ModelReferenced(fp.Affine(gain=-0.8))])
+def test_the_model_referenced_form_is_not_warned_of(map_):
+    """It leaves an exact model alone, whatever its gain."""
+    assert told(PROBLEM, replace(GENTLE, deformation=map_)) == []
+
+
+def test_without_adaptation_nothing_runs(monkeypatch):
+    """Neither where there is nothing to judge nor where the warning is ignored, nor where a cycle is timed."""
+    monkeypatch.setattr(harm_warning, "_reasons", lambda *_: pytest.fail("it ran"))
+    assert told(PROBLEM, GENTLE.unadapted()) == []
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.simplefilter("ignore", fp.HarmfulAdaptation)
+        fp.Stepper(PROBLEM, GENTLE, compiled=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        measure_cycle(PROBLEM, GENTLE, fp.simulate(PROBLEM, GENTLE, seed=0, compiled=False), compiled=False)
+
+
+def test_as_an_error_it_stops_the_build():
+    """Who wants no such controller on a machine turns the warning into an error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", fp.HarmfulAdaptation)
+        with pytest.raises(fp.HarmfulAdaptation, match="adaptation does harm"):
+            fp.Stepper(PROBLEM, GENTLE, compiled=False)
+
+
+def test_a_run_that_ends_early_is_harm():
+    """With a gain beyond its limit the adapted loop is lost where the other is not."""
+    wild = replace(GENTLE, deformation=fp.BeyondLimit(fp.Affine(gain=-60.0)))
+    [text] = told(PROBLEM, wild)
+    assert "without adaptation, a run that ends early with it" in text
