@@ -7,6 +7,7 @@ import warnings
 from dataclasses import replace
 
 import casadi as ca
+import numpy as np
 import pytest
 from plants import linear
 
@@ -36,7 +37,7 @@ def told(problem: fp.Problem, controller) -> list[str]:
         stepper = fp.Stepper(problem, controller, compiled=False)
         memory = stepper.start()
         for k in range(3):
-            _, memory = stepper.step(k * problem.period, problem.start_state, [0.0], memory)
+            _, memory = stepper.step(k * problem.period, problem.start_state, np.zeros(1), memory)
     assert all(one.category is fp.HarmfulAdaptation for one in caught)
     assert all(one.filename == __file__ for one in caught)
     return [str(one.message) for one in caught]
