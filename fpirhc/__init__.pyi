@@ -110,8 +110,7 @@ from .simulation.pictures.base import Quantity
 from .simulation.pictures.over_time import OverTime
 from .simulation.pictures.portrait import Portrait
 from .simulation.pictures.raster import Raster
-from .simulation.run import Run
-from .simulation.run_file import load_run
+from .simulation.run import Run, load_run
 from .simulation.simulate import simulate, simulator
 from .simulation.stepper import Stepper
 from .status import Status

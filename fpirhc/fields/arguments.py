@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import ClassVar, get_origin
 
 from fpirhc.errors import nearest
-from fpirhc.fields.expected import Anything, Expected, accepts, expected_by, mistakes_in
+from fpirhc.fields.expected import Anything, Expected, accepts, expected_by
 from fpirhc.fields.given import call_of, described
+from fpirhc.fields.mending import mistakes_in
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.fields.given import described, mended, shortened
+from fpirhc.fields.given import shortened
 from fpirhc.fields.kinds import Range
 from fpirhc.fields.real_number import real_number
 from fpirhc.symbolic.number import SymbolicNumber
@@ -46,17 +46,6 @@ class Expected(ABC):
 def accepts(expected: Expected, value: object) -> bool:
     """Whether the value and all its parts are as expected."""
     return expected.fits(value) and all(accepts(inner, part) for _, inner, part in expected.parts(value))
-
-
-def mistakes_in(expected: Expected, where: str, value: object) -> Iterator[str]:
-    """Yield every mistake of the value and its parts."""
-    if not expected.fits(value):
-        comma = isinstance(value, tuple) and len(value) == 1 and accepts(expected, value[0])
-        mend = "a comma behind the value makes a tuple of it; remove the comma" if comma else mended(expected, value)
-        yield f"{where}: expected {expected.words}, got {described(value)}{'; ' + mend if mend else ''}"
-        return
-    for place, inner, part in expected.parts(value):
-        yield from mistakes_in(inner, f"{where}{place}", part)
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fpirhc.simulation.log import Log
 from fpirhc.summary import printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from fpirhc.simulation.run import Run
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5b4a9c", "#8c6d1f", "#7f7f7f", "#111111")
 BANDS = ("#7f7f7f", "#e69f00", "#56b4e9", "#cc79a7")  # of time slots, drawn pale
@@ -37,18 +36,18 @@ def literal(text: str) -> str:
     return printable(text).replace("$", r"\$")
 
 
-def time_label(run: Run) -> str:
+def time_label(run: Log) -> str:
     """Return the label of a time axis: 'time [s]'."""
     return literal(f"time [{run.time_unit}]")
 
 
-def quantity_label(run: Run, signal: str, names: Sequence[str]) -> str:
+def quantity_label(run: Log, signal: str, names: Sequence[str]) -> str:
     """Return the label of an axis that shows these entries of a signal, with their unit where they have one in common."""
     units = list(dict.fromkeys(run.unit(f"{signal}.{name}") for name in names))
     return literal(", ".join(names) + (f" [{units[0]}]" if len(units) == 1 else ""))
 
 
-def draw_bands(axis: Axes, run: Run) -> None:
+def draw_bands(axis: Axes, run: Log) -> None:
     """Draw time slots as shaded bands, named in the legend."""
     named: set[int] = set()
     for start, end, slot in run.spans():
@@ -64,7 +63,7 @@ def draw_bands(axis: Axes, run: Run) -> None:
         named.add(slot)
 
 
-def draw_changes(axis: Axes, run: Run) -> None:
+def draw_changes(axis: Axes, run: Log) -> None:
     """Draw the times at which live settings changed as vertical lines, named in the legend."""
     for k, (time, _) in enumerate(run.in_force[1:]):
         axis.axvline(time, color="#777777", lw=0.8, ls=":", label=None if k else "change of settings")
@@ -75,7 +74,7 @@ def thinned(values: np.ndarray, points: int = _POINTS) -> np.ndarray:
     return values[:: max(1, values.shape[0] // points)]
 
 
-def draw_line(axis: Axes, run: Run, column: str, label: str, color: str, style: str = "-") -> None:
+def draw_line(axis: Axes, run: Log, column: str, label: str, color: str, style: str = "-") -> None:
     """Draw one column of a run over time; its unit stands in the legend."""
     axis.plot(
         thinned(run.time),
@@ -94,7 +93,7 @@ def draw_legend(axis: Axes) -> None:
         axis.legend(fontsize=7, loc="best", framealpha=0.8)
 
 
-def draw_responses(axis: Axes, run: Run, name: str) -> None:
+def draw_responses(axis: Axes, run: Log, name: str) -> None:
     """Draw the nominal, desired, deformed and realised response of one coordinate; a spike does not hide the rest."""
     for signal, color in _RESPONSES.items():
         style = ":" if signal == "realised" else "-"

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from fpirhc.by_name import ByName, FoundByName
-from fpirhc.errors import InvalidName, nearest
 from fpirhc.fields.checked_call import checked_call
+from fpirhc.simulation import run_file
+from fpirhc.simulation.log import Log
 from fpirhc.status import Status
 from fpirhc.summary import in_percent, line, number, table
-from fpirhc.symbolic.layout import Layout
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,7 +23,7 @@ _FEW = 0.01  # share of the cycles without a converged plan that says nothing ab
 
 
 @dataclass(frozen=True, eq=False)
-class Run(FoundByName):
+class Run(Log):
     """The log of one closed-loop run.
 
     `run["desired"]` has shape (cycles, entries); `run["desired.q1"]` has shape (cycles,).
@@ -45,16 +43,6 @@ class Run(FoundByName):
 
     LOADED: ClassVar[str] = "fp.load_run({})"
     """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
-
-    problem: str
-    controller: str
-    seed: int
-    period: float
-    layout: Layout
-    log: np.ndarray
-    stop: str | None
-    compiled: bool
-    settings: Mapping[str, object]
 
     def __repr__(self) -> str:
         return line(self, f"{self.problem or 'problem'}, {self.controller}", *self._facts())
@@ -99,58 +87,6 @@ class Run(FoundByName):
             f"virtual machine and another computer may give other runs: allow more iterations, or loosen the tolerance"
         )
 
-    def __getitem__(self, name: str) -> np.ndarray:
-        if name in self.layout:
-            return self.log[:, self.layout.slice(name)]
-        if name in self.layout.columns:
-            return self.log[:, self.layout.columns.index(name)]
-        raise self._unknown(name)
-
-    @property
-    def time(self) -> np.ndarray:
-        """Time of every cycle, shape (cycles,), in `time_unit`."""
-        return self["time"][:, 0]
-
-    @property
-    def time_unit(self) -> str:
-        """Unit of time, as the plant names it."""
-        return self.unit("time")
-
-    @property
-    def in_force(self) -> tuple[tuple[float, Mapping[str, float]], ...]:
-        """Times from which numbers of live settings were in force, with the numbers by path; empty without live settings."""
-        record = cast(Sequence[tuple[float, Mapping[str, float]]], self.settings.get("live", ()))
-        return tuple((float(time), ByName(numbers, "Run.in_force")) for time, numbers in record)
-
-    @property
-    def cycles(self) -> int:
-        """Number of cycles that were run."""
-        return int(self.log.shape[0])
-
-    def spans(self) -> list[tuple[float, float, int]]:
-        """Return the time slots as (start, end, number of the slot); empty where the controller has none."""
-        if "slot" not in self.layout or not self.cycles:
-            return []
-        slots = self["slot"][:, 0].astype(int)
-        starts = [0, *(np.flatnonzero(np.diff(slots)) + 1).tolist()]
-        ends = [*starts[1:], self.cycles]
-        return [(a * self.period, b * self.period, int(slots[a])) for a, b in zip(starts, ends, strict=True)]
-
-    def unit(self, column: str) -> str:
-        """Return the unit of one column.
-
-        Raises:
-            InvalidName: an unknown column; the nearest one is offered.
-        """
-        if column not in self.layout.columns:
-            raise self._unknown(column)
-        return self.layout.units[self.layout.columns.index(column)]
-
-    def _unknown(self, name: object) -> InvalidName:
-        valid = [*self.layout.names, *self.layout.columns]
-        rows = "" if isinstance(name, str) else " A run is read by names; run.log has its cycles by number."
-        return InvalidName(f"signal '{name}' is not in this run.{rows}{nearest(name, valid)}")
-
     def to_dataframe(self) -> pd.DataFrame:
         """Return all signals as a pandas DataFrame with one column per entry, indexed by time."""
         import pandas as pd
@@ -172,6 +108,16 @@ class Run(FoundByName):
         Raises:
             OutputError: the file cannot be written, or its place is a symbolic link.
         """
-        from fpirhc.simulation.run_file import save_run
+        run_file.save(self, Path(path))
 
-        save_run(self, Path(path))
+
+@checked_call
+def load_run(path: str | Path) -> Run:
+    """Read a run that `Run.save` wrote.
+
+    Raises:
+        OutputError: the file is missing, damaged, of another format, or no file of a run.
+    """
+    facts, layout, log = run_file.read(Path(path))
+    names = facts.problem, facts.controller, facts.seed, facts.period
+    return Run(*names, layout, log, facts.stop, facts.compiled, facts.settings)

@@ -16,14 +16,13 @@ from fpirhc.simulation.drawing import (
     quantity_label,
     time_label,
 )
+from fpirhc.simulation.log import Log
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from fpirhc.simulation.run import Run
 
-
-def run_figure(run: Run) -> Figure:
+def run_figure(run: Log) -> Figure:
     """Return a figure with errors, coordinates, commands and responses of one run over time."""
     figure = new_figure(10, 9, f"{run.controller}" + (f" ({run.stop})" if run.stop else ""))
     names = run.layout["error"].elements

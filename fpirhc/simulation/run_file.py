@@ -13,19 +13,15 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fpirhc.errors import FpirhcError, OutputError
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.checked_call import checked_call
 from fpirhc.fields.kinds import Positive
 from fpirhc.simulation.common_columns import with_common_columns
+from fpirhc.simulation.log import Log
 from fpirhc.symbolic.layout import Layout, Signal
-
-if TYPE_CHECKING:
-    from fpirhc.simulation.run import Run
 
 FORMAT = 1
 MOST = 2**34  # bytes of an unpacked file; a small file that unpacks to more is no run
@@ -47,7 +43,7 @@ class Facts(Checked):
     signals: Sequence[tuple[str, Sequence[str], Sequence[str]]]
 
 
-def save_run(run: Run, path: Path) -> None:
+def save(run: Log, path: Path) -> None:
     """Write the file: beside its place first, then under its name, so that a broken write leaves an earlier file as it was.
 
     Raises:
@@ -76,19 +72,15 @@ def save_run(run: Run, path: Path) -> None:
         raise OutputError(f"cannot write the run to '{path}': {error.strerror}") from None
 
 
-@checked_call
-def load_run(path: str | Path) -> Run:
-    """Read a run that `Run.save` wrote.
+def read(path: Path) -> tuple[Facts, Layout, np.ndarray]:
+    """Return facts, layout and log of a file, with columns that a file of an older version lacks.
 
     Raises:
         OutputError: the file is missing, damaged, of another format, or no file of a run.
     """
-    from fpirhc.simulation.run import Run
-
     try:
-        log, stored = _parts(Path(path))
+        log, stored = _parts(path)
         facts = _facts(stored)
-        # A file of an older version lacks columns; they follow from the others.
         layout, log = with_common_columns(_layout(facts, log), log)
     except OutputError as error:
         raise OutputError(f"cannot read a run from '{path}': {error}") from None
@@ -98,17 +90,7 @@ def load_run(path: str | Path) -> Run:
         text = str(getattr(error, "strerror", None) or error).partition("\n")[0][:200]
         raise OutputError(f"cannot read a run from '{path}': {text or type(error).__name__}") from None
     log.setflags(write=False)
-    return Run(
-        facts.problem,
-        facts.controller,
-        facts.seed,
-        facts.period,
-        layout,
-        log,
-        facts.stop,
-        facts.compiled,
-        facts.settings,
-    )
+    return facts, layout, log
 
 
 def _parts(path: Path) -> tuple[np.ndarray, object]:

@@ -14,7 +14,7 @@ from fpirhc.errors import InvalidProblem
 from fpirhc.problem_files.problem_file import load_problem
 from fpirhc.report.html import render
 from fpirhc.report.terminal import settings_in_force
-from fpirhc.simulation.run_file import load_run
+from fpirhc.simulation.run import load_run
 from fpirhc.studies.comparison.compare import Comparison, compare
 
 NAME, GAIN, SCALE = "CTC+FPI (eq 6)", "deformation.gain", "deformation.scale"

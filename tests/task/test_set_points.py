@@ -19,7 +19,7 @@ from fpirhc.controllers.demands import reference_demand
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidShape, InvalidValue, NotSupported
 from fpirhc.report.terminal import set_points_in_force
 from fpirhc.simulation.loop import close_loop
-from fpirhc.simulation.run_file import load_run
+from fpirhc.simulation.run import load_run
 from fpirhc.studies.comparison.optimality import measure_optimality
 from fpirhc.symbolic.native import native
 from fpirhc.task.equal_poles import transition

@@ -1,0 +1,81 @@
+"""The mistakes of a value, each with how to mend it."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from difflib import get_close_matches
+from importlib import import_module
+
+import casadi as ca
+
+from fpirhc.fields.expected import Expected, accepts
+from fpirhc.fields.given import call_of, described
+
+
+def mistakes_in(expected: Expected, where: str, value: object) -> Iterator[str]:
+    """Yield every mistake of the value and its parts."""
+    if not expected.fits(value):
+        comma = isinstance(value, tuple) and len(value) == 1 and accepts(expected, value[0])
+        mend = "a comma behind the value makes a tuple of it; remove the comma" if comma else mended(expected, value)
+        yield f"{where}: expected {expected.words}, got {described(value)}{'; ' + mend if mend else ''}"
+        return
+    for place, inner, part in expected.parts(value):
+        yield from mistakes_in(inner, f"{where}{place}", part)
+
+
+def mended(expected: Expected, value: object) -> str:
+    """Return what to write instead; empty where nothing is near."""
+    contract = expected.contract()
+    if isinstance(value, type):
+        return f"write {call_of(value)}" if contract is not None and issubclass(value, contract) else ""
+    if isinstance(value, str):
+        return _mended_text(expected, value, contract)
+    if isinstance(value, ca.SX | ca.MX):
+        return "a setting is a number" if expected.fits(1) or expected.fits(0.5) else ""
+    if isinstance(value, float) and value.is_integer() and abs(value) < 1e15 and expected.fits(int(value)):
+        return f"write {int(value)}"
+    if inspect.isroutine(value) and contract is not None:
+        return "call it and give its result, or give a value"
+    return _part_that_fits(expected, value) if contract is not None else ""
+
+
+def _mended_text(expected: Expected, text: str, contract: type | None) -> str:
+    for number in (int, float):
+        try:
+            if expected.fits(number(text)):
+                return f"write {text} without quotes"
+        except ValueError:
+            continue
+    if contract is None:
+        return ""
+    loaded = getattr(contract, "LOADED", "").format(repr(text))
+    members = {_plain(name): member for name, member in _public(contract) if member is not contract or not loaded}
+    close = get_close_matches(_plain(text), members, n=1, cutoff=0.5)
+    if close:
+        return f"write fp.{call_of(members[close[0]])}"
+    if loaded:
+        return f"write {loaded}"
+    return f"one of {', '.join(sorted(m.__name__ for m in members.values()))}" if members else ""
+
+
+def _part_that_fits(expected: Expected, value: object) -> str:
+    """Which part of the value is what is expected, such as the problem of a loaded file."""
+    if isinstance(value, Mapping):
+        return next((f"give one of its entries, such as [{k!r}]" for k, v in value.items() if expected.fits(v)), "")
+    names = [f.name for f in fields(value)] if is_dataclass(value) and not isinstance(value, type) else []
+    return next((f"give its .{name}" for name in names if expected.fits(getattr(value, name))), "")
+
+
+def _public(contract: type) -> Iterator[tuple[str, type]]:
+    """Public members of a contract; it imports all of them, which only a mistake pays for."""
+    package = import_module(contract.__module__.partition(".")[0])
+    for name in getattr(package, "__all__", ()):
+        member = getattr(package, name, None)
+        if isinstance(member, type) and issubclass(member, contract) and not inspect.isabstract(member):
+            yield name, member
+
+
+def _plain(name: str) -> str:
+    return "".join(c for c in name.lower() if c.isalnum())
