@@ -28,8 +28,7 @@ from fpirhc.problem_files.tuning_spans import TuningSpans, check_tuning
 from fpirhc.simulation.metrics import Metric, known_metrics, with_own_metrics
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.summary import line, table
-from fpirhc.task.problem import Problem
-from fpirhc.task.problem_view import problem_facts
+from fpirhc.task.problem import Problem, problem_facts
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX, nominal
 from fpirhc.task.dead_time import MEASUREMENT, Wait, delay_block
-from fpirhc.task.output_disturbance import LOGGED, added, disturbance_signal, disturbed_outputs, logged_signal
+from fpirhc.task.output_disturbance import LOGGED, added, disturbance_signal, logged_signal
 from fpirhc.task.problem import Problem
 
 Shown: TypeAlias = tuple[tuple[Signal, ...], Signal]  # signals of the motion, and of the response
@@ -278,7 +278,7 @@ def _sense_block(problem: Problem, motion: Sequence[Signal], response: Response)
     outputs = motion[-1:] if problem.plant.outputs else ()
     states = motion[: len(motion) - len(outputs)]
     outputs_of = problem.plant.output_function if reality is None else reality.output_function(problem.plant)
-    shifts = bool(disturbed_outputs(problem))
+    shifts = bool(problem.disturbed_outputs)
     if shifts:
         reads, own = (*reads, disturbance_signal(problem)), (*own, logged_signal(problem))
 

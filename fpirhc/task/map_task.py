@@ -8,46 +8,60 @@ outputs of the last cycles (`StepDifference`); that of an output of order 0 is t
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.integrators import USUAL, Integrator
 from fpirhc.plant.map_steps import MapSteps
 from fpirhc.plant.plant import Plant
+from fpirhc.sensing import Sensing
 from fpirhc.sensing.positions import StepDifference
-
-if TYPE_CHECKING:
-    from fpirhc.task.problem import Problem
+from fpirhc.task.reality import Reality
 
 
-def settle_maps(problem: Problem, mistakes: Mistakes) -> None:
-    """Put into a new problem what follows from its maps, and add to `mistakes` what does not fit their steps."""
+def settled_maps(
+    plant: Plant,
+    reality: Reality | None,
+    period: float,
+    integrator: Integrator,
+    horizon: Horizon | None,
+    sensing: Sensing,
+    mistakes: Mistakes,
+) -> dict[str, object]:
+    """Return the fields of a problem that follow from its maps, by name, and add to `mistakes` what does not fit their steps.
+
+    Args:
+        plant: the model.
+        reality: another plant that moves.
+        period: of the control cycle.
+        integrator: of the problem.
+        horizon: of the problem.
+        sensing: of the problem.
+        mistakes: of the problem.
+    """
     settled: dict[str, object] = {}
-    reality = problem.reality.symbolic if problem.reality is not None else None
     try:
-        settled["plant"] = problem.plant.over(problem.period)
+        settled["plant"] = plant.over(period)
         if reality is not None:
-            real = reality.plant.over(problem.period)
+            real = reality.plant.over(period)
             settled["reality"] = reality if real is reality.plant else replace(reality, plant=real)
     except InvalidValue as error:
         mistakes.add(str(error))
-        return
-    if problem.plant.step is not None:
-        settled["integrator"] = _steps("integrator", problem.integrator, mistakes)
-        if problem.horizon is not None:
-            discretisation = _steps("horizon: discretisation", problem.horizon.discretisation, mistakes)
-            settled["horizon"] = replace(problem.horizon, discretisation=discretisation)
-        if problem.sensing.estimator.measures_all and not _instant(problem.plant):
-            settled["sensing"] = replace(problem.sensing, estimator=StepDifference())
-    elif problem.integrator.steps_maps:
+        return {}
+    if plant.step is not None:
+        settled["integrator"] = _steps("integrator", integrator, mistakes)
+        if horizon is not None:
+            discretisation = _steps("horizon: discretisation", horizon.discretisation, mistakes)
+            settled["horizon"] = replace(horizon, discretisation=discretisation)
+        if sensing.estimator.measures_all and not _instant(plant):
+            settled["sensing"] = replace(sensing, estimator=StepDifference())
+    elif integrator.steps_maps:
         settled["integrator"] = USUAL
-    for name, value in settled.items():
-        object.__setattr__(problem, name, value)
+    return settled
 
 
-def check_map_task(problem: Problem, mistakes: Mistakes) -> None:
+def check_maps(model: Plant, reality: Reality | None, sensing: Sensing, mistakes: Mistakes) -> None:
     """Add what is not covered beside a map to `mistakes`."""
-    model, reality = problem.plant, problem.symbolic_reality
     instant = _instant(model)
     at_once = bool(instant) and set(instant) == set(model.controlled or model.outputs)  # no derivative is looked for
     if reality is not None and reality.plant.step is not None and model.step is None and not at_once:
@@ -62,12 +76,12 @@ def check_map_task(problem: Problem, mistakes: Mistakes) -> None:
             f"outputs: {', '.join(instant)} of order 0 beside outputs that steps move: their responses belong to other "
             "cycles, which is not covered; control them by two problems"
         )
-    if not instant and not problem.sensing.estimator.of_steps:
+    if not instant and not sensing.estimator.of_steps:
         mistakes.add(
-            f"sensing: {type(problem.sensing.estimator).__name__} estimates derivatives with respect to time, which a map does not "
+            f"sensing: {type(sensing.estimator).__name__} estimates derivatives with respect to time, which a map does not "
             "have; leave the estimator out, and differences of its steps are taken"
         )
-    if max(model.face.orders) > 1 and (problem.sensing.belief is not None or problem.sensing.measured is not None):
+    if max(model.face.orders) > 1 and (sensing.belief is not None or sensing.measured is not None):
         mistakes.add(
             "sensing: believed states are not covered where an output of a map has an order above 1, because its next values are "
             "predicted from measured states; leave measured and belief out"

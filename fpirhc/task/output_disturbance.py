@@ -10,31 +10,20 @@ judged, is `Sensor(noise=...)`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.symbolic.layout import Expression, Signal
-
-if TYPE_CHECKING:
-    from fpirhc.task.problem import Problem
+from fpirhc.task.problem import Problem
 
 SIGNAL = "disturbance"  # what a loop reads in every cycle
 LOGGED = "output_disturbance"
 
 
-def disturbed_outputs(problem: Problem) -> dict[str, int]:
-    """Return the disturbed outputs by name with their relative orders; a name of a coordinate of the moving plant is none."""
-    plant, moved = problem.plant, problem.real_plant.coordinates
-    orders = dict(zip(plant.face.names, plant.face.orders, strict=True)) if plant.outputs else {}
-    orders |= dict.fromkeys(plant.instant_names, 0)
-    return {n: orders[n] for n in problem.disturbances if n in orders and n not in moved}
-
-
 def disturbance_columns(problem: Problem) -> tuple[tuple[str, int], ...]:
     """Return name and derivative of every column of the disturbances: first all names, then d', d'', ... of outputs."""
-    orders = disturbed_outputs(problem)
+    orders = problem.disturbed_outputs
     higher = ((name, k) for name, order in orders.items() for k in range(1, order + 1))
     return (*((name, 0) for name in problem.disturbances), *higher)
 
@@ -73,7 +62,7 @@ def added(problem: Problem, disturbance: Expression) -> tuple[Expression, Expres
         problem: with disturbed outputs.
         disturbance: value of `disturbance_signal`.
     """
-    plant, orders = problem.plant, disturbed_outputs(problem)
+    plant, orders = problem.plant, problem.disturbed_outputs
     values: Mapping[str, Expression] = dict(
         zip(disturbance_signal(problem).elements, ca.vertsplit(disturbance), strict=True)
     )

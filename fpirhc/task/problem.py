@@ -23,19 +23,18 @@ from fpirhc.plant.algebraic import unsolved
 from fpirhc.plant.integrators import USUAL, Integrator
 from fpirhc.plant.map_steps import motion_of
 from fpirhc.plant.plant import Plant
+from fpirhc.plant.plant_view import plant_facts
 from fpirhc.plant.signals_in_outputs import differentiated_signals
 from fpirhc.sensing.sensing import Sensing
-from fpirhc.summary import line
+from fpirhc.summary import line, number, table
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.foreign import Foreign
 from fpirhc.task.limits import Limits
-from fpirhc.task.map_task import check_map_task, settle_maps
+from fpirhc.task.map_task import check_maps, settled_maps
 from fpirhc.task.needed import needed_measurements, needed_names
-from fpirhc.task.output_disturbance import disturbed_outputs
 from fpirhc.task.outside import External, check_signals, not_held, real_values, rows_of, signals_of
-from fpirhc.task.problem_view import problem_facts, problem_table
 from fpirhc.task.reality import Reality
 from fpirhc.task.reference import Reference
 from fpirhc.task.steps import check_steps
@@ -100,7 +99,9 @@ class Problem(Checked):
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("problem")
-        settle_maps(self, mistakes)
+        known = self.plant, self.symbolic_reality, self.period, self.integrator, self.horizon, self.sensing
+        for name, value in settled_maps(*known, mistakes).items():
+            object.__setattr__(self, name, value)
         mistakes.raise_if_any()
         _check_times(self, mistakes)
         _check_start(self, mistakes)
@@ -131,7 +132,7 @@ class Problem(Checked):
             except FpirhcError as error:
                 mistakes.add(str(error))
         mistakes.raise_if_any()
-        check_map_task(self, mistakes)
+        check_maps(plant, self.symbolic_reality, self.sensing, mistakes)
         mistakes.raise_if_any()
         check_stage(plant, self.cost, self.limits, mistakes)
         _check_inverse(self, mistakes)
@@ -146,7 +147,7 @@ class Problem(Checked):
 
     def _repr_html_(self) -> str:
         """Times, limits and what disturbs as a table, for notebooks."""
-        return problem_table(self)
+        return _table(self)
 
     @property
     def time_unit(self) -> str:
@@ -192,6 +193,14 @@ class Problem(Checked):
         """The plant that a run moves, with its exact parameters: the reality's, or the model's own."""
         return self.plant if self.symbolic_reality is None else self.symbolic_reality.plant
 
+    @cached_property
+    def disturbed_outputs(self) -> Mapping[str, int]:
+        """Relative orders of the disturbed outputs by name; a name of a coordinate of the moving plant is none."""
+        plant, moved = self.plant, self.real_plant.coordinates
+        orders = dict(zip(plant.face.names, plant.face.orders, strict=True)) if plant.outputs else {}
+        orders |= dict.fromkeys(plant.instant_names, 0)
+        return {n: orders[n] for n in self.disturbances if n in orders and n not in moved}
+
     @property
     def of_model(self) -> Problem:
         """The problem without its reality: the model's own plant moves, and disturbances of what it does not have are left out."""
@@ -227,7 +236,7 @@ class Problem(Checked):
 
     def _check_derivatives(self, instants: np.ndarray) -> None:
         """Raise if the disturbance of an output does not have the derivatives that are needed."""
-        for name, order in disturbed_outputs(self).items():
+        for name, order in self.disturbed_outputs.items():
             if self.plant.step is not None and order > 1:
                 raise InvalidValue(
                     f"disturbances: the output '{name}' of a map has relative order {order}, and its differences look ahead to "
@@ -411,3 +420,67 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
                 f"the response ({which} parameters) is not invertible at the start ({state}): input '{weakest}' has no "
                 "independent effect there; start elsewhere, or give Plant(inverse=...)"
             )
+
+
+def problem_facts(problem: Problem) -> tuple[str, ...]:
+    """Return what sums up a problem: its name, its cycles, its quantities."""
+    named = (problem.name,) if problem.name else ()
+    return *named, f"{problem.cycles} cycles of {problem.period:g} {problem.time_unit}", *plant_facts(problem.plant)
+
+
+def _table(problem: Problem) -> str:
+    """Return HTML: one fact per row; what the problem does not have is left out."""
+    title = f"Problem {problem.name}".strip()
+    rows = [*_time_rows(problem), *_limit_rows(problem), *_other_rows(problem)]
+    return table(title, ("", "value"), rows, [f"Plant: {'; '.join(plant_facts(problem.plant))}."])
+
+
+def _time_rows(problem: Problem) -> list[tuple[str, str]]:
+    unit, horizon = problem.time_unit, problem.horizon
+    rows = [
+        ("run", f"{problem.cycles} cycles of {problem.period:g} {unit}, {problem.duration:g} {unit} in all"),
+        ("measured from", f"{problem.measure_from:g} {unit}"),
+        ("start", _values(dict(zip(problem.plant.state.elements, problem.start_state, strict=True)))),
+        ("judged", ", ".join(problem.judged_names)),
+    ]
+    if horizon is not None:
+        rows.append(("horizon", f"{horizon.stages} stages of {horizon.step:g} {unit}"))
+    return rows
+
+
+def _limit_rows(problem: Problem) -> list[tuple[str, str]]:
+    limits, plant = problem.limits, problem.plant
+    states = dict(zip(plant.state.elements, plant.state.entry_units, strict=True))
+    rates = {name: plant.derivative_unit(unit, 1) for name, unit in plant.inputs.items()}
+    rows = [(f"limits of {name}", _interval(ends, plant.inputs[name])) for name, ends in limits.inputs.items()]
+    rows += [(f"limits of {name}", _interval(ends, states[name])) for name, ends in limits.states.items()]
+    rows += [(f"limits of the rate of {name}", _interval(ends, rates[name])) for name, ends in limits.rates.items()]
+    rows += [(f"limits of {name}", _interval((p.lower, p.upper), p.unit)) for name, p in limits.paths.items()]
+    return rows
+
+
+def _other_rows(problem: Problem) -> list[tuple[str, str]]:
+    unit, late = problem.time_unit, problem.dead_time
+    rows = [(f"dead time of {name}", f"{value:g} {unit}") for name, value in late.inputs.items()]
+    if late.measurement:
+        rows.append(("dead time of the measurement", f"{late.measurement:g} {unit}"))
+    rows += [(f"disturbance of {name}", type(one).__name__) for name, one in problem.disturbances.items()]
+    if problem.symbolic_reality is not None:
+        rows.append(("reality", "; ".join(plant_facts(problem.real_plant))))
+    if problem.foreign is not None:
+        rows.append(("reality", f"{type(problem.foreign.body).__name__}, outside"))
+    if not problem.sensing.ideal:
+        rows.append(("sensing", "with sensors or an estimator"))
+    believed = problem.sensing.believed(problem.plant)
+    if believed:
+        rows.append(("measured", ", ".join(problem.sensing.measures(problem.plant))))
+        rows.append(("believed", f"{', '.join(believed)}, by {type(problem.sensing.belief).__name__}"))
+    return rows
+
+
+def _interval(ends: tuple[float, float], unit: str) -> str:
+    return f"{number(ends[0])} to {number(ends[1])} {unit}".strip()
+
+
+def _values(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} = {number(value)}" for name, value in values.items())
