@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from fpirhc.simulation.metrics import Metrics
-    from fpirhc.studies.comparison.compare import Comparison, Entry
+    from fpirhc.studies.comparison.compare import Comparison
+    from fpirhc.studies.comparison.entry import Entry
     from fpirhc.studies.comparison.null_test import NullTest
     from fpirhc.studies.comparison.outcome import Finding
 

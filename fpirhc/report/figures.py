@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from fpirhc.simulation.run import Run
-    from fpirhc.studies.comparison.compare import Comparison, Entry
+    from fpirhc.studies.comparison.compare import Comparison
+    from fpirhc.studies.comparison.entry import Entry
     from fpirhc.studies.open_loop import Solved
     from fpirhc.task.problem import Problem
 

@@ -21,7 +21,8 @@ from fpirhc.simulation.metrics.columns import Column, columns
 from fpirhc.studies.comparison.optimality import gap
 
 if TYPE_CHECKING:
-    from fpirhc.studies.comparison.compare import Comparison, Entry
+    from fpirhc.studies.comparison.compare import Comparison
+    from fpirhc.studies.comparison.entry import Entry
 
 _CAPTIONS = {
     "Trajectory tracking": "Nominal (dashed) and realised motion over time.",

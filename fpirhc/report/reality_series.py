@@ -9,7 +9,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from fpirhc.simulation.run import Run
-    from fpirhc.studies.comparison.compare import Entry
+    from fpirhc.studies.comparison.entry import Entry
 
 _REALITY = "reality_state"
 Chart = dict[str, Any]

@@ -13,7 +13,8 @@ from fpirhc.simulation.common_columns import shown_motion
 
 if TYPE_CHECKING:
     from fpirhc.simulation.run import Run
-    from fpirhc.studies.comparison.compare import Comparison, Entry
+    from fpirhc.studies.comparison.compare import Comparison
+    from fpirhc.studies.comparison.entry import Entry
 
 INTERVALS = 300
 _RESPONSES = ("nominal", "desired", "deformed", "realised")

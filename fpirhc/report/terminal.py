@@ -25,8 +25,9 @@ from fpirhc.summary import in_percent, printable
 if TYPE_CHECKING:
     from fpirhc.simulation.metrics import Metrics
     from fpirhc.simulation.run import Run
-    from fpirhc.studies.comparison.compare import Comparison, Entry
+    from fpirhc.studies.comparison.compare import Comparison
     from fpirhc.studies.comparison.compare import Progress as Report
+    from fpirhc.studies.comparison.entry import Entry
     from fpirhc.studies.open_loop import Solved
 
 _MOST_STEPS = 6  # of the set-points of one coordinate in a text

@@ -13,7 +13,8 @@ from plants import linear
 import fpirhc as fp
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.metrics import Metrics, known_metrics
-from fpirhc.studies.comparison.compare import Entry, compare
+from fpirhc.studies.comparison.compare import compare
+from fpirhc.studies.comparison.entry import Entry
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.studies.comparison.timing import CycleTime, Price, measure_price, price_of
 from fpirhc.studies.comparison.verdict import findings

@@ -12,7 +12,7 @@ from hand_made_runs import CYCLES, SOLVE
 from fpirhc.simulation.metrics import Metrics, known_metrics
 from fpirhc.simulation.run import Run
 from fpirhc.studies.comparison.caveats import Yardstick
-from fpirhc.studies.comparison.compare import Entry
+from fpirhc.studies.comparison.entry import Entry
 from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.studies.comparison.timing import CycleTime, Price
 from fpirhc.studies.comparison.verdict import findings

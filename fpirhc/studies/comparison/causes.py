@@ -18,7 +18,7 @@ from fpirhc.studies.comparison.changes import times
 from fpirhc.summary import in_percent
 
 if TYPE_CHECKING:
-    from fpirhc.studies.comparison.compare import Entry
+    from fpirhc.studies.comparison.entry import Entry
 
 MANY_CYCLES = 3  # of a run from which the slew of its desired response is judged
 _MANY_PLANS = 0.05  # share of the cycles from which plans that did not converge are a reason

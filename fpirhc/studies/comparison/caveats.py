@@ -13,7 +13,7 @@ from fpirhc.plant.units import with_space
 from fpirhc.studies.comparison.causes import chatter_cause, limit_cause, plan_cause
 
 if TYPE_CHECKING:
-    from fpirhc.studies.comparison.compare import Entry
+    from fpirhc.studies.comparison.entry import Entry
 
 
 @dataclass(frozen=True)

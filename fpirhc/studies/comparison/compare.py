@@ -11,7 +11,7 @@ from typing import Any, cast
 
 from fpirhc.broken import attempted
 from fpirhc.by_name import FoundByName
-from fpirhc.contraction import ContractionReport, Spectrum, assess_gain
+from fpirhc.contraction import assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked, resolved
 from fpirhc.deformation.base import innermost
@@ -31,83 +31,20 @@ from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, judged_run, simulator
 from fpirhc.studies.comparison.caveats import Yardstick
 from fpirhc.studies.comparison.changes import ranges, scales
+from fpirhc.studies.comparison.entry import Contraction, Entry
 from fpirhc.studies.comparison.entry_facts import has_exact_model, plan_every, weighed
-from fpirhc.studies.comparison.information import Information, information, sentences
+from fpirhc.studies.comparison.information import information, sentences
 from fpirhc.studies.comparison.left_alone import error_left_alone
 from fpirhc.studies.comparison.null_test import NullTest
-from fpirhc.studies.comparison.optimality import Optimality, measure_optimality
+from fpirhc.studies.comparison.optimality import measure_optimality
 from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.studies.comparison.side_by_side import beside_each_other, null_tests
-from fpirhc.studies.comparison.timing import CycleTime, Price, measure_cycle
+from fpirhc.studies.comparison.timing import measure_cycle
 from fpirhc.studies.comparison.verdict import findings
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
 
 Progress = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True, eq=False)
-class Contraction:
-    """Contraction of one adaptive controller.
-
-    Args:
-        predicted: factor predicted from the symbols along the run.
-        measured: factor measured from the run.
-        report: admissible and recommended gains.
-        spectrum: eigenvalues of the response Jacobian along the run.
-    """
-
-    predicted: float
-    measured: float
-    report: ContractionReport
-    spectrum: Spectrum
-
-
-@dataclass(frozen=True, eq=False)
-class Entry:
-    """One controller of a comparison.
-
-    Args:
-        name: name of the controller.
-        run: its run.
-        metrics: metrics of the run.
-        cycle: time of a control cycle; None for a run that is too short.
-        adaptive: whether the controller adapts.
-        pair: name of the same controller without adaptation, if there is one.
-        contraction: contraction of the iteration, if the controller adapts.
-        optimality: excess cost of its plans, if it plans.
-        notes: sentences for the report.
-        lyapunov: Lyapunov function along the run, if one is known.
-        prediction: prediction of the response, for the adaptive controller of the headline.
-        weighed: judged coordinates that its cost weighs; None: all.
-        exact: whether its model is exact where the others' is not, so that it should be a bound.
-        learns: whether its model or its gains change during a run.
-        plan_every: cycles from plan to plan; 1 for a controller that does not plan.
-        price: its time per cycle beside that of its pair.
-        no_bound: why it is no bound, for an exact model that an adapted controller beats.
-        information: what it measures and when it acts; None: not asked.
-        automatic: settings of its deformation that were chosen automatically.
-    """
-
-    name: str
-    run: Run
-    metrics: Metrics
-    cycle: CycleTime | None
-    adaptive: bool
-    pair: str | None
-    contraction: Contraction | None
-    optimality: Optimality | None = None
-    notes: tuple[str, ...] = ()
-    lyapunov: LyapunovView | None = None
-    prediction: Prediction | None = None
-    weighed: frozenset[str] | None = None
-    exact: bool = False
-    learns: bool = False
-    plan_every: int = 1
-    price: Price | None = None
-    no_bound: tuple[str, ...] = ()
-    information: Information | None = None
-    automatic: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.simulate import Simulator, judged_run, simulator
 from fpirhc.studies.comparison.caveats import Yardstick
 from fpirhc.studies.comparison.changes import ranges, scales
-from fpirhc.studies.comparison.compare import Entry
+from fpirhc.studies.comparison.entry import Entry
 from fpirhc.studies.comparison.entry_facts import weighed
 from fpirhc.studies.comparison.left_alone import error_left_alone
 from fpirhc.studies.comparison.null_test import null_test

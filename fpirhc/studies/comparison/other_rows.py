@@ -14,7 +14,7 @@ from fpirhc.studies.comparison.changes import HELPS, ROUNDING, times
 from fpirhc.studies.comparison.outcome import Finding
 
 if TYPE_CHECKING:
-    from fpirhc.studies.comparison.compare import Entry
+    from fpirhc.studies.comparison.entry import Entry
 
 FAR = 2.0  # times a smaller error, from which another row is far better
 

@@ -19,7 +19,7 @@ from fpirhc.studies.comparison.timing import measure_price
 from fpirhc.task.problem import Problem
 
 if TYPE_CHECKING:
-    from fpirhc.studies.comparison.compare import Entry
+    from fpirhc.studies.comparison.entry import Entry
 
 
 def beside_each_other(

@@ -19,7 +19,7 @@ from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.summary import written_out
 
 if TYPE_CHECKING:
-    from fpirhc.studies.comparison.compare import Entry
+    from fpirhc.studies.comparison.entry import Entry
 
 
 def findings(
