@@ -39,6 +39,11 @@ class Mirror:
     measurement: float = 0.0
     lag: float | tuple[float, ...] = 0.0
 
+    @property
+    def lags(self) -> bool:
+        """Whether an actuator is believed to lag."""
+        return any(self.lag) if isinstance(self.lag, tuple) else self.lag > 0
+
 
 @dataclass(frozen=True)
 class Reach:

@@ -15,6 +15,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -29,6 +31,7 @@ from fpirhc.symbolic.layout import Layout
 
 FEASIBLE = 1e-4  # largest violation of a state bound that still counts as kept, where an optimiser has no unit for it
 KEPT = 1e-6  # the same as a share of half the range, where it has one
+_ITERATIONS = "iterations", "most_iterations"  # settings of an optimiser that bound its work
 UNKNOWN_ITERATIONS = -1.0  # a solver that is called inside a graph does not report its iterations
 
 
@@ -54,6 +57,13 @@ class Optimiser(Checked, ABC):
     def in_data(self) -> tuple[str, ...]:
         """Fields whose numbers may be live, because its code reads them from the data of the stages."""
         return ()
+
+    def longer(self, times: int) -> Optimiser | None:
+        """The same optimiser with so many times the iterations per call; None where it has no such setting."""
+        if not is_dataclass(self):
+            return None
+        more = {f.name: times * getattr(self, f.name) for f in fields(self) if f.name in _ITERATIONS}
+        return cast(Optimiser, replace(self, **more)) if more else None
 
     def check(self, ocp: OptimalControl) -> None:
         """Raise if the optimiser cannot serve the problem.

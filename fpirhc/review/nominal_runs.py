@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TypeVar, cast
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved, without_deformation
@@ -13,6 +15,8 @@ from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.task.problem import Problem
 
 CYCLES = 2000  # of a run
+
+Kept = TypeVar("Kept")
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +29,7 @@ class NominalRuns:
 
     problem: Problem
     _known: dict[str, NominalRun | str] = field(default_factory=dict, init=False)
+    _others: dict[str, object] = field(default_factory=dict, init=False)
 
     def of(self, controller: Controller) -> NominalRun | str:
         """Return the nominal run with the controller's deformation, or the reason why there is none."""
@@ -37,6 +42,12 @@ class NominalRuns:
             self._known[name] = self._run(controller)
         run = self._known[name]
         return run if isinstance(run, str) else replace(run, controller=controller)
+
+    def once(self, name: str, make: Callable[[], Kept]) -> Kept:
+        """Return what `make` returns, made when this name is first asked for."""
+        if name not in self._others:
+            self._others[name] = make()
+        return cast("Kept", self._others[name])
 
     def _run(self, controller: Controller) -> NominalRun | str:
         try:

@@ -1,7 +1,7 @@
 """The null run: the model is its own plant, so that every change by adaptation is harm.
 
 The controller runs on its model twice, with its deformation and without. There are no disturbances and no noise. Dead times and the
-estimator of the response are those of the problem.
+estimator of the response are those of the problem; a lag that the deformation believes is a part of the model, see `believed_way`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from fpirhc.controllers.contract import resolved, without_deformation
 from fpirhc.review.grid import each
 from fpirhc.review.nominal_runs import CYCLES
 from fpirhc.review.prediction import NominalRun, exactly
+from fpirhc.simulation.believed_way import with_believed_way
 from fpirhc.simulation.error_pair import ErrorPair
 from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.simulation.simulate import simulate
@@ -39,7 +40,7 @@ def null_runs(problem: Problem, controller: Controller, nominal: NominalRun | No
     model = null_problem(problem, controller)
     if nominal is None:
         run = simulate(model, without_deformation(resolved(model, controller)), seed=0, compiled=False)
-        states = run["state"]
+        states = run["plant_state"]
     else:
         states = nominal.states[:-1]
     without, ranges = _errors_along(model, states), _ranges(model, states)
@@ -54,7 +55,7 @@ def with_form(runs: ErrorPair, model: Problem, controller: Controller) -> ErrorP
     """
     run = simulate(model, controller, seed=0, compiled=False)
     lost = dict.fromkeys(runs.without, float("inf"))
-    return replace(runs, adapted=lost if run.stop is not None else _errors_along(model, run["state"]))
+    return replace(runs, adapted=lost if run.stop is not None else _errors_along(model, run["plant_state"]))
 
 
 def null_problem(problem: Problem, controller: Controller) -> Problem:
@@ -64,7 +65,7 @@ def null_problem(problem: Problem, controller: Controller) -> Problem:
     sensing = replace(problem.sensing, sensors={})
     signals = as_told(problem.plant, ready.told(problem))
     model = replace(problem.of_model, plant=plant, disturbances={}, sensing=sensing, signals=signals)
-    return shortened(model, CYCLES)
+    return with_believed_way(shortened(model, CYCLES), ready.deformation)
 
 
 def _errors_along(problem: Problem, states: np.ndarray) -> dict[str, float]:

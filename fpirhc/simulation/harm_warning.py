@@ -65,7 +65,7 @@ def _ignored() -> bool:
 
 def _reasons(problem: Problem, controller: Controller) -> list[str]:
     loops = [simulator(problem, c, compiled=False) for c in (controller.unadapted(), controller)]
-    model = ModelAsPlant(problem, seed=0)
+    model = ModelAsPlant(problem, seed=0).behind(loops[1].controller.deformation)
     null = _errors(model.problem, [model.run(loop) for loop in loops])
     if problem.foreign is not None:
         return [_sentence("on its own model", null)] if null.fails else []

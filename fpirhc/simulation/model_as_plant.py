@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
+from fpirhc.deformation.base import Deformation, Mirror
+from fpirhc.simulation.believed_way import with_believed_way
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.task.outside import as_told
@@ -23,9 +26,21 @@ class ModelAsPlant:
         self._foreign = problem.reality is not None or bool(problem.signals)
         self._seed = seed
         self._runs: dict[Simulator, Run] = {}
+        self._behind: dict[Mirror | None, ModelAsPlant] = {}
         plant, longest = self._own.plant, self._own.measure_from + CYCLES * self._own.period
         own = replace(self._own, plant=plant.with_exact(plant.approximate))
         self.problem = replace(own, duration=min(own.duration, longest))
+
+    def behind(self, deformation: Deformation) -> ModelAsPlant:
+        """Return the model behind the lag and the dead time that a deformation believes; itself where it believes none."""
+        way = with_believed_way(self.problem, deformation)
+        if way is self.problem:
+            return self
+        if deformation.mirror not in self._behind:
+            other = self._behind[deformation.mirror] = copy(self)
+            other._own = other.problem = way
+            other._foreign, other._runs = True, {}
+        return self._behind[deformation.mirror]
 
     def run(self, loop: Simulator) -> Run:
         """Return the run of a loop on the model."""

@@ -23,7 +23,7 @@ def needed_names(plant: Plant, sensing: Sensing, judged: Sequence[str] | None) -
     Args:
         plant: the model.
         sensing: of the problem.
-        judged: names whose errors are judged; None: the controlled ones.
+        judged: names whose errors are judged beside the controlled ones; None: no other need be there.
     """
     if sensing.belief is None:
         return frozenset((*plant.coordinates, *plant.outputs))

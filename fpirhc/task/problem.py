@@ -65,7 +65,8 @@ class Problem(Checked):
             and they act until the first command arrives. An input that is not named has the value of `DeadTime(before=...)`, or
             else zero, moved into its limits.
         measure_from: time from which metrics count; the transient before it is left out.
-        judged: coordinates, or outputs of a plant that has some, whose errors are logged and measured; None: the controlled ones.
+        judged: coordinates, or outputs of a plant that has some, whose errors are logged and measured; None: the controlled ones,
+            and those that the cost weighs.
         reality: what a run moves, where it is not `plant` with its exact parameters: another plant (`Reality`), or an object
             outside (`Foreign`). `plant` is then the model alone.
         signals: values over time of every signal from outside that the plants declare, by name: `Known`, `Unknown` or `Believed`.
@@ -167,7 +168,17 @@ class Problem(Checked):
     @cached_property
     def judged_names(self) -> tuple[str, ...]:
         """Coordinates whose errors are logged and measured."""
-        return self.plant.controlled_names if self.judged is None else tuple(self.judged)
+        if self.judged is not None:
+            return tuple(self.judged)
+        weighed = (self.cost.tracked if self.cost is not None else None) or {}
+        controlled = self.plant.controlled_names
+        return tuple(n for n in self.plant.face.coordinates if n in controlled or (n in weighed and self._shows(n)))
+
+    def _shows(self, name: str) -> bool:
+        """Whether the plant that moves has a coordinate or an output of the model."""
+        if self.foreign is not None:
+            return name in needed_measurements(self.plant, self.sensing)
+        return self.symbolic_reality is None or self.symbolic_reality.shows(name)
 
     @property
     def sees_plant(self) -> bool:

@@ -189,6 +189,10 @@ class Reality(Checked):
                 places[k] = elements.index(own)
         return places
 
+    def shows(self, coordinate: str) -> bool:
+        """Whether it has a coordinate or an output at which one of the model is judged."""
+        return self.true_name(coordinate) in quantities_of(self.plant)
+
     def true_name(self, coordinate: str) -> str:
         """Return its coordinate at which a coordinate of the model is judged."""
         return coordinate if coordinate in quantities_of(self.plant) else self.seen.get(coordinate, coordinate)

@@ -59,6 +59,7 @@ def test_columns_of_a_report(adaptive):
         "at limit",
         "cost",
         "contraction predicted",
+        "contraction above 1",
         "contraction measured",
         "iterations",
         "worst residual",
@@ -86,6 +87,7 @@ def test_which_numbers_a_finished_run_must_have():
     assert {name for name, m in BY_NAME.items() if not m.finite} == {
         "settling",
         "contraction.predicted",
+        "contraction.growing",
         "contraction.measured",
         "solve.median_stationarity",
         "solve.worst_stationarity",
@@ -190,7 +192,7 @@ def test_a_run_that_ended_early_has_no_cost():
 def test_contraction_needs_ten_cycles(adaptive):
     """Fewer say nothing; ten do."""
     task, result = adaptive
-    for cycles, names in ((9, set()), (10, {"contraction.predicted", "contraction.measured"})):
+    for cycles, names in ((9, set()), (10, {"contraction.predicted", "contraction.growing", "contraction.measured"})):
         metrics = fp.measure(task, cut(result, cycles))
         assert {m.name for m, _, _ in metrics if m.name.startswith("contraction")} == names
 
@@ -216,7 +218,7 @@ def test_spectrum_is_sampled_from_the_second_to_the_last_cycle(adaptive, monkeyp
         contraction, "spectrum_over_run", lambda plant, x, r, approximate: sampled_cycles.append((x, r, approximate))
     )
     for cycles in (1000, 50):
-        sampled_spectrum(task, cut(result, cycles))
+        sampled_spectrum(replace(task, measure_from=0.0), cut(result, cycles))
     (long, requests, believed), (short, *_) = sampled_cycles
     assert (len(long), len(requests), len(short)) == (200, 200, 49)
     np.testing.assert_array_equal(long[[0, -1]], result["state"][[1, 999]])

@@ -138,6 +138,35 @@ def test_contraction_is_the_factor_of_the_plant_and_the_gain():
     assert plain["contraction.predicted"] == {}
 
 
+def test_contraction_is_that_of_the_measured_cycles():
+    """Y'' = (1 + 2 exp(-4 t)) u in effect: the gain J falls from 3 to 1, so that a = 0.8 contracts from t = 0.0719 on.
+
+    1 - a J = -1 at J = 2.5, exp(-4 t) = 0.75.
+    """
+    plant = fp.Plant(
+        coordinates={"y": "m", "fading": "1"},
+        controlled=("y",),
+        order={"y": 2, "fading": 1},
+        inputs={"u": "N"},
+        response=lambda q, v, u, p: {"y": (1 + p.more * q.fading) * u.u, "fading": -4 * q.fading},
+        parameters={"more": fp.Parameter(approximate=0.0, exact=2.0, unit="1")},
+    )
+    task = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"y": 0 * t, "fading": 0 * t}),
+        start={"y": 0.0, "fading": 1.0},
+        period=1e-3,
+        duration=0.2,
+    )
+    controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.BeyondLimit(fp.Affine(gain=-1.6)))
+    result = fp.simulate(task, controller, seed=0, compiled=False)
+    early, late = (fp.measure(replace(task, measure_from=t), result) for t in (0.0, 0.1))
+    assert early["contraction.predicted"][""] == pytest.approx(abs(1 - 0.8 * 3), abs=0.02)
+    assert early["contraction.growing"][""] == pytest.approx(-np.log(0.75) / 4 / 0.2, abs=0.01)
+    assert late["contraction.predicted"][""] == pytest.approx(abs(1 - 0.8 * (1 + 2 * np.exp(-0.4))), abs=1e-3)
+    assert late["contraction.growing"][""] == 0.0
+
+
 @pytest.mark.parametrize("late", [False, True])
 def test_every_run_has_the_same_columns(late):
     """What the plant did is there with ideal and with late measurement; a loop that is told it does not log it twice."""

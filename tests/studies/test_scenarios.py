@@ -139,7 +139,11 @@ def test_a_prepared_loop_runs_what_a_fresh_one_runs(dead_time, task):
         for metric, numbers in result["metrics"].items():
             assert numbers == {e: v if math.isfinite(v) else None for e, v in fresh[metric].items()}
         # Contraction needs the symbols along the run; a scenario does not compute them.
-        assert set(fresh) - set(result["metrics"]) <= {"contraction.predicted", "contraction.measured"}
+        assert set(fresh) - set(result["metrics"]) <= {
+            "contraction.predicted",
+            "contraction.growing",
+            "contraction.measured",
+        }
 
 
 # --- Statistics -------------------------------------------------------------------------------------------------------

@@ -37,7 +37,10 @@ def entry(name: str, pair: str | None = None, *, micro: float | None = 5.0, erro
     numbers = {"rms_error": errors or {"y": 1.0}, **changes.get("measured", {})}
     metrics = Metrics(numbers, {}, {m.name: m for m in known_metrics()})
     factor = changes.get("factor")
-    report = SimpleNamespace(predicted=factor, report=SimpleNamespace(text=changes.get("advice", "Lower the gain.")))
+    growing = changes.get("growing", float((factor or 0.0) >= 1))
+    report = SimpleNamespace(
+        predicted=factor, growing=growing, report=SimpleNamespace(text=changes.get("advice", "Lower the gain."))
+    )
     cycle = None if micro is None else CycleTime(micro, micro, micro, micro, micro)
     contraction = cast(Any, None if factor is None else report)
     return Entry(name, made, metrics, cycle, pair is not None, pair, contraction, **changes.get("facts", {}))
@@ -209,6 +212,26 @@ def test_an_error_beyond_the_range_of_the_reference_is_a_failure_of_both():
     assert first(plain, entry("FPI", "RHC", errors={"y": 1.9}), ranges={"y": 2.0}).outcome is Outcome.BETTER
 
 
+def test_an_angle_that_is_held_is_lost_beyond_a_quarter_turn():
+    """A pendulum that is held upright and turns round fails although the cart stays; each such run says so."""
+    turns = {"turns": {"z": np.pi / 2}}
+    plain, adaptive = entry("RHC", errors={"y": 0.5, "z": 5.8}), entry("FPI", "RHC", errors={"y": 0.1, "z": 5.6})
+    failed, *left = findings([plain, adaptive], {}, None, Yardstick({}, **turns))
+    assert failed.outcome is Outcome.NOT_COMPARABLE
+    assert failed.text == (
+        "Neither RHC nor FPI follows the reference: the rms error of z is 5.8 and 5.6 rad, a quarter turn 1.57."
+    )
+    assert [one.text for one in left] == [
+        f"{name} leaves the neighbourhood of its reference, for which its gains and its review are made: rms error of z {size} "
+        "rad, a quarter turn 1.57."
+        for name, size in (("RHC", 5.8), ("FPI", 5.6))
+    ]
+    upright = entry("FPI", "RHC", errors={"y": 0.1, "z": 0.2})
+    better, *left = findings([plain, upright], {}, None, Yardstick({}, **turns))
+    assert better.outcome is Outcome.BETTER
+    assert [one.text.partition(" leaves ")[0] for one in left] == ["RHC"]
+
+
 def moving(before: float, after: float) -> Finding:
     """The verdict on half the error, with these movements of the command."""
     facts = [{"total_variation": {"u": v}, "effort": {"u": 1.0}} for v in (before, after)]
@@ -296,6 +319,14 @@ def test_a_gain_is_the_cause_from_a_factor_of_one_on():
     assert no_difference(factor=1.0) == " Its iteration is no contraction (predicted factor 1): Lower the gain."
     assert no_difference(factor=1.2345) == " Its iteration is no contraction (predicted factor 1.23): Lower the gain."
     assert no_difference(factor=0.99) == no_difference() == ""
+
+
+def test_a_gain_is_the_cause_where_the_factor_is_above_one_in_a_twentieth_of_the_cycles():
+    """A worst instant is no cause; how long it lasts is told."""
+    assert no_difference(factor=1.61, growing=0.04) == ""
+    assert no_difference(factor=1.61, growing=0.25) == (
+        " Its iteration is no contraction in 25 % of the cycles (predicted factor 1.61): Lower the gain."
+    )
 
 
 def test_a_step_limit_is_the_cause_from_the_largest_change_on():

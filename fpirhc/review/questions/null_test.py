@@ -16,11 +16,13 @@ import numpy as np
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.form import form_of
 from fpirhc.review.forms import forms_of
 from fpirhc.review.null_runs import null_problem, null_runs, with_form
 from fpirhc.review.pays import ROUNDING, nominal_size, rms
 from fpirhc.review.prediction import NominalRun, errors_without_adaptation, response_errors
 from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.simulation.believed_way import with_believed_way
 from fpirhc.simulation.error_pair import SLIGHT, ErrorPair
 
 QUESTION_TEXT = "Does adaptation leave a right model alone?"
@@ -30,7 +32,9 @@ _SHORTER = 16  # times, of the interpolated run from which on the error falls in
 
 def leaves_right_model_alone(case: Case) -> Answer:
     """Return the errors with the model as the plant, with adaptation and without."""
-    nominal = None if isinstance(case.nominal, str) else case.nominal
+    # The model's own run, without simulation, knows nothing of a lag or a dead time that the deformation believes.
+    foreseen = with_believed_way(case.problem, case.controller.deformation) is case.problem
+    nominal = case.nominal if foreseen and not isinstance(case.nominal, str) else None
     predicted = None if nominal is None else rms(nominal, response_errors(nominal, exact=nominal.believed))
     numbers, text = {}, ""
     if nominal is not None and predicted is not None:
@@ -73,8 +77,9 @@ def _cures_more(nominal: NominalRun | None, predicted: float | None) -> bool:
 def _remedy(case: Case, runs: ErrorPair, predicted: float | None) -> tuple[str, dict[str, float]]:
     """Which form passes, by a run, and which period would do, by the prediction."""
     sentences, numbers = [], {}
+    used = form_of(case.controller.deformation)
     for name, form in reversed(forms_of(case.problem, case.controller.deformation).items()):
-        other = _other(case, form, runs)
+        other = _other(case, form, runs) if name != used else None
         if other is not None and other.passes:
             sentences.append(f"The {name} form passes: rms error of {runs.worst} {other.adapted[runs.worst]:.3g}.")
             numbers["with_form"] = other.adapted[runs.worst]

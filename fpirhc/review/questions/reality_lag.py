@@ -20,9 +20,10 @@ _REAL = 1e-6  # share of the imaginary part, below which a pole is real
 
 
 def leaves_room(case: Case) -> Answer | None:
-    """Return N Lambda tau, and the largest a lambda with some damping; None without a reality, a lag or a law with known poles."""
+    """Return N Lambda tau, and the largest a lambda with some damping; None without a reality, an unpaired lag or a known law."""
     law = law_of(case.grid, case.controller) if case.grid.real is not None else None
-    if law is None:
+    mirror = case.controller.deformation.mirror
+    if law is None or (mirror is not None and mirror.lags):  # paired through it, which the loop with the reality judges
         return None
     rate, poles = law
     extras = [extra_modes(case.grid, point, case.believed) for point in real_points(case.grid)]

@@ -34,7 +34,11 @@ def real_pair_converges(case: Case) -> Answer | None:
     numbers = {"radius": adapted, "bare_radius": bare}
     if adapted < 1:
         return Answer(TEXT, Verdict.YES, text, "", numbers)
-    change = "Lower the gain, or pair through the reality's lag: ModelReferenced(map, lag=...)."
+    mirror = case.controller.deformation.mirror
+    paired = mirror is not None and mirror.lags
+    change = "Lower the gain, or pair through " + (
+        "the whole lag of the reality." if paired else "the reality's lag: ModelReferenced(map, lag=...)."
+    )
     if bare >= 1:
         change = "Lower the rate of the tracking law: the loop does not converge without adaptation either."
     return Answer(TEXT, Verdict.UNKNOWN if adapted < 1 + NEUTRAL else Verdict.NO, text, change, numbers)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fpirhc.plant.units import with_space
+from fpirhc.review.questions.iterations import MANY
 from fpirhc.status import Status
 from fpirhc.studies.comparison.changes import times
 from fpirhc.summary import in_percent
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from fpirhc.studies.comparison.entry import Entry
 
 MANY_CYCLES = 3  # of a run from which the slew of its desired response is judged
-_MANY_PLANS = 0.05  # share of the cycles from which plans that did not converge are a reason
 _MORE = 2.0  # times the pair's movement of the command, from which it is stated
 _CHATTER = 10.0  # times, from which it is a reason
 _STILL = 1e-9  # of the rms command per unit of time: what moves less stands still
@@ -42,10 +42,13 @@ def causes(plain: Entry, adaptive: Entry) -> str:
 
 
 def _gain_cause(entry: Entry) -> str:
-    if entry.contraction is None or entry.contraction.predicted < 1:
+    one = entry.contraction
+    if one is None or one.growing < MANY:
         return ""
-    advice = entry.contraction.report.text.rstrip(".")
-    return f"Its iteration is no contraction (predicted factor {entry.contraction.predicted:.3g}): {advice}."
+    share = "" if one.growing == 1 else f" in {in_percent(one.growing)} of the cycles"
+    return (
+        f"Its iteration is no contraction{share} (predicted factor {one.predicted:.3g}): {one.report.text.rstrip('.')}."
+    )
 
 
 def _slew_cause(plain: Entry, adaptive: Entry) -> str:
@@ -77,7 +80,7 @@ def plan_cause(plain: Entry, adaptive: Entry) -> str:
     """Return a sentence where plans that did not converge are a reason; else nothing."""
     before, after = (_share(e, "status", Status.NOT_CONVERGED.name) / max(1, e.run.cycles) for e in (plain, adaptive))
     swings = before < 0.5 * after and _share(adaptive, "at_limit", "") >= _OFTEN  # plans of a run that swings are hard
-    if after < _MANY_PLANS or swings:
+    if after < MANY or swings:
         return ""
     return (
         f"Its plans did not converge in {in_percent(after)} of the cycles (those of {plain.name} in {in_percent(before)}), so this "

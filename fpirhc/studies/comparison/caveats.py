@@ -5,12 +5,16 @@ Sentences of this module stand before a positive verdict, which is then doubtful
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from fpirhc.plant.units import with_space
 from fpirhc.studies.comparison.causes import chatter_cause, limit_cause, plan_cause
+from fpirhc.studies.comparison.changes import quarter_turns, ranges, scales
+from fpirhc.studies.comparison.left_alone import error_left_alone
+from fpirhc.task.problem import Problem
 
 if TYPE_CHECKING:
     from fpirhc.studies.comparison.entry import Entry
@@ -23,29 +27,51 @@ class Yardstick:
     Args:
         scales: by which errors are judged, see `fpirhc.studies.comparison.changes`; 1 where not named.
         ranges: of the references that move, the start included.
+        turns: a quarter turn for angles whose references do not move.
         alone: rms error of the plant left alone; empty where it is not known.
     """
 
     scales: Mapping[str, float] = field(default_factory=dict)
     ranges: Mapping[str, float] = field(default_factory=dict)
+    turns: Mapping[str, float] = field(default_factory=dict)
     alone: Mapping[str, float] = field(default_factory=dict)
+
+    def beyond(self, entry: Entry, name: str) -> str:
+        """What the rms error of a coordinate exceeds, in words: the range of its reference, or a quarter turn; else nothing."""
+        error = entry.metrics.rms_error[name]
+        if error > self.ranges.get(name, math.inf):
+            return f"the range of its reference {self.ranges[name]:.3g}"
+        return f"a quarter turn {self.turns[name]:.3g}" if error > self.turns.get(name, math.inf) else ""
+
+
+def yardstick_of(problem: Problem, *, seed: int) -> Yardstick:
+    """Return what errors of a problem are measured against; the seed is that of disturbances and noise of the plant left alone."""
+    return Yardstick(scales(problem), ranges(problem), quarter_turns(problem), error_left_alone(problem, seed=seed))
 
 
 def not_followed(plain: Entry, adaptive: Entry, names: list[str], yardstick: Yardstick) -> str:
-    """Return a sentence where neither controller follows a reference: both rms errors exceed its range; else nothing."""
-    errors = [
-        (n, plain.metrics.rms_error[n], adaptive.metrics.rms_error[n], yardstick.ranges[n])
-        for n in names
-        if n in yardstick.ranges
-    ]
-    lost = [one for one in errors if min(one[1], one[2]) > one[3]]
+    """Return a sentence where neither controller stays near a reference; else nothing."""
+    lost = [n for n in names if yardstick.beyond(plain, n) and yardstick.beyond(adaptive, n)]
     if not lost:
         return ""
     texts = ", ".join(
-        f"the rms error of {n} is {before:.3g} and {after:.3g}{_unit(adaptive, n)}, the range of its reference {span:.3g}"
-        for n, before, after, span in lost
+        f"the rms error of {n} is {plain.metrics.rms_error[n]:.3g} and {adaptive.metrics.rms_error[n]:.3g}{_unit(adaptive, n)}, "
+        f"{yardstick.beyond(adaptive, n)}"
+        for n in lost
     )
     return f"Neither {plain.name} nor {adaptive.name} follows the reference: {texts}."
+
+
+def leaves_reference(entry: Entry, yardstick: Yardstick) -> str:
+    """Return a sentence where a run that finished leaves the neighbourhood of its reference; else nothing."""
+    errors = entry.metrics.rms_error if entry.run.stop is None else {}
+    lost = [n for n in errors if yardstick.beyond(entry, n)]
+    texts = ", ".join(f"rms error of {n} {errors[n]:.3g}{_unit(entry, n)}, {yardstick.beyond(entry, n)}" for n in lost)
+    return (
+        f"{entry.name} leaves the neighbourhood of its reference, for which its gains and its review are made: {texts}."
+        if lost
+        else ""
+    )
 
 
 def caveats(plain: Entry, adaptive: Entry, names: list[str], yardstick: Yardstick) -> str:

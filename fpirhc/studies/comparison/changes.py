@@ -25,6 +25,7 @@ MINOR = 0.01  # of the largest relative error
 ROUNDING = 1e-9  # relative errors
 _SAMPLES = 2000
 _MANY = 1e6
+_QUARTER_TURN = {"rad": math.pi / 2, "deg": 90.0}
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,12 @@ def ranges(problem: Problem) -> dict[str, float]:
         if np.ptp(row) > ROUNDING * max(1.0, float(np.abs(row).max())):
             moving[name] = float(np.ptp(row))
     return moving
+
+
+def quarter_turns(problem: Problem) -> dict[str, float]:
+    """Return a quarter turn for every judged angle whose reference does not move; beyond it gravity and projections turn round."""
+    moving, units = ranges(problem), problem.plant.face.coordinates
+    return {n: _QUARTER_TURN[units[n]] for n in problem.judged_names if n not in moving and units[n] in _QUARTER_TURN}
 
 
 def _tolerance(problem: Problem, name: str) -> float:

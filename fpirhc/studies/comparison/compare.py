@@ -29,12 +29,11 @@ from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, judged_run, simulator
-from fpirhc.studies.comparison.caveats import Yardstick
-from fpirhc.studies.comparison.changes import ranges, scales
+from fpirhc.studies.comparison.caveats import yardstick_of
+from fpirhc.studies.comparison.changes import scales
 from fpirhc.studies.comparison.entry import Contraction, Entry
 from fpirhc.studies.comparison.entry_facts import has_exact_model, plan_every, weighed
 from fpirhc.studies.comparison.information import information, sentences
-from fpirhc.studies.comparison.left_alone import error_left_alone
 from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import measure_optimality
 from fpirhc.studies.comparison.outcome import Finding, Outcome
@@ -192,7 +191,7 @@ def compare(
     sizes = scales(task.problem)
     entries = beside_each_other(task.problem, ran, loops, sizes, compiled=compiled)
     broken: list[str] = []
-    yardstick = Yardstick(sizes, ranges(task.problem), error_left_alone(task.problem, seed=seed))
+    yardstick = yardstick_of(task.problem, seed=seed)
     judged = findings(entries, skipped, task.headline, yardstick)
     pairs = [finding.pair for finding in judged if finding.pair]
     nulls = null_tests(task.problem, pairs, entries, loops, sizes, seed=seed, broken=broken)
@@ -346,7 +345,8 @@ def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Me
     if not predicted:
         return None
     spectrum, measured = sampled_spectrum(problem, run), metrics["contraction.measured"][""]
-    return Contraction(predicted[""], measured, assess_gain(controller.deformation, spectrum), spectrum)
+    growing = metrics["contraction.growing"][""]
+    return Contraction(predicted[""], growing, measured, assess_gain(controller.deformation, spectrum), spectrum)
 
 
 def _notes(controller: Controller, ready: Controller) -> tuple[str, ...]:

@@ -19,13 +19,15 @@ class Contraction:
     """Contraction of one adaptive controller.
 
     Args:
-        predicted: factor predicted from the symbols along the run.
+        predicted: largest factor predicted from the symbols along the measured cycles.
+        growing: share of these cycles in which it is 1 or more.
         measured: factor measured from the run.
         report: admissible and recommended gains.
         spectrum: eigenvalues of the response Jacobian along the run.
     """
 
     predicted: float
+    growing: float
     measured: float
     report: ContractionReport
     spectrum: Spectrum

@@ -13,11 +13,10 @@ from fpirhc.errors import FpirhcError
 from fpirhc.simulation.metrics import Metric, measure
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.simulate import Simulator, judged_run, simulator
-from fpirhc.studies.comparison.caveats import Yardstick
-from fpirhc.studies.comparison.changes import ranges, scales
+from fpirhc.studies.comparison.caveats import yardstick_of
+from fpirhc.studies.comparison.changes import scales
 from fpirhc.studies.comparison.entry import Entry
 from fpirhc.studies.comparison.entry_facts import weighed
-from fpirhc.studies.comparison.left_alone import error_left_alone
 from fpirhc.studies.comparison.null_test import null_test
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.studies.comparison.verdict import judge
@@ -70,7 +69,7 @@ def _harm(
     cured: Mapping[str, float] = dict.fromkeys(problem.judged_names, 0.0)
     if problem.foreign is None:
         plain, adaptive = (_entry(problem, n, one, seed, metrics) for n, one in zip(pair, loops, strict=True))
-        finding = judge(plain, adaptive, Yardstick(sizes, ranges(problem), error_left_alone(problem, seed=seed)))
+        finding = judge(plain, adaptive, yardstick_of(problem, seed=seed))
         losses, cured = [finding.text] * (finding.outcome is Outcome.WORSE), plain.metrics.rms_error
     test = null_test(model, loops, pair, sizes, counted, cured=cured)
     return (*losses, *([test.text] if test.harmful else []))

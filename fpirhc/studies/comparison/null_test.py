@@ -7,8 +7,9 @@ The plain form passes on the changes of the desired response a little late, so s
 it is larger than the error that the wrong model causes without adaptation, which adaptation is there to remove.
 
 The loops of the comparison run once more with other exact parameters, so nothing is composed or compiled again; where the plant is
-no instance of the model they are composed around the model. A run is the original one, cut after 2000 measured cycles.
-A test costs two such runs, and pairs with the same controller without adaptation share its run.
+no instance of the model they are composed around the model, and so where the deformation believes a lag or a dead time that the
+problem does not have: a right model has it too. A run is the original one, cut after 2000 measured cycles. A test costs two such
+runs, and pairs with the same controller without adaptation share its run.
 """
 
 from __future__ import annotations
@@ -86,6 +87,7 @@ def null_test(
         weighed: coordinates that are judged; None: all.
         cured: rms error on the plant itself without adaptation, by judged coordinate.
     """
+    model = model.behind(loops[1].controller.deformation)
     begin, null = time.perf_counter(), model.problem
     runs = tuple(model.run(loop) for loop in loops)
     before, after = (_errors(run, null) for run in runs)

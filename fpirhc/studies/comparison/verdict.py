@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from fpirhc.plant.units import with_space
 from fpirhc.studies.comparison.causes import causes, movement
-from fpirhc.studies.comparison.caveats import Yardstick, caveats, left_alone_is_better, not_followed
+from fpirhc.studies.comparison.caveats import Yardstick, caveats, leaves_reference, left_alone_is_better, not_followed
 from fpirhc.studies.comparison.changes import Change, major, outcome_of, times
 from fpirhc.studies.comparison.other_rows import remarks
 from fpirhc.studies.comparison.outcome import Finding, Outcome
@@ -43,6 +43,8 @@ def findings(
     receding = [p for p in pairs if "solve" in p[1].run.layout]
     ordered = list(dict.fromkeys([*first, *receding, *pairs]))
     judged = [judge(plain, adaptive, measure) for plain, adaptive in ordered] or [_no_pair(entries)]
+    left = (leaves_reference(entry, measure) for entry in entries)
+    judged += [Finding(text) for text in left if text]
     judged += remarks(entries, ordered[0] if ordered else None, measure.scales)
     if skipped:
         judged.append(Finding("Not run: " + "; ".join(f"{name} ({why})" for name, why in skipped.items()) + "."))

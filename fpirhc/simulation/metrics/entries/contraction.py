@@ -1,4 +1,7 @@
-"""The factor by which the iteration shrinks an error per cycle: from the symbols along the run, and identified from the run."""
+"""The factor by which the iteration shrinks an error per cycle: from the symbols along the run, and identified from the run.
+
+Factors from the symbols are those of the measured cycles. A run that ended before `measure_from` has them all along.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,9 @@ import numpy as np
 from fpirhc.contraction import Spectrum, identified_factor, predicted_factor, spectrum_over_run
 from fpirhc.contraction.sampled import sampled_jacobians
 from fpirhc.simulation.metrics.base import Metric
+from fpirhc.simulation.metrics.window import measured_cycles
 from fpirhc.simulation.run import Run
+from fpirhc.summary import in_percent
 from fpirhc.task.problem import Problem
 
 _SHORTEST = 10  # cycles from which a run is long enough for a factor
@@ -17,10 +22,18 @@ _SAMPLES = 200  # cycles of a run whose eigenvalues are computed
 
 
 def predicted(problem: Problem, run: Run) -> float | None:
-    """Return the largest max|1 - a lambda| at sampled states of the run; None for a foreign reality. See `fpirhc.contraction`."""
+    """Return the largest max|1 - a lambda| in sampled cycles of the run; None for a foreign reality. See `fpirhc.contraction`."""
     if not _adapts(run) or problem.foreign is not None:
         return None
     return predicted_factor(sampled_spectrum(problem, run).eigenvalues, _gain(run))
+
+
+def growing(problem: Problem, run: Run) -> float | None:
+    """Return the share of the sampled cycles with max|1 - a lambda| >= 1, in which small errors do not shrink."""
+    if not _adapts(run) or problem.foreign is not None:
+        return None
+    factors = np.abs(1 - _gain(run) * sampled_spectrum(problem, run).eigenvalues).max(axis=1)
+    return float(np.mean(factors >= 1))
 
 
 def measured(problem: Problem, run: Run) -> float | None:  # noqa: ARG001 -- every metric is given the problem
@@ -39,12 +52,15 @@ def _gain(run: Run) -> float:
 def sampled_spectrum(problem: Problem, run: Run) -> Spectrum:
     """Return the eigenvalues of the response Jacobian at sampled cycles of a run, with the parameters of its controller's model.
 
+    The cycles are those from `measure_from` on, without the first of the run, before which there is no request.
+
     With a reality that is a plant they are those over a whole cycle.
 
     Raises:
         InvalidValue: no eigenvalue is finite.
     """
-    rows = np.unique(np.linspace(1, run.cycles - 1, _SAMPLES).astype(int))
+    first = max(1, int(np.argmax(measured_cycles(problem, run))))
+    rows = np.unique(np.linspace(first, run.cycles - 1, _SAMPLES).astype(int))
     approximate, states, deformed = np.array(run.settings["parameters"]), run["state"][rows], run["deformed"][rows]
     if problem.symbolic_reality is None:
         return spectrum_over_run(problem.plant, states, deformed, approximate=approximate)
@@ -61,5 +77,6 @@ def _adapts(run: Run) -> bool:
 # A difference of 1e-4 has no meaning: the factor is a fit, or a difference of eigenvalues from one.
 METRICS = (
     Metric("contraction.predicted", predicted, short="factor", headline=True, floor=1e-4, order=85),
+    Metric("contraction.growing", growing, title="contraction above 1", text=in_percent, compared="not", order=85.5),
     Metric("contraction.measured", measured, floor=1e-4, order=86),
 )
