@@ -100,13 +100,59 @@ class WorkerDied(FpirhcError, RuntimeError):
 
 
 def nearest(name: object, valid: Iterable[str]) -> str:
-    """Return ' Did you mean ...? Valid: ...', the end of a message about an unknown `name`, which may be no text."""
+    """Return ' Did you mean ...? Valid: ...', the end of a message about an unknown `name`, which may be no text.
+
+    The nearest name is also found by what other tools call it, and a derivative by the spellings angle_dot and angle_ddot.
+    Of a long list the nearest names are shown.
+    """
     names = [str(one) or "''" for one in valid]
     if not names:
         return " No names are valid here."
-    close = get_close_matches(name, names, n=1, cutoff=0.5) if isinstance(name, str) else []
-    hint = f" Did you mean '{close[0]}'?" if close else ""
-    return f"{hint} Valid: {', '.join(names)}."
+    near = _near(name, names) if isinstance(name, str) else []
+    hint = f" Did you mean '{near[0]}'?" if near else ""
+    if len(names) <= _MANY:
+        return f"{hint} Valid: {', '.join(names)}."
+    shown = get_close_matches(str(name), names, n=_SHOWN, cutoff=0)
+    return f"{hint} Valid: {', '.join(shown)} and {len(names) - len(shown)} more."
+
+
+def _near(name: str, names: Sequence[str]) -> list[str]:
+    """Valid names that may be meant, the likeliest first."""
+    derivative = name.removesuffix("_ddot") + "''" if name.endswith("_ddot") else name.removesuffix("_dot") + "'"
+    elsewhere = [one for one in (derivative, *OF_OTHER_TOOLS.get(name, ())) if one in names]
+    inside = [one for one in names if len(name) > _LETTER and name.casefold() in one.casefold()]
+    return [*elsewhere, *get_close_matches(name, names, n=1, cutoff=0.5), *inside]
+
+
+_MANY, _SHOWN = 40, 8  # names beyond which a list is cut, and to how many
+_LETTER = 1  # character, which is a part of too many names to mean one
+
+OF_OTHER_TOOLS = {
+    **dict.fromkeys(("MPC", "NMPC", "OptimalControlProblem", "AcadosOcp"), ("RecedingHorizon",)),
+    **dict.fromkeys(("Model", "System", "nlsys"), ("Plant",)),
+    **dict.fromkeys(("dt", "Ts", "ts", "sample_time"), ("period", "step")),
+    **dict.fromkeys(("T", "tf", "t_end", "t_final", "sim_time"), ("duration",)),
+    **dict.fromkeys(("N", "n_horizon", "N_horizon", "prediction_horizon"), ("stages",)),
+    **dict.fromkeys(("max_iter", "maxiter", "max_iterations", "nlp_solver_max_iter"), ("iterations",)),
+    **dict.fromkeys(("lbu", "ubu", "u_min", "u_max", "umin", "umax", "bounds"), ("inputs",)),
+    **dict.fromkeys(("lbx", "ubx", "x_min", "x_max"), ("states",)),
+    **dict.fromkeys(("ref", "x_ref", "y_ref", "yref", "setpoint", "trajectory"), ("reference",)),
+    **dict.fromkeys(("objective", "lterm", "stage_cost"), ("cost",)),
+    **dict.fromkeys(("rhs", "f_expl_expr", "updfcn", "dynamics"), ("response", "rates")),
+    **dict.fromkeys(("p", "params", "parameter_values"), ("parameters",)),
+    **dict.fromkeys(("Kp", "kp"), ("proportional",)),
+    **dict.fromkeys(("Ki", "ki"), ("integral",)),
+    **dict.fromkeys(("Kd", "kd"), ("derivative",)),
+    **dict.fromkeys(("P", "Qf", "mterm"), ("terminal",)),
+    **dict.fromkeys(("delay", "input_delay"), ("dead_time",)),
+    "t_step": ("step",),
+    "x0": ("start",),
+    "Q": ("states",),
+    "R": ("effort",),
+    "rterm": ("rate",),
+    "nominal": ("approximate",),
+}
+"""What do-mpc, acados, python-control and Simulink call a thing, and our names for it."""
 
 
 class Mistakes:

@@ -37,7 +37,9 @@ def read_baseline(path: Path, metrics: Sequence[run_metrics.Metric] | None = Non
             raise BaselineError(f"'{path.name}' is larger than {_LARGEST / 1e6:.0f} MB and no baseline; {_ACCEPT}")
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise BaselineError(f"there is no baseline '{path.name}'; {_ACCEPT}") from None
+        raise BaselineError(
+            f"there is no baseline '{path.name}'; write one: fpirhc accept PROBLEM --reason ..."
+        ) from None
     except OSError as error:
         raise BaselineError(f"'{path.name}' cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:

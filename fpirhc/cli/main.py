@@ -61,9 +61,10 @@ def _run(words: list[str]) -> ExitCode:
     if name not in verbs:
         from fpirhc.errors import InvalidName, nearest
 
-        raise InvalidName(f"the command '{name}' is unknown.{nearest(name, verbs)}")
+        mend = f" Write fpirhc compare {name}." if name.endswith(".py") else ""
+        raise InvalidName(f"the command '{name}' is unknown.{mend}{nearest(name, verbs)}")
     verb = verbs[name].load()
-    return verb.run(verb.parser().parse_args(rest))
+    return verb.run(verb.options(rest))
 
 
 def _about(words: list[str], verbs: Mapping[str, Known]) -> ExitCode:

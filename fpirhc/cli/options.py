@@ -45,7 +45,15 @@ def add_mismatch(parser: Parser, default: float | None = 0.0) -> None:
         "every exact parameter lies within PERCENT %% of its value in the problem file, or of its spread, and dead times likewise "
         "(default: 0)"
     )
-    parser.add_argument("--mismatch", type=float, default=default, metavar="PERCENT", help=text)
+    parser.add_argument("--mismatch", type=percent, default=default, metavar="PERCENT", help=text)
+
+
+def percent(text: str) -> float:
+    """A percentage, '20%' or '20'; what it is for says which ones are possible."""
+    try:
+        return float(text.strip().removesuffix("%"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is no percentage; write 20 or 20%") from None
 
 
 def add_scenarios(parser: Parser, default: int | None, text: str) -> None:

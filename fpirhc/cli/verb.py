@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from fpirhc.cli.exit_codes import OF_EVERY_VERB, ExitCode, table
@@ -53,6 +53,25 @@ class Verb:
         self.add(parser)
         parser.add_argument(DEBUG, action="store_true", help="print the traceback of an error")
         return parser
+
+    def options(self, words: Sequence[str]) -> argparse.Namespace:
+        """Return the options that the words after the command give.
+
+        Raises:
+            InvalidName: an unknown option, or a word too many; the nearest option is offered.
+        """
+        parser = self.parser()
+        options, unknown = parser.parse_known_args(words)
+        if not unknown:
+            return options
+        from fpirhc.errors import InvalidName, nearest
+
+        first = unknown[0]
+        valid = [name for name in parser._option_string_actions if name.startswith("--")]
+        if first.startswith("-"):
+            raise InvalidName(f"{self.name}: the option '{first}' is unknown.{nearest(first, valid)}")
+        needed = [str(one.metavar or one.dest) for one in parser._actions if not one.option_strings]
+        raise InvalidName(f"'{first}' is a word too many; write {' '.join((parser.prog, *needed))} [options]")
 
 
 def aligned(examples: tuple[tuple[str, str], ...]) -> str:

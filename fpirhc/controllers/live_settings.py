@@ -25,11 +25,11 @@ from fpirhc.symbolic.block import Block, Composite, Delay, open_settings
 from fpirhc.symbolic.constants import holds_nan
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX, copied, live_number
-from fpirhc.symbolic.paths import changed_at, content_at, names_in
+from fpirhc.symbolic.paths import changed_at, content_at, names_in, paths_to
 from fpirhc.task.problem import Problem
 
 _OF_PROBLEM = ("cost", "limits", "dead_time", "reference", "sensing")
-_ALWAYS_DATA = "parameters (exact and approximate) and the start are data of every loop; they need no live setting"
+_ALWAYS_DATA = "Parameters (exact and approximate) and the start are data of every loop; they need no live setting"
 Numbers = Mapping[str, float | Sequence[float]]  # by path; a pair for an interval
 
 
@@ -237,8 +237,13 @@ def _owner(problem: Problem, controller: Controller, path: str) -> Problem | Con
         return problem
     valid = [n for n in names_in(controller) if getattr(controller, n) is not None]
     valid += [n for n in _OF_PROBLEM if getattr(problem, n) is not None]
-    hint = f" {_ALWAYS_DATA}" if first in ("start", "plant", "parameters") else nearest(first, valid)
-    raise InvalidName(f"setting '{path}': neither the controller nor the problem's {_OF_PROBLEM} have '{first}'.{hint}")
+    below = " or ".join(f"'{one}'" for one in paths_to(first, controller))
+    hint = f" Did you mean {below}?" if below else nearest(first, valid)
+    if first in ("start", "plant", "parameters", *problem.plant.parameters):
+        hint = f" {_ALWAYS_DATA}"
+    raise InvalidName(
+        f"setting '{path}': neither the controller nor the problem's {', '.join(_OF_PROBLEM)} have '{first}'.{hint}"
+    )
 
 
 def _refuse_lost(composite: Composite, paths: Sequence[str]) -> None:

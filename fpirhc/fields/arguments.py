@@ -37,10 +37,21 @@ class Arguments:
         """Yield every mistake of a call."""
         values = dict(zip(self.positional, arguments, strict=False))
         yield from self._wrong_names(arguments, values, named)
-        for name, value in (*values.items(), *named.items()):
-            one = self.expected.get(name)
-            if one is not None and not accepts(one, value):
-                yield from mistakes_in(one, f"{self.owner.__name__}.{name}", value)
+        every = {**values, **named}
+        wrong = [n for n, value in every.items() if n in self.expected and not accepts(self.expected[n], value)]
+        if self._swapped(wrong, every):
+            name, (one, other) = self.owner.__name__, wrong
+            yield f"{name}: the values of '{one}' and '{other}' are swapped; write {name}({one}=..., {other}=...)"
+            return
+        for name in wrong:
+            yield from mistakes_in(self.expected[name], f"{self.owner.__name__}.{name}", every[name])
+
+    def _swapped(self, wrong: Sequence[str], values: Mapping[str, object]) -> bool:
+        """Whether two values are wrong, and each is what is expected of the other."""
+        if len(wrong) != 2:
+            return False
+        one, other = wrong
+        return accepts(self.expected[one], values[other]) and accepts(self.expected[other], values[one])
 
     def _wrong_names(
         self, arguments: Sequence[object], values: Mapping[str, object], named: Mapping[str, object]

@@ -9,7 +9,8 @@ from __future__ import annotations
 import inspect
 import sys
 from abc import ABCMeta
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import cache
 
 from fpirhc.by_name import find_by_name
@@ -44,6 +45,12 @@ class Checked(metaclass=_CheckedWhenCalled):
     def lacks(self) -> Iterator[str]:
         """Yield what the contract of the class asks for and this value does not have, beside abstract methods."""
         yield from ()
+
+
+def mistakes_of(owner: type, named: Mapping[str, object]) -> Iterator[str]:
+    """Yield the mistakes of some arguments of a class, whose others are not known."""
+    arguments = _arguments_of(owner)
+    yield from replace(arguments, required=()).mistakes((), named)
 
 
 def field_names(owner: type) -> tuple[str, ...]:

@@ -42,6 +42,11 @@ class Expected(ABC):
         """Return the class whose values are expected, for a hint at the members of a family; None where there is none."""
         return None
 
+    def completed(self, part: object) -> str:
+        """Return how a value that is only a part of what is expected is written; empty where it is none."""
+        del part
+        return ""
+
 
 def accepts(expected: Expected, value: object) -> bool:
     """Whether the value and all its parts are as expected."""
@@ -143,6 +148,10 @@ class Entries(Expected):
             yield f": name {shortened(key)}", self.key, key
             yield f"[{shortened(key)}]", self.value, entry
 
+    def completed(self, part: object) -> str:
+        """One entry needs a name."""
+        return "give it a name: {'name': ...}" if accepts(self.value, part) else ""
+
 
 @dataclass(frozen=True)
 class Items(Expected):
@@ -156,7 +165,7 @@ class Items(Expected):
         """(one, two) or a sequence."""
         if self.fixed:
             return f"({', '.join(item.words for item in self.items)})"
-        return f"a sequence, each entry {self.items[0].words}"
+        return f"({self.items[0].words}, ...)"
 
     def fits(self, value: object) -> bool:
         """Whether it is a sequence of that length; a text is none."""
@@ -169,6 +178,10 @@ class Items(Expected):
         """Every entry."""
         for k, part in enumerate(typing.cast(Sequence[object], value)):
             yield f"[{k}]", self.items[k] if self.fixed else self.items[0], part
+
+    def completed(self, part: object) -> str:
+        """One entry needs a comma."""
+        return "" if self.fixed or not accepts(self.items[0], part) else f"write ({shortened(part)},)"
 
 
 @dataclass(frozen=True)
@@ -214,6 +227,10 @@ class Choice(Expected):
         """The first contract among the options."""
         named = (option.contract() for option in self.options if option.contract() not in _WORDS)
         return next((one for one in named if one is not None), None)
+
+    def completed(self, part: object) -> str:
+        """By the first option of which it is a part."""
+        return next((text for option in self.options if (text := option.completed(part))), "")
 
 
 def takes(function: Callable[..., object], arguments: int | None) -> bool:

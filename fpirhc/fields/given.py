@@ -19,11 +19,11 @@ def described(value: object) -> str:
     if isinstance(value, type):
         return f"the class {value.__name__}"
     if isinstance(value, ca.SX | ca.MX):
-        return f"a CasADi symbol ({_SHORT.repr(value)})"
+        return f"a CasADi {'symbol' if value.is_valid_input() else 'expression'} ({_SHORT.repr(value)})"
     if isinstance(value, str):
         return f"the text {_SHORT.repr(value)}"
     if inspect.isroutine(value):
-        return f"the function {getattr(value, '__name__', value)}{_signature(value)}"
+        return f"the function {getattr(value, '__name__', value)}{signature_of(value)}"
     if value is None or isinstance(value, int | float | tuple | list | dict | set):
         return _SHORT.repr(value)
     array = f"an array of the shape {value.shape} and the type {value.dtype}" if isinstance(value, np.ndarray) else ""
@@ -48,7 +48,8 @@ def call_of(one: type | Callable[..., object]) -> str:
     return f"{one.__name__}({', '.join(f'{name}=...' for name in needed)})"
 
 
-def _signature(function: Callable[..., object]) -> str:
+def signature_of(function: Callable[..., object]) -> str:
+    """Return the arguments of a function as it declares them; (...) where they are not known."""
     try:
         return str(inspect.signature(function))
     except (TypeError, ValueError):

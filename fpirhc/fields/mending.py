@@ -11,14 +11,15 @@ from importlib import import_module
 import casadi as ca
 
 from fpirhc.fields.expected import Expected, accepts
-from fpirhc.fields.given import call_of, described
+from fpirhc.fields.given import call_of, described, shortened, signature_of
 
 
 def mistakes_in(expected: Expected, where: str, value: object) -> Iterator[str]:
     """Yield every mistake of the value and its parts."""
     if not expected.fits(value):
         comma = isinstance(value, tuple) and len(value) == 1 and accepts(expected, value[0])
-        mend = "a comma behind the value makes a tuple of it; remove the comma" if comma else mended(expected, value)
+        mend = "a comma behind the value makes a tuple of it; remove the comma" if comma else ""
+        mend = mend or expected.completed(value) or mended(expected, value)
         yield f"{where}: expected {expected.words}, got {described(value)}{'; ' + mend if mend else ''}"
         return
     for place, inner, part in expected.parts(value):
@@ -36,9 +37,18 @@ def mended(expected: Expected, value: object) -> str:
         return "a setting is a number" if expected.fits(1) or expected.fits(0.5) else ""
     if isinstance(value, float) and value.is_integer() and abs(value) < 1e15 and expected.fits(int(value)):
         return f"write {int(value)}"
-    if inspect.isroutine(value) and contract is not None:
-        return "call it and give its result, or give a value"
-    return _part_that_fits(expected, value) if contract is not None else ""
+    return _made_of(expected, value, contract)
+
+
+def _made_of(expected: Expected, value: object, contract: type | None) -> str:
+    """How what is expected is made of a value that holds it, or that it should hold."""
+    if isinstance(value, int | float | Mapping) and expected.fits(lambda t: t):
+        return f"write lambda t: {shortened(value)}"
+    if contract is None:
+        return ""
+    if inspect.isroutine(value) and signature_of(value) == "()":
+        return "call it and give its result"
+    return _part_that_fits(expected, value) or _member(contract)
 
 
 def _mended_text(expected: Expected, text: str, contract: type | None) -> str:
@@ -55,9 +65,17 @@ def _mended_text(expected: Expected, text: str, contract: type | None) -> str:
     close = get_close_matches(_plain(text), members, n=1, cutoff=0.5)
     if close:
         return f"write fp.{call_of(members[close[0]])}"
-    if loaded:
-        return f"write {loaded}"
-    return f"one of {', '.join(sorted(m.__name__ for m in members.values()))}" if members else ""
+    return f"write {loaded}" if loaded else _member(contract)
+
+
+def _member(contract: type) -> str:
+    """How a value of a public class is written, or which members a contract has; empty for classes of Python."""
+    if inspect.isabstract(contract):
+        return f"one of {', '.join(sorted(name for name, _ in _public(contract)))}"
+    if contract.__name__ not in getattr(import_module(contract.__module__.partition(".")[0]), "__all__", ()):
+        return ""
+    _, *first = inspect.signature(getattr(contract, "__init__")).parameters  # noqa: B009
+    return f"write fp.{call_of(contract)}".replace("()", f"({first[0]}=...)" if first else "()")
 
 
 def _part_that_fits(expected: Expected, value: object) -> str:

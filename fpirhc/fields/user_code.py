@@ -9,13 +9,14 @@ import re
 import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import TypeVar
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import FpirhcError, InvalidProblem
+from fpirhc.errors import FpirhcError, InvalidProblem, nearest
 from fpirhc.fields.given import described
 from fpirhc.fields.place import is_users
 from fpirhc.symbolic.expression import Expression, expression
@@ -82,8 +83,8 @@ def named_results(what: str, result: object) -> Mapping[str, object]:
         InvalidProblem: it gives something else.
     """
     if not isinstance(result, Mapping):
-        none = "; a function without `return` gives None" if result is None else ""
-        raise InvalidProblem(f"{what} must return {{name: expression}}, got {described(result)}{none}")
+        mend = "a function without `return` gives None" if result is None else "return {'name': expression, ...}"
+        raise InvalidProblem(f"{what} must return {{name: expression}}, got {described(result)}; {mend}")
     return result
 
 
@@ -98,6 +99,11 @@ def explained(error: BaseException) -> str:
     line = _line_of(error)
     call = re.search(r"\b(np|numpy|math|scipy|sp)\.((?:\w+\.)*)(\w+)", line)
     symbols = re.search(r"\b(SX|MX|to_double|to_int|new_SX|new_MX)\b", text) is not None
+    if re.search(r"\bMX\b", text) and re.search(r"\bSX\b", text):
+        return "the symbols here are of the kind SX, which cannot be mixed with MX; use them, numbers and functions of ca alone"
+    if isinstance(error, AttributeError) and is_dataclass(error.obj):
+        valid = [one.name for one in fields(error.obj)]
+        return f"a {type(error.obj).__name__} has no '{error.name}'.{nearest(error.name, valid)}"
     if symbols and call is not None:
         return f"{call.group(0)} cannot act on a symbol; {_instead(call.group(3))}"
     if symbols and re.search(r"\b(float|int|range|round)\(", line):

@@ -25,6 +25,7 @@ import casadi as ca
 from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.expected import takes
+from fpirhc.fields.given import described
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.maps import shifted
 from fpirhc.plant.plant_functions import by_name
@@ -180,7 +181,7 @@ def check_outputs(plant: Plant, mistakes: Mistakes) -> None:
             names = ", ".join(first[:lower])
             mistakes.add(
                 f"outputs: the expression of '{name}' is called as function({names}, p), or as function({names}, u, p) where the "
-                "command moves it at once; it takes other arguments"
+                f"command moves it at once; got {described(one.expression)}; write lambda {names}, p: ..."
             )
             continue
         try:

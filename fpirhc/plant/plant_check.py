@@ -10,7 +10,7 @@ import casadi as ca
 
 from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.expected import takes
-from fpirhc.fields.user_code import called, named_results, scalar_expression
+from fpirhc.fields.user_code import called, named_results, place_of, scalar_expression
 from fpirhc.plant.algebraic import check_algebraic
 from fpirhc.plant.inverse import inverse_by_user
 from fpirhc.plant.structural_order import structural_order
@@ -82,12 +82,7 @@ def check_response(plant: Plant, mistakes: Mistakes) -> None:
         arguments_of_step = (*arguments_of_step, algebraic.view(symbols[-1]))
     expected = len(arguments_of_step)
     if not takes(plant.response, expected):
-        arguments = len(inspect.signature(plant.response).parameters)
-        lower = ["x"] if quantity == "state" else ["q", "v", "a"] + [f"d{k}" for k in range(3, 12)]
-        mistakes.add(
-            f"{function} takes {arguments} argument(s); with order {max(plant.orders, default=0)} it is called as "
-            f"{function}({', '.join([*lower[: max(plant.orders, default=0)], 'u', 'p', *(['z'] if algebraic else [])])})"
-        )
+        mistakes.add(_wrong_arguments(plant, expected))
         return
     try:
         response = named_results(function, called(function, plant.response, *arguments_of_step))
@@ -110,6 +105,25 @@ def check_response(plant: Plant, mistakes: Mistakes) -> None:
         _check_orders(plant, mistakes)
     if mistakes.none and plant.inverse is not None:
         _check_inverse(plant, plant.inverse, mistakes)
+
+
+def _wrong_arguments(plant: Plant, expected: int) -> str:
+    """What a response of another number of arguments is, and what it should be."""
+    quantity, function = plant.words
+    kinds = [one.kind for one in inspect.signature(plant.response).parameters.values()]
+    given, order = len(kinds), max(plant.orders, default=0)
+    lower = ["x"] if quantity == "state" else ["q", "v", "a"] + [f"d{k}" for k in range(3, 12)]
+    names = [*lower[:order], "u", "p", *(["z"] if plant.algebraic else [])]
+    state, fitting, place = quantity == "state", order + given - expected, place_of(plant.response)
+    mend = f"; {given} arguments are those of order {fitting}" if fitting > 0 else _OF_STATES
+    mend = "" if state or inspect.Parameter.KEYWORD_ONLY in kinds else mend
+    return (
+        f"{function} takes {given} argument(s){f' ({place})' if place else ''}; "
+        f"{'' if state else f'with order {order} '}it is called as {function}({', '.join(names)}){mend}"
+    )
+
+
+_OF_STATES = "; equations in states go to Plant.of_states(rates=...)"
 
 
 def _check_order_numbers(plant: Plant, mistakes: Mistakes) -> None:
@@ -149,7 +163,10 @@ def _check_orders(plant: Plant, mistakes: Mistakes) -> None:
         name, stated = plant.names[k], plant.orders[k]
         order = structural_order(plant, name)
         if order is None:
-            mistakes.add(f"no input reaches coordinate '{name}', however often it is differentiated")
+            mistakes.add(
+                f"no input reaches coordinate '{name}', however often it is differentiated; use {' or '.join(plant.inputs)} in the "
+                f"{plant.words[1]}, or control another {plant.words[0]}"
+            )
         elif order != stated and plant.next is not None:
             mistakes.add(
                 f"an input reaches state '{name}' only after {order} steps; write it as an output, whose order is found: "

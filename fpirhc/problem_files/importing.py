@@ -3,36 +3,38 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import importlib.util
 import sys
-import traceback
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
-from fpirhc.errors import FpirhcError, InvalidField, ProblemFileError
-from fpirhc.fields.user_code import explained
+from fpirhc.errors import ProblemFileError
+from fpirhc.problem_files.every_mistake import MistakesOfFile, cause_of, message
 
 
 def imported(path: Path) -> ModuleType:
     """Return the module of a problem file.
 
     Raises:
-        ProblemFileError: the file raises an error, or is not Python; the message has the line.
+        ProblemFileError: the file raises an error, or is not Python; every mistake has its line.
     """
-    spec = importlib.util.spec_from_file_location(f"fpirhc_problem_{path.stem}", path)
-    if spec is None or spec.loader is None:
-        raise ProblemFileError(f"'{path}' is not a Python file")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
+    module = _empty(path)
     try:
-        spec.loader.exec_module(module)
+        with _neighbours(path):
+            assert module.__spec__ is not None
+            assert module.__spec__.loader is not None
+            module.__spec__.loader.exec_module(module)
     except SyntaxError as error:
-        source = (error.text or "").strip()
-        raise ProblemFileError(f"{path.name}, line {error.lineno}: {error.msg}\n    {source}") from None
+        source, name = (error.text or "").strip(), Path(error.filename or path).name
+        raise ProblemFileError(f"{name}, line {error.lineno}: {error.msg}\n    {source}") from None
     except SystemExit as error:
-        raise ProblemFileError(f"{_own_line(path, error)}\n    the file ends the program; leave the exit out") from None
+        raise ProblemFileError(message(path, error, "the file ends the program; leave the exit out")) from None
     except Exception as error:  # noqa: BLE001 -- every error of a user's file is shown with its line
-        raise ProblemFileError(f"{_own_line(path, error)}\n    {_cause(error)}") from None
+        with _neighbours(path):
+            every = MistakesOfFile(path, _empty(path)).text()
+        raise ProblemFileError(every or message(path, error, cause_of(error))) from None
     return module
 
 
@@ -51,21 +53,29 @@ def line_of(module: ModuleType, name: str) -> str:
     return f"line {lines[-1]}: " if lines else ""
 
 
-def _cause(error: Exception) -> str:
-    if isinstance(error, InvalidField):
-        return error.text.lstrip()
-    if isinstance(error, FpirhcError):
-        return str(error)
-    cause = explained(error)
-    if not cause.startswith(type(error).__name__):
-        return cause
-    # Python's own last line also has the nearest name that it knows.
-    return "".join(traceback.TracebackException.from_exception(error).format_exception_only()).strip()
+def _empty(path: Path) -> ModuleType:
+    """The module of a file before its first line."""
+    spec = importlib.util.spec_from_file_location(f"fpirhc_problem_{path.stem}", path)
+    if spec is None:
+        raise ProblemFileError(f"'{path}' is not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    return module
 
 
-def _own_line(path: Path, error: BaseException) -> str:
-    """The last line of the user's file in the traceback."""
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).resolve() == path.resolve()]
-    if not frames:
-        return path.name
-    return f"{path.name}, line {frames[-1].lineno}: {frames[-1].line}"
+@contextlib.contextmanager
+def _neighbours(path: Path) -> Iterator[None]:
+    """Let a file import the modules beside it, as a program can; libraries come first.
+
+    The modules are forgotten afterwards: another folder may have others of the same name.
+    """
+    folder, before = str(path.resolve().parent), set(sys.modules)
+    sys.path.append(folder)
+    try:
+        yield
+    finally:
+        sys.path.remove(folder)
+        for name in set(sys.modules) - before:
+            file = getattr(sys.modules[name], "__file__", None)
+            if file and Path(file).parent == Path(folder) and not name.startswith("fpirhc_problem_"):
+                del sys.modules[name]

@@ -127,7 +127,8 @@ def _problem(module: ModuleType, mistakes: Mistakes) -> Problem | None:
         return problem
     others = [name for name, value in vars(module).items() if isinstance(value, Problem)]
     named = f"; '{others[0]}' is one, so call it 'problem'" if others else ""
-    got = f", got {described(problem)}" if hasattr(module, "problem") else ""
+    outside = ", outside every function"
+    got = f", got {described(problem)}" if hasattr(module, "problem") else "" if others else outside
     mistakes.add(f"{_at(module, 'problem')}it must define problem = fpirhc.Problem(...){got}{named}")
     return None
 
@@ -136,7 +137,7 @@ def _controllers(module: ModuleType, mistakes: Mistakes) -> Mapping[str, Control
     controllers = getattr(module, "controllers", None)
     where = _at(module, "controllers")
     if not isinstance(controllers, Mapping) or not controllers:
-        got = f", got {described(controllers)}" if hasattr(module, "controllers") else ""
+        got = f", got {described(controllers)}" if hasattr(module, "controllers") else _called_otherwise(module)
         mistakes.add(f"{where}it must define controllers = {{'name': fpirhc.ComputedTorque(...), ...}}{got}")
         return {}
     for name, controller in controllers.items():
@@ -146,6 +147,14 @@ def _controllers(module: ModuleType, mistakes: Mistakes) -> Mapping[str, Control
             mend = f"; write {call_of(controller)}" if isinstance(controller, type) else ""
             mistakes.add(f"{where}controllers['{name}'] must be a controller, got {described(controller)}{mend}")
     return controllers
+
+
+def _called_otherwise(module: ModuleType) -> str:
+    """A mapping of controllers under another name."""
+    for name, value in vars(module).items():
+        if isinstance(value, Mapping) and value and all(isinstance(one, Controller) for one in value.values()):
+            return f"; '{name}' is such a mapping, so call it 'controllers'"
+    return ""
 
 
 def _headline(module: ModuleType, controllers: Mapping[str, Controller], mistakes: Mistakes) -> tuple[str, str] | None:

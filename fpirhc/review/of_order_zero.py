@@ -47,7 +47,7 @@ def _of(grid: ReviewGrid, controller: Controller) -> tuple[Answer, ...]:
     try:
         ready = checked(grid.real or grid.problem, controller)
     except FpirhcError as error:
-        return (Answer("Does the controller fit the problem?", Verdict.NO, str(error), "See the message."),)
+        return (Answer("Does the controller fit the problem?", Verdict.NO, str(error)),)
     if not ready.deformation.adapts:
         return ()
     believed = ready.parameters(grid.problem.plant)

@@ -111,7 +111,7 @@ def _of(grid: ReviewGrid, controller: Controller, general: list[Answer], runs: N
         ready = resolved(grid.problem, controller)
         ready.check(grid.problem)
     except FpirhcError as error:
-        return (Answer("Does the controller fit the problem?", Verdict.NO, str(error), "See the message."),)
+        return (Answer("Does the controller fit the problem?", Verdict.NO, str(error)),)
     broken: list[str] = []
     schedule = _asked(schedule_stable, grid.problem, ready)
     if schedule is not None:

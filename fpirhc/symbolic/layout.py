@@ -87,7 +87,10 @@ class Named:
         try:
             return self.vector[self._elements.index(name)]
         except ValueError:
-            raise InvalidName(f"{self._what} '{name}' is unknown.{nearest(name, self._elements)}") from None
+            number = (
+                f" Entries have names, such as .{self._elements[0]}, and no numbers." if isinstance(name, int) else ""
+            )
+            raise InvalidName(f"{self._what} '{name}' is unknown.{number}{nearest(name, self._elements)}") from None
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._elements)

@@ -5,7 +5,7 @@ A path leads through fields of dataclasses, keys of mappings and places of tuple
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import TypeVar, cast
 
@@ -45,12 +45,21 @@ def content_at(owner: object, path: str, what: str = "the controller") -> object
         valid = names_in(value)
         if name not in valid:
             where = f"'{'.'.join(done)}' of {what}" if done else what
-            raise InvalidName(
-                f"setting '{path}': {where} ({type(value).__name__}) has no '{name}'.{nearest(name, valid)}"
-            )
+            below = [".".join((*done, one)) for one in paths_to(name, value)]
+            hint = f" Did you mean '{below[0]}'?" if below else nearest(name, valid)
+            raise InvalidName(f"setting '{path}': {where} ({type(value).__name__}) has no '{name}'.{hint}")
         value = entry(value, name)
         done.append(name)
     return value
+
+
+def paths_to(name: str, value: object, depth: int = 4) -> Iterator[str]:
+    """Yield the paths inside a value that end with a name."""
+    for one in names_in(value) if depth else ():
+        if one == name:
+            yield one
+        else:
+            yield from (f"{one}.{rest}" for rest in paths_to(name, entry(value, one), depth - 1))
 
 
 def is_declared(owner: object, path: str, kinds: Sequence[object]) -> bool:

@@ -131,7 +131,8 @@ def _jump(motion: Motion, place: int, name: str, first: float, last: float) -> J
         first, last = times[larger], times[larger + 1]
     # At its very time a kink has the mean of both slopes: half the jump stands on either side.
     around = np.array([first - margin, last + margin])
-    return Jump(name, float(last), float(_rests(around, *motion(around))[place, 0]))
+    time = 0.0 if last <= margin else float(last)
+    return Jump(name, time, float(_rests(around, *motion(around))[place, 0]))
 
 
 QUESTION = ProblemQuestion(ask=reference_free_of_jumps, order=10)

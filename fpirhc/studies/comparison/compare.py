@@ -149,6 +149,8 @@ def select(task: Task, names: Sequence[str] | None) -> dict[str, Controller]:
         return dict(task.controllers)
     mistakes = Mistakes(f"problem '{task.name}'")
     mistakes.unknown("controller", names, task.controllers)
+    if not mistakes.none and any("," in name for name in names):
+        mistakes.add("names are separated by spaces, without commas")
     mistakes.raise_if_any()
     return {name: task.controllers[name] for name in names}
 

@@ -1,0 +1,563 @@
+"""Wrong files and command lines as they are written by people who come from other tools: what each message must say.
+
+Each case changes a correct file (`first_files`) and runs a command on it. The message names what is wrong, where, what was
+expected, and a fix; all mistakes of one file stand in it; the exit code is that of bad input, or of a review that answers no.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from inspect import signature
+from pathlib import Path
+
+import pytest
+from first_files import PENDULUM, REACTOR, TANKS
+
+import fpirhc as fp
+from fpirhc.cli.exit_codes import ExitCode
+from fpirhc.cli.main import main
+from fpirhc.errors import OF_OTHER_TOOLS
+from fpirhc.fields.checked import Checked, field_names
+
+REVIEW = ("review", "mine.py")
+ANGLE_COST = """fp.Quadratic(states={"angle": 1e3, "angle'": 1.0}, deviation={"torque": 1e-2})"""
+ANGLE_MOTION = 'fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(2 * t)})'
+ANGLE_LIMITS = 'fp.Limits(inputs={"torque": (-15.0, 15.0)})'
+BOTH = '{"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": fp.RecedingHorizon(optimiser, adaptive)}'
+
+
+@dataclass(frozen=True)
+class Wrong:
+    """A changed file and what must be said about it.
+
+    Args:
+        file: the correct file.
+        changes: (old, new) pieces of it.
+        said: what stands in the message, in this order.
+        words: of the command line.
+        beside: other files of the folder.
+    """
+
+    file: str
+    changes: tuple[tuple[str, str], ...]
+    said: tuple[str, ...]
+    words: tuple[str, ...] = REVIEW
+    beside: dict[str, str] = field(default_factory=dict)
+
+
+def one(file: str, old: str, new: str, *said: str) -> Wrong:
+    """One change, reviewed."""
+    return Wrong(file, ((old, new),), said)
+
+
+def line(words: str, *said: str) -> Wrong:
+    """A wrong command line beside a correct file."""
+    return Wrong(PENDULUM, (), said, tuple(words.split()), {"notes.txt": "x = 1\n", "two_mess.py": "1 / 0\n"})
+
+
+PLANTS = {
+    "right-hand side as a vector": one(
+        PENDULUM,
+        'return {"angle": (u.torque - p.friction * v.angle) / inertia - 9.81 / p.length * ca.sin(q.angle)}',
+        "return ca.vertcat(v.angle, u.torque / inertia)",
+        "mine.py, line 12: plant = fp.Plant(",
+        "response must return {name: expression}, got a CasADi expression",
+        "return {'name': expression, ...}",
+    ),
+    "response of x and u": one(
+        PENDULUM,
+        "def response(q, v, u, p):",
+        "def response(x, u):",
+        "response takes 2 argument(s) (mine.py, line 7)",
+        "it is called as response(q, v, u, p)",
+        "Plant.of_states(rates=...)",
+    ),
+    "rates of time": one(
+        REACTOR,
+        "def rates(x, u, p)",
+        "def rates(t, x, u, p)",
+        "rates takes 4 argument(s) (mine.py, line 7); it is called as rates(x, u, p)",
+    ),
+    "order of a velocity": one(
+        PENDULUM, "order=2", "order=1", "called as response(q, u, p); 4 arguments are those of order 2"
+    ),
+    "parameters as numbers": Wrong(
+        PENDULUM,
+        (
+            ('fp.Parameter(approximate=1.4, exact=1.0, unit="kg")', "1.4"),
+            ('fp.Parameter(approximate=0.5, exact=0.6, unit="m")', "(0.5, 0.6)"),
+        ),
+        (
+            "['mass']: expected a Parameter, got 1.4; write fp.Parameter(approximate=..., exact=..., unit=...)",
+            "['length']: expected a Parameter",
+        ),
+    ),
+    "unit in front": one(
+        PENDULUM,
+        'fp.Parameter(approximate=1.4, exact=1.0, unit="kg")',
+        'fp.Parameter("kg", 1.0, 1.4)',
+        "mine.py, line 18",
+        "the values of 'approximate' and 'unit' are swapped; write Parameter(approximate=..., unit=...)",
+    ),
+    "names without units": Wrong(
+        PENDULUM,
+        (('{"angle": "rad"}', '["angle"]'), ('{"torque": "N m"}', '"torque"')),
+        (
+            "Plant.coordinates: expected {name: a text}, got ['angle']",
+            "Plant.inputs: expected {name: a text}, got the text 'torque'",
+        ),
+    ),
+    "unit as a name": one(
+        PENDULUM, '{"angle": "rad"}', '{"rad": "angle"}', "line 9): coordinate 'angle' is unknown. Valid: rad."
+    ),
+    "entries by number": one(
+        PENDULUM,
+        "q.angle",
+        "q[0]",
+        "line 9): coordinate '0' is unknown. Entries have names, such as .angle, and no numbers.",
+    ),
+    "MX in a response": one(
+        PENDULUM,
+        "ca.sin(q.angle)",
+        "ca.sin(ca.MX(1) * q.angle)",
+        "line 9): the symbols here are of the kind SX, which cannot be mixed with MX",
+    ),
+    "no input in the response": one(
+        PENDULUM, "u.torque - ", "0 - ", "no input reaches coordinate 'angle'", "use torque in the response"
+    ),
+    "controlled by one name": Wrong(
+        TANKS,
+        (
+            (', "pump2": "m^3/s"', ""),
+            ("u.pump2 + ", ""),
+            (', "pump2": (0.0, 2.0)', ""),
+            ("order=1,", 'order=1,\n    controlled="h1",'),
+        ),
+        ("Plant.controlled: expected (a text, ...) or None, got the text 'h1'; write ('h1',)",),
+    ),
+    "output as a function": one(
+        REACTOR,
+        'fp.Output("K", lambda x, p: x.T)',
+        "lambda x, p: x.T",
+        "Plant.outputs['temperature']: expected an Output",
+        "write fp.Output(unit=..., expression=...)",
+    ),
+    "output before its unit": one(
+        REACTOR,
+        'fp.Output("K", lambda x, p: x.T)',
+        'fp.Output(lambda x, p: x.T, "K")',
+        "mine.py, line 20",
+        "the values of 'unit' and 'expression' are swapped",
+    ),
+    "output of the state alone": one(
+        REACTOR,
+        "lambda x, p: x.T",
+        "lambda x: x.T",
+        "called as function(x, p)",
+        "got the function <lambda>(x); write lambda x, p: ...",
+    ),
+    "output of an unknown state": one(
+        REACTOR,
+        "lambda x, p: x.T",
+        "lambda x, p: x.C_A",
+        "'temperature' (mine.py, line 20): state 'C_A' is unknown",
+        "Valid: C, T.",
+    ),
+}
+PROBLEMS = {
+    "names of another tool": Wrong(
+        PENDULUM,
+        (("period=1e-2", "dt=1e-2"), ("duration=0.2", "T=0.2"), ("start={", "x0={")),
+        (
+            "no field 'x0'. Did you mean 'start'?",
+            "no field 'dt'. Did you mean 'period'?",
+            "no field 'T'. Did you mean 'duration'?",
+            "Problem needs start, period, duration",
+        ),
+    ),
+    "start as an array": one(
+        PENDULUM,
+        'start={"angle": 0.0}',
+        "start=np.zeros(2)",
+        "Problem.start: expected {name: a number}, got an array of the shape (2,)",
+    ),
+    "start in another unit": one(
+        REACTOR, '"T": 350.0}', '"T": "77 C"}', "Problem.start['T']: expected a number, got the text '77 C'"
+    ),
+    "start of an output": one(
+        REACTOR,
+        'start={"C": 0.5, "T": 350.0}',
+        'start={"temperature": 350.0}',
+        "start: state 'temperature' is unknown. Valid: C, T.",
+        "state 'C' has no first value; add 'C': ...",
+        "state 'T' has no first value",
+    ),
+    "start outside the limits": one(
+        TANKS,
+        'start={"h1": 1.0',
+        'start={"h1": 3.0',
+        "no Does the run start inside the limits of states? h1 starts at 3 m, limits 0 and 2",
+        "Move the start of h1 inside the limits",
+    ),
+    "limits by vectors": one(
+        PENDULUM,
+        ANGLE_LIMITS,
+        "fp.Limits(lbu=np.array([-15.0]), ubu=np.array([15.0]))",
+        "mine.py, line 29",
+        "no field 'lbu'. Did you mean 'inputs'?",
+        "no field 'ubu'. Did you mean 'inputs'?",
+    ),
+    "limits as a mapping": one(
+        PENDULUM,
+        ANGLE_LIMITS,
+        '{"torque": (-15.0, 15.0)}',
+        "Problem.limits: expected a Limits",
+        "write fp.Limits(inputs=...)",
+    ),
+    "limits of unknown names": one(
+        PENDULUM,
+        ANGLE_LIMITS,
+        'fp.Limits(inputs={"tau": (-15.0, 15.0)}, states={"angle_dot": (-3, 3)})',
+        "input 'tau' is unknown. Valid: torque.",
+        "state 'angle_dot' is unknown. Did you mean 'angle''?",
+    ),
+    "limits reversed": Wrong(
+        TANKS,
+        (('"pump1": (0.0, 2.0)', '"pump1": (2.0, 0.0)'), ('{"h1": (0.0, 2.0)}', '{"h1": (2.0, 0.0)}')),
+        ("'pump1' has lower 2.0 above upper 0.0; swap them", "'h1' has lower 2.0 above upper 0.0; swap them"),
+    ),
+    "cost by matrices": one(
+        PENDULUM,
+        ANGLE_COST,
+        "fp.Quadratic(Q=np.diag([1e3, 1.0]), R=np.eye(1))",
+        "no field 'Q'. Did you mean 'states'?",
+        "no field 'R'. Did you mean 'effort'?",
+    ),
+    "cost as a function": one(
+        PENDULUM,
+        ANGLE_COST,
+        "lambda x, u: x[0] ** 2",
+        "Problem.cost: expected a Cost or None, got the function <lambda>(x, u); one of CustomCost, Quadratic",
+    ),
+    "cost on unknown names": one(
+        PENDULUM,
+        ANGLE_COST,
+        'fp.Quadratic(states={"theta": 1.0}, effort={"force": 1e-2}, terminal={"angle_dot": 1.0})',
+        "states: 'theta' is unknown",
+        "effort: 'force' is unknown. Did you mean 'torque'?",
+        "terminal: 'angle_dot' is unknown. Did you mean 'angle''?",
+    ),
+    "cost of an unknown member": one(
+        PENDULUM,
+        ANGLE_COST,
+        'fp.CustomCost(lambda v: {"e": v.x.angle**2})',
+        "line 31): a View has no 'x'",
+        "Valid: state, reference, input",
+    ),
+    "weights of states behind an output": one(
+        REACTOR,
+        'outputs={"temperature": 1.0}, rate',
+        'states={"T": 1.0}, rate',
+        "weigh temperature, Quadratic(outputs=...)",
+    ),
+    "horizon by one number": one(
+        PENDULUM,
+        "fp.Horizon(stages=6, step=2e-2)",
+        "20",
+        "expected a Horizon or None, got 20; write fp.Horizon(stages=..., step=...)",
+    ),
+    "horizon of another tool": one(
+        PENDULUM,
+        "stages=6, step=2e-2",
+        "n_horizon=20, t_step=2e-2",
+        "no field 'n_horizon'. Did you mean 'stages'?",
+        "no field 't_step'. Did you mean 'step'?",
+        "Horizon needs stages, step",
+    ),
+    "step before stages": one(
+        PENDULUM,
+        "fp.Horizon(stages=6, step=2e-2)",
+        "fp.Horizon(2e-2, 6)",
+        "Horizon.stages: expected a whole number from 1 to 1000000, got 0.02",
+    ),
+    "reference as a number": one(
+        PENDULUM,
+        ANGLE_MOTION,
+        "0.8",
+        "Problem.reference: expected a Reference, got 0.8; one of Setpoint, Table, Trajectory",
+    ),
+    "reference without a function": one(
+        PENDULUM,
+        ANGLE_MOTION,
+        'fp.Trajectory({"angle": 0.8})',
+        "mine.py, line 25",
+        "expected a function of 1 argument",
+        "write lambda t: {'angle': 0.8}",
+    ),
+    "reference that jumps": one(
+        PENDULUM,
+        "0.8 * ca.sin(2 * t)",
+        "ca.sign(ca.sin(2 * t))",
+        "no Is the reference free of jumps? angle by 2 rad at t = 0 s",
+        "Use a filtered set-point",
+    ),
+    "period of zero": one(
+        PENDULUM,
+        "period=1e-2",
+        "period=0",
+        "Problem.period: expected a number from 1e-12 to 1e12 in the plant's unit of time, got 0",
+    ),
+    "period above the run": one(
+        PENDULUM,
+        "period=1e-2",
+        "period=10.0",
+        "duration 0.2 s is shorter than one period of 10.0 s",
+        "period 10 s does not divide the horizon step 0.02 s",
+    ),
+    "measured after the end": one(
+        PENDULUM, "measure_from=0.05", "measure_from=5.0", "measure_from must lie in [0, 0.2), got 5.0"
+    ),
+    "disturbance without a name": one(
+        PENDULUM,
+        "measure_from=0.05",
+        "disturbances=fp.Sine(0.1, 1.0)",
+        "expected {name: a Disturbance}, got a value of the class Sine; give it a name: {'name': ...}",
+    ),
+    "disturbance as a number": one(
+        PENDULUM,
+        "measure_from=0.05",
+        'disturbances={"torque": 0.5}',
+        "expected a Disturbance, got 0.5; one of ColouredNoise, Formula, Noise",
+    ),
+    "dead time as a number": one(
+        PENDULUM, "measure_from=0.05", "dead_time=0.05", "expected a DeadTime, got 0.05; write fp.DeadTime(inputs=...)"
+    ),
+    "noise as a number": one(
+        PENDULUM,
+        "measure_from=0.05",
+        'sensing=fp.Sensing(sensors={"angle": fp.Sensor(noise=0.01)})',
+        "Sensor.noise: expected a Disturbance or None, got 0.01",
+    ),
+}
+CONTROLLERS = {
+    "deformation before the optimiser": one(
+        PENDULUM,
+        "fp.RecedingHorizon(optimiser, adaptive)",
+        "fp.RecedingHorizon(adaptive, optimiser)",
+        "the values of 'optimiser' and 'deformation' are swapped",
+    ),
+    "deformation as a number": one(
+        PENDULUM,
+        "fp.ModelReferenced(fp.Sigmoid(gain=-2.6))",
+        "fp.ModelReferenced(-2.6)",
+        "ModelReferenced.map: expected a Deformation, got -2.6; one of Affine",
+    ),
+    "gain of the wrong sign": one(
+        TANKS,
+        "gain=-0.7",
+        "gain=0.7",
+        "no Is the map's gain admissible? gain = 0.7; admissible 0 to -4",
+        "Use gain = -2",
+    ),
+    "gains of a PID": one(
+        PENDULUM,
+        '{"RHC": fp.RecedingHorizon(optimiser)',
+        '{"PID": fp.PID(Kp=9.0, Kd=1.0)',
+        "no field 'Kp'. Did you mean 'proportional'?",
+        "no field 'Kd'. Did you mean 'derivative'?",
+    ),
+    "options of a solver": one(
+        PENDULUM,
+        "fp.FixedPoint(iterations=1, tolerance=1e-2)",
+        "fp.Ipopt(max_iter=100)",
+        "Ipopt has no field 'max_iter'. Did you mean 'iterations'?",
+    ),
+    "class of another tool": one(
+        PENDULUM,
+        BOTH,
+        '{"MPC": fp.MPC(optimiser)}',
+        "fpirhc has no name 'MPC'. Did you mean 'RecedingHorizon'?",
+        "more.",
+    ),
+    "a horizon that is not there": one(
+        PENDULUM,
+        "    horizon=fp.Horizon(stages=6, step=2e-2),\n",
+        "",
+        "no Does the controller fit the problem? RecedingHorizon needs Problem(horizon=...), which this problem does not have",
+    ),
+    "one controller": one(
+        PENDULUM,
+        BOTH,
+        "fp.RecedingHorizon(optimiser)",
+        "line 36: it must define controllers = {'name': fpirhc.ComputedTorque(...), ...}, got a value of the class RecedingHorizon",
+    ),
+    "controllers under another name": one(
+        PENDULUM, "controllers = {", "controller = {", "'controller' is such a mapping, so call it 'controllers'"
+    ),
+    "headline of unknown names": one(
+        PENDULUM,
+        "controllers = {",
+        'headline = ("MPC", "RHC+FPi")\ncontrollers = {',
+        "'MPC' is unknown",
+        "'RHC+FPi' is unknown. Did you mean 'RHC+FPI'?",
+    ),
+}
+FILES = {
+    "mistakes all over the file": Wrong(
+        PENDULUM,
+        (
+            ("import numpy as np\n", "import numpy as np\nimport do_mpc_\n"),
+            ('unit="kg"', 'units="kg"'),
+            ("exact=0.6", 'exact="0.6"'),
+            ("period=1e-2", 'period="1e-2"'),
+            ("stages=6", "n_horizon=6"),
+            ("gain=-2.6", 'gain="big"'),
+        ),
+        (
+            "line 4: import do_mpc_ ModuleNotFoundError",
+            "line 19:",
+            "no field 'units'. Did you mean 'unit'?",
+            "line 20:",
+            "Parameter.exact: expected a number",
+            "line 24:",
+            "Problem.period: expected a number",
+            "write 1e-2 without quotes",
+            "line 31:",
+            "no field 'n_horizon'",
+            "line 36:",
+            "Sigmoid.gain: expected a number, got the text 'big'",
+        ),
+    ),
+    "key that is not there": one(
+        PENDULUM,
+        "optimiser = fp",
+        "n = {}['max_iter']\noptimiser = fp",
+        "mine.py, line 34: n = {}['max_iter'] KeyError: 'max_iter'",
+    ),
+    "data that are not there": one(
+        PENDULUM,
+        "optimiser = fp",
+        'table = np.loadtxt("gone.csv")\noptimiser = fp',
+        "line 34: table = np.loadtxt",
+        "gone.csv not found",
+    ),
+    "parenthesis that stays open": one(
+        PENDULUM,
+        f"reference={ANGLE_MOTION},",
+        f"reference={ANGLE_MOTION[:-1]},",
+        "mine.py, line 23: '(' was never closed problem = fp.Problem(",
+    ),
+    "everything in a function": one(
+        PENDULUM,
+        "problem = fp.Problem(",
+        "def main():\n  problem = fp.Problem(",
+        "it must define problem = fpirhc.Problem(...), outside every function",
+    ),
+    "circular imports": Wrong(
+        PENDULUM,
+        (("import fpirhc as fp", "import fpirhc as fp\nfrom helper import LENGTH"),),
+        ("mine.py, line 5: from helper import LENGTH", "circular import"),
+        beside={"helper.py": "from mine import response\nLENGTH = 1.0\n"},
+    ),
+    "name that a neighbour lacks": Wrong(
+        PENDULUM,
+        (("import fpirhc as fp", "import fpirhc as fp\nfrom helper import LENGTH"),),
+        ("mine.py, line 5", "cannot import name 'LENGTH' from 'helper'"),
+        beside={"helper.py": "LENGHT = 1.0\n"},
+    ),
+    "equations of MATLAB": Wrong("function dx = f(t, x)\n", (), ("mine.py, line 1: invalid syntax",)),
+    "nothing": Wrong("", (), ("it must define problem = fpirhc.Problem(...)", "it must define controllers = {")),
+}
+LINES = {
+    one.words: one
+    for one in (
+        line(
+            "compare nofile",
+            "problem 'nofile' is unknown. Give the path of a problem file, or a name from 'fpirhc list'",
+        ),
+        line("compare mien.py", "no file at 'mien.py'. Did you mean 'mine.py'?"),
+        line("compare mine", "problem 'mine' is unknown; for the file write 'mine.py'"),
+        line("compare Two_Mass", "Did you mean 'two_mass'?"),
+        line("compare .", "'.' is a folder; a problem file ends in .py, such as mine.py, two_mess.py"),
+        line("compare notes.txt", "'notes.txt' is not a Python file; a problem file ends in .py"),
+        line("mine.py", "the command 'mine.py' is unknown. Write fpirhc compare mine.py."),
+        line("reveiw mine.py", "Did you mean 'review'?"),
+        line(
+            "review mine.py --controler RHC",
+            "review: the option '--controler' is unknown. Did you mean '--controllers'?",
+        ),
+        line("compare mine.py two_mass", "'two_mass' is a word too many; write fpirhc compare PROBLEM [options]"),
+        line(
+            "compare mine.py --controllers RHC,RHC+FPI",
+            "controller 'RHC,RHC+FPI' is unknown",
+            "names are separated by spaces, without commas",
+        ),
+        line("compare mine.py --mismatch 20", "--mismatch needs --scenarios N"),
+        line("review mine.py --mismatch 120%", "mismatch 120.0: expected percent of at least 0 and below 100"),
+        line("run mine.py fpi", "controller 'fpi' is unknown. Did you mean 'RHC+FPI'?"),
+        line("run mine.py RHC+FPI --set gain=-2", "Did you mean 'optimiser.map.gain' or 'deformation.map.gain'?"),
+        line("run mine.py RHC+FPI --set deformation.gain=-2", "has no 'gain'. Did you mean 'deformation.map.gain'?"),
+        line("run mine.py RHC --set mass=2", "Parameters (exact and approximate) and the start are data of every loop"),
+        line("check mine.py", "there is no baseline 'mine.json'; write one: fpirhc accept PROBLEM --reason ..."),
+    )
+}
+WRONG = {**PLANTS, **PROBLEMS, **CONTROLLERS, **FILES, **{" ".join(words): case for words, case in LINES.items()}}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_file_or_command_line_is_explained(name, tmp_path, monkeypatch, capsys):
+    wrong = WRONG[name]
+    monkeypatch.chdir(tmp_path)
+    text = wrong.file
+    for old, new in wrong.changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    for file, content in {"mine.py": text, **wrong.beside}.items():
+        Path(file).write_text(content, encoding="utf-8")
+    try:
+        code = main(list(wrong.words))
+    except SystemExit as ended:  # argparse has its own end
+        code = int(str(ended.code))
+    printed = capsys.readouterr()
+    said = " ".join((printed.out + printed.err).split())
+    assert code in (ExitCode.BAD_INPUT, ExitCode.ANSWERED_NO, ExitCode.NO_BASELINE)
+    assert "Traceback" not in said
+    assert "an error inside" not in said
+    place = -1
+    for words in wrong.said:
+        place = said.find(words, place + 1)
+        assert place >= 0, f"'{words}' is not in its place in: {said}"
+
+
+@pytest.mark.parametrize("file", [PENDULUM, REACTOR, TANKS])
+def test_the_files_without_a_mistake_are_accepted(file, tmp_path):
+    (tmp_path / "mine.py").write_text(file, encoding="utf-8")
+    assert len(fp.load_problem(str(tmp_path / "mine.py")).controllers) == 2
+
+
+def test_a_file_imports_its_neighbours_and_forgets_them(tmp_path):
+    """Two folders with modules of one name, as `fpirhc check` meets them."""
+    for folder, angle in (("first", 0.1), ("second", 0.2)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "numbers_of_mine.py").write_text(f"START = {angle}\n", encoding="utf-8")
+        text = PENDULUM.replace("import fpirhc as fp", "import fpirhc as fp\nfrom numbers_of_mine import START", 1)
+        (tmp_path / folder / "mine.py").write_text(text.replace('{"angle": 0.0}', '{"angle": START}'), encoding="utf-8")
+    starts = [fp.load_problem(str(tmp_path / folder / "mine.py")).problem.start for folder in ("first", "second")]
+    assert starts == [{"angle": 0.1}, {"angle": 0.2}]
+
+
+def test_names_of_other_tools_lead_to_names_that_exist():
+    public = [getattr(fp, name) for name in fp.__all__]
+    fields = {name for one in public if isinstance(one, type) and issubclass(one, Checked) for name in field_names(one)}
+    known = {*fp.__all__, *fields, *signature(fp.Plant.of_states).parameters}
+    assert {ours for names in OF_OTHER_TOOLS.values() for ours in names} <= known
+    assert not OF_OTHER_TOOLS.keys() & set(fp.__all__)
+
+
+def test_a_long_list_of_valid_names_is_cut():
+    with pytest.raises(AttributeError) as caught:
+        getattr(fp, "Sigmiod")  # noqa: B009 -- the name is wrong on purpose
+    said = str(caught.value)
+    assert said.startswith("fpirhc has no name 'Sigmiod'. Did you mean 'Sigmoid'? Valid: Sigmoid, ")
+    assert re.search(r" and \d+ more\.$", said)

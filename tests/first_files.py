@@ -1,0 +1,110 @@
+"""Three correct problem files of the kinds that people write first: equations of motion, states with an output, two inputs."""
+
+PENDULUM = '''"""A pendulum."""
+import casadi as ca
+import numpy as np
+import fpirhc as fp
+
+
+def response(q, v, u, p):
+    inertia = p.mass * p.length**2
+    return {"angle": (u.torque - p.friction * v.angle) / inertia - 9.81 / p.length * ca.sin(q.angle)}
+
+
+plant = fp.Plant(
+    coordinates={"angle": "rad"},
+    inputs={"torque": "N m"},
+    order=2,
+    response=response,
+    parameters={
+        "mass": fp.Parameter(approximate=1.4, exact=1.0, unit="kg"),
+        "length": fp.Parameter(approximate=0.5, exact=0.6, unit="m"),
+        "friction": fp.Parameter(approximate=0.0, exact=0.2, unit="N m s"),
+    },
+)
+problem = fp.Problem(
+    plant=plant,
+    reference=fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(2 * t)}),
+    start={"angle": 0.0},
+    period=1e-2,
+    duration=0.2,
+    limits=fp.Limits(inputs={"torque": (-15.0, 15.0)}),
+    horizon=fp.Horizon(stages=6, step=2e-2),
+    cost=fp.Quadratic(states={"angle": 1e3, "angle'": 1.0}, deviation={"torque": 1e-2}),
+    measure_from=0.05,
+)
+optimiser = fp.FixedPoint(iterations=1, tolerance=1e-2)
+adaptive = fp.ModelReferenced(fp.Sigmoid(gain=-2.6))
+controllers = {"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": fp.RecedingHorizon(optimiser, adaptive)}
+'''
+REACTOR = '''"""A stirred tank reactor."""
+import casadi as ca
+import numpy as np
+import fpirhc as fp
+
+
+def rates(x, u, p):
+    k = p.k0 * ca.exp(-8750 / x.T) * x.C
+    return {"C": 1 - x.C - k, "T": 350 - x.T + 209.2 * k + p.wall * (u.Tc - x.T)}
+
+
+plant = fp.Plant.of_states(
+    states={"C": "mol/l", "T": "K"},
+    inputs={"Tc": "K"},
+    parameters={
+        "k0": fp.Parameter(approximate=7e10, exact=7.2e10, unit="1/min"),
+        "wall": fp.Parameter(approximate=2.2, exact=2.09, unit="1/min"),
+    },
+    rates=rates,
+    outputs={"temperature": fp.Output("K", lambda x, p: x.T)},
+    time_unit="min",
+)
+problem = fp.Problem(
+    plant=plant,
+    reference=fp.Trajectory(lambda t: {"temperature": 350 + 2 * ca.sin(t)}),
+    start={"C": 0.5, "T": 350.0},
+    period=0.05,
+    duration=2.0,
+    limits=fp.Limits(inputs={"Tc": (280.0, 320.0)}),
+    horizon=fp.Horizon(stages=6, step=0.1),
+    cost=fp.Quadratic(outputs={"temperature": 1.0}, rate={"Tc": 0.1}),
+    input_before={"Tc": 300.0},
+)
+controllers = {
+    "RHC": fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=0.1)),
+    "RHC+FPI": fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=0.1), fp.ModelReferenced(fp.Affine(gain=-0.7))),
+}
+'''
+TANKS = '''"""Two tanks in series."""
+import casadi as ca
+import numpy as np
+import fpirhc as fp
+
+
+def response(q, u, p):
+    between = p.pipe * (q.h1 - q.h2)
+    return {"h1": (u.pump1 - between) / p.area, "h2": (u.pump2 + between - p.drain * q.h2) / p.area}
+
+
+plant = fp.Plant(
+    coordinates={"h1": "m", "h2": "m"},
+    inputs={"pump1": "m^3/s", "pump2": "m^3/s"},
+    order=1,
+    response=response,
+    parameters={
+        "area": fp.Parameter(approximate=1.0, exact=1.2, unit="m^2"),
+        "pipe": fp.Parameter(approximate=0.3, exact=0.25, unit="m^2/s"),
+        "drain": fp.Parameter(approximate=0.1, exact=0.15, unit="m^2/s"),
+    },
+)
+problem = fp.Problem(
+    plant=plant,
+    reference=fp.Trajectory(lambda t: {"h1": 1 + 0.1 * ca.sin(t), "h2": 0.5 + 0.1 * ca.cos(t)}),
+    start={"h1": 1.0, "h2": 0.5},
+    period=0.05,
+    duration=1.0,
+    limits=fp.Limits(inputs={"pump1": (0.0, 2.0), "pump2": (0.0, 2.0)}, states={"h1": (0.0, 2.0)}),
+)
+law = fp.ComputedTorque(fp.Exponential(rate=2.0))
+controllers = {"CTC": law, "CTC+FPI": law.with_deformation(fp.ModelReferenced(fp.Affine(gain=-0.7)))}
+'''
