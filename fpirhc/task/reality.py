@@ -95,7 +95,7 @@ class Reality(Checked):
             )
         for name, unit in model.coordinates.items():
             if needed is None or name in needed:
-                check_coordinate(self, model, name, unit, mistakes)
+                check_coordinate(self.plant, self.seen, model, name, mistakes)
             elif self.plant.coordinates.get(name, unit) != unit:
                 mistakes.add(other_unit(self.plant, name, name, unit))
         if model.outputs and self.seen:
@@ -103,7 +103,7 @@ class Reality(Checked):
                 "seen: what is measured of a model with outputs are the outputs of the same names; write the sensor there"
             )
         for name in model.outputs:
-            check_expression(self, model, name, mistakes)
+            check_expression(self.plant, model, name, mistakes)
         mistakes.raise_if_any()
 
     def shown(self, model: Plant) -> tuple[str, ...]:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 from fpirhc.errors import Mistakes
 from fpirhc.plant.chain import input_reaches_at
 from fpirhc.plant.outputs import output_order
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.structural_order import structural_order
-
-if TYPE_CHECKING:
-    from fpirhc.task.reality import Reality
 
 
 def quantities_of(plant: Plant) -> dict[str, str]:
@@ -32,12 +29,19 @@ def check_inputs(plant: Plant, model: Plant, mistakes: Mistakes) -> None:
             mistakes.add(f"its input '{name}' is in {unit}, the model's in {other}; write both in one unit")
 
 
-def check_coordinate(reality: Reality, model: Plant, name: str, unit: str, mistakes: Mistakes) -> None:
-    """Add what is wrong with the reality's coordinate of the name of a coordinate of the model that it needs."""
-    plant, own = reality.plant, reality.seen.get(name, name)
-    units = quantities_of(plant)
+def check_coordinate(plant: Plant, seen: Mapping[str, str], model: Plant, name: str, mistakes: Mistakes) -> None:
+    """Add what is wrong with the coordinate of a reality that stands for a coordinate of the model.
+
+    Args:
+        plant: the reality's.
+        seen: name of the model's coordinate -> name of what is measured in its place.
+        model: of the problem.
+        name: of the model's coordinate.
+        mistakes: to which it is added.
+    """
+    own, units, unit = seen.get(name, name), quantities_of(plant), model.coordinates[name]
     if own not in units:
-        if name not in reality.seen:
+        if name not in seen:
             followed = not model.outputs and name in (model.controlled or model.names)
             believed = "" if followed else ", or have it believed: Sensing(measured=..., belief=ModelStates())"
             mistakes.add(
@@ -65,9 +69,9 @@ def other_unit(plant: Plant, own: str, name: str, unit: str) -> str:
     return f"its coordinate '{own}' is {units}; write both in one unit"
 
 
-def check_expression(reality: Reality, model: Plant, name: str, mistakes: Mistakes) -> None:
-    """Add what is wrong with the reality's output, or coordinate, of the name of an output of the model."""
-    plant, unit = reality.plant, model.outputs[name].unit
+def check_expression(plant: Plant, model: Plant, name: str, mistakes: Mistakes) -> None:
+    """Add what is wrong with the output, or coordinate, of a reality of the name of an output of the model."""
+    unit = model.outputs[name].unit
     units = quantities_of(plant)
     if name not in units:
         mistakes.add(
