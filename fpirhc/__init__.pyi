@@ -74,7 +74,7 @@ from .optimisers.reduced_gradient import ReducedGradient
 from .plant.algebraic import Algebraic
 from .plant.implicit import ImplicitMidpoint, RadauIIA
 from .plant.integrators import Cvodes, Euler, RungeKutta4
-from .plant.outputs import Output
+from .plant.output import Output
 from .plant.parameter import outside
 from .plant.plant import Parameter, Plant, structural_order
 from .plant.regressor import Combination, Regressor, linear_parameters

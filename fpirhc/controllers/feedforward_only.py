@@ -17,7 +17,6 @@ from fpirhc.deformation.identity import Identity
 from fpirhc.errors import NotInvertible, NotSupported
 from fpirhc.horizon.nominal import known_on_reference, reference_state
 from fpirhc.members import Example
-from fpirhc.plant.instant import response_orders
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
@@ -56,7 +55,7 @@ class FeedforwardOnly(Controller):
         plant = problem.plant
         if len(plant.controlled_names) != len(plant.inputs):
             raise NotInvertible("FeedforwardOnly needs as many controlled coordinates as inputs")
-        slow = ", ".join(name for name, order in response_orders(plant).items() if order)
+        slow = ", ".join(name for name, order in plant.response_orders.items() if order)
         if slow and not known_on_reference(plant):
             raise NotSupported(
                 f"FeedforwardOnly does not cover outputs that are expressions of the state ({slow}): without feedback their "

@@ -24,7 +24,6 @@ import numpy as np
 from fpirhc.deformation.queue import MOST, Queue, every
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
-from fpirhc.plant.instant import response_orders
 from fpirhc.plant.maps import growth_of
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal
@@ -127,7 +126,7 @@ class ThroughModel(Checked):
 
 def _own_lags(problem: Problem) -> float | tuple[float, ...]:
     """The model's own time constants, one per controlled quantity where some settle at once."""
-    orders = list(response_orders(problem.plant).values())
+    orders = list(problem.plant.response_orders.values())
     slowest = _slowest(problem) if any(orders) else 0.0
     return slowest if all(orders) else tuple(slowest if order else 0.0 for order in orders)
 

@@ -27,7 +27,6 @@ from collections.abc import Mapping
 
 import casadi as ca
 
-from fpirhc.plant.instant import response_orders
 from fpirhc.plant.plant import Plant
 
 _STEPS = 4
@@ -46,7 +45,7 @@ def consistent_state(plant: Plant) -> ca.Function:
         ca.MX.sym("y", plant.output.size),
         ca.MX.sym("p", plant.parameter.size),
     )
-    orders = response_orders(plant)
+    orders = plant.response_orders
     if not any(orders.values()):  # nothing but outputs that the command moves at once
         return ca.Function("fpirhc_consistent_state", [start, y, p], [start], ["x", "y", "p"], ["found"])
     newton = _newton(plant, orders)

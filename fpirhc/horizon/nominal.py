@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import NotSupported
-from fpirhc.plant.instant import nominal_responses, response_orders
+from fpirhc.plant.instant import nominal_responses
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Matrix
 from fpirhc.task.reference import Reference
@@ -72,7 +72,7 @@ def output_feedback(plant: Plant, x: Matrix, outputs: Matrix, p: Matrix, rate: f
     face, calm = plant.face, ca.DM.zeros(len(plant.names))
     error = outputs - plant.output_function(x, ca.DM.zeros(plant.input.size), p, calm)
     sums = []
-    for name, order in response_orders(plant).items():
+    for name, order in plant.response_orders.items():
         places = [face.state.elements.index(name + "'" * k) for k in range(order)]
         sums.append(sum(math.comb(order, k) * rate ** (order - k) * error[place] for k, place in enumerate(places)))
     return ca.vertcat(*sums)

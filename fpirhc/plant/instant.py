@@ -7,26 +7,10 @@ and has a reference like any other.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import casadi as ca
 
-from fpirhc.plant.outputs import output_order
+from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Matrix
-
-if TYPE_CHECKING:
-    from fpirhc.plant.plant import Plant
-
-
-def instant_outputs(plant: Plant) -> tuple[str, ...]:
-    """Return the names of the outputs of order 0."""
-    return tuple(name for name in plant.outputs if output_order(plant, name) == 0)
-
-
-def response_orders(plant: Plant) -> dict[str, int]:
-    """Return the relative order of every controlled coordinate or output: the derivative that the command moves at once."""
-    face, instant = plant.face, plant.instant_names
-    return {name: 0 if name in instant else face.orders[face.names.index(name)] for name in plant.controlled_names}
 
 
 def nominal_responses(plant: Plant, outputs: Matrix, responses: Matrix, later: Matrix | None = None) -> Matrix:

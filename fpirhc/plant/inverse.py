@@ -7,25 +7,25 @@ one is solved by Newton's method, and an input that Newton's method does not fin
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
 
 import casadi as ca
 
 from fpirhc.errors import Mistakes, NotInvertible
 from fpirhc.fields.user_code import called, named_results, scalar_expression
-from fpirhc.plant.plant_functions import by_name
+from fpirhc.plant.motion import Motion, by_name
 from fpirhc.symbolic.expression import expression, graph
 from fpirhc.symbolic.functions import nan_where
 from fpirhc.symbolic.layout import Expression, Named
 
-if TYPE_CHECKING:
-    from fpirhc.plant.plant import Plant
-
 INVERSE_TOLERANCE = 1e-8  # relative response error beyond which an input of Newton's method is NaN
 
 
-def inverse_function(plant: Plant) -> ca.Function:
+def inverse_function(plant: Motion, response: ca.Function) -> ca.Function:
     """Return the Function (state, response of the controlled coordinates, parameters) -> input.
+
+    Args:
+        plant: whose inverse it is.
+        response: Function (state, input, parameters) -> response of the controlled coordinates or outputs.
 
     Raises:
         NotInvertible: the inputs and the controlled coordinates differ in number.
@@ -34,10 +34,16 @@ def inverse_function(plant: Plant) -> ca.Function:
         raise NotInvertible(f"{len(plant.controlled_names)} controlled coordinates need as many inputs")
     if plant.inverse is not None:
         return inverse_by_user(plant, plant.inverse)
-    return inverse_of_affine(plant) if plant.affine else inverse_by_newton(plant)
+    return inverse_of_affine(plant, response) if affine(plant, response) else inverse_by_newton(plant, response)
 
 
-def inverse_by_user(plant: Plant, inverse: Callable[..., Mapping[str, Expression]]) -> ca.Function:
+def affine(plant: Motion, response: ca.Function) -> bool:
+    """Whether the response is affine in the inputs, decided from the symbols."""
+    x, u, p = plant.symbols()
+    return bool(ca.is_linear(response(x, u, p), u))
+
+
+def inverse_by_user(plant: Motion, inverse: Callable[..., Mapping[str, Expression]]) -> ca.Function:
     """Function (state, response, parameters) -> input, made of the user's `inverse`."""
     x, _, p = plant.symbols()
     r = ca.SX.sym("r", len(plant.controlled_names))
@@ -56,22 +62,21 @@ def inverse_by_user(plant: Plant, inverse: Callable[..., Mapping[str, Expression
     return ca.Function("fpirhc_inverse", [x, r, p], [ca.densify(column)], ["x", "r", "p"], ["u"])
 
 
-def inverse_of_affine(plant: Plant) -> ca.Function:
+def inverse_of_affine(plant: Motion, response: ca.Function) -> ca.Function:
     """Function (state, response, parameters) -> input, for a response that is affine in the inputs."""
     x, u, p = plant.symbols()
     r = ca.SX.sym("r", len(plant.controlled_names))
-    response = plant.controlled_response_function(x, u, p)
-    gain = ca.jacobian(response, u)
-    free = plant.controlled_response_function(x, ca.SX.zeros(len(plant.inputs)), p)
+    gain = ca.jacobian(response(x, u, p), u)
+    free = response(x, ca.SX.zeros(len(plant.inputs)), p)
     column = ca.densify(ca.solve(gain, r - free))
     return ca.Function("fpirhc_inverse", [x, r, p], [column], ["x", "r", "p"], ["u"])
 
 
-def inverse_by_newton(plant: Plant) -> ca.Function:
+def inverse_by_newton(plant: Motion, response: ca.Function) -> ca.Function:
     """Function (state, response, parameters) -> input, found from zero inputs by Newton's method."""
     x, u, p = plant.symbols()
     r = ca.SX.sym("r", len(plant.controlled_names))
-    error = ca.Function("fpirhc_inversion", [u, x, r, p], [plant.controlled_response_function(x, u, p) - r])
+    error = ca.Function("fpirhc_inversion", [u, x, r, p], [response(x, u, p) - r])
     finder = ca.rootfinder("fpirhc_newton", "fast_newton", error, {"error_on_fail": False})
     xm, rm, pm = (ca.MX.sym(n, s) for n, s in (("x", x.numel()), ("r", r.numel()), ("p", p.numel())))
     root = finder(ca.DM.zeros(len(plant.inputs)), xm, rm, pm)

@@ -24,19 +24,17 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, cast
+from typing import TypeVar, cast
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.real_number import finite_number
-from fpirhc.fields.user_code import called, scalar_expression
+from fpirhc.plant.motion import Motion
 from fpirhc.symbolic.layout import Expression, Named
 
-if TYPE_CHECKING:
-    from fpirhc.plant.plant import Plant
-
+_Motion = TypeVar("_Motion", bound=Motion)
 _WHOLE = 1e-6  # share of a step by which a cycle may differ from a whole number of steps
 
 
@@ -71,7 +69,7 @@ class Differences:
         }
 
 
-def check_map(plant: Plant, mistakes: Mistakes) -> None:
+def check_map(plant: Motion, mistakes: Mistakes) -> None:
     """Add every mistake of the steps to `mistakes`."""
     if plant.step is None:
         if plant.next is not None or plant.steps != 1:
@@ -88,7 +86,7 @@ def check_map(plant: Plant, mistakes: Mistakes) -> None:
         )
 
 
-def over(plant: Plant, cycle: float) -> Plant:
+def over(plant: _Motion, cycle: float) -> _Motion:
     """Return the map over one control cycle: as many steps with the command held as the cycle has.
 
     Args:
@@ -110,25 +108,7 @@ def over(plant: Plant, cycle: float) -> Plant:
     return plant if count == plant.steps else replace(plant, steps=count)
 
 
-def next_function(plant: Plant) -> ca.Function:
-    """Function (state, input, parameters, forcing) -> state one control cycle later.
-
-    In each of the cycle's steps x+ = f(x, u, p) + step * forcing: a forcing adds to the divided differences.
-    """
-    assert plant.step is not None
-    x, u, p = plant.symbols()
-    w = ca.SX.sym("w", len(plant.names))
-    if plant.next is None:
-        after = x + plant.sampling * plant.forced_derivative_function(x, u, p, w)
-        return ca.Function("fpirhc_next", [x, u, p, w], [after], ["x", "u", "p", "w"], ["x_next"])
-    one = ca.Function("fpirhc_step", [x, u, p], [_one_step(plant, plant.next, x, u, p)])
-    after = x
-    for _ in range(plant.steps):
-        after = one(after, u, p) + plant.step * w
-    return ca.Function("fpirhc_next", [x, u, p, w], [after], ["x", "u", "p", "w"], ["x_next"])
-
-
-def shifted(plant: Plant, value: Expression, symbols: tuple[ca.SX, ca.SX, ca.SX, ca.SX]) -> Expression:
+def shifted(plant: Motion, value: Expression, symbols: tuple[ca.SX, ca.SX, ca.SX, ca.SX]) -> Expression:
     """Return the divided difference of an expression of the state over one control cycle.
 
     Args:
@@ -151,16 +131,6 @@ def decay_rates(modes: np.ndarray, cycle: float) -> np.ndarray:
         return np.asarray(np.log(np.abs(1 + cycle * modes)) / cycle)
 
 
-def growth_of(plant: Plant) -> Callable[[np.ndarray], np.ndarray]:
+def growth_of(plant: Motion) -> Callable[[np.ndarray], np.ndarray]:
     """Return the function from eigenvalues of the rates to the rates with which modes grow: the real part, or that of a map."""
     return np.real if plant.step is None else partial(decay_rates, cycle=plant.sampling)
-
-
-def _one_step(plant: Plant, step: Callable[..., Mapping[str, Expression]], x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
-    views = plant.views(x, u, p)
-    if plant.algebraic is not None:
-        views = (*views, plant.algebraic.view(plant.algebraic_function(x, u, p)))
-    values = called("next", step, *views)
-    symbols = (x, u, p)
-    entries = [scalar_expression(f"next of '{name}'", values[name], of=step, symbols=symbols) for name in plant.names]
-    return ca.densify(ca.vertcat(*(ca.SX(entry) for entry in entries)))

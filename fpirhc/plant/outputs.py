@@ -16,45 +16,25 @@ References:
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TypeVar
 
 import casadi as ca
 
 from fpirhc.errors import FpirhcError, Mistakes
-from fpirhc.fields.checked import Checked
 from fpirhc.fields.expected import takes
 from fpirhc.fields.given import described
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.maps import shifted
-from fpirhc.plant.plant_functions import by_name
+from fpirhc.plant.motion import Motion, by_name
 from fpirhc.symbolic.layout import Expression, Named
 
-if TYPE_CHECKING:
-    from fpirhc.plant.plant import Plant
-
+_Motion = TypeVar("_Motion", bound=Motion)
 Symbols = tuple[ca.SX, ca.SX, ca.SX, ca.SX]
 
 
-@dataclass(frozen=True, eq=False)
-class Output(Checked):
-    """One output of a plant: y = h(q, q', ..., p), or h(x, p) of a plant that is given by its states.
-
-    Args:
-        unit: of the output.
-        expression: function of the arguments of the response, with or without the inputs; it returns one scalar.
-        response_disturbance: name of a parameter that a model believes to add to the response y^(r) and to nothing else, as
-            estimators of disturbances do; empty: none. The inverse has it in every cycle. A plan is made without it, as if the
-            response were the model's, which is how a plan is made behind a deformation.
-    """
-
-    unit: str
-    expression: Callable[..., Expression]
-    response_disturbance: str = field(default="", kw_only=True, metadata={"setting": False})
-
-
-def output_expression(plant: Plant, name: str, x: Expression, u: Expression, p: Expression) -> Expression:
+def output_expression(plant: Motion, name: str, x: Expression, u: Expression, p: Expression) -> Expression:
     """Return h(x, u, p) of one output.
 
     Raises:
@@ -66,7 +46,7 @@ def output_expression(plant: Plant, name: str, x: Expression, u: Expression, p: 
     return scalar_expression(what, called(what, expression, *arguments), of=expression, symbols=(x, u, p))
 
 
-def lie_derivatives(plant: Plant, value: Expression, count: int, symbols: Symbols) -> list[Expression]:
+def lie_derivatives(plant: Motion, value: Expression, count: int, symbols: Symbols) -> list[Expression]:
     """Return an expression of the state and its first `count` derivatives along the motion.
 
     Args:
@@ -81,20 +61,20 @@ def lie_derivatives(plant: Plant, value: Expression, count: int, symbols: Symbol
     return chain
 
 
-def believed_disturbance(plant: Plant, name: str, p: Expression) -> Expression:
+def believed_disturbance(plant: Motion, name: str, p: Expression) -> Expression:
     """Return what a model believes to add to the response of an output: zero, or a parameter of an estimator."""
     parameter = plant.outputs[name].response_disturbance
     return p[plant.parameter.elements.index(parameter)] if parameter else ca.SX(0)
 
 
-def without_disturbances(plant: Plant) -> Plant:
+def without_disturbances(plant: _Motion) -> _Motion:
     """Return the plant without believed disturbances of its outputs' responses; itself where there are none."""
     if not any(one.response_disturbance for one in plant.outputs.values()):
         return plant
     return replace(plant, outputs={n: replace(one, response_disturbance="") for n, one in plant.outputs.items()})
 
 
-def _along(plant: Plant, value: Expression, symbols: Symbols) -> Expression:
+def _along(plant: Motion, value: Expression, symbols: Symbols) -> Expression:
     """The derivative of an expression along the motion, or of a map its divided difference, with the input held."""
     if plant.step is not None:
         return shifted(plant, value, symbols)
@@ -102,7 +82,7 @@ def _along(plant: Plant, value: Expression, symbols: Symbols) -> Expression:
     return ca.jtimes(value, x, plant.forced_derivative_function(x, u, p, w))
 
 
-def output_order(plant: Plant, name: str) -> int | None:
+def output_order(plant: Motion, name: str) -> int | None:
     """Return the relative order of an output: the first derivative that depends on an input, or 0; None where none does."""
     x, u, p = plant.symbols()
     symbols = x, u, p, ca.SX.zeros(len(plant.names))
@@ -116,27 +96,28 @@ def output_order(plant: Plant, name: str) -> int | None:
     return None
 
 
-def face_of(plant: Plant) -> Plant:
+def instant_outputs(plant: Motion) -> tuple[str, ...]:
+    """Return the names of the outputs of order 0, y = h(x, u, p), which the command moves at once."""
+    return tuple(name for name in plant.outputs if output_order(plant, name) == 0)
+
+
+def face_of(plant: _Motion) -> _Motion:
     """Return the light plant whose coordinates are the outputs.
 
     An output that no input reaches has the order one, and so has one of order 0 (see `fpirhc.plant.instant`).
     """
     orders = {name: output_order(plant, name) or 1 for name in plant.outputs}
     units = {name: one.unit for name, one in plant.outputs.items()}
-    light = light_plant(plant, units, orders, plant.controlled_names)
-    vars(light)["instant_names"] = (
-        plant.instant_names
-    )  # the property of a light plant, which has no expressions to find them from
-    return light
+    return light_plant(plant, units, orders, plant.controlled_names)
 
 
 def light_plant(
-    plant: Plant,
+    plant: _Motion,
     coordinates: Mapping[str, str],
     order: Mapping[str, int],
     controlled: Sequence[str],
     inputs: Mapping[str, str] | None = None,
-) -> Plant:
+) -> _Motion:
     """Return the plant y^(r) = u of some quantities, each controlled one with an input of its own.
 
     Args:
@@ -172,7 +153,7 @@ def light_plant(
     )
 
 
-def check_outputs(plant: Plant, mistakes: Mistakes) -> None:
+def check_outputs(plant: Motion, mistakes: Mistakes) -> None:
     """Add every mistake of the outputs to `mistakes`."""
     for name, one in plant.outputs.items():
         lower = max(plant.orders, default=0)
@@ -190,7 +171,7 @@ def check_outputs(plant: Plant, mistakes: Mistakes) -> None:
             mistakes.add(str(error))
 
 
-def _check_one(plant: Plant, name: str, mistakes: Mistakes) -> None:
+def _check_one(plant: Motion, name: str, mistakes: Mistakes) -> None:
     x, u, p = plant.symbols()
     value = ca.SX(output_expression(plant, name, x, u, p))
     if name in plant.coordinates and not ca.is_equal(value, x[plant.state.elements.index(name)], 1):

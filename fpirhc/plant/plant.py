@@ -14,37 +14,40 @@ themselves are not converted anywhere.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import casadi as ca
-import numpy as np
 
-from fpirhc.errors import Mistakes, NotInvertible, NotSupported
-from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import Few
-from fpirhc.plant import by_states, by_steps, output_functions, plant_functions
+from fpirhc.errors import Mistakes
 from fpirhc.plant.algebraic import Algebraic
-from fpirhc.plant.instant import instant_outputs, response_orders
-from fpirhc.plant.inverse import inverse_function
-from fpirhc.plant.maps import check_map, next_function, over
-from fpirhc.plant.outputs import Output, check_outputs, face_of
-from fpirhc.plant.parameter import Parameter, check_parameters, with_exact_values
+from fpirhc.plant.inverse import affine, inverse_function
+from fpirhc.plant.maps import Differences, check_map
+from fpirhc.plant.maps import over as map_over
+from fpirhc.plant.motion import Motion
+from fpirhc.plant.output import Output
+from fpirhc.plant.outputs import (
+    believed_disturbance,
+    check_outputs,
+    face_of,
+    instant_outputs,
+    lie_derivatives,
+    output_expression,
+)
+from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import check_names, check_ranges, check_response
-from fpirhc.plant.plant_view import plant_facts, plant_table
 from fpirhc.plant.structural_order import structural_order
 from fpirhc.plant.units import derivative_unit
-from fpirhc.summary import line
-from fpirhc.symbolic.layout import Expression, Named, Signal, scalar, vector
+from fpirhc.summary import line, number, table
+from fpirhc.symbolic.layout import Expression, Signal, vector
 
 __all__ = ["Output", "Parameter", "Plant", "derivative_unit", "structural_order"]
 
 
 @dataclass(frozen=True, eq=False)
-class Plant(Checked):
+class Plant(Motion):
     """A system q^(r) = f(q, q', ..., u, p); a controller has its approximate parameters only.
 
     Args:
@@ -73,25 +76,6 @@ class Plant(Checked):
         InvalidProblem: all mistakes together.
     """
 
-    coordinates: Mapping[str, str]
-    inputs: Mapping[str, str]
-    parameters: Mapping[str, Parameter]
-    response: Callable[..., Mapping[str, Expression]]
-    order: int | Mapping[str, int] = 2
-    controlled: Sequence[str] | None = None
-    inverse: Callable[..., Mapping[str, Expression]] | None = None
-    ranges: Mapping[str, tuple[float, float]] = field(
-        default_factory=dict, kw_only=True, metadata={"setting": "where given"}
-    )
-    algebraic: Algebraic | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
-    outputs: Mapping[str, Output] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
-    time_unit: str = field(default="s", kw_only=True, metadata={"setting": False})
-    step: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
-    next: Callable[..., Mapping[str, Expression]] | None = field(
-        default=None, kw_only=True, metadata={"setting": "where given"}
-    )
-    steps: Few = field(default=1, kw_only=True, metadata={"setting": False})
-
     def __post_init__(self) -> None:
         mistakes = Mistakes("plant")
         check_names(self, mistakes)
@@ -104,99 +88,131 @@ class Plant(Checked):
         check_outputs(self, mistakes)
         mistakes.raise_if_any()
 
-    of_states = classmethod(by_states.of_states)
-    of_map = classmethod(by_steps.of_map)
+    @classmethod
+    def of_states(
+        cls,
+        *,
+        states: Mapping[str, str],
+        inputs: Mapping[str, str],
+        parameters: Mapping[str, Parameter],
+        rates: Callable[..., Mapping[str, Expression]],
+        outputs: Mapping[str, Output],
+        controlled: Sequence[str] | None = None,
+        inverse: Callable[..., Mapping[str, Expression]] | None = None,
+        ranges: Mapping[str, tuple[float, float]] | None = None,
+        algebraic: Algebraic | None = None,
+        time_unit: str = "s",
+    ) -> Self:
+        """Return the plant x' = f(x, u, p), y = h(x, p): every state is a coordinate of order one, and the outputs have references.
+
+        Args:
+            states: name -> unit of every state.
+            inputs: name -> unit of every input.
+            parameters: name -> Parameter(approximate, exact, unit).
+            rates: function of (x, u, p) that returns {state: its derivative with respect to time}.
+            outputs: name -> Output(unit, function of (x, p)).
+            controlled: outputs on which a tracking law and a deformation act, as many as there are inputs; None: all.
+            inverse: optional function of (x, r, p) that returns {input: command} for wanted highest derivatives r of the controlled
+                outputs; see `Plant`.
+            ranges: physical range (lowest, highest) of states by name.
+            algebraic: quantities that equations tie to the state at every instant; see `Plant`.
+            time_unit: unit of time of the equations.
+
+        Raises:
+            InvalidProblem: all mistakes together.
+        """
+        return cls(
+            coordinates=states,
+            inputs=inputs,
+            parameters=parameters,
+            response=rates,
+            order=1,
+            controlled=controlled,
+            inverse=inverse,
+            ranges=ranges or {},
+            outputs=outputs,
+            algebraic=algebraic,
+            time_unit=time_unit,
+        )
+
+    @classmethod
+    def of_map(
+        cls,
+        *,
+        states: Mapping[str, str],
+        inputs: Mapping[str, str],
+        parameters: Mapping[str, Parameter],
+        next: Callable[..., Mapping[str, Expression]],
+        step: float,
+        outputs: Mapping[str, Output] | None = None,
+        controlled: Sequence[str] | None = None,
+        ranges: Mapping[str, tuple[float, float]] | None = None,
+        algebraic: Algebraic | None = None,
+        time_unit: str = "s",
+    ) -> Self:
+        """Return the map x+ = f(x, u, p), y = h(x, p), which steps and has no differential equation.
+
+            plant = Plant.of_map(states={"stock": "t"}, inputs={"catch": "t/year"}, parameters={...}, next=grown, step=1.0, ...)
+
+        A response is a divided difference, (y_{k+1} - y_k) / T for an output that an input reaches in one control cycle of T; see
+        `fpirhc.plant.maps`. `Problem` takes no integrator for a map, and its period is a whole number of steps.
+
+        Args:
+            states: name -> unit of every state.
+            inputs: name -> unit of every input.
+            parameters: name -> Parameter(approximate, exact, unit), or outside(nominal, unit).
+            next: function of (x, u, p) that returns {state: its value one step later}.
+            step: time from one state to the next.
+            outputs: name -> Output(unit, function of (x, p)); None: the states follow a reference.
+            controlled: outputs, or states, on which a tracking law and a deformation act, as many as there are inputs; None: all.
+            ranges: physical range (lowest, highest) of states by name.
+            algebraic: quantities that equations tie to the state in every step; see `Plant`.
+            time_unit: unit of time of the step.
+
+        Raises:
+            InvalidProblem: all mistakes together.
+        """
+        return cls(
+            coordinates=states,
+            inputs=inputs,
+            parameters=parameters,
+            response=Differences(next, tuple(states), step),
+            order=1,
+            controlled=controlled,
+            ranges=ranges or {},
+            outputs=outputs or {},
+            algebraic=algebraic,
+            time_unit=time_unit,
+            step=step,
+            next=next,
+        )
 
     def __repr__(self) -> str:
         return line(self, *plant_facts(self))
 
     def _repr_html_(self) -> str:
         """Coordinates, inputs and parameters as a table, for notebooks."""
-        return plant_table(self)
-
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """Names of the coordinates."""
-        return tuple(self.coordinates)
-
-    @cached_property
-    def orders(self) -> tuple[int, ...]:
-        """Relative order of every coordinate."""
-        order = self.order
-        return tuple(order if isinstance(order, int) else order[c] for c in self.coordinates)
-
-    @property
-    def words(self) -> tuple[str, str]:
-        """What a coordinate and the response are called: "state" and "rates", or "next", where the plant is given by its states."""
-        if self.next is not None:
-            return "state", "next"
-        return ("state", "rates") if self.outputs and set(self.orders) == {1} else ("coordinate", "response")
-
-    @cached_property
-    def state(self) -> Signal:
-        """The state vector's signal: q, q', ... below the highest derivative."""
-        names, units = [], []
-        for k in range(max(self.orders, default=0)):
-            for c, r in zip(self.names, self.orders, strict=True):
-                if r > k:
-                    names.append(c + "'" * k)
-                    units.append(self.derivative_unit(self.coordinates[c], k))
-        return vector("state", names, units)
-
-    @cached_property
-    def input(self) -> Signal:
-        """The command's signal."""
-        return vector("command", tuple(self.inputs), tuple(self.inputs.values()))
-
-    @cached_property
-    def parameter(self) -> Signal:
-        """The parameters' signal."""
-        return vector("parameters", tuple(self.parameters), tuple(p.unit for p in self.parameters.values()))
-
-    @cached_property
-    def signal_names(self) -> tuple[str, ...]:
-        """Names of the parameters that are signals from outside."""
-        return tuple(name for name, one in self.parameters.items() if one.outside)
-
-    @cached_property
-    def controlled_names(self) -> tuple[str, ...]:
-        """The outputs, or without any the coordinates, on which tracking and deformation act.
-
-        Raises:
-            NotInvertible: another number of inputs, and `controlled` is None.
-        """
-        if self.controlled is not None:
-            return tuple(self.controlled)
-        names, what = (tuple(self.outputs), "outputs") if self.outputs else (self.names, "coordinates")
-        if len(self.inputs) != len(names):
-            raise NotInvertible(
-                f"{len(self.inputs)} input(s) cannot prescribe {len(names)} {what}: name the "
-                f"controlled ones, as many as there are inputs: Plant(..., controlled=({names[0]!r},))"
-            )
-        return names
-
-    @cached_property
-    def controlled_indices(self) -> tuple[int, ...]:
-        """Places of the controlled coordinates among all coordinates.
-
-        Raises:
-            NotSupported: the controlled quantities are outputs; those of a face are coordinates.
-        """
-        if self.outputs:
-            raise NotSupported(
-                f"{', '.join(self.controlled_names)} are outputs of the plant and no coordinates, which this part does not cover"
-            )
-        return tuple(self.names.index(c) for c in self.controlled_names)
+        return _plant_table(self)
 
     @cached_property
     def face(self) -> Plant:
         """The plant as reference, tracking law, judging and sensors take it: its coordinates are the outputs; else itself."""
-        return face_of(self) if self.outputs else self
+        if not self.outputs:
+            return self
+        face = face_of(self)
+        vars(face)["instant_names"] = self.instant_names  # a light plant has no expressions to find them from
+        return face
 
     @cached_property
     def instant_names(self) -> tuple[str, ...]:
         """Outputs of order 0, which the command moves at once."""
         return instant_outputs(self)
+
+    @cached_property
+    def response_orders(self) -> dict[str, int]:
+        """Relative order of every controlled coordinate or output: the derivative that the command moves at once."""
+        face, instant = self.face, self.instant_names
+        return {name: 0 if name in instant else face.orders[face.names.index(name)] for name in self.controlled_names}
 
     @cached_property
     def output(self) -> Signal:
@@ -206,60 +222,33 @@ class Plant(Checked):
     @cached_property
     def output_function(self) -> ca.Function:
         """Function (state, input, parameters, forcing) -> y, y', ... of the face; without outputs the state."""
-        return output_functions.output_function(self)
+        x, u, p = self.symbols()
+        w = ca.SX.sym("w", len(self.names))
+        chains = {
+            name: lie_derivatives(self, output_expression(self, name, x, u, p), order, (x, u, p, w))
+            for name, order in zip(self.face.names, self.face.orders, strict=True)
+            if self.outputs
+        }
+        entries = [chains[e.rstrip("'")][e.count("'")] for e in self.output.elements] if self.outputs else [x]
+        return ca.Function(
+            "fpirhc_outputs", [x, u, p, w], [ca.densify(ca.vertcat(*entries))], ["x", "u", "p", "w"], ["y"]
+        )
 
     @cached_property
     def known_by_outputs(self) -> tuple[int, ...]:
         """For every entry of the state its place among y, y', ...; -1 where it is none of these, and so has no reference."""
-        return output_functions.known_by_outputs(self)
-
-    @cached_property
-    def time(self) -> Signal:
-        """The time's signal."""
-        return scalar("time", self.time_unit)
-
-    def derivative_unit(self, unit: str, derivative: int) -> str:
-        """Return the unit of a time derivative of a quantity in `unit`."""
-        return derivative_unit(unit, derivative, self.time_unit)
-
-    @cached_property
-    def response_units(self) -> tuple[str, ...]:
-        """Units of the highest derivative of every coordinate."""
-        return tuple(self.derivative_unit(u, r) for u, r in zip(self.coordinates.values(), self.orders, strict=True))
+        x, u, p = self.symbols()
+        if not self.outputs:
+            return tuple(range(self.state.size))
+        entries = ca.vertsplit(self.output_function(x, u, p, ca.SX.zeros(len(self.names))))
+        equal = [[k for k, e in enumerate(entries) if ca.is_equal(e, x[i], 1)] for i in range(x.numel())]
+        return tuple(places[0] if places else -1 for places in equal)
 
     def response_signal(self, name: str) -> Signal:
         """Return a signal that holds a highest derivative of every controlled quantity; of order 0 it is the quantity."""
         face = self.face.coordinates
-        units = [self.derivative_unit(face[n], order) for n, order in response_orders(self).items()]
+        units = [self.derivative_unit(face[n], order) for n, order in self.response_orders.items()]
         return vector(name, self.controlled_names, units)
-
-    @cached_property
-    def approximate(self) -> np.ndarray:
-        """Parameters of the model, shape (np,)."""
-        return np.array([p.approximate for p in self.parameters.values()], dtype=float)
-
-    @cached_property
-    def exact(self) -> np.ndarray:
-        """Parameters of the plant, shape (np,)."""
-        return np.array([p.exact for p in self.parameters.values()], dtype=float)
-
-    def with_exact(self, exact: np.ndarray) -> Plant:
-        """Return the plant with other exact parameters, shape (np,); both plants share the Functions derived from the symbols.
-
-        Raises:
-            InvalidProblem: a parameter that is not finite or outside its bounds.
-        """
-        parameters = with_exact_values(self.parameters, exact)
-        other = copy(self)
-        # No other cached property depends on the exact values.
-        other.__dict__.pop("exact", None)
-        object.__setattr__(other, "parameters", parameters)
-        return other
-
-    @property
-    def sampling(self) -> float:
-        """Time from one state of a map to the next that a controller sees: the control cycle; NaN for differential equations."""
-        return math.nan if self.step is None else self.step * self.steps
 
     def over(self, cycle: float) -> Plant:
         """Return the plant as a controller with this cycle sees it: a map's steps with the command held, or the plant itself.
@@ -267,57 +256,31 @@ class Plant(Checked):
         Raises:
             InvalidValue: the cycle is no whole number of the map's steps; the next ones are named.
         """
-        return self if self.step is None else over(self, cycle)
-
-    @cached_property
-    def next_function(self) -> ca.Function:
-        """Function (state, input, parameters, forcing) -> state of a map one control cycle later."""
-        return next_function(self)
-
-    def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Return new symbols of the state, the input and the parameters, with the sizes of this plant."""
-        return (ca.SX.sym("x", self.state.size), ca.SX.sym("u", len(self.inputs)), ca.SX.sym("p", len(self.parameters)))
-
-    def indices(self, derivative: int) -> tuple[int, ...]:
-        """Places in the state vector of one derivative, for every coordinate whose order is higher."""
-        elements = [c + "'" * derivative for c, r in zip(self.names, self.orders, strict=True) if r > derivative]
-        return tuple(self.state.elements.index(e) for e in elements)
-
-    @cached_property
-    def response_function(self) -> ca.Function:
-        """Function (state, input, parameters) -> highest derivative of every coordinate (n)."""
-        return plant_functions.response_function(self)
-
-    def views(self, x: Expression, u: Expression, p: Expression) -> tuple[Named, ...]:
-        """Return the arguments of the response by name, without algebraic states: q, q', ..., u, p."""
-        *derivatives, parameters = plant_functions.by_name(self, x, p)
-        return (*derivatives, Named(self.input.elements, u, "input"), parameters)
-
-    @cached_property
-    def algebraic_function(self) -> ca.Function:
-        """Function (state, input, parameters) -> algebraic states (nz); empty without any."""
-        return plant_functions.algebraic_function(self)
+        return self if self.step is None else map_over(self, cycle)
 
     @cached_property
     def controlled_response_function(self) -> ca.Function:
-        """Function (state, input, parameters) -> highest derivative of the controlled coordinates or outputs."""
-        return output_functions.controlled_response_function(self)
+        """Function (state, input, parameters) -> highest derivative of the controlled coordinates or outputs.
 
-    @cached_property
-    def forced_derivative_function(self) -> ca.Function:
-        """Function (state, input, parameters, forcing) -> dx/dt; `forcing` (n) adds to the responses."""
-        return plant_functions.forced_derivative_function(self)
-
-    @cached_property
-    def derivative_function(self) -> ca.Function:
-        """Function (state, input, parameters) -> dx/dt, undisturbed."""
-        return plant_functions.derivative_function(self)
+        The response of an output of order 0 is the output.
+        """
+        x, u, p = self.symbols()
+        if self.outputs:
+            calm = ca.SX.zeros(len(self.names))
+            chains = {
+                name: lie_derivatives(self, output_expression(self, name, x, u, p), order, (x, u, p, calm))
+                for name, order in self.response_orders.items()
+            }
+            entries = (chain[-1] + believed_disturbance(self, name, p) for name, chain in chains.items())
+            responses = ca.densify(ca.vertcat(*entries))
+        else:
+            responses = self.response_function(x, u, p)[list(self.controlled_indices)]
+        return ca.Function("fpirhc_controlled_response", [x, u, p], [responses], ["x", "u", "p"], ["r"])
 
     @cached_property
     def affine(self) -> bool:
         """Whether the controlled response is affine in the inputs, decided from the symbols."""
-        x, u, p = self.symbols()
-        return bool(ca.is_linear(self.controlled_response_function(x, u, p), u))
+        return affine(self, self.controlled_response_function)
 
     @property
     def inverse_opaque(self) -> bool:
@@ -333,4 +296,46 @@ class Plant(Checked):
         Raises:
             NotInvertible: the inputs and the controlled coordinates differ in number.
         """
-        return inverse_function(self)
+        return inverse_function(self, self.controlled_response_function)
+
+
+def plant_facts(plant: Plant) -> tuple[str, ...]:
+    """Return what sums up a plant: its coordinates or outputs with their orders, its inputs, the number of its parameters."""
+    if plant.outputs:
+        face = zip(plant.face.names, _orders(plant), strict=True)
+        shown = ", ".join(f"{name} of relative order {order}" for name, order in face)
+        states = f"{plant.state.size} states"
+        return f"outputs {shown}", states, f"inputs {', '.join(plant.inputs)}", f"{len(plant.parameters)} parameters"
+    orders = ", ".join(f"{name} of order {order}" for name, order in zip(plant.names, plant.orders, strict=True))
+    return orders, f"inputs {', '.join(plant.inputs)}", f"{len(plant.parameters)} parameters"
+
+
+def _plant_table(plant: Plant) -> str:
+    """Return HTML: coordinates, inputs and parameters, one per row."""
+    rows = [
+        (name, f"coordinate, order {order}", unit, "", "")
+        for (name, unit), order in zip(plant.coordinates.items(), plant.orders, strict=True)
+    ]
+    face = zip(plant.face.coordinates.items(), _orders(plant), strict=True) if plant.outputs else ()
+    rows += [(name, f"output, relative order {order}", unit, "", "") for (name, unit), order in face]
+    rows += [(name, "input", unit, "", "") for name, unit in plant.inputs.items()]
+    rows += [
+        (
+            name,
+            "signal from outside" if one.outside else "parameter",
+            one.unit,
+            number(one.approximate),
+            number(one.exact),
+        )
+        for name, one in plant.parameters.items()
+    ]
+    notes = [f"Unit of time: {plant.time_unit}."]
+    if plant.controlled is not None:
+        notes.append(f"Controlled: {', '.join(plant.controlled)}.")
+    return table("Plant", ("name", "is", "unit", "model", "plant"), rows, notes)
+
+
+def _orders(plant: Plant) -> list[int]:
+    """Relative orders of the outputs."""
+    face = zip(plant.face.names, plant.face.orders, strict=True)
+    return [0 if name in plant.instant_names else order for name, order in face]

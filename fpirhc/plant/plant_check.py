@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
 
 import casadi as ca
 
 from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.expected import takes
 from fpirhc.fields.user_code import called, named_results, place_of, scalar_expression
-from fpirhc.plant.algebraic import check_algebraic
+from fpirhc.plant.algebraic_check import check_algebraic
 from fpirhc.plant.inverse import inverse_by_user
+from fpirhc.plant.motion import Motion
 from fpirhc.plant.structural_order import structural_order
 from fpirhc.symbolic.layout import Expression
-
-if TYPE_CHECKING:
-    from fpirhc.plant.plant import Plant
 
 HIGHEST_ORDER = 20  # every derivative is a state with a name of its own: a mistyped 10**9 would fill the memory
 
 
-def check_names(plant: Plant, mistakes: Mistakes) -> None:
+def check_names(plant: Motion, mistakes: Mistakes) -> None:
     """Add every mistake in names, units, orders and the choice of controlled coordinates to `mistakes`."""
     outputs = {name: one.unit for name, one in plant.outputs.items()}
     quantities = "states" if plant.next is not None or (plant.outputs and plant.order == 1) else "coordinates"
@@ -52,7 +49,7 @@ def check_names(plant: Plant, mistakes: Mistakes) -> None:
     _check_controlled(plant, mistakes)
 
 
-def _check_controlled(plant: Plant, mistakes: Mistakes) -> None:
+def _check_controlled(plant: Motion, mistakes: Mistakes) -> None:
     if plant.controlled is not None:
         what = "output" if plant.outputs else "coordinate"
         mistakes.unknown(f"controlled: {what}", plant.controlled, plant.outputs or plant.coordinates)
@@ -63,7 +60,7 @@ def _check_controlled(plant: Plant, mistakes: Mistakes) -> None:
             )
 
 
-def check_ranges(plant: Plant, mistakes: Mistakes) -> None:
+def check_ranges(plant: Motion, mistakes: Mistakes) -> None:
     """Add every mistake of the physical ranges to `mistakes`."""
     mistakes.unknown("ranges: state", plant.ranges, plant.state.elements)
     for name, (low, high) in plant.ranges.items():
@@ -71,7 +68,7 @@ def check_ranges(plant: Plant, mistakes: Mistakes) -> None:
             mistakes.add(f"ranges: '{name}' must be (lowest, highest), got {(low, high)!r}")
 
 
-def check_response(plant: Plant, mistakes: Mistakes) -> None:
+def check_response(plant: Motion, mistakes: Mistakes) -> None:
     """Add every mistake of the response and of the orders to `mistakes`."""
     x, u, p = plant.symbols()
     arguments_of_step, symbols = plant.views(x, u, p), [x, u, p]
@@ -107,7 +104,7 @@ def check_response(plant: Plant, mistakes: Mistakes) -> None:
         _check_inverse(plant, plant.inverse, mistakes)
 
 
-def _wrong_arguments(plant: Plant, expected: int) -> str:
+def _wrong_arguments(plant: Motion, expected: int) -> str:
     """What a response of another number of arguments is, and what it should be."""
     quantity, function = plant.words
     kinds = [one.kind for one in inspect.signature(plant.response).parameters.values()]
@@ -126,7 +123,7 @@ def _wrong_arguments(plant: Plant, expected: int) -> str:
 _OF_STATES = "; equations in states go to Plant.of_states(rates=...)"
 
 
-def _check_order_numbers(plant: Plant, mistakes: Mistakes) -> None:
+def _check_order_numbers(plant: Motion, mistakes: Mistakes) -> None:
     if isinstance(plant.order, Mapping):
         mistakes.unknown("order: coordinate", plant.order, plant.coordinates)
         for c in plant.coordinates:
@@ -143,7 +140,7 @@ def _check_order_numbers(plant: Plant, mistakes: Mistakes) -> None:
             )
 
 
-def _check_inverse(plant: Plant, inverse: Callable[..., Mapping[str, Expression]], mistakes: Mistakes) -> None:
+def _check_inverse(plant: Motion, inverse: Callable[..., Mapping[str, Expression]], mistakes: Mistakes) -> None:
     arguments = max(plant.orders, default=0) + 2
     if not takes(inverse, arguments):
         mistakes.add(
@@ -156,7 +153,7 @@ def _check_inverse(plant: Plant, inverse: Callable[..., Mapping[str, Expression]
         mistakes.add(str(error))
 
 
-def _check_orders(plant: Plant, mistakes: Mistakes) -> None:
+def _check_orders(plant: Motion, mistakes: Mistakes) -> None:
     if plant.outputs or (plant.controlled is None and len(plant.inputs) != len(plant.coordinates)):
         return  # orders of outputs are found, not stated
     for k in plant.controlled_indices:

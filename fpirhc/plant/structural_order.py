@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import casadi as ca
 import numpy as np
 
-if TYPE_CHECKING:
-    from fpirhc.plant.plant import Plant
+from fpirhc.plant.motion import Motion
 
 
-def structural_order(plant: Plant, coordinate: str) -> int | None:
+def structural_order(plant: Motion, coordinate: str) -> int | None:
     """Return the number of the first derivative of `coordinate` that depends on an input; None if there is none.
 
     Only the pattern of dependence counts, so an accidental cancellation has no effect. The search is a breadth-first walk from the

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from fpirhc.plant.instant import response_orders
 from fpirhc.plant.structural_order import structural_order
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
@@ -13,7 +12,7 @@ QUESTION = "Are the relative orders those of the plant?"
 def relative_orders(grid: ReviewGrid) -> Answer:
     """Return the structural order of every controlled coordinate; a sum below the size of the state leaves zero dynamics."""
     plant = grid.problem.plant
-    declared = response_orders(plant)
+    declared = plant.response_orders
     structural = declared if plant.outputs else {c: structural_order(plant, c) for c in plant.controlled_names}
     text = ", ".join(f"{c} {r}" for c, r in structural.items())
     inside = plant.state.size - sum(declared.values())

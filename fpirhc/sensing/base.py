@@ -25,7 +25,6 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.fields.checked import Checked
-from fpirhc.plant.instant import response_orders
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.layout import Expression, Signal
@@ -101,7 +100,7 @@ def known_by_positions(plant: Plant, measured: Sequence[str]) -> tuple[str, ...]
 
 def response_names(plant: Plant) -> tuple[str, ...]:
     """Names of the highest derivatives of the controlled coordinates: "q1''"; of order 0 it is the output's own name."""
-    return tuple(name + "'" * order for name, order in response_orders(plant).items())
+    return tuple(name + "'" * order for name, order in plant.response_orders.items())
 
 
 def quantities(plant: Plant) -> tuple[str, ...]:

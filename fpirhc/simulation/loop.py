@@ -24,7 +24,6 @@ from fpirhc.controllers.plausible import plausible_range
 from fpirhc.controllers.response_jumps import response_jumps
 from fpirhc.controllers.seeing import compose_seeing, first_estimates, first_shown, seeing_blocks
 from fpirhc.plant.chain import derivatives_function
-from fpirhc.plant.instant import response_orders
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.foreign_blocks import SENT, foreign_block, foreign_signals, sending_block, shows_truth
 from fpirhc.simulation.map_blocks import with_true_response
@@ -247,7 +246,7 @@ def _own_response(problem: Problem, *, seen: bool) -> Response:
     if problem.symbolic_reality is not None:
         return Response(plant.response_signal("realised"), problem.symbolic_reality.response_function(plant, seen=seen))
     if plant.outputs:
-        function = derivatives_function(plant, list(response_orders(plant).items()))
+        function = derivatives_function(plant, list(plant.response_orders.items()))
         return Response(plant.response_signal("realised"), function)
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))

@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import casadi as ca
 
-from fpirhc.plant.instant import response_orders
 from fpirhc.sensing.base import backward_difference, combine
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, Value, expression
@@ -32,7 +31,7 @@ def with_true_response(problem: Problem, sense: Block, motion: Signal, response:
         response: signal of the response.
     """
     face, period = problem.plant.face, problem.period
-    orders = response_orders(problem.plant)
+    orders = problem.plant.response_orders
     if not any(orders.values()):
         return sense  # a response of order 0 is the output, and no difference
     places = {c: face.state.elements.index(c) for c in orders}

@@ -21,7 +21,6 @@ import numpy.typing as npt
 from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero, Positive
-from fpirhc.plant.instant import response_orders
 from fpirhc.plant.plant import Plant
 from fpirhc.task.giving_up import Caller, GaveUp
 
@@ -206,7 +205,7 @@ def _short(answer: object) -> str:
 
 def quantities(model: Plant) -> dict[str, str]:
     """Return the unit of every quantity of a model that can be measured: state elements, outputs, and controlled responses."""
-    signals, orders = (model.state, model.output), response_orders(model)
+    signals, orders = (model.state, model.output), model.response_orders
     shown = {name: unit for s in signals for name, unit in zip(s.elements, s.entry_units, strict=True)}
     units = model.response_signal("realised").entry_units
     responses = {name + "'" * order: unit for (name, order), unit in zip(orders.items(), units, strict=True)}

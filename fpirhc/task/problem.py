@@ -19,11 +19,10 @@ from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.regular_gain import Bounds, nominal_run, singular_gain
 from fpirhc.horizon.stage_check import check_stage
-from fpirhc.plant.algebraic import unsolved
+from fpirhc.plant.algebraic_check import unsolved
 from fpirhc.plant.integrators import USUAL, Integrator
 from fpirhc.plant.map_steps import motion_of
-from fpirhc.plant.plant import Plant
-from fpirhc.plant.plant_view import plant_facts
+from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.plant.signals_in_outputs import differentiated_signals
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line, number, table

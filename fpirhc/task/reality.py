@@ -20,9 +20,8 @@ import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
-from fpirhc.plant.algebraic import unsolved
+from fpirhc.plant.algebraic_check import unsolved
 from fpirhc.plant.chain import derivatives_function
-from fpirhc.plant.instant import response_orders
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.settling import settled
@@ -125,7 +124,7 @@ class Reality(Checked):
     def response_function(self, model: Plant, *, seen: bool) -> ca.Function:
         """Function (state, input, parameters, forcing) of the reality -> the model's controlled responses."""
         if model.outputs:
-            return derivatives_function(self.plant, list(response_orders(model).items()))
+            return derivatives_function(self.plant, list(model.response_orders.items()))
         names = self._names(model, seen=seen)
         return derivatives_function(self.plant, [(names[k], model.orders[k]) for k in model.controlled_indices])
 

@@ -15,7 +15,7 @@ import casadi as ca
 
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.plant.maps import Differences
-from fpirhc.plant.outputs import Output
+from fpirhc.plant.output import Output
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.layout import Expression, Named

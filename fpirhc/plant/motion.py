@@ -1,0 +1,273 @@
+"""The motion of a plant: named quantities with units, two sets of parameters, and their CasADi Functions.
+
+With the state x = (q, q', ...), derivative-major, and a forcing w that adds to the highest derivatives,
+
+    response    r = f(x, u, p),        algebraic states    z(x, u, p),        x' = (q', q'', ..., f(x, u, p) + w).
+
+Those of a map are its divided differences over one control cycle; see `fpirhc.plant.maps`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Self
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import NotInvertible, NotSupported
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import Few
+from fpirhc.fields.user_code import called, scalar_expression
+from fpirhc.plant.algebraic import Algebraic
+from fpirhc.plant.output import Output
+from fpirhc.plant.parameter import Parameter, with_exact_values
+from fpirhc.plant.units import derivative_unit
+from fpirhc.symbolic.layout import Expression, Named, Signal, scalar, vector
+
+
+@dataclass(frozen=True, eq=False)
+class Motion(Checked):
+    """What moves: x' = f(x, u, p), or x+ = f(x, u, p); the fields are described at `Plant`."""
+
+    coordinates: Mapping[str, str]
+    inputs: Mapping[str, str]
+    parameters: Mapping[str, Parameter]
+    response: Callable[..., Mapping[str, Expression]]
+    order: int | Mapping[str, int] = 2
+    controlled: Sequence[str] | None = None
+    inverse: Callable[..., Mapping[str, Expression]] | None = None
+    ranges: Mapping[str, tuple[float, float]] = field(
+        default_factory=dict, kw_only=True, metadata={"setting": "where given"}
+    )
+    algebraic: Algebraic | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    outputs: Mapping[str, Output] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
+    time_unit: str = field(default="s", kw_only=True, metadata={"setting": False})
+    step: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    next: Callable[..., Mapping[str, Expression]] | None = field(
+        default=None, kw_only=True, metadata={"setting": "where given"}
+    )
+    steps: Few = field(default=1, kw_only=True, metadata={"setting": False})
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coordinates."""
+        return tuple(self.coordinates)
+
+    @cached_property
+    def orders(self) -> tuple[int, ...]:
+        """Relative order of every coordinate."""
+        order = self.order
+        return tuple(order if isinstance(order, int) else order[c] for c in self.coordinates)
+
+    @property
+    def words(self) -> tuple[str, str]:
+        """What a coordinate and the response are called: "state" and "rates", or "next", where the plant is given by its states."""
+        if self.next is not None:
+            return "state", "next"
+        return ("state", "rates") if self.outputs and set(self.orders) == {1} else ("coordinate", "response")
+
+    @cached_property
+    def state(self) -> Signal:
+        """The state vector's signal: q, q', ... below the highest derivative."""
+        names, units = [], []
+        for k in range(max(self.orders, default=0)):
+            for c, r in zip(self.names, self.orders, strict=True):
+                if r > k:
+                    names.append(c + "'" * k)
+                    units.append(self.derivative_unit(self.coordinates[c], k))
+        return vector("state", names, units)
+
+    @cached_property
+    def input(self) -> Signal:
+        """The command's signal."""
+        return vector("command", tuple(self.inputs), tuple(self.inputs.values()))
+
+    @cached_property
+    def parameter(self) -> Signal:
+        """The parameters' signal."""
+        return vector("parameters", tuple(self.parameters), tuple(p.unit for p in self.parameters.values()))
+
+    @cached_property
+    def signal_names(self) -> tuple[str, ...]:
+        """Names of the parameters that are signals from outside."""
+        return tuple(name for name, one in self.parameters.items() if one.outside)
+
+    @cached_property
+    def controlled_names(self) -> tuple[str, ...]:
+        """The outputs, or without any the coordinates, on which tracking and deformation act.
+
+        Raises:
+            NotInvertible: another number of inputs, and `controlled` is None.
+        """
+        if self.controlled is not None:
+            return tuple(self.controlled)
+        names, what = (tuple(self.outputs), "outputs") if self.outputs else (self.names, "coordinates")
+        if len(self.inputs) != len(names):
+            raise NotInvertible(
+                f"{len(self.inputs)} input(s) cannot prescribe {len(names)} {what}: name the "
+                f"controlled ones, as many as there are inputs: Plant(..., controlled=({names[0]!r},))"
+            )
+        return names
+
+    @cached_property
+    def controlled_indices(self) -> tuple[int, ...]:
+        """Places of the controlled coordinates among all coordinates.
+
+        Raises:
+            NotSupported: the controlled quantities are outputs; those of a face are coordinates.
+        """
+        if self.outputs:
+            raise NotSupported(
+                f"{', '.join(self.controlled_names)} are outputs of the plant and no coordinates, which this part does not cover"
+            )
+        return tuple(self.names.index(c) for c in self.controlled_names)
+
+    @cached_property
+    def time(self) -> Signal:
+        """The time's signal."""
+        return scalar("time", self.time_unit)
+
+    def derivative_unit(self, unit: str, derivative: int) -> str:
+        """Return the unit of a time derivative of a quantity in `unit`."""
+        return derivative_unit(unit, derivative, self.time_unit)
+
+    @cached_property
+    def response_units(self) -> tuple[str, ...]:
+        """Units of the highest derivative of every coordinate."""
+        return tuple(self.derivative_unit(u, r) for u, r in zip(self.coordinates.values(), self.orders, strict=True))
+
+    @cached_property
+    def approximate(self) -> np.ndarray:
+        """Parameters of the model, shape (np,)."""
+        return np.array([p.approximate for p in self.parameters.values()], dtype=float)
+
+    @cached_property
+    def exact(self) -> np.ndarray:
+        """Parameters of the plant, shape (np,)."""
+        return np.array([p.exact for p in self.parameters.values()], dtype=float)
+
+    def with_exact(self, exact: np.ndarray) -> Self:
+        """Return the same with other exact parameters, shape (np,); both share the Functions derived from the symbols.
+
+        Raises:
+            InvalidProblem: a parameter that is not finite or outside its bounds.
+        """
+        parameters = with_exact_values(self.parameters, exact)
+        other = copy(self)
+        # No other cached property depends on the exact values.
+        other.__dict__.pop("exact", None)
+        object.__setattr__(other, "parameters", parameters)
+        return other
+
+    @property
+    def sampling(self) -> float:
+        """Time from one state of a map to the next that a controller sees: the control cycle; NaN for differential equations."""
+        return math.nan if self.step is None else self.step * self.steps
+
+    def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Return new symbols of the state, the input and the parameters, with the sizes of this plant."""
+        return (ca.SX.sym("x", self.state.size), ca.SX.sym("u", len(self.inputs)), ca.SX.sym("p", len(self.parameters)))
+
+    def indices(self, derivative: int) -> tuple[int, ...]:
+        """Places in the state vector of one derivative, for every coordinate whose order is higher."""
+        elements = [c + "'" * derivative for c, r in zip(self.names, self.orders, strict=True) if r > derivative]
+        return tuple(self.state.elements.index(e) for e in elements)
+
+    def views(self, x: Expression, u: Expression, p: Expression) -> tuple[Named, ...]:
+        """Return the arguments of the response by name, without algebraic states: q, q', ..., u, p."""
+        *derivatives, parameters = by_name(self, x, p)
+        return (*derivatives, Named(self.input.elements, u, "input"), parameters)
+
+    @cached_property
+    def response_function(self) -> ca.Function:
+        """Function (state, input, parameters) -> highest derivative of every coordinate (n)."""
+        x, u, p = self.symbols()
+        if self.next is not None:
+            differences = (self.next_function(x, u, p, ca.SX.zeros(len(self.names))) - x) / self.sampling
+            return ca.Function("fpirhc_response", [x, u, p], [differences], ["x", "u", "p"], ["r"])
+        views = self.views(x, u, p)
+        if self.algebraic is not None:
+            views = (*views, self.algebraic.view(self.algebraic_function(x, u, p)))
+        responses = called(self.words[1], self.response, *views)
+        column = ca.vertcat(*(ca.SX(responses[c]) for c in self.names))
+        return ca.Function("fpirhc_response", [x, u, p], [ca.densify(column)], ["x", "u", "p"], ["r"])
+
+    @cached_property
+    def algebraic_function(self) -> ca.Function:
+        """Function (state, input, parameters) -> algebraic states (nz); empty without any."""
+        x, u, p = self.symbols()
+        solution = ca.SX(0, 1)
+        if self.algebraic is not None:
+            solution = self.algebraic.solved(self.views(x, u, p), ca.vertcat(x, u, p))
+        return ca.Function("fpirhc_algebraic", [x, u, p], [ca.densify(solution)], ["x", "u", "p"], ["z"])
+
+    @cached_property
+    def forced_derivative_function(self) -> ca.Function:
+        """Function (state, input, parameters, forcing) -> dx/dt; `forcing` (n) adds to the responses."""
+        x, u, p = self.symbols()
+        w = ca.SX.sym("w", len(self.names))
+        if self.next is not None:
+            differences = (self.next_function(x, u, p, w) - x) / self.sampling
+            return ca.Function("fpirhc_derivative", [x, u, p, w], [differences], ["x", "u", "p", "w"], ["xdot"])
+        responses = self.response_function(x, u, p) + w
+        rates = []
+        for element in self.state.elements:
+            higher = element + "'"
+            if higher in self.state.elements:
+                rates.append(x[self.state.elements.index(higher)])
+            else:
+                rates.append(responses[self.names.index(element.rstrip("'"))])
+        return ca.Function("fpirhc_derivative", [x, u, p, w], [ca.vertcat(*rates)], ["x", "u", "p", "w"], ["xdot"])
+
+    @cached_property
+    def derivative_function(self) -> ca.Function:
+        """Function (state, input, parameters) -> dx/dt, undisturbed."""
+        x, u, p = self.symbols()
+        rate = self.forced_derivative_function(x, u, p, ca.SX.zeros(len(self.names)))
+        return ca.Function("fpirhc_free_derivative", [x, u, p], [rate], ["x", "u", "p"], ["xdot"])
+
+    @cached_property
+    def next_function(self) -> ca.Function:
+        """Function (state, input, parameters, forcing) -> state of a map one control cycle later.
+
+        In each of the cycle's steps x+ = f(x, u, p) + step * forcing: a forcing adds to the divided differences.
+        """
+        assert self.step is not None
+        x, u, p = self.symbols()
+        w = ca.SX.sym("w", len(self.names))
+        if self.next is None:
+            after = x + self.sampling * self.forced_derivative_function(x, u, p, w)
+            return ca.Function("fpirhc_next", [x, u, p, w], [after], ["x", "u", "p", "w"], ["x_next"])
+        one = ca.Function("fpirhc_step", [x, u, p], [_one_step(self, self.next, x, u, p)])
+        after = x
+        for _ in range(self.steps):
+            after = one(after, u, p) + self.step * w
+        return ca.Function("fpirhc_next", [x, u, p, w], [after], ["x", "u", "p", "w"], ["x_next"])
+
+
+def by_name(motion: Motion, x: Expression, p: Expression) -> tuple[Named, ...]:
+    """Return the arguments of a user's function without the inputs, each with its entries by name: q, q', ..., p."""
+    derivatives = [
+        Named(
+            [c for c, r in zip(motion.names, motion.orders, strict=True) if r > k],
+            x[list(motion.indices(k))],
+            motion.words[0],
+        )
+        for k in range(max(motion.orders, default=0))
+    ]
+    return (*derivatives, Named(tuple(motion.parameters), p, "parameter"))
+
+
+def _one_step(motion: Motion, step: Callable[..., Mapping[str, Expression]], x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
+    views = motion.views(x, u, p)
+    if motion.algebraic is not None:
+        views = (*views, motion.algebraic.view(motion.algebraic_function(x, u, p)))
+    values = called("next", step, *views)
+    symbols = (x, u, p)
+    entries = [scalar_expression(f"next of '{name}'", values[name], of=step, symbols=symbols) for name in motion.names]
+    return ca.densify(ca.vertcat(*(ca.SX(entry) for entry in entries)))
