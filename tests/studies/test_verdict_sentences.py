@@ -21,7 +21,7 @@ from fpirhc.symbolic.layout import Layout, Signal
 STOP = "signal 'x' is not finite"
 EFFORT = (
     " Its cost weighs the absolute effort, so the optimum of the wrong model trades tracking against a wrong effort and "
-    "adaptation realises that plan faithfully: weigh the deviation from the model's feedforward, or the input's rate."
+    "adaptation realises that plan faithfully. Weigh the deviation from the model's feedforward, or the input's rate."
 )
 
 
@@ -357,11 +357,11 @@ def test_a_run_of_two_cycles_shows_no_slew():
 
 
 def test_a_cost_of_absolute_effort_is_a_cause():
-    """Only where the settings say so; causes follow each other, the gain first."""
+    """Only where the settings say so; causes follow each other in the order in which they act."""
     assert no_difference(settings={"weighs_effort": True}) == EFFORT
     assert no_difference(settings={"weighs_effort": False}) == ""
     both = no_difference(factor=2.0, settings={"weighs_effort": True})
-    assert both == " Its iteration is no contraction (predicted factor 2): Lower the gain." + EFFORT
+    assert both == EFFORT + " Its iteration is no contraction (predicted factor 2): Lower the gain."
     [ended] = said(entry("RHC"), entry("FPI", "RHC", stop=STOP, factor=2.0))
     assert ended.endswith(f"{STOP}. Its iteration is no contraction (predicted factor 2): Lower the gain.")
     [worse] = said(entry("RHC"), entry("FPI", "RHC", errors={"y": 2.0}, factor=2.0))
@@ -370,8 +370,12 @@ def test_a_cost_of_absolute_effort_is_a_cause():
 
 def test_a_full_stop_stands_between_causes():
     """Advice on a gain may come without one."""
-    both = no_difference(factor=2.0, advice="Lower the gain", settings={"weighs_effort": True})
-    assert both == " Its iteration is no contraction (predicted factor 2): Lower the gain." + EFFORT
+    often = {"total_variation": {"u": 12.0}, "effort": {"u": 1.0}}
+    plain = entry("RHC", measured={"total_variation": {"u": 0.1}, "effort": {"u": 1.0}})
+    both = no_difference(plain=plain, factor=2.0, advice="Lower the gain", measured=often)
+    assert both.startswith(
+        " Its iteration is no contraction (predicted factor 2): Lower the gain. Its command moves 120 times"
+    )
 
 
 def test_plans_that_did_not_converge_are_a_cause_from_a_twentieth_of_the_cycles_on():

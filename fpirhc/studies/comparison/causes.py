@@ -1,8 +1,9 @@
 """Known reasons why adaptation does not help in a run, in sentences.
 
-They are the response Jacobian's eigenvalues, a step limit below the slew of the desired response, a cost that weighs absolute
-effort, plans that did not converge, commands that stand at their limits, and commands that move far more than those of the pair.
-The last three are facts of the runs, where the share of the cycles is no start or single event.
+They stand in the order in which they act: a cost that weighs absolute effort, plans that did not converge, a gain that is too large
+by the response Jacobian's eigenvalues or too small by the review, a step limit below the slew of the desired response, commands
+that stand at their limits, and commands that move far more than those of the pair. What is a fact of the runs alone is stated where
+the share of the cycles is no start or single event. Where the gain is the cause, limits that are reached are its effect.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fpirhc.plant.units import with_space
+from fpirhc.review.questions import effort
 from fpirhc.review.questions.iterations import MANY
 from fpirhc.status import Status
 from fpirhc.studies.comparison.changes import times
@@ -30,12 +32,13 @@ _OFTEN = 0.2  # share of the cycles from which commands at their limits are a re
 
 def causes(plain: Entry, adaptive: Entry) -> str:
     """Return the known reasons, each a sentence after a space; empty where none is known."""
+    gain = _gain_cause(adaptive)
     sentences = (
-        _gain_cause(adaptive),
-        _slew_cause(plain, adaptive),
-        _effort_cause(adaptive),
+        effort_cause(adaptive),
         plan_cause(plain, adaptive),
-        limit_cause(plain, adaptive),
+        gain,
+        _slew_cause(plain, adaptive),
+        "" if gain else limit_cause(plain, adaptive),
         chatter_cause(plain, adaptive),
     )
     return "".join(f" {sentence}" for sentence in sentences if sentence)
@@ -44,7 +47,7 @@ def causes(plain: Entry, adaptive: Entry) -> str:
 def _gain_cause(entry: Entry) -> str:
     one = entry.contraction
     if one is None or one.growing < MANY:
-        return ""
+        return entry.slow_gain
     share = "" if one.growing == 1 else f" in {in_percent(one.growing)} of the cycles"
     return (
         f"Its iteration is no contraction{share} (predicted factor {one.predicted:.3g}): {one.report.text.rstrip('.')}."
@@ -67,13 +70,9 @@ def _slew_cause(plain: Entry, adaptive: Entry) -> str:
     return f"{fact}: {change}."
 
 
-def _effort_cause(entry: Entry) -> str:
-    if not entry.run.settings.get("weighs_effort"):
-        return ""
-    return (
-        "Its cost weighs the absolute effort, so the optimum of the wrong model trades tracking against a wrong effort and "
-        "adaptation realises that plan faithfully: weigh the deviation from the model's feedforward, or the input's rate."
-    )
+def effort_cause(entry: Entry) -> str:
+    """Return the sentence of a review where the cost weighs the absolute effort; else nothing."""
+    return f"I{effort.FACT[1:]}. {effort.CHANGE}" if entry.run.settings.get("weighs_effort") else ""
 
 
 def plan_cause(plain: Entry, adaptive: Entry) -> str:

@@ -37,7 +37,7 @@ from fpirhc.studies.comparison.information import information, sentences
 from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import measure_optimality
 from fpirhc.studies.comparison.outcome import Finding, Outcome
-from fpirhc.studies.comparison.side_by_side import beside_each_other, null_tests
+from fpirhc.studies.comparison.side_by_side import beside_each_other, null_tests, with_slow_gains
 from fpirhc.studies.comparison.timing import measure_cycle
 from fpirhc.studies.comparison.verdict import findings
 from fpirhc.summary import line, number, table
@@ -194,6 +194,8 @@ def compare(
     entries = beside_each_other(task.problem, ran, loops, sizes, compiled=compiled)
     broken: list[str] = []
     yardstick = yardstick_of(task.problem, seed=seed)
+    judged = findings(entries, skipped, task.headline, yardstick)
+    entries = with_slow_gains(task.problem, entries, loops, judged)
     judged = findings(entries, skipped, task.headline, yardstick)
     pairs = [finding.pair for finding in judged if finding.pair]
     nulls = null_tests(task.problem, pairs, entries, loops, sizes, seed=seed, broken=broken)

@@ -10,11 +10,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from fpirhc.broken import attempted
+from fpirhc.review.slow_gain import slow_gain
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.simulate import Simulator
 from fpirhc.studies.comparison.entry_facts import no_bound_because
 from fpirhc.studies.comparison.null_test import NullTest, null_test
 from fpirhc.studies.comparison.other_rows import beaten_by
+from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.studies.comparison.timing import measure_price
 from fpirhc.task.problem import Problem
 
@@ -46,6 +48,23 @@ def beside_each_other(
     except KeyboardInterrupt:
         return [*shown, *entries[len(shown) :]]
     return shown
+
+
+def with_slow_gains(
+    problem: Problem, entries: Sequence[Entry], loops: Mapping[str, Simulator], judged: Sequence[Finding]
+) -> list[Entry]:
+    """Return the entries with what a review says of their gain, where a pair's verdict is not plainly positive.
+
+    Args:
+        problem: of the comparison.
+        entries: the controllers that ran.
+        loops: their loops, by name.
+        judged: the verdict so far.
+    """
+    asked = {finding.pair[1] for finding in judged if finding.pair and finding.outcome is not Outcome.BETTER}
+    return [
+        replace(e, slow_gain=slow_gain(problem, loops[e.name].controller)) if e.name in asked else e for e in entries
+    ]
 
 
 def null_tests(

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from fpirhc.plant.units import with_space
-from fpirhc.studies.comparison.causes import causes, movement
+from fpirhc.studies.comparison.causes import causes, effort_cause, movement
 from fpirhc.studies.comparison.caveats import Yardstick, caveats, leaves_reference, left_alone_is_better, not_followed
 from fpirhc.studies.comparison.changes import Change, major, outcome_of, times
 from fpirhc.studies.comparison.other_rows import remarks
@@ -80,8 +80,8 @@ def judge(plain: Entry, adaptive: Entry, yardstick: Yardstick) -> Finding:
     if outcome is not Outcome.BETTER:
         worse = left_alone_is_better(plain, adaptive, list(counted), yardstick)
         return Finding(text + (f" {worse}" if worse else "") + causes(plain, adaptive), outcome, pair, ratios)
-    against, moves = caveats(plain, adaptive, list(counted), yardstick), movement(plain, adaptive)
-    text += f" {moves}" if moves else ""
+    against = caveats(plain, adaptive, list(counted), yardstick)
+    text += "".join(f" {s}" for s in (movement(plain, adaptive), effort_cause(adaptive)) if s)
     return Finding(f"{against} {text}" if against else text, Outcome.DOUBTFUL if against else outcome, pair, ratios)
 
 

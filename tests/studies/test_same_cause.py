@@ -1,0 +1,63 @@
+"""The cause in a verdict is the cause in a review: one function decides, both print it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from test_verdict_sentences import EFFORT, entry, first, no_difference
+
+import fpirhc as fp
+from fpirhc.review.slow_gain import slow_gain
+from fpirhc.studies.comparison.outcome import Outcome
+
+SLOW = "Its gain is too small: the effective gain is 0.1. Use gain = -3 or more."
+GENTLE = "RHC+FPI, gentle"
+
+
+@pytest.fixture(scope="module")
+def daily():
+    """The tumour with one dose a day, whose gentle gain is worse than none."""
+    return fp.load_problem("problems/gallery/tumour_daily.py")
+
+
+def test_a_gentle_gain_is_blamed_and_not_the_limits_that_it_swings_between(daily):
+    """Doses go from zero to the largest, because the gain is too small: the verdict says what the review says."""
+    pair = {name: daily.controllers[name] for name in ("RHC", GENTLE)}
+    task = replace(daily, controllers=pair, headline=("RHC", GENTLE))
+    comparison = fp.compare(task, seed=0, compiled=False)
+    answers = fp.review(daily.problem, {GENTLE: pair[GENTLE]}, mismatch=0.0, seed=0).controllers[GENTLE]
+    [slow] = [a for a in answers if "keep up" in a.question]
+    assert comparison.outcome is Outcome.WORSE
+    assert f" Its gain is too small: {slow.evidence}. {slow.change}" in comparison.verdict[0]
+    assert "stands at a limit" not in comparison.verdict[0]
+    assert slow_gain(daily.problem, daily.controllers["RHC+FPI"]) == ""
+    assert slow_gain(daily.problem, daily.controllers["RHC"]) == ""
+
+
+def test_causes_stand_in_the_order_in_which_they_act():
+    """The cost before the plans, the plans before the gain; limits are an effect of the gain."""
+    often = {"at_limit": {"": 0.9}, "status": {"NOT_CONVERGED": 0.0}}
+    assert no_difference(facts={"slow_gain": SLOW}, measured=often) == f" {SLOW}"
+    assert no_difference(facts={"slow_gain": SLOW}, settings={"weighs_effort": True}) == f"{EFFORT} {SLOW}"
+    assert no_difference(facts={"slow_gain": SLOW}, factor=1.5, growing=1.0).startswith(
+        " Its iteration is no contraction"
+    )
+
+
+def test_a_weight_of_the_effort_is_named_whether_adaptation_helps_or_not():
+    """A smaller error of a plan that trades tracking against a wrong effort stays a success, with its reason to look."""
+    better = first(entry("RHC"), entry("FPI", "RHC", errors={"y": 0.5}, settings={"weighs_effort": True}))
+    assert better.outcome is Outcome.BETTER
+    assert better.text == f"FPI lowers the rms error of y from 1 to 0.5 m (2 times less).{EFFORT}"
+
+
+def test_a_review_names_the_weight_of_the_effort_in_the_same_words():
+    """two_mass has a pair with such a cost on purpose."""
+    task = fp.load_problem("two_mass")
+    for name, verdict in (("RHC+FPI, absolute effort", "unknown"), ("RHC+FPI", "yes")):
+        answers = fp.review(task.problem, {name: task.controllers[name]}, mismatch=0.0, seed=0).controllers[name]
+        [one] = [a for a in answers if "effort free" in a.question]
+        assert one.verdict == verdict
+        if verdict == "unknown":
+            assert f" I{one.evidence[1:]}. {one.change}" == EFFORT
