@@ -346,10 +346,11 @@ def _predict_block(problem: Problem, by: Predictor, lead: _Lead, before: Signal,
 
     def wait(s: Signals) -> dict[str, Expression]:
         """The value that is held was sent once more."""
-        later: dict[str, Expression] = {"sent_next": ca.vertcat(s._sent_before, s.sent[: size * cycles])}
+        later = {"sent_next": ca.vertcat(s._sent_before, s.sent[: size * cycles]), "time_ahead": s.time + lead.time}
         return {**later, "residual_next": s.residual} if corrected else later
 
-    waits = Block("predict_waits", Layout((before,)), Layout(), wait, Layout(own))
+    ahead = tuple(w for w in writes if w.name == "time_ahead")
+    waits = Block("predict_waits", Layout((plant.time, before)), Layout(ahead), wait, Layout(own))
     return Block("predict", Layout(reads), Layout(writes), step, Layout(own), opaque=True, waits=waits)
 
 
