@@ -1,0 +1,239 @@
+"""A closed loop that is asked: it runs from a point of its task, and is linearised at points along this run.
+
+The step is the one that simulates, with disturbances and noise left out and sensors without their quantum. Both parameter sets are
+part of its memory, so other plants and other models need no other build.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import resolved
+from fpirhc.errors import NotSupported
+from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
+from fpirhc.simulation.linearise.slopes import Step, Way, reached
+from fpirhc.simulation.loop import close_loop, start_memory
+from fpirhc.symbolic.block import Composite
+from fpirhc.task.disturbance import Step as Jump
+from fpirhc.task.problem import Problem
+
+# Columns of the memory that jump or are only recorded: counts, and what the line search of a plan remembers.
+_COUNTS = re.compile(r"^cycle$|(^|\.)plan_\w+$|plan_held_solve|_phase$|warm_up$")
+# Columns of maps and models that change on line, which stay what they are at the point.
+_LEARNED = re.compile(r"(^|\.)(tuner|delay_weights|_gains|_?learned|window|least_squares_covariance)")
+_SHARE = 0.01  # of their sizes, by which states and inputs are moved to find the scales of all else
+_SMALLEST = 1e-5  # scale of an entry, as a share of its value
+_ROOM = 0.01  # share of the range between an input's limits, nearer than which a command stands at one
+_STILL = 1e-7  # change of a command from period to period, as a share of the largest
+
+
+@dataclass(frozen=True, eq=False)
+class Passage:
+    """A part of a loop's run.
+
+    Args:
+        memories: before every cycle and after the last, shape (cycles + 1, n).
+        trace: of every cycle, shape (cycles, columns).
+    """
+
+    memories: np.ndarray
+    trace: np.ndarray
+
+
+class AskedLoop:
+    """A closed loop whose step is run and differentiated; it works in one thread only."""
+
+    def __init__(self, problem: Problem, controller: Controller) -> None:
+        """Compose the loop.
+
+        Raises:
+            NotSupported: a reality whose equations are not known.
+            FpirhcError: every error that the controller raises about the problem.
+        """
+        if problem.foreign is not None:
+            raise NotSupported("the step of a loop with a foreign reality cannot be evaluated twice at one point")
+        self.problem, self.controller = _calm(problem), resolved(problem, controller)
+        self.loop: Composite = close_loop(self.problem, self.controller)
+        self._step = Step(self.loop)
+        names = self.loop.trace.names
+        self._command = self.loop.trace.slice("command")
+        self._arriving = self.loop.trace.slice("arriving" if "arriving" in names else "command")
+        self._errors = self.loop.trace.slice("true_error" if "true_error" in names else "error")
+        self._state = self.loop.memory.slice("_state_before")
+
+    @property
+    def quick(self) -> bool:
+        """Whether a step has neither a plan nor a solver in it."""
+        return self._step.scalar
+
+    @cached_property
+    def repeats(self) -> int:
+        """Cycles after which the loop repeats itself: those between two plans."""
+        return len(self._period(self.start()))
+
+    def start(
+        self,
+        *,
+        time: float = 0.0,
+        state: Mapping[str, float] | None = None,
+        before: Mapping[str, float] | None = None,
+        exact: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Return the memory of a loop that is started.
+
+        Args:
+            time: of the start.
+            state: first state of the model; None: that of the problem.
+            before: inputs before; None: those of the problem.
+            exact: parameters of the plant that moves; None: its own.
+        """
+        moved = self.problem if state is None else replace(self.problem, start=state)
+        if before is not None:
+            moved = replace(moved, input_before=before, dead_time=replace(moved.dead_time, before={}))
+        memory = start_memory(self.loop, moved, self.controller)
+        memory[self.loop.memory.slice("cycle")] = round(time / self.problem.period)
+        if exact is not None:
+            memory[self.loop.memory.slice("_exact")] = exact
+        return memory
+
+    def run(self, memory: np.ndarray, cycles: int, led: np.ndarray | None = None) -> Passage:
+        """Return the run from a memory; it ends before the first cycle that is not finite, or where it is led and has come to rest.
+
+        Args:
+            memory: at its start.
+            cycles: at most.
+            led: states (cycles, nx) at which the plant is put after each cycle, so that it stays on the reference while what the
+                controller remembers finds its place there; None: the plant moves by itself.
+        """
+        memories, traces, still = [memory], [], 0
+        for k in range(cycles):
+            following, trace = self._step(memories[-1])
+            if not (np.isfinite(following).all() and np.isfinite(trace[self._arriving]).all()):
+                break
+            if led is not None:
+                following[self._state] = led[k]
+            memories.append(following)
+            traces.append(trace)
+            if led is not None and k > self._warm:
+                command, before = trace[self._command], traces[-1 - self.repeats][self._command]
+                still = still + 1 if (np.abs(command - before) <= _STILL * np.abs(command).max()).all() else 0
+                if still > self._longest:
+                    break
+        return Passage(np.array(memories), np.array(traces).reshape(-1, self.loop.trace.size))
+
+    def quietest(self, passage: Passage) -> LinearLoop:
+        """Return the linear loop in the quietest part of a run: where commands differ least from those of the period before.
+
+        Cycles at a limit are left out as long as there are others: there a command has no slope.
+
+        Raises:
+            NotSupported: a run that is not finite from its first cycles on.
+        """
+        commands, n = passage.trace[:, self._command], self.repeats
+        if len(commands) <= n + 1:
+            raise NotSupported("the loop's run does not stay finite in its first cycles")
+        lower, upper = self.problem.limits.input_bounds(self.problem.plant)
+        room = _ROOM * np.where(np.isfinite(upper - lower), upper - lower, 0.0)
+        inside = ((commands > lower + room) & (commands < upper - room)).all(axis=1)
+        sizes = np.maximum(np.abs(commands).max(axis=0), 1e-300)
+        change = (np.abs(commands[n:] - commands[:-n]) / sizes).max(axis=1)
+        quiet = inside[n:] & inside[:-n]
+        quiet[: min(self._warm, len(quiet) - 1)] = False
+        change = np.where(quiet, change, np.inf) if quiet.any() else change
+        return self.at(passage.memories[n + len(change) - 1 - int(np.argmin(change[::-1]))])
+
+    def at(self, memory: np.ndarray) -> LinearLoop:
+        """Return the linear loop of the period that begins at a memory."""
+        ways = [self._step.way(one, self._scales(memory)) for one in self._period(memory)]
+        free, places = self._free, np.arange(self._state.start, self._state.stop)
+        nu, scales = len(self.problem.plant.inputs), self._scales(memory)[places]
+        whole = [np.eye(memory.size)[:, free]] * len(ways)
+        bases = whole if self.quick else reached(ways, free, places, nu)
+        cycles = [self._cycle(*one) for one in zip(ways, bases, [*bases[1:], bases[0]], strict=True)]
+        errors = np.column_stack([ways[0](direction, np.zeros(nu))[1][self._errors] for direction in bases[0].T])
+        state, placed = bases[0][places] * scales[:, None], (bases[0][places] / scales[:, None]).T
+        return LinearLoop(tuple(cycles), errors, state, placed, self.problem.period)
+
+    def _cycle(self, way: Way, basis: np.ndarray, following: np.ndarray) -> LinearCycle:
+        """F, G, C of one cycle, from the directions at its beginning to those at its end."""
+        nu, nothing = len(self.problem.plant.inputs), np.zeros(len(basis))
+        images = [way(direction, np.zeros(nu)) for direction in basis.T]
+        moved, trace = (np.column_stack(columns) for columns in zip(*images, strict=True))
+        entry = np.column_stack([way(nothing, one)[0] for one in np.eye(nu)])
+        return LinearCycle(following.T @ moved, following.T @ entry, trace[self._arriving])
+
+    @cached_property
+    def _longest(self) -> int:
+        """Cycles that a command may take through the loop before anything of it is seen."""
+        return 2 * self.repeats + 2 * math.ceil(self.problem.response_delay) + 2
+
+    @cached_property
+    def _warm(self) -> int:
+        """Cycles before which no deformation acts, or no command has gone all the way."""
+        return self._longest + math.ceil(self.problem.warm_up_cycles)
+
+    def _period(self, memory: np.ndarray) -> list[np.ndarray]:
+        """The memories of as many cycles as pass until the phases of plans are the same again."""
+        phases = np.array([column.endswith("_phase") for column in self.loop.memory.columns])
+        memories = [memory]
+        while True:
+            following, _ = self._step(memories[-1])
+            if np.array_equal(following[phases], memory[phases]):
+                return memories
+            memories.append(following)
+
+    @cached_property
+    def _free(self) -> np.ndarray:
+        """Entries that may deviate: all that neither jump, nor are parameters, nor are learned."""
+        fixed = np.array([bool(_COUNTS.search(c) or _LEARNED.search(c)) for c in self.loop.memory.columns])
+        for name in ("_exact", "parameters"):
+            fixed[self.loop.memory.slice(name)] = True
+        return ~fixed
+
+    def _scales(self, memory: np.ndarray) -> np.ndarray:
+        """The size by which every entry deviates at the first point where states and inputs deviate by their own sizes."""
+        if self._sizes is None:
+            self._sizes = self._deviations(memory)
+        return self._sizes
+
+    _sizes: np.ndarray | None = None
+
+    def _deviations(self, memory: np.ndarray) -> np.ndarray:
+        lower, upper = self.problem.limits.input_bounds(self.problem.plant)
+        inputs = np.where(np.isfinite(upper - lower), (upper - lower) / 2, 1.0)
+        moved = memory.copy()
+        moved[self._state] *= 1 + _SHARE
+        largest = np.abs(moved - memory)
+        for start, w in ((moved, 0.0), (memory, _SHARE * inputs)):
+            one, other = start, memory
+            for k in range(2 * self._longest):
+                one, other = self._step(one, w if k == 0 else 0.0)[0], self._step(other)[0]
+                deviation = np.abs(one - other)
+                largest = np.maximum(largest, np.where(np.isfinite(deviation), deviation, 0.0))
+        scales = np.maximum(largest / _SHARE, _SMALLEST * np.abs(memory))
+        for places in self._alike:
+            scales[places] = scales[places].max()
+        scales[scales == 0] = 1.0
+        return scales
+
+    @cached_property
+    def _alike(self) -> list[list[int]]:
+        """Places of entries that are the same quantity at other times: those of a queue, or of a plan's stages."""
+        groups: dict[str, list[int]] = {}
+        for k, column in enumerate(self.loop.memory.columns):
+            groups.setdefault(column.split("@")[0], []).append(k)
+        return [places for places in groups.values() if len(places) > 1]
+
+
+def _calm(problem: Problem) -> Problem:
+    """The problem without disturbances and noise, and with an entry for signals at its inputs."""
+    sensors = {n: replace(s, noise=None, quantum=None, dropout=0.0) for n, s in problem.sensing.sensors.items()}
+    still = {name: Jump(at=0.0, size=0.0) for name in problem.plant.inputs}
+    return replace(problem, disturbances=still, sensing=replace(problem.sensing, sensors=sensors))

@@ -1,0 +1,97 @@
+"""A linear loop, z+ = F z + G w, v = C z, e = E z: its poles, and the neutral modes among them that no judged quantity shows.
+
+z are deviations of what the loop remembers, w is added to the plant's inputs, v are the commands that arrive there, and e are the
+judged errors. A loop that repeats itself after n cycles only has n such matrices; its modes are those of their product.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, reduce
+
+import numpy as np
+import scipy.linalg
+
+NEUTRAL = 1e-6  # distance of |pole| from 1, where a mode neither decays nor grows
+_SHOWN = 1e-6  # share of a judged error in an eigenvector, in balanced units
+
+
+@dataclass(frozen=True, eq=False)
+class LinearCycle:
+    """One cycle: F (n, n), G (n, nu), C (nu, n)."""
+
+    dynamics: np.ndarray
+    entry: np.ndarray
+    arriving: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class LinearLoop:
+    """The cycles of one period of a linear loop.
+
+    Args:
+        cycles: as many as the loop needs to repeat itself; one for plans in every cycle.
+        errors: E (judged, n); no rows: every mode counts.
+        state: X (nx, n), the states of the plant that moves, at the first cycle.
+        placed: Z (n, nx), the deviation z of a deviation of the plant's state alone.
+        period: of the control cycle.
+    """
+
+    cycles: tuple[LinearCycle, ...]
+    errors: np.ndarray
+    state: np.ndarray
+    placed: np.ndarray
+    period: float
+
+    @cached_property
+    def dynamics(self) -> np.ndarray:
+        """F of a whole period, the product of those of its cycles."""
+        return np.asarray(reduce(lambda done, one: one.dynamics @ done, self.cycles[1:], self.cycles[0].dynamics))
+
+    @cached_property
+    def poles(self) -> np.ndarray:
+        """Eigenvalues of a whole period."""
+        return np.asarray(np.linalg.eigvals(self.dynamics))
+
+    @property
+    def radius(self) -> float:
+        """The factor per cycle of the slowest or fastest growing mode; neutral modes that no judged error shows are left out."""
+        return float(np.abs(self.poles[~self.hidden]).max(initial=0.0) ** (1 / len(self.cycles)))
+
+    @cached_property
+    def hidden(self) -> np.ndarray:
+        """Which poles are no fault of the loop: of modes that neither plant nor command show, and neutral ones that no error shows.
+
+        The first live in the controller's memory alone, such as a covariance that forgets. A neutral mode, |pole| = 1, neither
+        decays nor grows; where E V = 0 for its eigenvector V, it is the amount of a drug that has left the body, or the heat of a
+        jacket whose change alone is weighed.
+        """
+        count = len(self.cycles)
+        lasting = np.abs(self.poles) > 1 - NEUTRAL * count
+        if not len(self.errors) or not lasting.any():
+            return np.zeros(len(self.poles), dtype=bool)
+        neutral = lasting & (np.abs(self.poles) < 1 + NEUTRAL * count)
+        balanced, (scale, _) = scipy.linalg.matrix_balance(self.dynamics, permute=False, separate=True)
+        values, vectors = np.linalg.eig(balanced)
+        sizes = np.abs(vectors).max(axis=0)
+        by_error, by_any = (_seen(rows * scale, vectors) / sizes for rows in (self.errors, self._everything))
+        near = [np.abs(values - pole) < 10 * NEUTRAL * count for pole in self.poles]
+        no_error, nothing = (
+            np.array([share[one].max(initial=0.0) < _SHOWN for one in near]) for share in (by_error, by_any)
+        )
+        return (neutral & no_error) | (lasting & nothing)
+
+    @property
+    def _everything(self) -> np.ndarray:
+        """What plant, errors and commands show of the deviation at the first cycle, by rows."""
+        rows, moved = [self.errors, self.state], np.eye(len(self.cycles[0].dynamics.T))
+        for one in self.cycles:
+            rows.append(one.arriving @ moved)
+            moved = one.dynamics @ moved
+        return np.vstack(rows)
+
+
+def _seen(rows: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Largest share of a row, of length 1, in each vector."""
+    lengths = np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
+    return np.asarray(np.abs((rows / lengths) @ vectors).max(axis=0))
