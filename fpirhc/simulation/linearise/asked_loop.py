@@ -141,10 +141,10 @@ class AskedLoop:
             raise NotSupported("the loop's run does not stay finite in its first cycles")
         lower, upper = self.problem.limits.input_bounds(self.problem.plant)
         room = _ROOM * np.where(np.isfinite(upper - lower), upper - lower, 0.0)
-        inside = ((commands > lower + room) & (commands < upper - room)).all(axis=1)
+        inside = np.all((commands > lower + room) & (commands < upper - room), axis=1)
         sizes = np.maximum(np.abs(commands).max(axis=0), 1e-300)
         change = (np.abs(commands[n:] - commands[:-n]) / sizes).max(axis=1)
-        quiet = inside[n:] & inside[:-n]
+        quiet = np.logical_and(inside[n:], inside[:-n])
         quiet[: min(self._warm, len(quiet) - 1)] = False
         change = np.where(quiet, change, np.inf) if quiet.any() else change
         return self.at(passage.memories[n + len(change) - 1 - int(np.argmin(change[::-1]))])
