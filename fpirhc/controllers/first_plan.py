@@ -6,29 +6,22 @@ takes about half of the time in which a receding horizon is composed, so the lat
 
 from __future__ import annotations
 
-from collections import deque
-
 import casadi as ca
 import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.base import Optimiser
+from fpirhc.symbolic.latest import Latest
 from fpirhc.task.problem import Problem
 
-_LATEST: deque[tuple[Problem, Optimiser, np.ndarray]] = deque(maxlen=8)
+_LATEST: Latest[np.ndarray] = Latest(8)
 
 
 def built_first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> np.ndarray:
-    """Return `first_memory` with the numbers of the build; horizon and data are those of this problem and optimiser.
-
-    Both are values, and the same objects give the same plan.
-    """
-    for known, by, memory in tuple(_LATEST):
-        if known is problem and by is optimiser:
-            return memory.copy()
-    memory = first_memory(problem, optimiser, ocp, data_of)
-    _LATEST.append((problem, optimiser, memory.copy()))
-    return memory
+    """Return `first_memory` with the numbers of the build; the data are those of this horizon at this start."""
+    start = problem.start_state.tobytes(), np.asarray(problem.inputs_before, dtype=float).tobytes()
+    memory = _LATEST.of((ocp, optimiser), start, lambda: first_memory(problem, optimiser, ocp, data_of))
+    return memory.copy()
 
 
 def first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> np.ndarray:

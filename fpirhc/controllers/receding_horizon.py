@@ -37,7 +37,7 @@ from fpirhc.horizon.nominal import feedforward, known_on_reference
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import offset_limits, shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.optimisers.base import Optimiser
+from fpirhc.optimisers.base import Optimiser, built
 from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
@@ -198,7 +198,7 @@ def _plan_block(problem: Problem, optimiser: Optimiser, on_failure: OnFailure) -
     running_data = data_of if preview is None else _stage_data(problem, count, previewed=True)
     start = nominal(problem)
     memory = optimiser.memory(ocp).starting_at(built_first_memory(start, optimiser, ocp, data_of))
-    solve = optimiser.step(ocp.opened())
+    solve = built(optimiser, ocp, "step")
     feedforward_of = _feedforward(problem)
     low, high = problem.limits.input_ends(plant)
     logged = tuple(scalar(name) for name in optimiser.logged)

@@ -22,19 +22,26 @@ from fpirhc.controllers.own_reference import with_reference
 from fpirhc.controllers.steps_ahead import with_steps_ahead
 from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.block import Block, Composite
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Layout, Signal
 from fpirhc.task.problem import Problem
+
+_LATEST: Latest[Composite] = Latest(4)
 
 
 def compose_seeing(problem: Problem, controller: Controller) -> Composite:
     """Return sensing and controller as one step: (memory, time, raw measurements, parameters) -> (memory, trace, command).
 
-    Where nothing is estimated it is `compose_controller`.
+    Where nothing is estimated it is `compose_controller`. A loop and a stepper of the same values have the same one.
 
     Args:
         problem: that the controller is composed for.
         controller: checked here against the problem.
     """
+    return _LATEST.of((problem, controller), (), lambda: _composed(problem, controller))
+
+
+def _composed(problem: Problem, controller: Controller) -> Composite:
     raw = raw_signal(problem)
     if raw is None:
         return compose_controller(problem, controller)

@@ -37,10 +37,14 @@ def split_stage(ocp: OptimalControl) -> dict[str, ca.Function]:
 
 def linearise_stage(ocp: OptimalControl) -> ca.Function:
     """Return the Function linearise as scalar code."""
-    split_stage(ocp)
-    ns, rule = ocp.state.size, _rules[ocp]
-    rates, slopes = rule.jacobian[:ns, :], rule.jacobian[ns, :].T
-    return _dense("linearise", [rule.symbols], [rates[:, :ns], rates[:, ns:], slopes[:ns], slopes[ns:]])
+    parts = split_stage(ocp)
+    if "linearise" not in parts:
+        ns, rule = ocp.state.size, _rules[ocp]
+        rates, slopes = rule.jacobian[:ns, :], rule.jacobian[ns, :].T
+        parts["linearise"] = _dense(
+            "linearise", [rule.symbols], [rates[:, :ns], rates[:, ns:], slopes[:ns], slopes[ns:]]
+        )
+    return parts["linearise"]
 
 
 def stage_leaves(ocp: OptimalControl, names: tuple[str, ...]) -> tuple[_Parts, str]:

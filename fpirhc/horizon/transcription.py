@@ -32,10 +32,13 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.reference_expansion import expand_along, input_curvature
 from fpirhc.horizon.stage_data import data_layout, stage_data
 from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Named, Signal
 from fpirhc.symbolic.live import PREFIX, LiveNumber, live_numbers, nominal, settled
 from fpirhc.task.limits import Limits
 from fpirhc.task.reference import Reference
+
+_LATEST: Latest[OptimalControl] = Latest(8)
 
 
 def transcribe(
@@ -48,7 +51,7 @@ def transcribe(
     start: np.ndarray | None = None,
     others: Mapping[str, LiveNumber] = MappingProxyType({}),
 ) -> OptimalControl:
-    """Return the standard form of one horizon.
+    """Return the standard form of one horizon; the same objects have the same one.
 
     Args:
         plant: the model.
@@ -64,6 +67,21 @@ def transcribe(
     Raises:
         InvalidProblem: mistakes in the cost or the limits, or a cost that is not finite at the reference (the term is named).
     """
+    values = plant, reference, horizon, cost, limits, signals
+    first = None if start is None else np.asarray(start, dtype=float).tobytes()
+    return _LATEST.of((*values, *others.values()), (first, *others), lambda: _transcribed(*values, start, others))
+
+
+def _transcribed(
+    plant: Plant,
+    reference: Reference,
+    horizon: Horizon,
+    cost: Cost,
+    limits: Limits,
+    signals: ca.Function | None,
+    start: np.ndarray | None,
+    others: Mapping[str, LiveNumber],
+) -> OptimalControl:
     nominal(cost).check(plant)
     limits.check(plant)
     _check_names(plant, horizon, limits)

@@ -16,7 +16,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
-from typing import cast
+from typing import Literal, cast
 
 import casadi as ca
 import numpy as np
@@ -110,6 +110,14 @@ class Optimiser(Checked, ABC):
             data: of the first horizon, shape (ntheta, N + 1).
         """
         return self.memory(ocp).start()
+
+
+def built(optimiser: Optimiser, ocp: OptimalControl, form: Literal["step", "converging"]) -> ca.Function:
+    """Return the Function `step` or `converging`, built once: horizons that differ in numbers of settings only share it."""
+    key = form, _Same(optimiser)
+    if key not in ocp.functions:
+        ocp.functions[key] = getattr(optimiser, form)(ocp.opened())
+    return ocp.functions[key]
 
 
 def require_settings(owner: str, iterations: int, tolerance: float) -> None:
@@ -223,3 +231,19 @@ def status_of(finite: Matrix, residual: Matrix, violation: Matrix | float, toler
     converged = ca.if_else(residual <= tolerance, int(Status.OK), int(Status.NOT_CONVERGED))
     feasible = ca.if_else(violation <= FEASIBLE, converged, int(Status.INFEASIBLE))
     return ca.if_else(finite, feasible, int(Status.NON_FINITE))
+
+
+class _Same:
+    """A value as a key that equals itself alone, whether it can be hashed or not.
+
+    The key keeps the value: the address of one that is gone is given to another, which would then find its Function.
+    """
+
+    def __init__(self, value: object) -> None:
+        self.value = value
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and other.value is self.value
+
+    def __hash__(self) -> int:
+        return id(self.value)

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.base import Optimiser
+from fpirhc.optimisers.base import Optimiser, built
 from fpirhc.status import Status
 
 _PATIENCE = 4  # calls in a row that may leave the violation as it is
@@ -35,11 +35,7 @@ def improved(
     Returns:
         Plan (nu, N), diagnostics with the iterations of all calls, memory, and the number of calls.
     """
-    # Horizons that differ in numbers of settings only share their Functions.
-    key = "converging", _Same(optimiser)
-    if key not in ocp.functions:
-        ocp.functions[key] = optimiser.converging(ocp.opened())
-    step, bounds, rescue = ocp.functions[key], (ocp.input_lower, ocp.input_upper), None
+    step, bounds, rescue = built(optimiser, ocp, "converging"), (ocp.input_lower, ocp.input_upper), None
     status, count, iterations, violation, stuck = Status.NOT_CONVERGED, 0, 0.0, np.inf, 0
     inputs, diagnostics = np.zeros((ocp.input.size, ocp.stages)), np.zeros(5)
     while status in (Status.NOT_CONVERGED, Status.INFEASIBLE) and stuck < _PATIENCE and count < calls:
@@ -57,19 +53,3 @@ def improved(
         stuck, violation = (0 if better else stuck + 1), min(violation, diagnostics[2])
     diagnostics[3] = iterations if diagnostics[3] >= 0 else diagnostics[3]
     return inputs, diagnostics, memory, count
-
-
-class _Same:
-    """A value as a key that equals itself alone, whether it can be hashed or not.
-
-    The key keeps the value: the address of one that is gone is given to another, which would then find its Function.
-    """
-
-    def __init__(self, value: object) -> None:
-        self.value = value
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and other.value is self.value
-
-    def __hash__(self) -> int:
-        return id(self.value)

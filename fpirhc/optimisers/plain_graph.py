@@ -11,6 +11,9 @@ from fpirhc.optimisers.plain_settings import MOST_PLAIN, PlainSettings, plain_me
 from fpirhc.optimisers.search import Search, first_gamma
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import FINITE, is_finite
+from fpirhc.symbolic.latest import Latest
+
+_SEARCHES: Latest[Search] = Latest(4)
 
 
 def plain_graph(ocp: OptimalControl, settings: PlainSettings, name: str) -> ca.Function:
@@ -63,7 +66,8 @@ def first_anchor(ocp: OptimalControl, arguments: Arguments, memory: ca.MX) -> An
 
 
 def _search(ocp: OptimalControl, settings: PlainSettings) -> Search:
-    return Search(ocp, settings.hessian, settings.map, settings.damping)
+    own = settings.hessian, settings.damping
+    return _SEARCHES.of((ocp, settings.map), own, lambda: Search(ocp, settings.hessian, settings.map, settings.damping))
 
 
 def _converged(
@@ -76,15 +80,21 @@ def _converged(
     work = ca.Function("fpirhc_iteration", [*arguments, *symbols], list(search.directed(tried, plan, arguments)))
     rest = ca.Function("fpirhc_rest", [*arguments, *symbols], list(symbols))
     choice = ca.Function.if_else("fpirhc_iteration_if_needed", work, rest)
+    again = _needed(ocp, settings, arguments, symbols)
     for _ in range(settings.iterations + 1):
-        residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper, arguments.data)
-        needed = ca.logic_not(
-            ca.logic_and(anchor.value < UNTRIED, residual <= ocp.number_in(settings.tolerance, arguments.data))
-        )
-        needed = ca.logic_and(needed, plain < MOST_PLAIN)
+        needed = again(*arguments, anchor.inputs, anchor.slope, anchor.value, plain)
         plain += ca.logic_and(needed, anchor.step < SHORTEST)
         anchor, count = Anchor(*choice(needed, *arguments, *anchor)), count + needed
     return anchor, count
+
+
+def _needed(ocp: OptimalControl, settings: PlainSettings, arguments: Arguments, anchor: Anchor) -> ca.Function:
+    """Function (arguments, inputs, slope, value, plain steps) -> whether another iteration is needed."""
+    plain = ca.MX.sym("plain")
+    residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper, arguments.data)
+    solved = ca.logic_and(anchor.value < UNTRIED, residual <= ocp.number_in(settings.tolerance, arguments.data))
+    needed = ca.logic_and(ca.logic_not(solved), plain < MOST_PLAIN)
+    return ca.Function("fpirhc_needed", [*arguments, anchor.inputs, anchor.slope, anchor.value, plain], [needed])
 
 
 def _results(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
-import io
 import tempfile
 from collections.abc import Sequence
 from importlib.resources import files
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fpirhc.errors import OutputError
+from fpirhc.simulation.picture import png
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -94,8 +94,6 @@ def text(value: object) -> str:
 
 def picture(figure: Figure, alt: str, caption: str) -> str:
     """Return a figure as a picture inside the page."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=88)
-    code = base64.b64encode(buffer.getvalue()).decode("ascii")
+    code = base64.b64encode(png(figure)).decode("ascii")
     note = f"<figcaption>{text(caption)}</figcaption>" if caption else ""
     return f"<figure><img alt='{text(alt)}' src='data:image/png;base64,{code}'>{note}</figure>"

@@ -18,7 +18,7 @@ the deviation is not small, and the loop is linear. Limits that clip in the run 
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import fftconvolve
+from scipy.fft import irfft, next_fast_len, rfft
 
 from fpirhc.contraction import response_jacobians
 from fpirhc.errors import NotSupported
@@ -55,7 +55,7 @@ def tube(nominal: NominalRun, errors: ResponseErrors, gain: float, exact: np.nda
     longest = max(len(a) for a in answers)
     largest = np.max([np.pad(a, ((0, longest - len(a)), (0, 0), (0, 0))) for a in answers], axis=0)
     bound = np.zeros((nominal.cycles + 1, largest.shape[1]))
-    summed = fftconvolve(largest, force[:, None, :], axes=0).sum(axis=2)
+    summed = _convolved(largest, force[:, None, :]).sum(axis=2)
     bound[1:] = np.maximum(summed[: nominal.cycles], 0.0)
     return bound
 
@@ -90,3 +90,11 @@ def _impulses(loop: LinearLoop, gain: np.ndarray, cycles: int) -> np.ndarray:
             break
         memory = loop.dynamics @ memory
     return np.array(sizes)
+
+
+def _convolved(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Convolution along the first axis, as in scipy.signal, whose import takes longer than all of this."""
+    length = len(one) + len(other) - 1
+    padded = next_fast_len(length, real=True)
+    convolved: np.ndarray = irfft(rfft(one, padded, axis=0) * rfft(other, padded, axis=0), padded, axis=0)
+    return convolved[:length]

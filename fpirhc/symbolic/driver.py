@@ -14,6 +14,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from fpirhc.symbolic.latest import Latest
+
 SIGNATURE = "(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem)"
 _FUNCTION = re.compile(r"^/\*[^\n]*\*/\nstatic int (casadi_f\d+)\([^\n]*\{\n.*?^\}\n", re.MULTILINE | re.DOTALL)
 _CALL = re.compile(r"\bcasadi_f\d+\b")
@@ -23,6 +25,7 @@ _FAST = """#if defined(__GNUC__) && !defined(__clang__)
 #pragma GCC optimize ("O3", "no-ipa-ra")
 #endif"""
 _drivers: dict[str, str] = {}
+_LATEST: Latest[ca.Function] = Latest(16)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +61,11 @@ class Driver:
 
 
 def with_driver(name: str, driver: Driver, build: Callable[[str], ca.Function]) -> ca.Function:
-    """Return `build(unique name)` with this driver as its body in C."""
+    """Return `build(unique name)` with this driver as its body in C; the same body has the same Function."""
     source = driver.source()
     unique = f"{name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     _drivers[unique] = source
-    return build(unique)
+    return _LATEST.of((), (unique,), lambda: build(unique))
 
 
 def substitute(source: str) -> tuple[str, list[str]]:

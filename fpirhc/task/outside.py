@@ -23,7 +23,10 @@ from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import kind
+from fpirhc.symbolic.latest import Latest
 from fpirhc.task.samples import Course, course_function, is_held, is_opaque, span_of
+
+_LATEST: Latest[ca.Function | None] = Latest(8)
 
 
 class External(Checked, ABC):
@@ -111,7 +114,7 @@ def model_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function |
 def previewed_values(plant: Plant, signals: Mapping[str, External]) -> ca.Function | None:
     """Function (time, parameters) -> parameters with what the model is told of a later time; None where it is told nothing."""
     ahead = {n: one for n, one in signals.items() if one.preview}
-    return model_values(plant, ahead)
+    return _LATEST.of((plant, *ahead.values()), tuple(ahead), lambda: model_values(plant, ahead))
 
 
 def told_places(plant: Plant, signals: Mapping[str, External]) -> tuple[int, ...]:

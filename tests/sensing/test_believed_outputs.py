@@ -312,7 +312,8 @@ def test_raw_measurements_of_a_run_give_its_commands(name: str) -> None:
         command, memory = stepper.step_measured(float(result.time[k]), measured[k], memory)
         assert np.array_equal(command, result["command"][k]), k
     assert np.ptp(result["command"]) > 1
-    assert measure_cycle(problem, controller, result, compiled=False) is not None
+    stepper = fp.Stepper(problem, controller, compiled=False, bounded=False)
+    assert measure_cycle(problem, stepper, result) is not None
 
 
 # What is known before a run

@@ -136,12 +136,13 @@ def test_two_loops_are_timed_in_turn():
     problem = fp.Problem(linear(1.6, 1.0), fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}), {"y": 0.0}, 1e-3, 0.1)
     one = fp.ComputedTorque(TRACK)
     run = fp.simulate(problem, one, seed=0, compiled=False)
-    price = measure_price(problem, (one, run), (one, run), compiled=False)
+    stepper = fp.Stepper(problem, one, compiled=False)
+    price = measure_price(problem, (stepper, run), (stepper, run))
     assert price is not None
     assert price.beside == "ComputedTorque"
     assert price.noise > 0
     short = replace(run, log=run.log[:9])
-    assert measure_price(problem, (one, short), (one, short), compiled=False) is None
+    assert measure_price(problem, (stepper, short), (stepper, short)) is None
 
 
 @pytest.mark.parametrize(

@@ -22,13 +22,15 @@ from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.response_prediction import Prediction, predict_response
 from fpirhc.simulation.changes import Changes
+from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
 from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.metrics.columns import columns
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import Simulator, judged_run, simulator
+from fpirhc.simulation.simulate import judged_run, simulator
+from fpirhc.simulation.stepper import Stepper
 from fpirhc.studies.comparison.caveats import yardstick_of
 from fpirhc.studies.comparison.changes import scales
 from fpirhc.studies.comparison.entry import Contraction, Entry
@@ -37,8 +39,8 @@ from fpirhc.studies.comparison.information import information, sentences
 from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import measure_optimality
 from fpirhc.studies.comparison.outcome import Finding, Outcome
-from fpirhc.studies.comparison.side_by_side import beside_each_other, null_tests, with_slow_gains
-from fpirhc.studies.comparison.timing import measure_cycle
+from fpirhc.studies.comparison.side_by_side import Built, beside_each_other, null_tests, with_slow_gains
+from fpirhc.studies.comparison.timing import CycleTime, measure_cycle
 from fpirhc.studies.comparison.verdict import findings
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
@@ -188,17 +190,17 @@ def compare(
     mistakes.unknown("controller", changes or (), selected)
     mistakes.raise_if_any()
     check_gains(task, selected)
-    loops: dict[str, Simulator] = {}
-    ran, skipped = _entries(task, selected, seed, compiled, progress, loops, changes or {})
+    built: dict[str, Built] = {}
+    ran, skipped = _entries(task, selected, seed, compiled, progress, built, changes or {})
     sizes = scales(task.problem)
-    entries = beside_each_other(task.problem, ran, loops, sizes, compiled=compiled)
+    entries = beside_each_other(task.problem, ran, built, sizes)
     broken: list[str] = []
     yardstick = yardstick_of(task.problem, seed=seed)
     judged = findings(entries, skipped, task.headline, yardstick)
-    entries = with_slow_gains(task.problem, entries, loops, judged)
+    entries = with_slow_gains(task.problem, entries, built, judged)
     judged = findings(entries, skipped, task.headline, yardstick)
     pairs = [finding.pair for finding in judged if finding.pair]
-    nulls = null_tests(task.problem, pairs, entries, loops, sizes, seed=seed, broken=broken)
+    nulls = null_tests(task.problem, pairs, entries, built, sizes, seed=seed, broken=broken)
     return Comparison(
         problem=task.name,
         title=task.title,
@@ -247,16 +249,16 @@ def _entries(
     seed: int,
     compiled: bool,
     progress: Progress | None,
-    loops: dict[str, Simulator],
+    built: dict[str, Built],
     changes: Mapping[str, Changes],
 ) -> tuple[list[Entry], dict[str, str]]:
-    """Entries of the controllers that ran, and reasons why the others were skipped; the loops that ran are added to `loops`."""
+    """Entries of the controllers that ran, and reasons why the others were skipped; what ran is added to `built`."""
     entries: list[Entry] = []
     skipped: dict[str, str] = {}
     for name, controller in controllers.items():
         try:
             entries.append(
-                _entry(task, controllers, name, controller, seed, compiled, progress, loops, changes.get(name, {}))
+                _entry(task, controllers, name, controller, seed, compiled, progress, built, changes.get(name, {}))
             )
         except FpirhcError as error:
             skipped[name] = str(error)
@@ -279,7 +281,7 @@ def _entry(
     seed: int,
     compiled: bool,
     progress: Progress | None,
-    loops: dict[str, Simulator],
+    built: dict[str, Built],
     changes: Changes,
 ) -> Entry:
     problem = task.problem
@@ -291,19 +293,20 @@ def _entry(
 
     report(0, problem.cycles)
     live = tuple(dict.fromkeys(path for numbers in changes.values() for path in numbers))
-    loops[name] = simulator(problem, ready, compiled=compiled, live=live)
-    run = judged_run(loops[name], seed=seed, name=name, progress=report, changes=changes)
+    loop = simulator(problem, ready, compiled=compiled, live=live)
+    run = judged_run(loop, seed=seed, name=name, progress=report, changes=changes)
     adaptive, every = ready.deformation.adapts, plan_every(problem, ready)
     broken = list(cast(Sequence[str], run.settings.get("broken", ())))
     part = partial(attempted, broken=broken)
     metrics = measure(problem, run, task.metrics)
     view = part("the Lyapunov function", lyapunov_view, problem, ready, run)
-    cycle = part("the time of a cycle", measure_cycle, problem, ready, run, compiled=compiled)
+    stepper, cycle = part("the time of a cycle", _timed, problem, ready, run, compiled=compiled) or (None, None)
+    built[name] = Built(loop, stepper)
     contraction = part("the contraction", _contraction, problem, ready, run, metrics)
     optimality = part("the excess cost of the plans", measure_optimality, problem, ready, run, compiled=compiled)
     predicts = adaptive and name in (task.headline or ())
     prediction = part("the prediction", _predicted, problem, controller, compiled) if predicts else None
-    told = part("the sentence about what it measures", information, problem, ready, loops[name].loop, every)
+    told = part("the sentence about what it measures", information, problem, ready, loop.loop, every)
     return Entry(
         name=name,
         run=run,
@@ -323,6 +326,13 @@ def _entry(
         information=told,
         automatic=tuple(controller.deformation.automatic),
     )
+
+
+def _timed(problem: Problem, ready: Controller, run: Run, *, compiled: bool) -> tuple[Stepper, CycleTime | None]:
+    """The controller stepped by hand, and the time of its cycle."""
+    with without_warning():
+        stepper = Stepper(problem, ready, compiled=compiled, bounded=False)
+    return stepper, measure_cycle(problem, stepper, run)
 
 
 def _predicted(problem: Problem, controller: Controller, compiled: bool) -> Prediction | None:

@@ -18,6 +18,7 @@ from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
 from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.native import native
 from fpirhc.task.outside import model_values, previewed_values, rows_of, signals_of
 from fpirhc.task.problem import Problem, cycles_per_stage
@@ -25,6 +26,8 @@ from fpirhc.task.problem import Problem, cycles_per_stage
 SAMPLES = 25  # plans of a run that are solved again
 _OTHER = 1e-6  # relative; closer to the optimum a negative excess is the accuracy of the solves
 _ACCURATE = 1e-8  # of the input's range
+
+_SOLVERS: Latest[_Solver] = Latest(8)
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ def measure_optimality(
     limits, start = planned.limits, planned.start_state
     ocp = transcribe(planned.plant, planned.reference, planned.horizon, planned.cost, limits, ahead, start)
     try:
-        solve = _Solver(ocp, compiled)
+        solve = _SOLVERS.of((ocp,), (compiled,), lambda: _Solver(ocp, compiled))
     except FpirhcError:
         return None
     data_of = stage_data(planned.plant, planned.reference, planned.horizon, planned.cost, signals=ahead)

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from fpirhc.broken import attempted
 from fpirhc.review.slow_gain import slow_gain
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.simulate import Simulator
+from fpirhc.simulation.stepper import Stepper
 from fpirhc.studies.comparison.entry_facts import no_bound_because
 from fpirhc.studies.comparison.null_test import NullTest, null_test
 from fpirhc.studies.comparison.other_rows import beaten_by
@@ -24,46 +25,48 @@ if TYPE_CHECKING:
     from fpirhc.studies.comparison.entry import Entry
 
 
+class Built(NamedTuple):
+    """What a controller of a comparison was built to: its loop, and its step by hand, None where that is broken or not needed."""
+
+    loop: Simulator
+    stepper: Stepper | None
+
+
 def beside_each_other(
-    problem: Problem,
-    entries: Sequence[Entry],
-    loops: Mapping[str, Simulator],
-    scales: Mapping[str, float],
-    *,
-    compiled: bool,
+    problem: Problem, entries: Sequence[Entry], built: Mapping[str, Built], scales: Mapping[str, float]
 ) -> list[Entry]:
     """Return the entries with what only shows beside the others.
 
     Args:
         problem: of the comparison.
         entries: the controllers that ran.
-        loops: their loops, by name.
+        built: what they were built to, by name.
         scales: by which errors are judged, by coordinate.
-        compiled: whether controllers are timed in C.
     """
     shown: list[Entry] = []
     try:
         for entry in entries:
-            shown.append(_beside(problem, entry, entries, loops, scales, compiled))
+            shown.append(_beside(problem, entry, entries, built, scales))
     except KeyboardInterrupt:
         return [*shown, *entries[len(shown) :]]
     return shown
 
 
 def with_slow_gains(
-    problem: Problem, entries: Sequence[Entry], loops: Mapping[str, Simulator], judged: Sequence[Finding]
+    problem: Problem, entries: Sequence[Entry], built: Mapping[str, Built], judged: Sequence[Finding]
 ) -> list[Entry]:
     """Return the entries with what a review says of their gain, where a pair's verdict is not plainly positive.
 
     Args:
         problem: of the comparison.
         entries: the controllers that ran.
-        loops: their loops, by name.
+        built: what they were built to, by name.
         judged: the verdict so far.
     """
     asked = {finding.pair[1] for finding in judged if finding.pair and finding.outcome is not Outcome.BETTER}
     return [
-        replace(e, slow_gain=slow_gain(problem, loops[e.name].controller)) if e.name in asked else e for e in entries
+        replace(e, slow_gain=slow_gain(problem, built[e.name].loop.controller)) if e.name in asked else e
+        for e in entries
     ]
 
 
@@ -71,7 +74,7 @@ def null_tests(
     problem: Problem,
     pairs: Sequence[tuple[str, str]],
     entries: Sequence[Entry],
-    loops: Mapping[str, Simulator],
+    built: Mapping[str, Built],
     scales: Mapping[str, float],
     *,
     seed: int,
@@ -83,7 +86,7 @@ def null_tests(
         problem: of the comparison.
         pairs: names of the controllers.
         entries: the controllers that ran.
-        loops: their loops, by name.
+        built: what they were built to, by name.
         scales: by which errors are judged, by coordinate.
         seed: of the sensors' noise.
         broken: takes a sentence for every test that could not be made.
@@ -93,7 +96,7 @@ def null_tests(
     try:
         for pair in pairs:
             plain, adaptive = (by_name[name] for name in pair)
-            facts = model, (loops[plain.name], loops[adaptive.name]), pair, scales, adaptive.weighed
+            facts = model, (built[plain.name].loop, built[adaptive.name].loop), pair, scales, adaptive.weighed
             test = attempted("the null test", null_test, *facts, cured=plain.metrics.rms_error, broken=broken)
             tests += [] if test is None else [test]
     except KeyboardInterrupt:
@@ -102,23 +105,19 @@ def null_tests(
 
 
 def _beside(
-    problem: Problem,
-    entry: Entry,
-    entries: Sequence[Entry],
-    loops: Mapping[str, Simulator],
-    scales: Mapping[str, float],
-    compiled: bool,
+    problem: Problem, entry: Entry, entries: Sequence[Entry], built: Mapping[str, Built], scales: Mapping[str, float]
 ) -> Entry:
     """The entry with its price, or with why its exact model is no bound."""
-    controller, by_name = loops[entry.name].controller, {e.name: e for e in entries}
+    own, by_name = built[entry.name], {e.name: e for e in entries}
     if entry.exact and beaten_by(entry, entries, scales):
-        facts = problem, controller, entry.metrics, entry.optimality
+        facts = problem, own.loop.controller, entry.metrics, entry.optimality
         why = attempted("why it is no bound", no_bound_because, *facts, broken=[])
         return replace(entry, no_bound=why or ())
     plain = by_name.get(entry.pair or "")
-    if plain is None:
+    beside = None if plain is None else built[plain.name].stepper
+    if plain is None or beside is None or own.stepper is None:
         return entry
-    both = (loops[plain.name].controller, plain.run), (controller, entry.run)
     broken: list[str] = []
-    price = attempted("the price of adaptation", measure_price, problem, *both, compiled=compiled, broken=broken)
+    both = (beside, plain.run), (own.stepper, entry.run)
+    price = attempted("the price of adaptation", measure_price, problem, *both, broken=broken)
     return replace(entry, price=price, notes=(*entry.notes, *broken))

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fpirhc.controllers.base import Controller
-from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.simulation.stepper import Stepper
@@ -55,9 +53,7 @@ class Price:
     noise: float
 
 
-def measure_price(
-    problem: Problem, plain: tuple[Controller, Run], adaptive: tuple[Controller, Run], *, compiled: bool = True
-) -> Price | None:
+def measure_price(problem: Problem, plain: tuple[Stepper, Run], adaptive: tuple[Stepper, Run]) -> Price | None:
     """Replay two runs in turn, and return how much longer a cycle of the adaptive controller takes.
 
     Other work on the machine slows both alike, because they take turns, now one first and now the other; what is left is the noise.
@@ -69,8 +65,7 @@ def measure_price(
     rounds = cycles // block
     if rounds < _FEWEST:
         return None
-    with without_warning():
-        replays = [_Replay(Stepper(problem, c, compiled=compiled), run) for c, run in (plain, adaptive)]
+    replays = [_Replay(*one) for one in (plain, adaptive)]
     times = np.empty((rounds, 2))
     for number in range(rounds):
         for k in (0, 1) if number % 2 else (1, 0):
@@ -134,8 +129,8 @@ def _step_of(stepper: Stepper) -> Callable[[float, np.ndarray, np.ndarray, np.nd
     return lambda now, measured, _, memory: stepper.step_measured(now, measured, memory)
 
 
-def measure_cycle(problem: Problem, controller: Controller, run: Run, *, compiled: bool = True) -> CycleTime | None:
-    """Replay the run's measurements through the controller, one call per cycle, and return the times.
+def measure_cycle(problem: Problem, stepper: Stepper, run: Run) -> CycleTime | None:
+    """Replay the run's measurements through its controller, one call per cycle, and return the times.
 
     The replay repeats the computations of the run: the controller starts afresh and has the same measurements.
     The result is None for a run of fewer than two cycles.
@@ -143,8 +138,6 @@ def measure_cycle(problem: Problem, controller: Controller, run: Run, *, compile
     cycles = min(run.cycles, REPLAYED)
     if cycles < 2:
         return None
-    with without_warning():
-        stepper = Stepper(problem, controller, compiled=compiled, bounded=False)
     memory = stepper.start()
     taken = np.empty(cycles)
     times, step = run.time[:cycles], _step_of(stepper)
