@@ -6,7 +6,7 @@ from dataclasses import replace
 import fpirhc as fp
 from fpirhc.controllers.receding_horizon import RecedingHorizon
 from fpirhc.controllers.wrappers.exact_model import ExactModel
-from fpirhc.optimisers import plain
+from fpirhc.optimisers.plain_graph import plain_graph
 
 
 def test_a_comparison_composes_every_controller_once(monkeypatch):
@@ -14,8 +14,9 @@ def test_a_comparison_composes_every_controller_once(monkeypatch):
 
     The Functions of plans are built once too: one that a cycle calls, one for the first plan, and one for sampled plans.
     """
-    composed, planned = Counter(), Counter()
-    blocks, graph = RecedingHorizon.blocks, plain.plain_graph
+    composed: Counter[int] = Counter()
+    planned: Counter[str] = Counter()
+    blocks, graph = RecedingHorizon.blocks, plain_graph
 
     def counted_blocks(self, problem):
         composed[id(problem.plant)] += 1
@@ -26,7 +27,7 @@ def test_a_comparison_composes_every_controller_once(monkeypatch):
         return graph(ocp, settings, name)
 
     monkeypatch.setattr(RecedingHorizon, "blocks", counted_blocks)
-    monkeypatch.setattr(plain, "plain_graph", counted_graph)
+    monkeypatch.setattr("fpirhc.optimisers.plain.plain_graph", counted_graph)
     task = fp.load_problem("two_mass")
     task = replace(task, problem=replace(task.problem, duration=0.4, measure_from=0.0))
     names = ["RHC", "RHC+FPI", "RHC exact model"]

@@ -22,7 +22,6 @@ from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.response_prediction import Prediction, predict_response
 from fpirhc.simulation.changes import Changes
-from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
 from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.metrics.columns import columns
@@ -40,7 +39,7 @@ from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import measure_optimality
 from fpirhc.studies.comparison.outcome import Finding, Outcome
 from fpirhc.studies.comparison.side_by_side import Built, beside_each_other, null_tests, with_slow_gains
-from fpirhc.studies.comparison.timing import CycleTime, measure_cycle
+from fpirhc.studies.comparison.timing import CycleTime, measure_cycle, stepper_to_time
 from fpirhc.studies.comparison.verdict import findings
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
@@ -330,8 +329,7 @@ def _entry(
 
 def _timed(problem: Problem, ready: Controller, run: Run, *, compiled: bool) -> tuple[Stepper, CycleTime | None]:
     """The controller stepped by hand, and the time of its cycle."""
-    with without_warning():
-        stepper = Stepper(problem, ready, compiled=compiled, bounded=False)
+    stepper = stepper_to_time(problem, ready, compiled=compiled)
     return stepper, measure_cycle(problem, stepper, run)
 
 

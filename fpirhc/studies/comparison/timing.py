@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fpirhc.controllers.base import Controller
+from fpirhc.simulation.harm_warning import without_warning
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.sample import raw_measurements
 from fpirhc.simulation.stepper import Stepper
@@ -127,6 +129,12 @@ def _step_of(stepper: Stepper) -> Callable[[float, np.ndarray, np.ndarray, np.nd
         size = stepper.beside
         return lambda now, seen, realised, memory: stepper.step(now, seen[size:], realised, memory, output=seen[:size])
     return lambda now, measured, _, memory: stepper.step_measured(now, measured, memory)
+
+
+def stepper_to_time(problem: Problem, controller: Controller, *, compiled: bool) -> Stepper:
+    """Return the controller stepped by hand: not warned of, because a comparison judges it, and with any optimiser."""
+    with without_warning():
+        return Stepper(problem, controller, compiled=compiled, bounded=False)
 
 
 def measure_cycle(problem: Problem, stepper: Stepper, run: Run) -> CycleTime | None:
