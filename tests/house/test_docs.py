@@ -10,7 +10,10 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.cli.main import main
+from fpirhc.controllers.contract import resolved
+from fpirhc.controllers.seeing import compose_seeing
 from fpirhc.members import FAMILIES, member_classes
+from fpirhc.simulation.loop import close_loop
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGES = sorted(p for p in DOCS.rglob("*.md") if "_build" not in p.parts)
@@ -109,3 +112,18 @@ def test_the_site_has_its_formulas_inside():
     named = set(re.findall(r"url\(([^)]+)\)", style))
     assert named == {f"fonts/{path.name}" for path in (folder / "fonts").iterdir()}
     assert (folder / "LICENSE").read_text(encoding="utf-8").startswith("The MIT License")
+
+
+def test_the_page_on_architecture_names_the_blocks_of_a_cycle_in_their_order_and_files_that_are_there():
+    text = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (`[^|]*) \| [^|]* \| `(fpirhc/[^|]*)` \|$", text, re.MULTILINE)
+    told = [name for cell, _ in rows for name in re.findall(r"`(\w+)`", cell)]
+    task = fp.load_problem("noisy_motor")
+    ready = resolved(task.problem, task.controllers["RHC+FPI"])
+    loop = [block.name for block in close_loop(task.problem, ready).blocks]
+    inside = [block.name for block in compose_seeing(task.problem, ready).blocks]
+    cycle = [name for block in loop for name in ([block, *inside] if block == "gate" else [block])]
+    assert told == [name for name in cycle if name in told]
+    assert {"sense", "plan_every_2", "deform", "advance"} <= set(told)
+    files = [*(file for _, file in rows), *re.findall(r"\((?:`(fpirhc/[^`]*)`)\)", text)]
+    assert [file for file in files if not (DOCS.parent / file).is_file()] == []
