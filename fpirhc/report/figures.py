@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from fpirhc.errors import OutputError
 from fpirhc.simulation.common_columns import shown_motion
 from fpirhc.simulation.drawing import (
     PALETTE,
+    by_unit,
     draw_bands,
     draw_changes,
     draw_legend,
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
     from fpirhc.studies.comparison.entry import Entry
     from fpirhc.studies.open_loop import Solved
     from fpirhc.task.problem import Problem
+
+    Draw: TypeAlias = Callable[[Axes, Run, Sequence[str]], None]
 
 
 def save_figure(figure: Figure, path: Path) -> None:
@@ -75,49 +78,55 @@ def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
 
 
 def pair_figures(plain: Entry, adaptive: Entry) -> dict[str, Figure]:
-    """Return the pictures of the method's papers as pairs, without adaptivity on the left and with it on the right."""
-    phase = {"Phase trajectories": _draw_phase} if _phase_names(plain.run) else {}
-    draws = {
-        "Trajectory tracking": _draw_trajectory,
-        **phase,
-        "Tracking error": _draw_error,
-        "Command": _draw_command,
-        "Second derivatives" if _is_second_order(plain.run) else "Highest derivatives": _draw_responses,
-    }
+    """Return the pictures of the method's papers as pairs, without adaptivity on the left and with it on the right.
+
+    Both sides have the same axes, and a picture has one unit: quantities of several units are several pictures.
+    """
     figures = {}
-    for title, draw in draws.items():
-        figure = new_figure(11, 3.6, "")
-        axes = figure.subplots(1, 2)
-        for axis, entry in zip(axes, (plain, adaptive), strict=True):
-            draw(axis, entry.run)
-            if draw is not _draw_phase:
-                draw_bands(axis, entry.run)
-                draw_changes(axis, entry.run)
-            axis.set_title(literal(entry.name), fontsize=10)
-            draw_legend(axis)
-        figures[title] = figure
+    for title, draw, signal, names in _pictures(plain.run):
+        groups = by_unit(plain.run, signal, names)
+        for unit, same in groups.items():
+            name = title if len(groups) == 1 else f"{title} [{unit}]"
+            figures[name] = _pair(draw, quantity_label(plain.run, signal, same), same, (plain, adaptive))
     return figures
 
 
-def contraction_figure(comparison: Comparison) -> Figure | None:
-    """Predicted factor against the effective gain with its limits, and the response error's first cycles."""
-    entries = [e for e in comparison.entries if e.contraction is not None and e.run.cycles > 2]
-    if not entries:
-        return None
-    figure = new_figure(11, 3.8, "")
-    left, right = figure.subplots(1, 2)
-    _draw_factor(left, entries)
-    for k, entry in enumerate(entries):
-        run = entry.run
-        size = np.linalg.norm(run["realised"][1:] - run["desired"][:-1], axis=1)[:150]
-        right.semilogy(
-            np.arange(1, size.size + 1), np.maximum(size, 1e-12), color=PALETTE[k], label=literal(entry.name), lw=1
-        )
-    right.set_xlabel("control cycle")
-    right.set_ylabel("|realised - desired|, response units")
-    right.set_title("The response error in the first cycles", fontsize=10)
-    draw_legend(right)
+def _pictures(run: Run) -> list[tuple[str, Draw, str, list[str]]]:
+    """Title, drawing, signal with the units, and names of every picture of a pair."""
+    judged, inputs = list(run.layout["error"].elements), list(run.layout["command"].elements)
+    highest = "Second derivatives" if _is_second_order(run) else "Highest derivatives"
+    phases = [("Phase trajectories", _draw_phase, "error", _phase_names(run))] if _phase_names(run) else []
+    return [
+        ("Trajectory tracking", _draw_trajectory, "error", judged),
+        *phases,
+        ("Tracking error", _draw_error, "error", judged),
+        ("Command", _draw_command, "command", inputs),
+        (highest, _draw_responses, "desired", list(run.layout["desired"].elements[:1])),
+    ]
+
+
+def _pair(draw: Draw, label: str, names: Sequence[str], entries: tuple[Entry, Entry]) -> Figure:
+    figure = new_figure(11, 3.6, "")
+    axes = figure.subplots(1, 2)
+    for axis, entry in zip(axes, entries, strict=True):
+        draw(axis, entry.run, names)
+        if draw is not _draw_phase:
+            draw_bands(axis, entry.run)
+            draw_changes(axis, entry.run)
+            axis.set_xlabel(time_label(entry.run))
+            axis.set_ylabel(label)
+        axis.set_title(literal(entry.name), fontsize=10)
+        draw_legend(axis)
+    _share_axes(axes)
     return figure
+
+
+def _share_axes(axes: Sequence[Axes]) -> None:
+    """Give both sides the range that shows all of both."""
+    x, y = np.array([axis.get_xlim() for axis in axes]), np.array([axis.get_ylim() for axis in axes])
+    for axis in axes:
+        axis.set_xlim(x.min(), x.max())
+        axis.set_ylim(y.min(), y.max())
 
 
 def lyapunov_figure(comparison: Comparison) -> Figure | None:
@@ -144,13 +153,14 @@ def headline_figure(comparison: Comparison, plain: Entry, adaptive: Entry) -> Fi
     figure = new_figure(11, 4.2, comparison.title)
     axes = figure.subplots(2, 2, sharex=True)
     for column, entry in enumerate((plain, adaptive)):
-        _draw_trajectory(axes[0, column], entry.run)
-        _draw_error(axes[1, column], entry.run)
+        names = entry.run.layout["error"].elements
+        _draw_trajectory(axes[0, column], entry.run, names)
+        _draw_error(axes[1, column], entry.run, names)
         for row in (0, 1):
             draw_bands(axes[row, column], entry.run)
             draw_changes(axes[row, column], entry.run)
         axes[0, column].set_title(literal(entry.name), fontsize=10)
-        axes[0, column].set_xlabel("")
+        axes[1, column].set_xlabel(time_label(entry.run))
         draw_legend(axes[0, column])
     limit = max(axes[1, 0].get_ylim(), key=abs)
     for column in (0, 1):
@@ -162,11 +172,10 @@ def _is_second_order(run: Run) -> bool:
     return all(unit.endswith("s^2") for unit in run.layout["desired"].entry_units)
 
 
-def _draw_trajectory(axis: Axes, run: Run) -> None:
-    for k, name in enumerate(run.layout["error"].elements):
-        draw_line(axis, run, f"reference.{name}", f"{name} nominal", PALETTE[k], "--")
-        draw_line(axis, run, f"{shown_motion(run.layout)}.{name}", f"{name} realised", PALETTE[k])
-    axis.set_xlabel(time_label(run))
+def _draw_trajectory(axis: Axes, run: Run, names: Sequence[str]) -> None:
+    for k, name in enumerate(names):
+        draw_line(axis, run, f"reference.{name}", f"{name} nominal", PALETTE[k % len(PALETTE)], "--")
+        draw_line(axis, run, f"{shown_motion(run.layout)}.{name}", f"{name} realised", PALETTE[k % len(PALETTE)])
 
 
 def _phase_names(run: Run) -> list[str]:
@@ -176,65 +185,27 @@ def _phase_names(run: Run) -> list[str]:
     ]
 
 
-def _draw_phase(axis: Axes, run: Run) -> None:
-    names, motion = _phase_names(run), shown_motion(run.layout)
+def _draw_phase(axis: Axes, run: Run, names: Sequence[str]) -> None:
+    motion = shown_motion(run.layout)
     for k, name in enumerate(names):
         for signal, style in (("reference", "--"), (motion, "-")):
             x, y = run[f"{signal}.{name}"], run[f"{signal}.{name}'"]
-            axis.plot(thinned(x), thinned(y), style, color=PALETTE[k], lw=1, label=literal(f"{name} {signal}"))
+            color = PALETTE[k % len(PALETTE)]
+            axis.plot(thinned(x), thinned(y), style, color=color, lw=1, label=literal(f"{name} {signal}"))
     axis.set_xlabel(quantity_label(run, motion, names))
     axis.set_ylabel(quantity_label(run, motion, [f"{name}'" for name in names]))
     axis.grid(visible=True, alpha=0.25)
 
 
-def _draw_error(axis: Axes, run: Run) -> None:
-    for k, name in enumerate(run.layout["error"].elements):
-        draw_line(axis, run, f"error.{name}", name, PALETTE[k])
-    axis.set_xlabel(time_label(run))
+def _draw_error(axis: Axes, run: Run, names: Sequence[str]) -> None:
+    for k, name in enumerate(names):
+        draw_line(axis, run, f"error.{name}", name, PALETTE[k % len(PALETTE)])
 
 
-def _draw_command(axis: Axes, run: Run) -> None:
-    for k, name in enumerate(run.layout["command"].elements):
-        draw_line(axis, run, f"command.{name}", name, PALETTE[k])
-    axis.set_xlabel(time_label(run))
+def _draw_command(axis: Axes, run: Run, names: Sequence[str]) -> None:
+    for k, name in enumerate(names):
+        draw_line(axis, run, f"command.{name}", name, PALETTE[k % len(PALETTE)])
 
 
-def _draw_responses(axis: Axes, run: Run) -> None:
-    draw_responses(axis, run, run.layout["desired"].elements[0])
-    axis.set_xlabel(time_label(run))
-
-
-def _draw_factor(axis: Axes, entries: list[Entry]) -> None:
-    first = entries[0].contraction
-    assert first is not None
-    limit = max(abs(e) for e in first.report.linear_limit) or 1.0
-    gains = np.linspace(0, 1.2 * limit, 300) * (1 if first.report.linear_limit[1] > 0 else -1)
-    eigenvalues = first.spectrum.eigenvalues.ravel()
-    axis.plot(gains, np.abs(1 - gains[:, None] * eigenvalues[None, :]).max(axis=1), color="#444444", lw=1.2)
-    axis.axhline(1.0, color="#aa0000", lw=0.8)
-    axis.axvline(limit * np.sign(gains[-1]), color="#aa0000", lw=0.8, ls="--", label="linear limit")
-    sectors: dict[float, str] = {}
-    for k, entry in enumerate(entries):
-        assert entry.contraction is not None
-        report = entry.contraction.report
-        axis.plot(
-            report.effective_gain,
-            report.predicted,
-            "o",
-            color=PALETTE[k],
-            ms=6,
-            label=literal(f"{entry.name}, predicted"),
-        )
-        if np.isfinite(entry.contraction.measured):
-            axis.plot(report.effective_gain, entry.contraction.measured, "x", color=PALETTE[k], ms=8)
-        low, high = report.sector_limit
-        sectors.setdefault(round(high if high > 0 else low, 3), PALETTE[k])
-    for sector, color in sectors.items():
-        if sector and abs(sector) < 0.999 * limit:
-            axis.axvline(sector, color=color, lw=0.8, ls=":", label="sector limit")
-    axis.set_ylim(0, 1.6)
-    axis.set_xlabel("effective gain a")
-    axis.set_ylabel("contraction factor max|1 - a lambda|")
-    axis.set_title("Predicted factor; o predicted, x measured", fontsize=10)
-    axis.grid(visible=True, alpha=0.25)
-    draw_legend(axis)
+def _draw_responses(axis: Axes, run: Run, names: Sequence[str]) -> None:
+    draw_responses(axis, run, names[0])

@@ -8,7 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fpirhc.report.figures import contraction_figure, lyapunov_figure, pair_figures
+from fpirhc.report.contraction_figure import contraction_figure
+from fpirhc.report.figures import lyapunov_figure, pair_figures
 from fpirhc.report.outcomes import css_class
 from fpirhc.report.page import asset as _asset
 from fpirhc.report.page import page, wide_table, write_page
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 _CAPTIONS = {
     "Trajectory tracking": "Nominal (dashed) and realised motion over time.",
     "Phase trajectories": "First derivative against coordinate.",
-    "Tracking error": "Nominal minus realised. Mind the different scales.",
+    "Tracking error": "Nominal minus realised.",
     "Command": "After clipping.",
     "Second derivatives": "With adaptation the realised acceleration lies on the desired one, although the deformed request "
     "is far from both: the wrong model needs this request.",
@@ -182,8 +183,9 @@ def _pictures(comparison: Comparison) -> list[str]:
     blocks = []
     for title, figure in pair_figures(*pair).items():
         alt = f"{title}: {pair[0].name} on the left, {pair[1].name} on the right"
-        blocks.append(_picture(figure, alt, f"{title}. {_CAPTIONS.get(title, '')}"))
-    return [f"<section><h2>Without | with adaptivity</h2>{''.join(blocks)}</section>"]
+        blocks.append(_picture(figure, alt, f"{title}. {_CAPTIONS.get(title.partition(' [')[0], '')}"))
+    pictures = f"<div class='pictures'>{''.join(blocks)}</div>"
+    return [f"<section><h2>Without | with adaptivity</h2><p>Both sides have the same axes.</p>{pictures}</section>"]
 
 
 def headline_pair(comparison: Comparison) -> tuple[Entry, Entry] | None:

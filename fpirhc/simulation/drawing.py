@@ -47,6 +47,14 @@ def quantity_label(run: Log, signal: str, names: Sequence[str]) -> str:
     return literal(", ".join(names) + (f" [{units[0]}]" if len(units) == 1 else ""))
 
 
+def by_unit(run: Log, signal: str, names: Sequence[str]) -> dict[str, list[str]]:
+    """Return these entries of a signal by their unit, in their order: a chart has one unit."""
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        groups.setdefault(run.unit(f"{signal}.{name}"), []).append(name)
+    return groups
+
+
 def draw_bands(axis: Axes, run: Log) -> None:
     """Draw time slots as shaded bands, named in the legend."""
     named: set[int] = set()

@@ -157,6 +157,24 @@ def test_charts_lie_side_by_side_on_a_desktop_and_below_each_other_on_a_telephon
         assert set(widths) == {0}
 
 
+def test_a_wide_window_is_used(reports, visit):
+    """At 1900 px tables, charts and pairs are as wide as the window but for a margin, and lines of text stay readable."""
+    page = visit(reports["many"], 1900).page
+    widths = page.evaluate(
+        "['#charts', '.scroll', '.pictures'].map((s) => document.querySelector(s).getBoundingClientRect().width)"
+    )
+    assert min(widths) > 1800
+    assert page.evaluate("document.querySelector('.headline').getBoundingClientRect().width") <= 1860
+    assert (
+        max(page.evaluate("[...document.querySelectorAll('p.about, li')].map((e) => e.getBoundingClientRect().width)"))
+        < 1500
+    )
+    lefts = (
+        "[...new Set([...document.querySelectorAll('.pictures figure')].map((e) => e.getBoundingClientRect().left))]"
+    )
+    assert len(page.evaluate(lefts)) == 2
+
+
 def test_a_chart_that_was_hidden_fits_when_it_is_shown(reports, visit):
     """Charts of one controller's responses are hidden while three are shown; meanwhile the window has become smaller."""
     one = visit(reports["many"])
