@@ -3,7 +3,8 @@
 The key of a library is a hash of the generated C, the compiler and its version, the flags, the machine and CasADi's version, so
 a library can never be another model's. It is compiled in a folder of its own, its checksum is stored, and both are renamed into
 place atomically: any number of processes may compile the same or different Functions at once. A library whose checksum does not
-fit is compiled again, and so is one that another user may have written (see `private_folder`).
+fit is compiled again, and so is one that another user may have written (see `private_folder`). The loops of optimisers are files of
+their own, whose objects are kept in the same way, so that the libraries of several controllers share them.
 
 FPIRHC_CC names the compiler ('none' turns compilation off); FPIRHC_CACHE names a folder, in which the cache has one of its own.
 A compiled Function has no derivatives: differentiate first, compile last.
@@ -22,8 +23,9 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import casadi as ca
@@ -35,12 +37,11 @@ from fpirhc.symbolic.work_vector import with_less_work
 
 # -ffp-contract=off: no fused multiply-add, so that C and the virtual machine round alike.
 # -z defs: a missing symbol must fail here and not end the process at the first call.
-_LINK = ("-Wl,-z,defs",) if sys.platform == "linux" else ()
+_LINK = ("-shared", *(("-Wl,-z,defs",) if sys.platform == "linux" else ()))
 # -falign: where a loop begins in a cache line decides up to 17 % of a plan's time, and any other number of the code moves it.
 _ALIGNED = ("-falign-functions=64", "-falign-loops=64")
-_FLAGS = ("-O3", *_ALIGNED, "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared", *_LINK)
+_FLAGS = (*_ALIGNED, "-ffp-contract=off", "-fno-math-errno", "-fPIC")
 _LARGE = 500_000  # bytes of C above which optimising takes longer than it saves: at 1.2 MB -O3 took 52 s and -O1 21 s
-_LARGE_FLAGS = ("-O1", *_FLAGS[1:])
 _NAME = "fpirhc_native"  # stands for the exported name, which is made of the key
 _loaded: dict[str, ca.Function] = {}
 
@@ -192,15 +193,34 @@ def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
         raise CompileError(f"the C compiler '{command[0]}' cannot be started: {error}") from None
 
 
+@dataclass(frozen=True)
+class _Unit:
+    """A C file with the command that compiles it, and the hash of all that its object depends on."""
+
+    source: str
+    command: tuple[str, ...]
+
+    @property
+    def key(self) -> str:
+        facts = (self.source, *self.command, _version(self.command[0]), platform.machine(), ca.CasadiMeta.version())
+        return hashlib.sha256("\0".join(facts).encode()).hexdigest()[:32]
+
+
+def _unit(source: str, compiler: str, more: Sequence[str]) -> _Unit:
+    level = "-O3" if len(source) < _LARGE else "-O1"
+    return _Unit(source, (compiler, level, *_FLAGS, *more, "-c"))
+
+
 def _library(sources: Sequence[str], compiler: str, more: Sequence[str] = ()) -> ca.Function:
     """Return the external Function of the library for these files, compiling it when needed."""
-    flags = (*(_FLAGS if max(map(len, sources)) < _LARGE else _LARGE_FLAGS), *more)
-    facts = "\0".join((*sources, compiler, _version(compiler), *flags, platform.machine(), ca.CasadiMeta.version()))
-    key = hashlib.sha256(facts.encode()).hexdigest()[:32]
+    own, *drivers = (_unit(source, compiler, more) for source in sources)
+    link = (compiler, *more, *_LINK)
+    key = hashlib.sha256("\0".join((own.key, *(d.key for d in drivers), *link)).encode()).hexdigest()[:32]
     if key not in _loaded:
         path = cache_folder() / f"{key}{_suffix()}"
         name = f"fpirhc_{key}"
-        _loaded[key] = _load(path, name, [source.replace(_NAME, name) for source in sources], [compiler, *flags])
+        named = _Unit(own.source.replace(_NAME, name), own.command)
+        _loaded[key] = _load(path, name, [named, *drivers], link)
     return _loaded[key]
 
 
@@ -208,13 +228,13 @@ def _suffix() -> str:
     return {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
 
 
-def _load(path: Path, name: str, sources: Sequence[str], command: Sequence[str]) -> ca.Function:
+def _load(path: Path, name: str, units: Sequence[_Unit], link: Sequence[str]) -> ca.Function:
     if _is_intact(path):
         # An intact library that does not load was made on another system: it is compiled again here.
         with contextlib.suppress(RuntimeError):
             return ca.external(name, str(path))
     try:
-        _compile(sources, command, path)
+        _compile(units, link, path)
         return ca.external(name, str(path))
     except (OSError, RuntimeError) as error:
         if isinstance(error, CompileError):
@@ -233,22 +253,49 @@ def _is_intact(path: Path) -> bool:
         return False
 
 
-def _compile(sources: Sequence[str], command: Sequence[str], path: Path) -> None:
-    """Compile into a folder of its own beside the cache entry, then rename library and checksum into place."""
+def _compile(units: Sequence[_Unit], link: Sequence[str], path: Path) -> None:
+    """Compile into a folder of its own beside the cache entry, files side by side, then link and put the library into place.
+
+    The first file is of this library alone. Others are drivers, whose objects are kept for the libraries that share them.
+    """
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=BUILDING, ignore_cleanup_errors=True) as work:
-        library, checksum = (Path(work) / f for f in (f"model{_suffix()}", "model.sha256"))
-        texts = [Path(work) / f"model{k or ''}.c" for k in range(len(sources))]
-        for text, source in zip(texts, sources, strict=True):
-            text.write_text(source, encoding="utf-8")
-        process = _run([*command, "-o", str(library), *map(str, texts), "-lm"])
-        if process.returncode != 0 or not library.is_file():
-            message = _first_error(process.stderr.replace(work + os.sep, "")) or f"exit code {process.returncode}"
-            raise CompileError(f"the C compiler '{command[0]}' failed: {message}")
-        checksum.write_text(hashlib.sha256(library.read_bytes()).hexdigest(), encoding="ascii")
-        library.chmod(0o700)
-        checksum.chmod(0o600)
-        library.replace(path)
-        checksum.replace(_checksum_file(path))
+        own = Path(work) / "model.o"
+        objects = [own, *(path.parent / f"{unit.key}.o" for unit in units[1:])]
+        missing = [(u, o) for u, o in zip(units, objects, strict=True) if o is own or not _is_intact(o)]
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            built = list(pool.map(partial(_object, Path(work)), range(len(missing)), (unit for unit, _ in missing)))
+        for result, (_, place) in zip(built, missing, strict=True):
+            if place is own:
+                result.replace(own)
+            else:
+                _publish(result, place)
+        library = Path(work) / f"model{_suffix()}"
+        _succeed([*link, "-o", str(library), *map(str, objects), "-lm"], library, work)
+        _publish(library, path)
+
+
+def _object(work: Path, number: int, unit: _Unit) -> Path:
+    text, made = (work / f"part{number}{suffix}" for suffix in (".c", ".o"))
+    text.write_text(unit.source, encoding="utf-8")
+    _succeed([*unit.command, "-o", str(made), str(text)], made, str(work))
+    return made
+
+
+def _succeed(command: Sequence[str], made: Path, work: str) -> None:
+    process = _run(command)
+    if process.returncode != 0 or not made.is_file():
+        message = _first_error(process.stderr.replace(work + os.sep, "")) or f"exit code {process.returncode}"
+        raise CompileError(f"the C compiler '{command[0]}' failed: {message}")
+
+
+def _publish(made: Path, path: Path) -> None:
+    """Put a file and its checksum into their places in the cache."""
+    checksum = made.with_suffix(".sha256")
+    checksum.write_text(hashlib.sha256(made.read_bytes()).hexdigest(), encoding="ascii")
+    made.chmod(0o700)
+    checksum.chmod(0o600)
+    made.replace(path)
+    checksum.replace(_checksum_file(path))
 
 
 def _first_error(messages: str) -> str:

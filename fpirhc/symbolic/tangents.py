@@ -65,12 +65,20 @@ def _slopes(graph: Graph) -> list[ca.SX]:
     return [slope for n in (*graph.between, *graph.results) for slope in graph.slopes[n].values()]
 
 
+# The lines are many. Apart from the loops around them they are compiled several times as fast, and less optimising is enough.
 _TEXT = """
-INLINE int {name}(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {{
+#if defined(__GNUC__) && !defined(__clang__)
+#define APART __attribute__((noinline, optimize("O2", "tree-vectorize")))
+#elif defined(__GNUC__)
+#define APART __attribute__((noinline))
+#else
+#define APART
+#endif
+
+INLINE int {name}_lines(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w) {{
   casadi_real e[{count}], t[{rows}][{width}];
   Out made[8];
   int i, j;
-  (void)mem;
   made[0] = e;
   if ({slopes}(arg, made, iw, w, 0)) return 1;
   {lines}
@@ -81,5 +89,25 @@ INLINE int {name}(const casadi_real** arg, casadi_real** res, casadi_int* iw, ca
   for (j = 0; j < {ns}; ++j) res[2][j] = t[{first} + {ns}][j];
   for (j = 0; j < {nu}; ++j) res[3][j] = t[{first} + {ns}][{ns} + j];
   return 0;
+}}
+
+APART static int {name}_plain(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w) {{
+  return {name}_lines(arg, res, iw, w);
+}}
+
+#if defined(__GNUC__) && defined(__x86_64__)
+APART __attribute__((target("avx2")))
+static int {name}_wide(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w) {{
+  return {name}_lines(arg, res, iw, w);
+}}
+#define WIDE __builtin_cpu_supports("avx2")
+#else
+#define {name}_wide {name}_plain
+#define WIDE 0
+#endif
+
+INLINE int {name}(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {{
+  (void)mem;
+  return WIDE ? {name}_wide(arg, res, iw, w) : {name}_plain(arg, res, iw, w);
 }}
 """

@@ -15,6 +15,7 @@ import pytest
 
 from fpirhc.symbolic import native as module
 from fpirhc.symbolic import private_folder
+from fpirhc.symbolic.driver import SIGNATURE, Driver, with_driver
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import find_compiler, native
 
@@ -57,6 +58,38 @@ def test_accumulated_functions_are_compiled_under_a_fixed_name(cache):
     values = np.arange(37.0)
     for result, expected in zip(native(many).function(1.0, values), many(1.0, values), strict=True):
         np.testing.assert_array_equal(result.full(), expected.full())
+
+
+@needs_compiler
+@pytest.mark.parametrize("damage", [False, True])
+def test_libraries_share_the_object_of_a_driver(cache, monkeypatch, damage):
+    """The second of two Functions that call the same driver compiles its own file only, unless the kept object is damaged."""
+    compiled: list[str] = []
+    run = module._run
+
+    def counted(command):
+        compiled.extend(word for word in command if word.endswith(".c"))
+        return run(command)
+
+    text = f"int ENTRY{SIGNATURE} {{ return leaf(arg, res, iw, w, mem); }}"
+    inner = with_driver("fpirhc_shared", Driver(text, {"leaf": model(5.0)}, {}), lambda name: renamed(model(5.0), name))
+    x = ca.MX.sym("x", 3)
+    first, second = (ca.Function("fpirhc_outer", [x], [factor * inner(x)]) for factor in (2, 3))
+    monkeypatch.setattr(module, "_run", counted)
+    at = np.array([0.3, 0.7, -2.0])
+    np.testing.assert_array_equal(native(first).function(at).full(), first(at).full())
+    assert len(compiled) == 2
+    if damage:
+        [kept] = cache.glob("*.o")
+        kept.write_bytes(kept.read_bytes()[:-1])
+    np.testing.assert_array_equal(native(second).function(at).full(), second(at).full())
+    assert len(compiled) == (4 if damage else 3)
+
+
+def renamed(function: ca.Function, name: str) -> ca.Function:
+    """The same Function under another name."""
+    x = ca.MX.sym("x", function.sparsity_in(0))
+    return ca.Function(name, [x], [function(x)])
 
 
 @needs_compiler
