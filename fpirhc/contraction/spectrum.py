@@ -198,8 +198,19 @@ def response_jacobians(plant: Plant, states: Array, deformed: Array, exact: Arra
     function, n = response_jacobian(plant), deformed.shape[1]
     count = len(states)
     assumed = np.broadcast_to(model, (count, model.shape[-1]))
-    stacked = function.map(count)(states.T, deformed.T, exact.T, assumed.T)
-    return np.asarray(stacked.full()).reshape((n, count, n)).transpose(1, 0, 2)
+    try:
+        stacked = function.map(count)(states.T, deformed.T, exact.T, assumed.T).full()
+    except RuntimeError:  # Newton's method has no derivative where the inputs have no effect
+        stacked = np.hstack([_value(function, n, row) for row in zip(states, deformed, exact, assumed, strict=True)])
+    return np.asarray(stacked).reshape((n, count, n)).transpose(1, 0, 2)
+
+
+def _value(function: ca.Function, n: int, row: tuple[Array, ...]) -> Array:
+    """The Jacobian of one row; NaN where it cannot be computed."""
+    try:
+        return np.asarray(function(*row).full())
+    except RuntimeError:
+        return np.full((n, n), np.nan)
 
 
 def _thinned(cycles: int) -> Array:

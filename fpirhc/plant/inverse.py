@@ -73,13 +73,19 @@ def inverse_of_affine(plant: Motion, response: ca.Function) -> ca.Function:
 
 
 def inverse_by_newton(plant: Motion, response: ca.Function) -> ca.Function:
-    """Function (state, response, parameters) -> input, found from zero inputs by Newton's method."""
+    """Function (state, response, parameters) -> input, found by Newton's method.
+
+    It begins at zero inputs; where these have no effect, as with the square of a current, at one unit of every input.
+    """
     x, u, p = plant.symbols()
     r = ca.SX.sym("r", len(plant.controlled_names))
     error = ca.Function("fpirhc_inversion", [u, x, r, p], [response(x, u, p) - r])
     finder = ca.rootfinder("fpirhc_newton", "fast_newton", error, {"error_on_fail": False})
     xm, rm, pm = (ca.MX.sym(n, s) for n, s in (("x", x.numel()), ("r", r.numel()), ("p", p.numel())))
-    root = finder(ca.DM.zeros(len(plant.inputs)), xm, rm, pm)
+    count = len(plant.inputs)
+    gain_at_zero = ca.sparsify(ca.substitute(ca.jacobian(response(x, u, p), u), u, ca.SX.zeros(count)))
+    blind = ca.sprank(gain_at_zero.sparsity()) < count
+    root = finder(ca.DM.ones(count) if blind else ca.DM.zeros(count), xm, rm, pm)
     residual = ca.norm_inf(error(root, xm, rm, pm))
     # NaN is on neither side of a comparison, so arriving is asked for and not missing.
     lost = ca.logic_not(residual <= INVERSE_TOLERANCE * (1 + ca.norm_inf(rm)))

@@ -19,10 +19,12 @@ from fpirhc.review.loops import Loops
 from fpirhc.review.neutral import NEUTRAL
 from fpirhc.review.state_matrix import state_matrices
 from fpirhc.review.straight import straightened
+from fpirhc.summary import in_percent
 from fpirhc.task.problem import Problem
 
 QUESTION = "Are the zero dynamics stable?"
 _STILL = 1e-4  # growth over the run, as a share, below which a mode is neutral
+_LITTLE = 0.1  # below which the run does not show it
 
 
 def zero_dynamics_rate(grid: ReviewGrid) -> float | None:
@@ -83,7 +85,7 @@ def zero_dynamics(problem: Problem, rate: float | None, planned: bool, loops: Lo
         return Answer(QUESTION, verdict, text, "Weigh the other states in the cost, or lengthen the horizon.", numbers)
     if rate < 0 and not neutral:
         return Answer(QUESTION, Verdict.YES, text, "", numbers)
-    if rate > 0 and not neutral and not planned:
+    if rate * problem.duration > _LITTLE and not planned:
         change = "Let a plan carry those states in its cost, use time slots, or control another coordinate."
         return Answer(QUESTION, Verdict.NO, text, change, numbers)
     change = "Run it and look at the coordinates that are not controlled."
@@ -101,5 +103,7 @@ def _text(problem: Problem, rate: float) -> str:
     if abs(rate) * problem.duration <= _STILL:
         return "they neither grow nor decay"
     if rate > 0:
-        return f"unstable: while the reference is followed they grow at up to {rate:.3g} {unit}"
+        grown = rate * problem.duration
+        over = f", by {in_percent(grown)} over the run" if grown <= _LITTLE else ""
+        return f"unstable: while the reference is followed they grow at up to {rate:.3g} {unit}{over}"
     return f"stable: while the reference is followed they decay at {-rate:.3g} {unit} or faster"

@@ -1,0 +1,91 @@
+"""Comparisons of plants of others beside an integration that shares no line with the library's loop."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from foreign_plants import (
+    PLANTS,
+    ball_and_beam,
+    magnet,
+    masses,
+    planned_by_hand,
+    plans,
+    rms_by_hand,
+    rocket,
+    underwater,
+)
+
+import fpirhc as fp
+from fpirhc.errors import InvalidProblem
+from fpirhc.review.answer import Verdict
+from fpirhc.studies.comparison.outcome import Outcome
+
+QUICK = ("cruise", "conical_tank", "magnet", "masses")
+INVERTED = [
+    pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in PLANTS if name != "ball_and_beam"
+]
+
+
+@pytest.mark.parametrize("name", INVERTED)
+def test_errors_and_verdict_are_those_of_an_independent_integration(name):
+    """Every number of the verdict's sentence is the integration's, in its digits; the sentence says what these numbers say."""
+    one = PLANTS[name]()
+    comparison = one.compared(name)
+    plain, adaptive = rms_by_hand(one, adaptive=False), rms_by_hand(one, adaptive=True)
+    for label, rms in (("CTC", plain), ("CTC+FPI", adaptive)):
+        assert dict(comparison[label].metrics.rms_error) == pytest.approx(rms, rel=1e-4)
+    assert comparison.outcome is Outcome.BETTER
+    for quantity, least in adaptive.items():
+        assert least < plain[quantity] / 5
+        assert f"{quantity} from {plain[quantity]:.3g} to {least:.3g}" in comparison.verdict[0]
+    null = comparison.null
+    assert null is not None
+    assert not null.harmful
+
+
+def test_an_output_whose_gain_vanishes_on_the_way_is_refused_with_place_and_time():
+    with pytest.raises(
+        InvalidProblem, match=r"the gain from torque to place vanishes .* at t = 0\.\d+ s .*choose another output"
+    ):
+        ball_and_beam()
+
+
+@pytest.mark.parametrize(("plant", "grown"), [(rocket, "1.6 %"), (masses, "7.59 %")])
+def test_zero_dynamics_that_hardly_grow_over_the_run_are_no_refusal(plant, grown):
+    """The rocket's mass, and rounded matrices: the run cannot show the growth, and the comparison is good."""
+    one = plant()
+    answers = fp.review(one.problem, one.controllers, mismatch=0.0, seed=0).controllers["CTC"]
+    zero = next(a for a in answers if a.question == "Are the zero dynamics stable?")
+    assert zero.verdict is Verdict.UNKNOWN
+    assert f"by {grown} over the run" in zero.evidence
+
+
+@pytest.mark.slow
+def test_plans_are_those_of_opti_in_closed_loop():
+    """A wrong model, limits, and a plan in every cycle: the course is that of IPOPT's plans."""
+    problem, controller = plans(underwater())
+    errors = fp.simulate(problem, controller, seed=0, compiled=False)["error.x"]
+    hand = planned_by_hand(underwater(), problem)
+    assert np.abs(hand).max() > 0.1
+    assert errors[: len(hand)] == pytest.approx(hand, abs=1e-6)
+
+
+def test_a_force_by_the_square_of_its_current_is_inverted():
+    """Newton's method begins where the current has an effect, which it has not at zero."""
+    plant = magnet().problem.plant
+    current = float(plant.inverse_function([0.05, 0.0], -1.0, plant.approximate))
+    assert current == pytest.approx(np.sqrt((9.81 + 1.0) * 0.1 * 2 * 0.05 * 4 / 0.01), rel=1e-9)
+
+
+def test_a_start_at_which_the_input_has_no_effect_is_no_error_inside():
+    """The gain of the start is not known there, and so refuses nothing."""
+    one = magnet()
+    still = replace(
+        one.problem, limits=fp.Limits(inputs={"current": (0.0, 12.0)}), input_before={}, duration=0.1, measure_from=0.0
+    )
+    comparison = replace(one, problem=still).compared("still")
+    assert not comparison.skipped
+    assert comparison["CTC+FPI"].run.stop is None
