@@ -16,6 +16,7 @@ from fpirhc.conformance.laws import hold, within
 from fpirhc.conformance.loops import Replay, Trial, coarse_steps, spelled_by_states
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
+from fpirhc.controllers.form_check import MAPS
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import FpirhcError
@@ -177,9 +178,9 @@ def outputs_are_controlled(trial: Trial, generator: np.random.Generator) -> None
 
 
 def maps_are_controlled(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """If `maps_unusable` is empty, it does not drive away a plant that moves in coarse steps and is known exactly."""
+    """If it covers maps, it does not drive away a plant that moves in coarse steps and is known exactly."""
     problem = coarse_steps()
-    if trial.controller.maps_unusable(problem):
+    if MAPS not in trial.controller.covers:
         return
     run = _moved(problem, trial)
     if run is None:
@@ -188,7 +189,7 @@ def maps_are_controlled(trial: Trial, generator: np.random.Generator) -> None:  
     rest, first = float(errors[-run.cycles // 4 :].max()), float(errors[0].max())
     hold(
         run.stop is None and within(rest, first * (1 + _SAME)),
-        f"maps_unusable() is empty, but the error {first:.3g} of stocks that are filled in steps of {problem.period:g} s is "
+        f"it says that it covers maps, but the error {first:.3g} of stocks that are filled in steps of {problem.period:g} s is "
         f"{rest:.3g} after {run.cycles} steps; write its law for differences of steps, or give the reason why it cannot",
     )
 

@@ -18,7 +18,7 @@ import numpy as np
 from fpirhc.controllers.demands import plan_demand, reference_demand
 from fpirhc.controllers.form_check import check_form, check_maps, check_outputs
 from fpirhc.controllers.gain_check import check_gain_sign, check_gain_size
-from fpirhc.deformation.base import Deformation, Demand, Mirror, with_inner
+from fpirhc.deformation.base import Deformation, Demand, with_inner
 from fpirhc.deformation.identity import Identity
 from fpirhc.describe import replaced
 from fpirhc.errors import NotSupported
@@ -285,23 +285,14 @@ class Controller(Checked, ABC):
         """Return the response that the controller reads as 'realised'; None: that of the plant's controlled coordinates."""
         return None if self.inner is None else self.inner.response(self.inner_problem(problem))
 
-    def unusable(self, problem: Problem, mirror: Mirror) -> str:
-        """Return why a model-referenced deformation with this mirror cannot be used on this problem; empty where it can."""
-        return "" if self.inner is None else self.inner.unusable(self.inner_problem(problem), mirror)
-
     @property
-    def covers_order_zero(self) -> bool:
-        """Whether it controls outputs of order 0, which the command moves at once and no tracking law follows."""
-        return False if self.inner is None else self.inner.covers_order_zero
+    def covers(self) -> frozenset[str]:
+        """Which plants it controls besides differential equations whose inputs show in derivatives: of `MAPS`, `ORDER_ZERO`.
 
-    def maps_unusable(self, problem: Problem) -> str:
-        """Return why the controller cannot control a map, x+ = f(x, u); empty where it can.
-
-        By default it cannot: a law for derivatives with respect to time is another one for differences of steps.
+        None by default: a law for derivatives with respect to time is another one for differences of steps, and an output of
+        order 0 has no derivative to prescribe.
         """
-        if self.inner is not None:
-            return self.inner.maps_unusable(self.inner_problem(problem))
-        return "its law is written for derivatives with respect to time"
+        return frozenset() if self.inner is None else self.inner.covers
 
     def floquet(self, problem: Problem) -> Floquet | None:
         """Return the stability of one period of a controller that switches; None for a controller that does not switch."""

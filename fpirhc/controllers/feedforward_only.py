@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
+from fpirhc.controllers.form_check import MAPS, ORDER_ZERO
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import NotInvertible, NotSupported
@@ -36,14 +37,9 @@ class FeedforwardOnly(Controller):
         return Identity()
 
     @property
-    def covers_order_zero(self) -> bool:
-        """Yes."""
-        return True
-
-    def maps_unusable(self, problem: Problem) -> str:
-        """Return nothing: it has no law."""
-        del problem
-        return ""
+    def covers(self) -> frozenset[str]:
+        """Everything that has an inverse: it has no law."""
+        return frozenset({MAPS, ORDER_ZERO})
 
     def check(self, problem: Problem) -> None:
         """Raise if the model has no inverse, or a derivative is prescribed where states have no reference.

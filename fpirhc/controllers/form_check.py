@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import Protocol
 
 from fpirhc.controllers.mirror_path import NONE
-from fpirhc.deformation.base import Deformation, Mirror
+from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import form_inside
 from fpirhc.deformation.queue import every
 from fpirhc.errors import NotSupported
 from fpirhc.task.problem import Problem
+
+MAPS, ORDER_ZERO = "maps", "outputs of order 0"  # of `Controller.covers`
 
 
 class _Controller(Protocol):
@@ -18,15 +20,11 @@ class _Controller(Protocol):
     @property
     def deformation(self) -> Deformation: ...
 
-    def unusable(self, problem: Problem, mirror: Mirror) -> str: ...
-
     @property
-    def covers_order_zero(self) -> bool: ...
+    def covers(self) -> frozenset[str]: ...
 
     @property
     def planner(self) -> object: ...
-
-    def maps_unusable(self, problem: Problem) -> str: ...
 
 
 def check_outputs(problem: Problem, controller: _Controller) -> None:
@@ -52,10 +50,10 @@ def check_maps(problem: Problem, controller: _Controller) -> None:
     Raises:
         NotSupported: with the reason.
     """
-    reason = controller.maps_unusable(problem) if problem.plant.step is not None else ""
-    if reason:
+    if problem.plant.step is not None and MAPS not in controller.covers:
         raise NotSupported(
-            f"{type(controller).__name__} does not cover maps: {reason}; use ComputedTorque, RecedingHorizon or FeedforwardOnly"
+            f"{type(controller).__name__} does not cover maps: it is written for derivatives with respect to time; use "
+            "ComputedTorque, RecedingHorizon or FeedforwardOnly"
         )
 
 
@@ -64,7 +62,7 @@ def check_form(problem: Problem, controller: _Controller) -> None:
 
     Raises:
         NotSupported: the number of dead times or lags differs from the plant's number of channels; a wrapper changes what a
-            model-referenced form inside it compares; the controller cannot compute the model's response for the form.
+            model-referenced form inside it compares.
     """
     deformation, plant = controller.deformation, problem.plant
     channels, controlled = deformation.channels, len(plant.controlled_names)
@@ -95,16 +93,13 @@ def check_form(problem: Problem, controller: _Controller) -> None:
             f"{type(deformation).__name__}: a map has no lag, and no dead time of parts of a cycle; write an actuator as a state "
             "of the map, and dead times in whole cycles"
         )
-    reason = controller.unusable(problem, mirror)
-    if reason:
-        raise NotSupported(f"{type(controller).__name__} cannot use a model-referenced deformation here: {reason}")
 
 
 def _check_order_zero(problem: Problem, controller: _Controller) -> None:
     """Raise for outputs of order 0 that the controller does not cover."""
     plant, name = problem.plant, type(controller).__name__
     controlled = [n for n in plant.controlled_names if n in plant.instant_names]
-    if controlled and not controller.covers_order_zero:
+    if controlled and ORDER_ZERO not in controller.covers:
         raise NotSupported(
             f"{name} does not cover outputs of order 0 ({', '.join(controlled)}): the command moves them at once, so there "
             "is no derivative to prescribe; use FeedforwardOnly(), and Cascade(FeedforwardOnly(), map) to iterate on its target"

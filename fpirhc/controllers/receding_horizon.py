@@ -23,6 +23,7 @@ from fpirhc.controllers.base import Controller, closing_blocks, like, reference_
 from fpirhc.controllers.consistent_start import at_consistent_start, consistent_start
 from fpirhc.controllers.contract import Planner
 from fpirhc.controllers.first_plan import built_first_memory, first_memory
+from fpirhc.controllers.form_check import MAPS
 from fpirhc.controllers.on_failure import STOPPED, HoldPlan, OnFailure
 from fpirhc.controllers.own_reference import motion_of, own_signals, own_values, preview_of
 from fpirhc.controllers.planned_model import as_planned, held_model
@@ -96,10 +97,10 @@ class RecedingHorizon(Controller):
         """Return the controller with another optimiser."""
         return replace(self, optimiser=optimiser)
 
-    def maps_unusable(self, problem: Problem) -> str:
-        """Return nothing: a stage of a map is a whole number of its steps."""
-        del problem
-        return ""
+    @property
+    def covers(self) -> frozenset[str]:
+        """Maps: a stage is a whole number of their steps."""
+        return frozenset({MAPS})
 
     def check(self, problem: Problem) -> None:
         """Raise if the problem has no horizon or cost, or the optimiser does not support it.

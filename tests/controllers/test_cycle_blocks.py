@@ -225,9 +225,10 @@ class Telling(Controller):
             Response(plant.response_signal("realised"), plant.controlled_response_function) if self.of_its_own else None
         )
 
-    def unusable(self, problem, mirror):  # noqa: ARG002
-        """Names the mass."""
-        return f"mass {problem.plant.approximate[0]}"
+    @property
+    def covers(self):
+        """Maps."""
+        return frozenset({"maps"})
 
     def floquet(self, problem) -> Any:
         """Anything."""
@@ -250,11 +251,10 @@ def test_a_wrapper_tells_the_facts_of_what_it_wraps():
     """On the problem that the inner controller sees: the exact mass of 2 kg in place of 1 kg."""
     problem, inner = masses(), Telling(fp.Affine(-0.25))
     outer = fp.ExactModel(inner)
-    mirror: Any = None
     assert outer.learns
     assert (outer.planner, dict(outer.feeds)) == (inner.planner, {"state": "predicted"})
     assert outer.demand(problem) == Demand(2.0, sudden=True)
-    assert outer.unusable(problem, mirror) == "mass 2.0"
+    assert outer.covers == {"maps"}
     stability: Any = outer.floquet(problem)
     assert stability == 2.0
     assert outer.notes(problem) == ("mass 2.0",)
@@ -271,12 +271,11 @@ def test_a_wrapper_tells_the_facts_of_what_it_wraps():
 def test_a_controller_that_stands_alone_has_no_facts_of_others():
     """It believes the approximate parameters, learns nothing, plans nothing, and tracks by its own law."""
     problem, alone = masses(), fp.ComputedTorque(TRACK)
-    mirror: Any = None
     assert (alone.inner, alone.learns, alone.planner, dict(alone.feeds)) == (None, False, None, {})
     assert alone.law is fp.ExactModel(alone).law is TRACK
     assert alone.parameters(problem.plant).tolist() == [1.0, 8.0]
     assert (alone.response(problem), alone.floquet(problem)) == (None, None)
-    assert (alone.unusable(problem, mirror), alone.notes(problem)) == ("", ())
+    assert alone.notes(problem) == ()
     assert alone.inner_problem(problem) is problem
     alone.check(problem)
     with pytest.raises(NotSupported, match="ComputedTorque has no optimiser"):

@@ -259,13 +259,13 @@ def test_scenarios_draw_parameters_of_a_map(tmp_path: Path) -> None:
 
 
 REFUSED = {
-    "PID": (lambda: fp.PID(proportional={"stock": 1.0}), "PID does not cover maps: its law is written for derivatives"),
+    "PID": (lambda: fp.PID(proportional={"stock": 1.0}), "PID does not cover maps: it is written for derivatives"),
     "Estimating": (
         lambda: fp.Estimating(
             fp.ComputedTorque(LAW),
             fp.RecursiveLeastSquares({"growth": fp.Uncertain(0.1, 2.0, 0.3)}, {"stock": 0.1}, 5.0),
         ),
-        "Estimating does not cover maps: its estimators add what they learn to derivatives",
+        "Estimating does not cover maps: it is written for derivatives",
     ),
     "lag": (
         lambda: fp.ComputedTorque(LAW, fp.ModelReferenced(fp.Affine(gain=-1.0), lag=0.1)),

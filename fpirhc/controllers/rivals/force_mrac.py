@@ -28,7 +28,7 @@ from fpirhc.controllers.demands import command_demand
 from fpirhc.controllers.face import on_face
 from fpirhc.controllers.tracked import bounded, desired_blocks
 from fpirhc.deformation.base import Deformation, Demand, Mirror
-from fpirhc.errors import Mistakes
+from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.real_number import finite_number
 from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
@@ -66,22 +66,20 @@ class ForceMRAC(Controller):
         """No: it deforms a command."""
         return False
 
-    def unusable(self, problem: Problem, mirror: Mirror) -> str:
-        """Return a reason unless sensing is ideal and nothing is late: only then the last command equals the modelled one."""
-        late = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
-        if problem.sensing.ideal and not late and mirror == Mirror():
-            return ""
-        return (
-            "it compares the last command with the one recalculated from the response, through no estimator, dead time or lag; "
-            "use the map itself or Increment"
-        )
-
     def check(self, problem: Problem) -> None:
         """Raise if the reference model has parameters that the plant does not have, or values that are no numbers.
 
         Raises:
             InvalidProblem: all mistakes together.
+            NotSupported: a model-referenced deformation where sensing is not ideal or something is late, because the last command
+                is then not the one that the response recalculates.
         """
+        mirror, late = self.deformation.mirror, any((problem.dead_time.measurement, *problem.dead_time.inputs.values()))
+        if mirror is not None and (late or not problem.sensing.ideal or mirror != Mirror()):
+            raise NotSupported(
+                "ForceMRAC cannot use a model-referenced deformation here: it compares the last command with the one recalculated "
+                "from the response, through no estimator, dead time or lag; use the map itself or Increment"
+            )
         mistakes = Mistakes("ForceMRAC")
         mistakes.unknown("model: parameter", self.model, problem.plant.parameters)
         for name, value in self.model.items():

@@ -28,7 +28,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller, compose_controller, embedded, like, reference_block
 from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.target_pairing import ThroughModel
-from fpirhc.deformation.base import Deformation, Demand, Mirror
+from fpirhc.deformation.base import Deformation, Demand
 from fpirhc.errors import NotContractive, NotSupported
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Composite, Delay
@@ -87,11 +87,6 @@ class Cascade(Controller):
         """Return the cascade with lag and dead time of its pairing as numbers."""
         return self if self.paired is None else replace(self, paired=self.paired.stated(problem))
 
-    def unusable(self, problem: Problem, mirror: Mirror) -> str:
-        """Return why a model-referenced deformation cannot be used: `paired` is this form."""
-        del problem, mirror
-        return "`paired` already compares with the model; use the map itself"
-
     def demand(self, problem: Problem) -> Demand:
         """Return the size of the reference's controlled quantities, which the shift may have to make up for at once."""
         plant, function = problem.plant, problem.reference.function(problem.plant)
@@ -106,10 +101,15 @@ class Cascade(Controller):
 
         Raises:
             NotContractive: a gain of the wrong sign.
-            NotSupported: a map with a pairing of its own; a controller that predicts over the dead time inside.
+            NotSupported: a model-referenced map, or one with a pairing of its own; a controller that predicts over the dead time
+                inside.
             InvalidValue: see `ThroughModel`.
         """
         self.controller.check(self.inner_problem(problem))
+        if self.deformation.mirror is not None:
+            raise NotSupported(
+                "Cascade cannot use a model-referenced deformation: `paired` already compares with the model; use the map itself"
+            )
         if self.deformation.pairing is not None:
             raise NotSupported(
                 f"Cascade: {type(self.deformation).__name__} pairs by itself; give the map inside, and "

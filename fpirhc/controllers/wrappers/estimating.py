@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, command_before, compose_controller, embedded, like
+from fpirhc.controllers.form_check import MAPS
 from fpirhc.controllers.response_pairs import ResponsePairs
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotSupported
@@ -80,10 +81,10 @@ class Estimating(Controller):
         """Whether a new estimate changes the command in every cycle."""
         return self.at_once or self.estimator.acts_at_once or self.controller.model_acts_at_once
 
-    def maps_unusable(self, problem: Problem) -> str:
-        """Return why not: the estimators' models add to derivatives."""
-        del problem
-        return "its estimators add what they learn to derivatives with respect to time"
+    @property
+    def covers(self) -> frozenset[str]:
+        """No maps: the estimators add what they learn to derivatives."""
+        return self.controller.covers - {MAPS}
 
     def linear_around(self, inner: Controller) -> Controller:
         """Return the inner controller: near the reference the parameters are those of the start."""

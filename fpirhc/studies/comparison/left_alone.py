@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block, rename
+from fpirhc.controllers.form_check import MAPS, ORDER_ZERO
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import FpirhcError
@@ -51,14 +52,9 @@ class _HeldInput(Controller):
         return Identity()
 
     @property
-    def covers_order_zero(self) -> bool:
-        """Yes: it follows nothing."""
-        return True
-
-    def maps_unusable(self, problem: Problem) -> str:
-        """Return nothing: it has no law."""
-        del problem
-        return ""
+    def covers(self) -> frozenset[str]:
+        """Everything: it follows nothing."""
+        return frozenset({MAPS, ORDER_ZERO})
 
     def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
         """Return the blocks reference, hold, limit, judge, running."""
