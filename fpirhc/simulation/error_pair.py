@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
+
+from fpirhc.simulation.common_columns import judged_motion
+from fpirhc.simulation.metrics.entries.errors import rms_error
+from fpirhc.simulation.metrics.window import measured_errors
+from fpirhc.simulation.run import Run
+from fpirhc.task.problem import Problem
 
 WORSE, MUCH_WORSE, FAR_WORSE = 1.2, 2.0, 10.0  # ratio of the errors
 SLIGHT, CLEAR = 1e-3, 1e-2  # added error as a share of the coordinate's range
@@ -57,3 +66,21 @@ class ErrorPair:
 
     def _beyond(self, ratio: float, share: float) -> bool:
         return any(not (self.ratio(n) <= ratio or self.added(n) <= share) for n in self.without)
+
+
+def errors_of(problem: Problem, runs: Sequence[Run]) -> ErrorPair:
+    """Return the errors of two runs, without adaptation and with it, from `measure_from` on."""
+    before, after = (
+        {name: value if math.isfinite(value) else math.inf for name, value in rms_error(problem, run).items()}
+        for run in runs
+    )
+    return ErrorPair(before, after, _ranges(problem, runs[0]))
+
+
+def _ranges(problem: Problem, run: Run) -> dict[str, float]:
+    """Range of the reference, or the largest error where that is larger."""
+    errors, motion = run["true_error"], run[judged_motion(run.layout)]
+    places = [problem.plant.output.elements.index(name) for name in problem.judged_names]
+    spans = np.ptp(errors + motion[:, places], axis=0)
+    largest = np.abs(measured_errors(problem, run)).max(axis=0)
+    return {n: float(max(a, b)) for n, a, b in zip(problem.judged_names, spans, largest, strict=True)}

@@ -12,17 +12,11 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import numpy as np
-
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, HarmfulAdaptation
 from fpirhc.fields.place import users_level
-from fpirhc.simulation.common_columns import judged_motion
-from fpirhc.simulation.error_pair import ErrorPair
-from fpirhc.simulation.metrics.entries.errors import rms_error
-from fpirhc.simulation.metrics.window import measured_errors
+from fpirhc.simulation.error_pair import ErrorPair, errors_of
 from fpirhc.simulation.model_as_plant import ModelAsPlant, shortened
-from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulator
 from fpirhc.task.problem import Problem
 
@@ -66,31 +60,14 @@ def _ignored() -> bool:
 def _reasons(problem: Problem, controller: Controller) -> list[str]:
     loops = [simulator(problem, c, compiled=False) for c in (controller.unadapted(), controller)]
     model = ModelAsPlant(problem, seed=0).behind(loops[1].controller.deformation)
-    null = _errors(model.problem, [model.run(loop) for loop in loops])
+    null = errors_of(model.problem, [model.run(loop) for loop in loops])
     if problem.foreign is not None:
         return [_sentence("on its own model", null)] if null.fails else []
-    real = _errors(problem, [loop.run(seed=0) for loop in loops])
+    real = errors_of(problem, [loop.run(seed=0) for loop in loops])
     reasons = [_sentence("on the plant", real)] if real.fails else []
     if null.fails and null.adapted[null.worst] > real.without[null.worst]:
         reasons.append(_sentence("on its own model, with nothing to adapt", null))
     return reasons
-
-
-def _errors(problem: Problem, runs: list[Run]) -> ErrorPair:
-    before, after = (
-        {name: value if math.isfinite(value) else math.inf for name, value in rms_error(problem, run).items()}
-        for run in runs
-    )
-    return ErrorPair(before, after, _ranges(problem, runs[0]))
-
-
-def _ranges(problem: Problem, run: Run) -> dict[str, float]:
-    """Range of the reference, or the largest error where that is larger."""
-    errors, motion = run["true_error"], run[judged_motion(run.layout)]
-    places = [problem.plant.output.elements.index(name) for name in problem.judged_names]
-    spans = np.ptp(errors + motion[:, places], axis=0)
-    largest = np.abs(measured_errors(problem, run)).max(axis=0)
-    return {n: float(max(a, b)) for n, a, b in zip(problem.judged_names, spans, largest, strict=True)}
 
 
 def _sentence(where: str, errors: ErrorPair) -> str:
