@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from importlib import import_module
+from pathlib import Path
+from types import ModuleType
 
 import casadi as ca
 
@@ -87,12 +90,23 @@ def _part_that_fits(expected: Expected, value: object) -> str:
 
 
 def _public(contract: type) -> Iterator[tuple[str, type]]:
-    """Public members of a contract; it imports all of them, which only a mistake pays for."""
-    package = import_module(contract.__module__.partition(".")[0])
-    for name in getattr(package, "__all__", ()):
+    """Public members of a contract, those of its part of the package; only a mistake pays for importing them."""
+    top, *part = contract.__module__.split(".")[:2]
+    package = import_module(top)
+    for name in _declared_in(package, ".".join(part)):
         member = getattr(package, name, None)
         if isinstance(member, type) and issubclass(member, contract) and not inspect.isabstract(member):
             yield name, member
+
+
+def _declared_in(package: ModuleType, part: str) -> list[str]:
+    """Public names that the stub of a package imports from one part of it; all public names without a stub."""
+    stub = Path(package.__file__ or "").with_suffix(".pyi")
+    if not stub.is_file():
+        return list(getattr(package, "__all__", ()))
+    lines = (one for one in ast.parse(stub.read_text(encoding="utf-8")).body if isinstance(one, ast.ImportFrom))
+    of_part = (one for one in lines if (one.module or "").partition(".")[0] == part)
+    return [alias.asname or alias.name for one in of_part for alias in one.names]
 
 
 def _plain(name: str) -> str:
