@@ -16,8 +16,10 @@ def __getattr__(name: str) -> object:
     if name in __all__:
         return _import(name)
     from fpirhc.errors import InvalidName, nearest
-    from fpirhc.members import public_member
+    from fpirhc.members import FORMER, public_member
 
+    if name in FORMER:
+        raise InvalidName(f"fpirhc.{name} is called fpirhc.{FORMER[name]} now.")
     member = None if name.startswith("_") else public_member(name)
     if member is None:
         raise InvalidName(f"fpirhc has no name '{name}'.{nearest(name, __all__)}")

@@ -126,11 +126,40 @@ def examples(family: str, inner: Any = None) -> tuple[Any, ...]:
 
 def public_member(name: str) -> Any:
     """The member `FooBar` of the module `foo_bar`, or of a module of another distribution; None if there is none."""
-    for kind in FAMILIES.values():
-        for package in kind.packages:
-            root = importlib.import_module(package)
-            for info in pkgutil.walk_packages(root.__path__, f"{package}."):
-                if info.name.rpartition(".")[2].replace("_", "") == name.lower():
-                    return getattr(importlib.import_module(info.name), name, None)
-    foreign = (getattr(importlib.import_module(e.value), name, None) for e in entry_points(group=GROUP))
-    return next((value for value in foreign if value is not None), None)
+    own = [package for kind in FAMILIES.values() for package in kind.packages]
+    for package in own:
+        found = _in_module_of_its_name(importlib.import_module(package), name)
+        if found is not None:
+            return found
+    for point in entry_points(group=GROUP):
+        root = importlib.import_module(point.value)
+        found = getattr(root, name, None) or _in_module_of_its_name(root, name)
+        if found is not None:
+            return found
+    return None
+
+
+def _in_module_of_its_name(root: ModuleType, name: str) -> Any:
+    """The value `FooBar` of a module `foo_bar` below a package; None if there is none."""
+    for info in pkgutil.walk_packages(getattr(root, "__path__", ()), f"{root.__name__}."):
+        if info.name.rpartition(".")[2].replace("_", "") == name.lower():
+            return getattr(importlib.import_module(info.name), name, None)
+    return None
+
+
+FORMER = {  # names of earlier versions
+    "BacksteppingMrac": "BacksteppingMRAC",
+    "ForceMrac": "ForceMRAC",
+    "General": "CustomCost",
+    "Informed": "ExactModel",
+    "InteriorPoint": "Ipopt",
+    "LqrTerminal": "LQRTerminal",
+    "LyapunovMrac": "LyapunovMRAC",
+    "OpenPlan": "FromPlan",
+    "Path": "PathConstraint",
+    "Pid": "PID",
+    "Restart": "FromMeasurement",
+    "RestartAndTrack": "FromMeasurementTracked",
+    "Rfpt": "RFPT",
+    "RfptVector": "RFPTVector",
+}

@@ -77,6 +77,8 @@ def measure_all(
 
 def _collected(name: str, results: Iterable[Measurement], total: int, progress: Progress | None) -> list[Measurement]:
     measurements: list[Measurement] = []
+    if progress:
+        progress(name, 0, total)  # the first run may take long
     for one in results:
         measurements.append(one)
         if progress:

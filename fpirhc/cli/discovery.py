@@ -23,11 +23,13 @@ class Known:
     Args:
         name: its name.
         summary: its line in `fpirhc --help`.
+        group: the group there.
         load: function that loads it.
     """
 
     name: str
     summary: str
+    group: str
     load: Callable[[], Verb]
 
 
@@ -40,12 +42,14 @@ def shipped() -> dict[str, Verb]:
 
 def known() -> dict[str, Known]:
     """Return all commands by name; those of other packages are loaded at their first use and replace none of this package."""
-    verbs = {verb.name: Known(verb.name, verb.summary, partial(_itself, verb)) for verb in shipped().values()}
+    verbs = {
+        verb.name: Known(verb.name, verb.summary, verb.group, partial(_itself, verb)) for verb in shipped().values()
+    }
     for point in entry_points(group=GROUP):
         if point.name in verbs:
             print(f"fpirhc: '{_origin(point)}' adds a command '{point.name}', which exists: ignored", file=sys.stderr)
             continue
-        verbs[point.name] = Known(point.name, f"(of the package {_origin(point)})", partial(_loaded, point))
+        verbs[point.name] = Known(point.name, f"(of the package {_origin(point)})", "tools", partial(_loaded, point))
     return verbs
 
 

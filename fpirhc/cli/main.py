@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from fpirhc.cli.crash import closed_by_reader, crash, interrupted, of_a_problem_file, silence_output
 from fpirhc.cli.discovery import Known, former_names, known, shipped
 from fpirhc.cli.exit_codes import ExitCode, table
-from fpirhc.cli.verb import DEBUG, aligned
+from fpirhc.cli.verb import DEBUG, GROUPS, aligned
 from fpirhc.summary import printable
 
 
@@ -69,12 +69,12 @@ def _run(words: list[str]) -> ExitCode:
 
 def _about(words: list[str], verbs: Mapping[str, Known]) -> ExitCode:
     """Answer `fpirhc`, `fpirhc --help` and `fpirhc --version`."""
-    commands = "\n".join(f"  {one.name:10s} {one.summary}" for one in verbs.values())
+    commands = "\n\n".join(filter(None, (_listed(title, group, verbs) for group, title in GROUPS.items())))
     codes = table({code: code.meaning for code in ExitCode})
     parser = argparse.ArgumentParser(
         prog="fpirhc",
         usage="fpirhc [--help] [--version] COMMAND ...",
-        description=f"Adaptive receding-horizon control by fixed-point iteration.\n\ncommands:\n{commands}",
+        description=f"Adaptive receding-horizon control by fixed-point iteration.\n\n{commands}",
         epilog=f"examples:\n{aligned(tuple(verb.examples[0] for verb in shipped().values()))}\n\nexit codes:\n{codes}\n\n"
         "fpirhc COMMAND --help has the options of a command, more examples, and the exit codes that it can return.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -87,6 +87,12 @@ def _about(words: list[str], verbs: Mapping[str, Known]) -> ExitCode:
     else:
         parser.print_help()
     return ExitCode.FINISHED
+
+
+def _listed(title: str, group: str, verbs: Mapping[str, Known]) -> str:
+    """The commands of a group below its title; nothing where there are none."""
+    lines = [f"  {one.name:10s} {one.summary}" for one in verbs.values() if one.group == group]
+    return "\n".join([f"{title}:", *lines]) if lines else ""
 
 
 def _complain(error: object, code: ExitCode) -> int:

@@ -28,10 +28,7 @@ def add_controllers(parser: Parser, default: str = "all") -> None:
 
 def add_optimisers(parser: Parser) -> None:
     """--optimisers NAME ...; the names are those of `optimiser_choices`."""
-    from fpirhc.studies.comparison.optimiser_choices import optimiser_choices
-
-    names = f"{', '.join(optimiser_choices())}, or all"
-    parser.add_argument("--optimisers", nargs="+", metavar="NAME", help=names)
+    parser.add_argument("--optimisers", action=_Optimisers, nargs="+", metavar="NAME")
 
 
 def add_seed(parser: Parser, use: str) -> None:
@@ -102,3 +99,18 @@ class Former(argparse.Action):
         notice = f"fpirhc: the option {option} is now {self.new}; the next version removes the old name"
         print(notice, file=sys.stderr)
         setattr(namespace, self.dest, values)
+
+
+class _Optimisers(argparse._StoreAction):
+    """An option whose help names every optimiser, which takes the import of all of them."""
+
+    @property
+    def help(self) -> str:
+        """The names, found when they are shown."""
+        from fpirhc.studies.comparison.optimiser_choices import optimiser_choices
+
+        return f"{', '.join(optimiser_choices())}, or all"
+
+    @help.setter
+    def help(self, text: str | None) -> None:
+        """Take no other text."""

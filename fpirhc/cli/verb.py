@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from fpirhc.cli.exit_codes import OF_EVERY_VERB, ExitCode, table
 
+GROUPS = {"start": "to start", "run": "to run", "keep": "to keep results right", "tools": "tools"}  # in this order
 DEBUG = "--debug"  # an option of every command; `main` reads it before the command does
 
 
@@ -24,6 +25,7 @@ class Verb:
         examples: pairs of a command line and a remark; the first one also stands in `fpirhc --help`.
         notes: paragraphs below the examples.
         former: earlier names, accepted for one version with a notice.
+        group: heading under which it stands in `fpirhc --help`, a key of `GROUPS`.
     """
 
     name: str
@@ -34,6 +36,7 @@ class Verb:
     codes: Mapping[ExitCode, str] = field(default_factory=dict)
     notes: str = ""
     former: tuple[str, ...] = ()
+    group: str = "tools"
 
     @property
     def exit_codes(self) -> dict[ExitCode, str]:

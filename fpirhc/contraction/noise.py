@@ -21,7 +21,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 
 from fpirhc.contraction.spectrum import Array
 from fpirhc.errors import InvalidShape, InvalidValue, NotContractive
@@ -97,7 +96,9 @@ def noise_spread(jacobian: Array, noise: Array, gain: float, pole: float) -> Noi
             "the gain"
         )
     entry = share * np.vstack([-gain * one, one])
-    spread = scipy.linalg.solve_discrete_lyapunov(loop, entry @ covariance @ entry.T)
+    from scipy.linalg import solve_discrete_lyapunov  # it takes longer to import than a problem to load
+
+    spread = solve_discrete_lyapunov(loop, entry @ covariance @ entry.T)
     n = len(j)
     return NoiseSpread(spread[:n, :n], gain**2 * spread[n:, n:])
 

@@ -196,6 +196,18 @@ def test_what_comes_first_is_light(first, absent):
     assert done.stdout.splitlines()[-1] == "[]"
 
 
+@pytest.mark.parametrize("verb", ["compare", "review", "run", "solve", "tune"])
+def test_the_message_of_a_wrong_file_is_light(verb, tmp_path):
+    """What a file lacks is said before anything that draws, computes or tells a result is imported."""
+    wrong = tmp_path / "wrong.py"
+    wrong.write_text("nothing = 3\n")
+    words = [verb, str(wrong), *(["RHC"] if verb == "run" else [])]
+    code = f"import sys; from fpirhc.cli.main import main; main({words}); print([m for m in {HEAVY[2:]} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert "wrong.py" in done.stderr
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
 def test_pages_are_what_the_code_says():
     """README's table of exit codes is the one that the script writes; its page has every command with its options."""
     spec = importlib.util.spec_from_file_location("make_command_line", ROOT / "docs" / "make_command_line.py")

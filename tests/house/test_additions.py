@@ -133,6 +133,12 @@ def test_members_from_abroad_are_found(abroad: Path) -> None:
     assert "Named" in families["controllers"]
 
 
+def test_members_from_abroad_are_names_of_fpirhc(abroad: Path) -> None:
+    """`fp.NAME` finds them by the name of their file below the package of the entry point."""
+    answer = run(abroad, "-c", "import fpirhc as fp; print(fp.Poles.__module__, fp.Named.__module__)")
+    assert (answer.returncode, answer.stdout.split()) == (0, ["abroad.poles", "abroad.named"]), answer.stderr
+
+
 def test_members_from_abroad_keep_the_laws(abroad: Path) -> None:
     """The conformance laws find them and try their examples like the shipped ones."""
     script = (

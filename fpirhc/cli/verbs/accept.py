@@ -46,6 +46,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
 VERB = Verb(
     name="accept",
     summary="measure a problem anew and write its baseline",
+    group="keep",
     add=_add,
     run=_run,
     codes={ExitCode.NOT_WRITABLE: "the baseline cannot be written, or lies outside of the project"},

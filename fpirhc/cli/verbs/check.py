@@ -92,6 +92,7 @@ def _code(judgements: Sequence[Judgement]) -> ExitCode:
 VERB = Verb(
     name="check",
     summary="compare fresh results with the committed baselines",
+    group="keep",
     add=_add,
     run=_run,
     codes={

@@ -36,6 +36,8 @@ def _run(options: argparse.Namespace) -> ExitCode:
 
 def _run_once(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
+
+    task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
     from fpirhc.report.as_json import to_json
     from fpirhc.report.html import write_report
     from fpirhc.report.page import write_page
@@ -44,7 +46,6 @@ def _run_once(options: argparse.Namespace) -> ExitCode:
     from fpirhc.studies.comparison.optimiser_choices import with_optimisers
     from fpirhc.studies.tuning.tuned_file import noted, read_tuned, with_tuned
 
-    task = load_problem(options.problem)
     tuned = read_tuned(options.tuned, task) if options.tuned else None
     task = with_tuned(task, tuned.values) if tuned else task
     controllers = options.controllers
@@ -96,6 +97,7 @@ def _command(options: argparse.Namespace) -> str:
 VERB = Verb(
     name="compare",
     summary="run several controllers on one problem, once or in many scenarios, and write a report",
+    group="run",
     add=_add,
     run=_run,
     codes={

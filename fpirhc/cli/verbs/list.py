@@ -24,6 +24,7 @@ def _run(options: argparse.Namespace) -> ExitCode:  # noqa: ARG001
 VERB = Verb(
     name="list",
     summary="list the shipped problems",
+    group="start",
     add=_add,
     run=_run,
     examples=(("fpirhc list", "names and titles of the shipped problems"),),

@@ -34,6 +34,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
 VERB = Verb(
     name="new",
     summary="write a problem file, its test and its baseline to start from",
+    group="start",
     add=_add,
     run=_run,
     codes={ExitCode.NOT_WRITABLE: "a file exists already, or the folder cannot be written"},

@@ -19,11 +19,12 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
+
+    task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
     from fpirhc.report.answers import review_to_json, show_review
     from fpirhc.review.review import review
     from fpirhc.studies.comparison.compare import select
 
-    task = load_problem(options.problem)
     controllers = select(task, options.controllers)
     answers = review(task.problem, controllers, mismatch=options.mismatch, seed=options.seed)
     if options.json:
@@ -36,6 +37,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
 VERB = Verb(
     name="review",
     summary="answer before a run: well posed, gains, limits, margins, convergence",
+    group="start",
     add=_add,
     run=_run,
     codes={ExitCode.FINISHED: "every answer is yes or unknown", ExitCode.ANSWERED_NO: "at least one answer is no"},

@@ -33,13 +33,15 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
+
+    task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
     from fpirhc.report.figures import save_figure
     from fpirhc.report.terminal import announce_backend, progress_bars, show_run
     from fpirhc.simulation.metrics import measure
     from fpirhc.studies.comparison.compare import select
     from fpirhc.studies.comparison.harm import harm_of_adaptation
 
-    task, name = load_problem(options.problem), options.controller
+    name = options.controller
     controller = select(task, [name])[name]
     folder = results_folder(options.out, task.name)
     with progress_bars() as progress:
@@ -138,6 +140,7 @@ def _named(progress: Progress, name: str) -> Callable[[int, int], None]:
 VERB = Verb(
     name="run",
     summary="run one controller and save every signal",
+    group="run",
     add=_add,
     run=_run,
     codes={

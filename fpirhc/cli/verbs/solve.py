@@ -20,12 +20,13 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
+
+    task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
     from fpirhc.report.figures import plan_figure, save_figure
     from fpirhc.report.terminal import show_plans
     from fpirhc.status import Status
     from fpirhc.studies.open_loop import solve_first
 
-    task = load_problem(options.problem)
     folder = results_folder(options.out, task.name)
     solved = solve_first(task, options.optimisers or ["fixed-point"], options.tolerance)
     picture = folder / "plan.png"
@@ -38,6 +39,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
 VERB = Verb(
     name="solve",
     summary="solve a problem's first horizon open loop, to a tolerance",
+    group="run",
     add=_add,
     run=_run,
     codes={

@@ -35,11 +35,12 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
+
+    task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
     from fpirhc.report.terminal import progress_bars
     from fpirhc.studies.tuning.tune import LEDGER, tune
     from fpirhc.studies.tuning.tuned_file import write_tuned
 
-    task = load_problem(options.problem)
     name = f"tuning_{options.scenarios}x{options.mismatch:g}percent_seed{options.seed}"
     name += f"_by_{options.metric}" if options.metric else ""
     folder = results_folder(options.out, task.name, name)
@@ -88,6 +89,7 @@ def _show(tuning: Tuning, saved: Path) -> None:
 VERB = Verb(
     name="tune",
     summary="find better settings, with the same budget and cost for every controller",
+    group="run",
     add=_add,
     run=_run,
     codes={
