@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.deformation.base import Deformation
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.loop import close_loop
 
@@ -96,8 +97,10 @@ def circles(graph: grimp.ImportGraph) -> int:
 
 
 def members(contract: type) -> int:
-    """Public names that the body of a class defines, fields included."""
-    return len({n for n in (*vars(contract), *vars(contract).get("__annotations__", {})) if not n.startswith("_")})
+    """Public names that a class and its bases define, fields included; those of checked settings are not counted."""
+    own = [one for one in contract.__mro__ if one.__module__.startswith("fpirhc.") and one is not Checked]
+    names = {n for one in own for n in (*vars(one), *vars(one).get("__annotations__", {}))}
+    return len({n for n in names if not n.startswith("_")})
 
 
 def closing() -> dict[str, int]:
