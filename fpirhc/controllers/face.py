@@ -16,7 +16,7 @@ from fpirhc.symbolic.layout import Layout, Signal
 
 def measured_signals(plant: Plant) -> tuple[Signal, ...]:
     """Return the signals of what a controller is given of the motion: the state, and the outputs where there are any."""
-    return (plant.state, plant.output) if plant.outputs else (plant.state,)
+    return tuple(dict.fromkeys((plant.state, plant.output)))
 
 
 def on_face(plant: Plant, block: Block) -> Block:
@@ -26,8 +26,6 @@ def on_face(plant: Plant, block: Block) -> Block:
         plant: whose face it is.
         block: built for `plant.face`.
     """
-    if not plant.outputs:
-        return block
     own, name = plant.face.state.name, plant.output.name
 
     def renamed(layout: Layout) -> Layout:

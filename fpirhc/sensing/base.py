@@ -112,9 +112,8 @@ def values_of(plant: Plant, x: ca.SX, u: ca.SX, p: ca.SX) -> dict[str, ca.SX]:
     """Return everything that a sensor may show as expressions of the state and the input that acted, by name."""
     responses = ca.vertsplit(plant.controlled_response_function(x, u, p))
     named = dict(zip(plant.state.elements, ca.vertsplit(x), strict=True))
-    if plant.outputs:
-        outputs = plant.output_function(x, u, p, np.zeros(len(plant.names)))
-        named = {**dict(zip(plant.output.elements, ca.vertsplit(outputs), strict=True)), **named}
+    outputs = ca.vertsplit(plant.output_function(x, u, p, np.zeros(len(plant.names))))
+    named = {**dict(zip(plant.output.elements, outputs, strict=True)), **named}
     return {**named, **dict(zip(response_names(plant.face), responses, strict=True))}
 
 

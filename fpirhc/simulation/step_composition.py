@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.face import measured_signals
 from fpirhc.controllers.gap import across_gaps, gap_of
 from fpirhc.controllers.gate import Gate
 from fpirhc.controllers.live_settings import LiveSettings
@@ -47,9 +48,9 @@ def measures(problem: Problem, controller: Controller) -> tuple[str, ...]:
     raw, plant, own = raw_signal(problem), problem.plant, controller.response(problem)
     if raw is not None:
         return (*(e for signal in given_states(problem) for e in signal.elements), *raw.elements)
-    outputs = plant.output.elements if plant.outputs else ()
     responses = plant.response_signal("realised") if own is None else own.signal
-    return (*plant.state.elements, *outputs, *names_of_responses(plant.face, responses))
+    motions = (e for signal in measured_signals(plant) for e in signal.elements)
+    return (*motions, *names_of_responses(plant.face, responses))
 
 
 def refuse_unbounded(controller: Controller) -> None:

@@ -24,6 +24,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block, rename
+from fpirhc.controllers.face import measured_signals
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.identity import Identity
 from fpirhc.errors import Mistakes
@@ -156,8 +157,7 @@ class PID(Controller):
             }
 
         before, in_use = integral_signal(face, "_integral_before"), integral_signal(face, "_integral_used")
-        outputs = (seen,) if plant.outputs else ()
-        reads = (plant.state, *outputs, like(seen, "reference"), plant.parameter, scalar("warm_up"), before)
+        reads = (*measured_signals(plant), like(seen, "reference"), plant.parameter, scalar("warm_up"), before)
         writes = (
             error_signal(face),
             in_use,

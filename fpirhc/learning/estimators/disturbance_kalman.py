@@ -34,7 +34,7 @@ from fpirhc.learning.estimators.base import Correct, Estimator, Seen, Wait
 from fpirhc.learning.estimators.disturbed import disturbance_name, disturbed
 from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import response_names
+from fpirhc.sensing.base import quantities, response_names
 from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.following import Following, following
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -105,7 +105,7 @@ class DisturbanceKalman(Estimator):
         mistakes = Mistakes("DisturbanceKalman")
         plant = problem.plant
         what = "state, output or response" if plant.outputs else "state or response"
-        mistakes.unknown(f"measured: {what}", self.measured, _measurable(plant))
+        mistakes.unknown(f"measured: {what}", self.measured, quantities(plant))
         mistakes.unknown("noise: coordinate", self.noise, problem.plant.coordinates)
         mistakes.raise_if_any()
         late = problem.sensing.delay(plant.face, problem.period)
@@ -303,16 +303,8 @@ def _rank(a: np.ndarray, c: np.ndarray) -> int:
     return int(np.linalg.matrix_rank(stacked[rows] / np.abs(stacked[rows]).max(axis=1, keepdims=True), tol=1e-9))
 
 
-def _measurable(plant: Plant) -> tuple[str, ...]:
-    """Names of states, of outputs with their derivatives, and of responses."""
-    outputs = plant.output.elements if plant.outputs else ()
-    return (*plant.state.elements, *outputs, *response_names(plant.face))
-
-
 def _shown_by(plant: Plant, names: Sequence[str]) -> list[int]:
     """Places of the states on which these coordinates or outputs depend."""
-    if not plant.outputs:
-        return [plant.state.elements.index(n) for n in names]
     x, u, p = plant.symbols()
     values = plant.output_function(x, u, p, ca.DM.zeros(len(plant.names)))
     shown = values[[plant.output.elements.index(n) for n in names]]
