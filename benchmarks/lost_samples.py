@@ -43,6 +43,9 @@ def loops() -> dict[str, Lossy]:
     for name, estimator in ESTIMATORS.items():
         problem = replace(MASSES.problem, sensing=fp.Sensing(estimator=estimator))
         result[f"two_mass, {name}, CTC+FPI (eq 6)"] = Lossy(problem, adaptive)
+    force = fp.DisturbanceKalman({"q1": 30.0, "q2": 30.0}, dict.fromkeys(MASSES.problem.plant.state.elements, 1e-3))
+    filtered = fp.Estimating(MASSES.controllers["CTC"], force)
+    result["two_mass, everything measured, CTC with a disturbance filter"] = Lossy(MASSES.problem, filtered)
     for name in ("CT+FPI", "Slotine-Li"):
         result[f"three_link_arm as shipped, {name}, without quanta"] = Lossy(ARM.problem, ARM.controllers[name])
     return result

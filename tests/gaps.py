@@ -8,17 +8,11 @@ import fpirhc as fp
 from fpirhc.simulation.clock import MEMORY as CLOCK
 
 COUNTS = {"missing_cycles", "skipped_before", CLOCK.name}  # in every stepper
+MANY = {"jumps", "_integral_before"}  # in many: the check of responses, and integrals of errors, which go on
 
 
 def gone_on(stepper: fp.Stepper, before: np.ndarray, after: np.ndarray) -> set[str]:
-    """Names of the signals of a memory that a cycle without a sample changed, beside its counts."""
+    """Names of the signals of a memory that a cycle without a sample changed, beside its counts and integrals."""
     changed = {s.name for s in stepper.memory.signals if np.any((after != before)[stepper.memory.slice(s.name)])}
     assert changed >= COUNTS, changed
-    return changed - COUNTS - {"jumps"}
-
-
-def later(stepper: fp.Stepper, memory: np.ndarray, time: float) -> np.ndarray:
-    """The memory of a controller that knows nothing of the cycles until this time."""
-    result = memory.copy()
-    result[stepper.memory.slice(CLOCK.name)] = time, time, 0.0
-    return result
+    return changed - COUNTS - MANY

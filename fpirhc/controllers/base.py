@@ -218,6 +218,7 @@ def closing_blocks(
             deformation,
             deform_block(plant, deformation, problem.warm_up_cycles, largest),
             settles=problem.sensing.estimates,
+            answered=math.inf if problem.dead_time.queued else problem.warm_up_cycles,
         ),
         invert_block(plant),
         *closing,

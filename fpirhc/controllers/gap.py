@@ -39,7 +39,7 @@ class Gap:
 
     Args:
         bridged: number of missing cycles up to which a gap is bridged.
-        settles: number of samples after a long gap that a response needs, that of the start.
+        settles: number of samples after a long gap that a response needs: that of the start, and what a filter forgets in.
     """
 
     bridged: int
@@ -95,7 +95,10 @@ def gap_of(problem: Problem, bridged: int) -> Gap:
         problem: of the steps; where state and response are measured as they are, nothing settles.
         bridged: number of missing cycles up to which a gap is bridged.
     """
-    return Gap(bridged, float(problem.longest_warm_up) if problem.sensing.estimates else 0.0)
+    if not problem.sensing.estimates:
+        return Gap(bridged, 0.0)
+    settling = problem.sensing.settling_cycles(problem.plant.face, problem.period)
+    return Gap(bridged, float(problem.longest_warm_up + settling))
 
 
 def across_gaps(step: Composite) -> Composite:

@@ -128,6 +128,10 @@ class Sensing(Checked):
             return 1
         return ceil(late) + max(self.estimator.fills(plant.orders[k]) for k in plant.controlled_indices)
 
+    def settling_cycles(self, plant: Plant, period: float) -> int:
+        """Number of further cycles after a long gap until estimates are those of later samples alone."""
+        return max((self.estimator.settles(plant.orders[k], period) for k in plant.controlled_indices), default=0)
+
     @property
     def drawn(self) -> tuple[Signal, ...]:
         """The signal of all random series; empty where there is none."""

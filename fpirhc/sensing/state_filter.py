@@ -26,6 +26,7 @@ from fpirhc.symbolic.gap import GAP, is_long
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 _STAGES, _INPUTS = "filter_stages", "filter_inputs"
+_FORGOTTEN = 0.01  # share of a jump after which the filter has settled
 _TAIL = 1e-16  # share of a low-pass's weights that is left out
 
 
@@ -87,20 +88,27 @@ class StateVariableFilter(DerivativeEstimator):
         del order
         return 1
 
+    def settles(self, order: int, period: float) -> int:
+        """Cycles after which 1 % of a jump of the response is left."""
+        return int(np.argmax(np.cumsum(self.weights(order, period)) >= 1 - _FORGOTTEN)) + 1
+
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
-        """Block (positions) -> (state, response); over a gap the positions are on a straight line."""
+        """Block (positions) -> (state, response).
+
+        Over a gap the positions go on by the polynomial of the plant's order whose filtered derivatives are those before it.
+        """
         return self._block(plant, period, start, seen, lost=False)
 
     def _block(self, plant: Plant, period: float, start: Array, seen: Signal, *, lost: bool) -> Block:
         memory = tuple(self._memory(plant, period, start, kind) for kind in (_STAGES, _INPUTS))
-        ramps = tuple(Signal(f"{m.name}_of_ramp", m.elements) for m in memory) if lost else ()
+        powers = tuple(Signal(f"{m.name}_of_power", m.elements) for m in memory) if lost else ()
 
         def step(s: Signals) -> dict[str, Expression]:
             positions = ca.vertsplit(getattr(s, seen.name))
             before = [s.filter_stages, s.filter_inputs]
             if lost:
                 before = self._moved(
-                    plant, period, positions, before, (s.filter_stages_of_ramp, s.filter_inputs_of_ramp), s.gap
+                    plant, period, positions, before, (s.filter_stages_of_power, s.filter_inputs_of_power), s.gap
                 )
             chains = self._chains(plant, period, positions, *before)
             known: dict[str, Expression] = {}
@@ -113,16 +121,16 @@ class StateVariableFilter(DerivativeEstimator):
                 "state": ca.vertcat(*(known[e] for e in plant.state.elements)),
                 "realised": ca.vertcat(*(responses[k] for k in plant.controlled_indices)),
                 **_remembered(chains, memory),
-                **{f"{m.name}_next": expression(ca.DM.zeros(m.size)) for m in ramps},
+                **{f"{m.name}_next": expression(ca.DM.zeros(m.size)) for m in powers},
             }
 
         reads, writes = (
             Layout((seen, GAP) if lost else (seen,)),
             Layout((plant.state, plant.response_signal("realised"))),
         )
-        own = Layout((*memory, *ramps))
+        own = Layout((*memory, *powers))
         if lost:
-            return Block("estimate", reads, writes, step, own, waits=self._waiting(plant, period, memory, ramps))
+            return Block("estimate", reads, writes, step, own, waits=self._waiting(plant, period, memory, powers))
         return Block(
             "estimate", reads, writes, step, own, bridged=lambda: self._block(plant, period, start, seen, lost=True)
         )
@@ -142,11 +150,18 @@ class StateVariableFilter(DerivativeEstimator):
         return chains
 
     def _ahead(self, plant: Plant, period: float, stages: Expression, inputs: Expression) -> list[Expression]:
-        """Positions one cycle after the last ones, at the filter's speed; of a coordinate of order one the last ones."""
+        """Positions one cycle after the last ones, on the polynomials that n low-passes show as these derivatives D_s.
+
+        Such a polynomial has the derivatives (1 + D / w)^n D_s = sum_j C(n, j) D_{s+j} / w^j, those beyond D_n being zero.
+        """
         positions, at = [], 0
         for order in plant.orders:
             chain = [inputs[at], *(stages[at + j] for j in range(order))]
-            positions.append(chain[0] + period * self._derivative(chain, order, 1) if order > 1 else chain[0])
+            seen = [self._derivative(chain, order, d) for d in range(1, order + 1)]
+            positions.append(chain[0])
+            for d in range(1, order + 1):
+                true = total(math.comb(order, j) / self.bandwidth**j * seen[d + j - 1] for j in range(order - d + 1))
+                positions[-1] += true * period**d / math.factorial(d)
             at += order
         return positions
 
@@ -156,28 +171,28 @@ class StateVariableFilter(DerivativeEstimator):
         period: float,
         positions: Sequence[Expression],
         before: Sequence[Expression],
-        ramps: Sequence[Expression],
+        powers: Sequence[Expression],
         gap: Expression,
     ) -> list[Expression]:
-        """Memory of the last cycle, had the positions been on a line: what the filter answers to a ramp is added."""
+        """Memory of the last cycle, had the positions gone on to now: what the filter answers to a power of the time is added."""
         expected = self._ahead(plant, period, *before)
         away = ca.vertcat(*(y - h for y, h, n in zip(positions, expected, plant.orders, strict=True) for _ in range(n)))
-        share = [ca.if_else(is_long(gap), 1, ramp / (gap + 1)) for ramp in ramps]
+        now = ca.vertcat(*((gap + 1) ** n for n in plant.orders for _ in range(n)))
+        share = [ca.if_else(is_long(gap), 1, one / now) for one in powers]
         return [value + w * away for value, w in zip(before, share, strict=True)]
 
-    def _waiting(self, plant: Plant, period: float, memory: Sequence[Signal], ramps: Sequence[Signal]) -> Block:
-        """Block of a cycle without a sample: positions go on at their speed, and beside them a ramp of one per cycle from zero."""
+    def _waiting(self, plant: Plant, period: float, memory: Sequence[Signal], powers: Sequence[Signal]) -> Block:
+        """Block of a cycle without a sample: positions go on by a polynomial, and beside them the n-th power of the cycles from zero."""
 
         def step(s: Signals) -> dict[str, Expression]:
-            firsts = [sum(plant.orders[:k]) for k in range(len(plant.orders))]
             filtered = s.filter_stages, s.filter_inputs
             later = _remembered(self._chains(plant, period, self._ahead(plant, period, *filtered), *filtered), memory)
-            ramp = [s.filter_inputs_of_ramp[k] + 1 for k in firsts]
-            rising = self._chains(plant, period, ramp, s.filter_stages_of_ramp, s.filter_inputs_of_ramp)
-            later |= _remembered(rising, ramps)
+            power = [(s.gap + 1) ** n for n in plant.orders]
+            rising = self._chains(plant, period, power, s.filter_stages_of_power, s.filter_inputs_of_power)
+            later |= _remembered(rising, powers)
             return {k: ca.if_else(is_long(s.gap), getattr(s, k.removesuffix("_next")), v) for k, v in later.items()}
 
-        return Block("estimate_waits", Layout((GAP,)), Layout(), step, Layout((*memory, *ramps)))
+        return Block("estimate_waits", Layout((GAP,)), Layout(), step, Layout((*memory, *powers)))
 
     def _coefficients(self, period: float) -> tuple[float, float]:
         """Coefficients (keep, new) of y_j(k) = keep y_j(k-1) + new (y_{j-1}(k) + y_{j-1}(k-1))."""

@@ -14,6 +14,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.functions import numbers
+from fpirhc.symbolic.gap import GAP, is_long
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.symbolic.live import is_live, nominal
 
@@ -64,11 +65,15 @@ def law_signals(plant: Plant) -> tuple[Layout, Layout]:
 def integral_update(plant: Plant, period: float, useful: Sequence[Useful] = ()) -> Block:
     """Block that integrates the error, except while the command is clipped, and where it asks for what no limits could meet.
 
+    Over a gap the error is on a line: cycle by cycle the last one is integrated again, and the next sample adds the rest.
+
     Args:
         plant: whose errors are integrated.
         period: of the control cycle, s.
         useful: what the integral of every controlled coordinate may ask for; empty: anything.
     """
+    writes = Layout((integral_signal(plant, "integral"),))
+    increment, before = integral_signal(plant, "integral_increment"), integral_signal(plant, "_integral_before")
     reads = (error_signal(plant), scalar("clipped"), integral_signal(plant, "_integral_used"))
 
     def step(s: Signals) -> dict[str, Expression]:
@@ -78,7 +83,20 @@ def integral_update(plant: Plant, period: float, useful: Sequence[Useful] = ()) 
         columns = zip(useful, ca.vertsplit(s._integral_used), ca.vertsplit(error), strict=True)
         return {"integral": ca.vertcat(*(one.next(i, e, period) for one, i, e in columns))}
 
-    return Block("tracking_update", Layout(reads), Layout((integral_signal(plant, "integral"),)), step)
+    def lossy(s: Signals) -> dict[str, Expression]:
+        integral = step(s)["integral"]
+        added = integral - s._integral_used
+        missing = ca.if_else(is_long(s.gap), 0, s.gap)
+        rest = ca.if_else(missing > 0.5, missing / 2 * (added - s.integral_increment), 0)
+        return {"integral": integral + rest, "integral_increment_next": added}
+
+    def wait(s: Signals) -> dict[str, Expression]:
+        added = ca.if_else(is_long(s.gap), 0, s.integral_increment)
+        return {"_integral_before_next": s._integral_before + added, "integral_increment_next": s.integral_increment}
+
+    waits = Block("tracking_waits", Layout((GAP,)), Layout(), wait, Layout((before, increment)))
+    bridged = Block("tracking_update", Layout((*reads, GAP)), writes, lossy, Layout((increment,)), waits=waits)
+    return Block("tracking_update", Layout(reads), writes, step, bridged=lambda: bridged)
 
 
 def integral_delay(plant: Plant) -> tuple[Delay, ...]:

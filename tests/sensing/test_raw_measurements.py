@@ -124,7 +124,7 @@ def test_compiled_step_estimates_alike():
 
 # Bad samples
 
-GO_ON = {"estimate_past", "filter_stages", "filter_inputs", "filter_stages_of_ramp", "filter_inputs_of_ramp", "sent"}
+GO_ON = {"estimate_past", "filter_stages", "filter_inputs", "filter_stages_of_power", "filter_inputs_of_power", "sent"}
 GO_ON |= {
     "mirror_state",
     "mirror_cycles",

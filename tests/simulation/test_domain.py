@@ -99,7 +99,7 @@ QUEUES = {
 
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_sample_outside_the_domain_is_a_skipped_tick(name):
-    """Nothing but counts and queues goes on, and afterwards every command is that of the tick missed, bit for bit."""
+    """Nothing but counts, queues and integrals goes on, and afterwards every command is that of the tick missed, bit for bit."""
     stepper = fp.Stepper(TANK, CONTROLLERS[name], compiled=False)
     times, rows = measurements()
     command, memory = before_the_fault(stepper)
