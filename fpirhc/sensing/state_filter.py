@@ -182,7 +182,7 @@ class StateVariableFilter(DerivativeEstimator):
         return [value + w * away for value, w in zip(before, share, strict=True)]
 
     def _waiting(self, plant: Plant, period: float, memory: Sequence[Signal], powers: Sequence[Signal]) -> Block:
-        """Block of a cycle without a sample: positions go on by a polynomial, and beside them the n-th power of the cycles from zero."""
+        """Block of a cycle without a sample: positions go on, and beside them the n-th power of the cycles from zero."""
 
         def step(s: Signals) -> dict[str, Expression]:
             filtered = s.filter_stages, s.filter_inputs

@@ -57,7 +57,7 @@ class Stepper(Checked):
 
     A bad sample skips the cycle: one that is not finite, outside its plausible range, or (with `max_age`) out of date. The command
     is the last one, the status is BAD_SAMPLE, and the signal 'skipped' counts. What is remembered stays as it was, but for what
-    goes on with the time: queues, integrals, filters and observers. The next good sample moves estimators and queues over the gap, with the
+    goes on with the time: queues, integrals, filters, observers. The next good sample moves them over the gap, with the
     status BRIDGED. After more than `bridged` cycles they begin anew, and deformations are held until their windows are full, with
     the status SETTLING. Cycles that the caller missed, by the times of two steps, are gaps too. Before the first good sample the
     command is the one before the run. A sample for which the model has no number skips the cycle too, as NON_FINITE. So does a time
