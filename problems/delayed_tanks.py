@@ -5,10 +5,20 @@
 The input reaches h2 through h1, so its relative order is two. The state is written in h2 and h2': with the flow between the
 tanks q = A h2' + 0.8 s sqrt(2 g h2) the upper level is h1 = h2 + (q / s)^2 / (2 g). The pipe's dead time is twice the time
 constants of the tanks, so the future levels depend more on the commands in the pipe than on the present levels. With the
-wrong areas and valves of the model alone the prediction is wrong by centimetres. A deformation cannot help, because it
-makes the plant follow the desired response from a state that the plant will not have. With the model's residual in the
-prediction the error of plain RHC is 3 mm, and that of RHC+FPI half as much. Areas and valve ratios are those of the
-triple-tank example of do-mpc; the task, the limits and the wrong parameters are chosen here.
+wrong areas and valves of the model alone the prediction is wrong. A deformation cannot help, because it makes the plant
+follow the desired response from a state that the plant will not have. With the model's residual in the prediction both
+plans are better. Areas and valve ratios are those of the triple-tank example of do-mpc; the task, the limits and the wrong
+parameters are chosen here.
+
+Errors count from `measure_from` on:
+
+    rms error, seed 0       h2 [m]
+    RHC                     0.0026
+    RHC+FPI                 0.0013
+    RHC exact model        1.2e-06
+    RHC uncorrected          0.025
+    RHC uncorrected+FPI      0.026
+    RHC not predicting       0.093
 """
 
 import casadi as ca

@@ -1,29 +1,25 @@
 """A three-link arm with encoders of 4096 counts: where Slotine and Li do better than fixed-point iteration.
 
-The arm hangs in a vertical plane and has the size of a human one. Lengths (0.186, 0.146, 0.108 of the height), masses (0.028,
-0.016, 0.006 of the body's), centres of mass and radii of gyration are those of D. A. Winter, Biomechanics and Motor Control of
-Human Movement (2009), table 4.1 (from memory), for 1.75 m and 75 kg; it holds 1 kg in the hand. Friction is chosen here. The
-model's masses are a quarter too small, and its load is a fifth of the true one.
+The arm hangs in a vertical plane and has the size of a human one. Lengths (0.186, 0.146, 0.108 of the height), masses
+(0.028, 0.016, 0.006 of the body's), centres of mass and radii of gyration are those of D. A. Winter, Biomechanics and Motor
+Control of Human Movement (2009), table 4.1 (from memory), for 1.75 m and 75 kg; it holds 1 kg in the hand. Friction is
+chosen here. The model's masses are a quarter too small, and its load is a fifth of the true one.
 
 Every controller measures positions rounded to 2 pi / 4096 rad, and velocities and accelerations from a filter of 300 rad/s.
-One count changes the acceleration by 140 rad/s^2, and the motion itself has 8. Fixed-point iteration feeds that
-acceleration back; the law of Slotine and Li needs only the velocity. Measured from 10 s on, rms error of q1, q2, q3 (mrad)
-and rms change of tau1 per cycle (N m):
+One count changes the acceleration by more than the motion does. Fixed-point iteration feeds that
+acceleration back; the law of Slotine and Li needs only the velocity. Errors count from 10 s on:
 
-    computed torque      44  140  380    0.26          Slotine-Li           1.6  2.9  4.0    0.35
-    CT+FPI              2.0  3.3  5.0    6.0           adaptive inverse     4.0  4.9  4.5    0.54
-    CT+FPI, half gain   2.0  4.3  9.7    3.1           the same with FPI    2.1  3.3  1.9    6.4
+    rms error, seed 0    q1 [rad]    q2 [rad]    q3 [rad]
+    CT                      0.044        0.14        0.38
+    CT+FPI                 0.0019      0.0034      0.0049
+    CT+FPI, half gain       0.002      0.0043      0.0097
+    AID                     0.004      0.0049      0.0045
+    AID+FPI                0.0019      0.0033      0.0019
+    Slotine-Li             0.0016      0.0029       0.004
 
-So Slotine-Li is more precise than FPI, with a torque that is 17 times smoother. Of the gains -0.1, -0.2, -0.4, -0.8 and
--1.6 of FPI, -0.8 is the best one here: less is too slow, more is too noisy (25 mrad at most). Adaptive inverse dynamics
-with FPI is as precise as Slotine-Li, and as rough as FPI. FPI is better in the first second (4, 7, 22 mrad at most, against
-9, 11, 31), because it need not learn. The encoder was chosen to show this. Of four sensors tried, Slotine-Li tracks better
-only with this one: with 16384 counts or more and the same filter both are about equally precise (2, 7, 8 to 13 mrad at
-most) and only the torque is rougher, 16 times; with 16384 counts and a filter of 100 rad/s FPI with gain -0.4 is more
-precise (6, 17, 24 mrad against 11, 21, 31), also with the rougher torque. Slotine-Li's gain is the best of three, its
-damping the second of two; the first one, higher, chattered. With acceleration and state known exactly, FPI has 0.5, 2.2,
-6.7 mrad and Slotine-Li 0.4, 0.6, 1.2: this motion excites every parameter that matters, and a learned model is better than
-a corrected one.
+Slotine-Li is more precise than FPI here, with a smoother torque, because this sensor is coarse and the motion excites every
+parameter that matters; a learned model is then better than a corrected one. FPI is better at first, because it need not
+learn. The encoder was chosen to show this.
 """
 
 import casadi as ca

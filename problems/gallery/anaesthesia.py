@@ -1,28 +1,35 @@
 """Depth of anaesthesia by propofol: the controlled quantity is an output, and the curve from the drug to it is wrong in the model.
 
-Three compartments and an effect site (Schnider et al., Anesthesiology 88, 1998, and 90, 1999), concentrations in mg/l, infusion in
-mg/min, time in min,
+Three compartments and an effect site (Schnider et al., Anesthesiology 88, 1998, and 90, 1999), concentrations in mg/l,
+infusion in mg/min, time in min,
 
     C1' = -(k10 + k12 + k13) C1 + k12 C2 + k13 C3 + u / V1,    C2' = k21 (C1 - C2),    C3' = k31 (C1 - C3),
     Ce' = ke0 (C1 - Ce),                                       bis = E0 (1 - Ce^g / (C50^g + Ce^g)).
 
-Nobody gives references of concentrations. The plant is therefore written by its states, and `bis` is an output; its relative order,
-two, is found from the symbols. The kinetics follow from age, weight, height and sex, as in an infusion pump. The curve is the
-patient's own: the exact values are those of a man of 61 years, 175 cm and 77 kg, and the model has the medians of 44 patients
-(Hosseinirad et al. 2023; the numbers are those of the table pd_data_schnider.csv of ManuMerlo/AReS-Anesthesia-Response-Simulator,
-commit 0f0d1f9, MIT licence). This patient answers without dead time. The bis is measured without noise, with its derivatives.
+Nobody gives references of concentrations. The plant is therefore written by its states, and `bis` is an output; its
+relative order, two, is found from the symbols. The kinetics follow from age, weight, height and sex, as in an infusion
+pump. The curve is the patient's own: the exact values are those of a man of 61 years, 175 cm and 77 kg, and the model has
+the medians of 44 patients (Hosseinirad et al. 2023; the numbers are those of the table pd_data_schnider.csv of
+ManuMerlo/AReS-Anesthesia-Response-Simulator, commit 0f0d1f9, MIT licence). This patient answers without dead time. The bis
+is measured without noise, with its derivatives.
 
-Task: from a light sedation to 50 within some minutes, to 40 for the incision, and to 45; a dose every 5 s, at most 400 mg/min.
-Errors count from 5 min on. Rms error of bis (seed 0):
+Task: from a light sedation to 50 within some minutes, to 40 for the incision, and to 45; a dose every 5 s, at most 400
+mg/min. Errors count from 5 min on:
 
-    CTC 0.142    CTC+FPI 0.013    RHC 0.356    RHC consistent 0.085    RHC+FPI 0.0087    RHC exact model 0.0010
+    rms error, seed 0    bis [1]
+    CTC                     0.14
+    CTC+FPI                0.013
+    RHC                     0.36
+    RHC consistent         0.085
+    RHC+FPI               0.0087
+    RHC exact model        0.001
 
-The outputs and their derivatives are measured, and the model's curve only says which dose they need. A deformation of an output
-that the wrong model computes would chase the wrong number.
+The outputs and their derivatives are measured, and the model's curve only says which dose they need. A deformation of an
+output that the wrong model computes would chase the wrong number.
 
-Where a plan starts decides here. At the measured concentrations the wrong curve gives another bis and another bis'. A plan that
-only holds the distance of the bis misses its motion within the horizon (RHC). "RHC consistent" starts at the concentrations at
-which the model has the measured bis and bis', as plans behind a deformation always do.
+Where a plan starts decides here. At the measured concentrations the wrong curve gives another bis and another bis'. A plan
+that only holds the distance of the bis misses its motion within the horizon (RHC). "RHC consistent" starts at the
+concentrations at which the model has the measured bis and bis', as plans behind a deformation always do.
 """
 
 import casadi as ca

@@ -5,16 +5,22 @@ Clark, Mathematical Bioeconomics, 2nd ed. 1990, section 7.2),
 
     A+ = (s - q E) A + R,        R+ = a A exp(-A / B).
 
-The response is the change of the adults from one survey to the next. The model believes in a fleet that catches a third more per
-day, in a higher survival and in a poorer recruitment than the plant has. Only the surveys are known, one per year.
+The response is the change of the adults from one survey to the next. The model believes in a fleet that catches a third
+more per day, in a higher survival and in a poorer recruitment than the plant has. Only the surveys are known, one per year.
 
-Task: rebuild the stock from 60 kt to 110 kt, keep it, and let it go down to 90 kt when the fishery is opened again. Errors count
-from year 5 on. Rms error of the adults (seed 0):
+Task: rebuild the stock from 60 kt to 110 kt, keep it, and let it go down to 90 kt when the fishery is opened again. Errors
+count from year 5 on:
 
-    CTC 4.21 kt    CTC+FPI 0.75 kt    RHC 2.39 kt    RHC+FPI 0.40 kt    RHC exact model 0.0005 kt
+    rms error, seed 0    adults [kt]
+    CTC                          4.2
+    CTC+FPI                     0.75
+    RHC                          2.4
+    RHC+FPI                      0.4
+    RHC exact model          0.00047
 
 The iteration compares the change that the model expects of the effort with the change that the next survey shows. It is the
-model-referenced form: in steps as coarse as a year the stock moves so much that the last request says little about the next one.
+model-referenced form: in steps as coarse as a year the stock moves so much that the last request says little about the next
+one.
 """
 
 import casadi as ca

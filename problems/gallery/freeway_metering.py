@@ -1,27 +1,29 @@
 """A freeway with a metered on-ramp: the density at the merge, by METANET, with a model whose traffic is denser and slower.
 
-Six segments of 1 km with two lanes; a ramp joins the fifth. Segment i has the density rho_i (veh/km/lane) and the speed v_i (km/h),
-each origin a queue w (veh). With T = 10 s, METANET is a map from one T to the next (Messmer and Papageorgiou: METANET, a
-macroscopic simulation program for motorway networks, Traffic Engineering and Control 31, 1990),
+Six segments of 1 km with two lanes; a ramp joins the fifth. Segment i has the density rho_i (veh/km/lane) and the speed v_i
+(km/h), each origin a queue w (veh). With T = 10 s, METANET is a map from one T to the next (Messmer and Papageorgiou:
+METANET, a macroscopic simulation program for motorway networks, Traffic Engineering and Control 31, 1990),
 
     rho_i+ = rho_i + T/(lanes L) (q_(i-1) - q_i + q_ramp),        q_i = lanes rho_i v_i,
     v_i+ = v_i + T/tau (V(rho_i) - v_i) + T/L v_i (v_(i-1) - v_i) - eta T/(tau L) (rho_(i+1) - rho_i)/(rho_i + kappa)
            - delta T/(L lanes) q_ramp v_i/(rho_i + kappa),        V(rho) = v_free exp(-(rho/rho_crit)^a / a),
     w+ = w + T (d - q),        q = r min(d + w/T, C min(1, (rho_max - rho)/(rho_max - rho_crit))).
 
-Layout, numbers, start and demands are those of the example in A. Hegyi, Model predictive control for integrating traffic control
-measures, thesis, Delft 2004, as in FilippoAiraldi/sym-metanet (MIT licence).
+Layout, numbers, start and demands are those of the example in A. Hegyi, Model predictive control for integrating traffic
+control measures, thesis, Delft 2004, as in FilippoAiraldi/sym-metanet (MIT licence).
 
-Model: free traffic is slower and takes longer to settle, vehicles that merge slow nobody down, and more cars per hour fit through
-the light. Its demands stay at their nominal values.
+Model: free traffic is slower and takes longer to settle, vehicles that merge slow nobody down, and more cars per hour fit
+through the light. Its demands stay at their nominal values.
 
-Task: a metering rate once a minute, six steps, holds the density at the merge at 30 veh/km +- 2, below the critical one, while 1500
-veh/h come to the ramp. Errors count from 6 min on. Rms error, veh/km per lane:
+Task: a metering rate once a minute, six steps, holds the density at the merge at 30 veh/km +- 2, below the critical one,
+while 1500 veh/h come to the ramp. Errors count from 6 min on.
 
-    CTC 0.79    CTC+FPI 0.16    CTC exact model 1e-14
+    rms error, seed 0    density [veh/km]
+    CTC                              0.79
+    CTC+FPI                          0.16
 
-The model of a minute is the map applied six times, so the exact one has no error at all. With the ramp open, the density rises to
-71 and all cars together spend 571 veh h in the hour; metered, 553 veh h, and up to 349 cars wait at the light.
+The model of a minute is the map applied six times, so the exact one has no error at all. With the ramp open, the density
+rises beyond the critical one, and all cars together spend more time than with a metered ramp.
 """
 
 import casadi as ca

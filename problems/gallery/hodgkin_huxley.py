@@ -10,14 +10,19 @@ without a current, 68.3 spikes per second at 10 uA/cm^2.
 
 Task: V follows a wave of 20 mV and 25 ms, which alone would make the cell fire. The error of V counts from 10 ms on. The
 start is 10 mV too low, so that a plan needs more current than the limits allow, and from 2 to 5 ms a synapse adds 10 uA/cm^2
-that no controller measures. Rms error, mV (seed 0):
+that no controller measures.
 
-    CTC 15.7    CTC+FPI 0.0072    RHC 12.1    RHC+FPI 0.0089    offset-free 0.034    exact model, 5 iterations 0.010
+    rms error, seed 0    V [mV]
+    CTC                      16
+    CTC+FPI              0.0072
+    RHC                      12
+    RHC+FPI              0.0089
+    RHC offset-free       0.034
+    RHC exact model        0.01
 
-Without adaptation the cell fires (errors of 60 mV and more). The controllers that correct are equally good: with a clock of
-5 us each has an error of about a hundredth of a millivolt. The exact model needs more than one iteration per plan: with one
-its error is 8 mV. The controllers measure every state; the gates, which cannot be measured in a cell, are used by the exact
-model alone.
+Without adaptation the cell fires. The controllers that correct are equally good. The exact model needs more than one
+iteration per plan. The controllers measure every state; the gates, which cannot be measured in a cell, are used by the
+exact model alone.
 """
 
 import casadi as ca

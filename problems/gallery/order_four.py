@@ -6,21 +6,24 @@ point transformations at relative order four (a mass pulled through another one 
     m q'''' = F - 4 w q''' - 6 w^2 q'' - 4 w^3 q' - w^4 q,        nominal motion  q^N = sin t.
 
 The error of q counts from 10 s on. The first second needs more force than the limits allow, and at 3 s a force of 30 N pushes
-for half a second; no controller measures it. All derivatives are ideal; rms error, mm (seed 0):
+for half a second; no controller measures it. All derivatives are ideal.
 
-    CTC 17.8    CTC+FPI 0.038    RHC 7.3    RHC+FPI 0.024    offset-free 1.3    exact model 0.0002
+    rms error, seed 0            q [m]
+    CTC                          0.018
+    CTC+FPI                    3.8e-05
+    CTC+FPI, gain too large      0.052
+    RHC                         0.0073
+    RHC+FPI                    2.4e-05
+    RHC offset-free             0.0013
+    RHC exact model            1.6e-07
 
 The plant answers three times as strongly as the model expects (gain 3), so the effective gain of a deformation must stay
-below 2/3: eq. (3) with K_c = 1e6 may have A_c up to 6.7e-7. With 1e-6 the response error doubles in every cycle from the
-first on; it passes 100 m/s^4 at 10 ms, and from then on the limits of the force bound it. An offset-free plan whose filter
-estimates the disturbance in one cycle is an iteration of unit gain, beyond that limit: it diverges (760 mm). Slow filters
-are late. The one below is the best of `fpirhc tune order_four --trials 20 --scenarios 2 --mismatch 10`, which lowers its
-relative error from 0.083 (drift 1, noise of the third derivative 0.1) to 6.6e-4; the same budget lowers that of RHC+FPI
-from 1.2e-5 to 1.0e-5 (gain -1.3).
+below 2/3: eq. (3) with K_c = 1e6 may have A_c up to 6.7e-7. Beyond that the response error grows in every cycle, until the
+limits of the force bound it. An offset-free plan whose filter estimates the disturbance in one cycle is an iteration of
+unit gain, beyond that limit: it diverges. Slow filters are late.
 
-FPI is worse where only positions are measured, with a noise of 1 um and derivatives by a polynomial over 51 ms. This gain
-is then refused before the run (the response is 24.5 cycles late). With the delay in its pairing and a tenth of the gain FPI
-has an error of 103 mm, and CTC alone 21 mm.
+FPI is worse where only positions are measured, with noise and derivatives by a polynomial: this gain is then refused before
+the run, and told of the delay, with a smaller gain, adaptation is worse than none.
 """
 
 import casadi as ca

@@ -1,8 +1,15 @@
 """The same tumour with one reading and one dose a day: a hasty gain is worse than none, and offset-free control wins.
 
-Everything but the cycle is that of `tumour`: a day, as long as a stage of the plan. Rms error of ln x from 60 days on (seed 0):
+Everything but the cycle is that of `tumour`: a day, as long as a stage of the plan. Errors count from 60 days on:
 
-    RHC 0.14    RHC+FPI 1.0e-4    gain -0.3 0.67    offset-free 2.8e-5    exact model 0.025
+    rms error, seed 0    size [ln(mm^3)]
+    CTC                            0.012
+    CTC+FPI                        0.004
+    RHC                             0.14
+    RHC+FPI                       0.0001
+    RHC offset-free              2.8e-05
+    RHC exact model                0.025
+    RHC+FPI, gentle                 0.67
 
 An offset-free plan now uses its estimate in every cycle, as often as the deformation acts, and its model of a constant
 disturbance fits. A small gain is no safe choice: with -0.3 the correction takes days to act, the plan reacts to the errors of

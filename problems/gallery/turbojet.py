@@ -10,19 +10,21 @@ a jet-driven humanoid robot (ami-iit, paper_nava_2023_icra_fault-control-ironcub
 P100 gives 110 N, the P220 150 N. The throttle's effect is kept above 0.3 N/s^2 in both, so that it never changes its sign.
 
 Task: T = 120 + 40 sin 0.3 t, from 60 N; a cycle of 10 ms and a plan every 100 ms; the error counts from 20 s on. The first
-second needs more throttle than the limits allow, and from 5 to 8 s a gust takes 15 N/s^2, which no controller measures. Rms
-error, N (seed 0):
+second needs more throttle than the limits allow, and from 5 to 8 s a gust takes 15 N/s^2, which no controller measures.
 
-    CTC 4.60    CTC+FPI 0.020    RHC 4.36    RHC+FPI 0.012    offset-free 0.11    exact model 0.0004
+    rms error, seed 0      T [N]
+    CTC                      4.6
+    CTC+FPI                 0.02
+    RHC                      4.4
+    RHC+FPI                0.012
+    RHC offset-free         0.11
+    RHC exact model      0.00042
 
 The estimate of an offset-free plan acts when a plan is made, ten times less often than the deformation. At equal rates, see
-`turbojet_slow`, it is a draw. `fpirhc tune turbojet --trials 20 --seeds 2 --mismatch 10` takes the relative error of CTC+FPI
-from 6.1e-4 to 1.9e-4, of RHC+FPI from 1.7e-4 to 1.3e-4, and leaves offset-free at 1.2e-3. The settings below are near its
-best but for the gain of RHC+FPI (-1.6 instead of -2.4): in the first second the model believes the throttle to be at its
-weakest, and there the iteration converges up to -1.9 only.
+`turbojet_slow`, it is a draw.
 
-The polynomial is good for slow motions only: at rates above 17 N/s (P100) its own term in T' squared outweighs the damping,
-and a step of the throttle from idle to 60 % never settles.
+The polynomial is good for slow motions only: at high rates its own term in T' squared outweighs the damping, and a step of
+the throttle from idle to 60 % never settles.
 """
 
 import casadi as ca

@@ -1,8 +1,14 @@
 """The same jet engine with a cycle as long as a stage of the plan, 100 ms: adaptation and offset-free control are equally good.
 
-Everything but the cycle is that of `turbojet`. Rms error of the thrust, N (seed 0):
+Everything but the cycle is that of `turbojet`.
 
-    CTC 4.7    CTC+FPI 0.21    RHC 4.36    RHC+FPI 0.14    gain -0.3 27    offset-free 0.13    exact model 0.0004
+    rms error, seed 0      T [N]
+    CTC                      4.7
+    CTC+FPI                 0.21
+    RHC                      4.4
+    RHC+FPI                 0.14
+    RHC offset-free         0.13
+    RHC exact model      0.00041
 
 The deformation and the estimate of an offset-free plan act equally often now. A small gain is no safe choice: with -0.3 the
 correction takes a second to act, the plan reacts to the errors of this second with all or no throttle, and the thrust swings.

@@ -1,0 +1,80 @@
+"""Numbers in the descriptions of problems: every measured one stands in a table, and every table is read here.
+
+A table gives rms errors in two digits; `fpirhc check` compares those of the baselines with fresh runs, and problems without a
+baseline run here.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import fpirhc as fp
+
+ROOT = Path(__file__).parents[2] / "problems"
+FILES = sorted([*ROOT.glob("*.py"), *(ROOT / "gallery").glob("*.py")])
+HEAD = "rms error, seed 0"
+WITHOUT = {
+    "delayed_mass",
+    "heat_exchanger",
+    "two_mass",
+    "van_der_pol",
+}  # their descriptions claim nothing that is measured
+
+
+def rows(text: str) -> list[list[str]]:
+    """The table of a description, head first: cells are apart by two spaces or more."""
+    lines = text.splitlines()
+    first = next((k for k, line in enumerate(lines) if line.startswith(f"    {HEAD}")), None)
+    if first is None:
+        return []
+    table = []
+    for line in lines[first:]:
+        if not line.startswith("    "):
+            break
+        table.append([cell.strip() for cell in line.strip().split("  ") if cell.strip()])
+    return table
+
+
+@cache
+def error(path: Path, controller: str, element: str) -> float:
+    """The rms error of the baseline, or of a run where there is none."""
+    baseline = path.parent / "baselines" / f"{path.stem}.json"
+    if baseline.exists():
+        metrics = json.loads(baseline.read_text(encoding="utf-8"))["controllers"][controller]["metrics"]
+        return float(metrics[f"rms_error.{element}"]["value"])
+    task = fp.load_problem(str(path))
+    run = fp.simulate(task.problem, task.controllers[controller], seed=0, compiled=False)
+    for name, value in fp.measure(task.problem, run).rms_error.items():
+        if name == element:
+            return value
+    raise AssertionError(element)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
+def test_a_table_is_what_runs_give(path):
+    """Every judged quantity with its unit, in two digits; a run on another machine may differ in the last one."""
+    task = fp.load_problem(str(path))
+    table = rows(task.description)
+    assert bool(table) != (path.stem in WITHOUT)
+    if not table:
+        return
+    units = task.problem.plant.face.coordinates
+    names = task.problem.judged_names
+    assert table[0] == [HEAD, *(f"{n} [{units[n]}]" for n in names)]
+    assert len(table) > 2
+    for controller, *numbers in table[1:]:
+        for name, number in zip(names, numbers, strict=True):
+            assert float(number) == pytest.approx(error(path, controller, name), rel=0.05), (controller, name)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
+def test_nothing_else_is_measured(path):
+    """No error, and no result of tuning, is told outside a table, where nobody would notice that it is no longer so."""
+    text = fp.load_problem(str(path)).description
+    assert "easured (" not in text
+    assert "fpirhc tune" not in text
+    assert text.lower().count("rms error") == (0 if path.stem in WITHOUT else 1)
