@@ -169,7 +169,7 @@ class Problem(Checked):
         """Coordinates whose errors are logged and measured."""
         if self.judged is not None:
             return tuple(self.judged)
-        weighed = (self.cost.tracked if self.cost is not None else None) or {}
+        weighed = (nominal(self.cost).tracked if self.cost is not None else None) or {}  # weights may be live
         controlled = self.plant.controlled_names
         return tuple(n for n in self.plant.face.coordinates if n in controlled or (n in weighed and self._shows(n)))
 

@@ -91,3 +91,10 @@ def test_a_lost_balance_is_no_success():
 def test_shipped_problems_judge_what_they_weigh(name, judged):
     """The chain weighs speeds of its inner masses and no positions."""
     assert fp.load_problem(name).problem.judged_names == judged
+
+
+def test_a_live_weight_is_judged_by_the_number_of_the_build():
+    """No branch on it is needed while the loop is built."""
+    plan = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=0.1))
+    loop = fp.simulator(pendulum(duration=0.05, measure_from=0.0), plan, compiled=False, live=["cost.states.th1"])
+    assert loop.run(seed=0).layout["error"].elements == ("pos", "th1", "th2")
