@@ -21,6 +21,7 @@ from fpirhc.summary import in_percent
 
 QUESTION = "Is the horizon long enough?"
 _SAME = 0.1  # relative change of the plan's feedback
+_LITTLE = 0.1  # growth over the run, as a share, that the run does not show
 _STILL = 1e-6  # of a growth per stage: a mode that neither decays nor grows
 
 
@@ -47,14 +48,20 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
     if grows > 0:
         text += f"; the model under the plan's feedback diverges at {grows:.3g} {problem.rate_unit}"
         stiff = stiff_advice(grid, plant.approximate, planned=True)
-        return Answer(
-            QUESTION, Verdict.NO, text, stiff or "Lengthen the horizon, or weigh its end (LQRTerminal).", numbers
-        )
+        verdict = Verdict.UNKNOWN if grows * problem.duration <= _LITTLE else Verdict.NO
+        return Answer(QUESTION, verdict, text, stiff or _advice(plant, change), numbers)
     if change > _SAME:
         return Answer(
             QUESTION, Verdict.UNKNOWN, text, "A longer horizon, or a weight of its end, plans differently.", numbers
         )
     return Answer(QUESTION, Verdict.YES, text, "", numbers)
+
+
+def _advice(plant: Plant, change: float) -> str:
+    """What to change where the model diverges under the plan's feedback."""
+    if change <= _SAME:
+        return "A longer horizon plans the same: weigh what diverges, see the zero dynamics."
+    return f"Lengthen the horizon, or weigh its end{'' if plant.outputs else ' (LQRTerminal)'}."
 
 
 def _slowest(grid: ReviewGrid) -> float:

@@ -89,3 +89,30 @@ def test_a_start_at_which_the_input_has_no_effect_is_no_error_inside():
     comparison = replace(one, problem=still).compared("still")
     assert not comparison.skipped
     assert comparison["CTC+FPI"].run.stop is None
+
+
+@pytest.mark.parametrize(
+    ("plant", "question", "said", "change"),
+    [
+        (rocket, "Are the zero dynamics stable?", "by 1.6 % over the run", "Weigh the other states in the cost"),
+        (
+            masses,
+            "Is the horizon long enough?",
+            "diverges at 0.000759 1/s",
+            "A longer horizon plans the same: weigh what div",
+        ),
+    ],
+)
+def test_a_plan_is_not_refused_for_growth_that_the_run_does_not_show(plant, question, said, change):
+    """Nor is a longer horizon advised where it changes nothing."""
+    one = plant()
+    [output], period = one.problem.plant.outputs, one.problem.period * (1 if one.problem.plant.step else 5)
+    problem = replace(
+        one.problem, horizon=fp.Horizon(stages=15, step=period), cost=fp.Quadratic(outputs={output: 100.0})
+    )
+    controllers = {"RHC": fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=1e-3))}
+    review = fp.review(problem, controllers, mismatch=0.0, seed=0)
+    answer = next(a for a in (*review.problem, *review.controllers["RHC"]) if a.question == question)
+    assert answer.verdict is Verdict.UNKNOWN
+    assert said in answer.evidence
+    assert answer.change.startswith(change)

@@ -248,7 +248,7 @@ def test_movement_of_the_command_is_stated_and_chatter_is_a_reason():
     chatter = moving(0.15, 12.0)
     assert chatter.outcome is Outcome.DOUBTFUL
     assert chatter.text == (
-        "Its command moves 80 times as much as that of RHC (u 12 against 0.15): it chatters, or carries the noise. "
+        "FPI: its command moves 80 times as much as that of RHC (u 12 against 0.15): it chatters, or carries the noise. "
         + lower
     )
     assert "moves and not that of RHC (u 0.2 against 0)" in moving(0.0, 0.2).text
@@ -260,7 +260,7 @@ def test_reasons_stand_before_a_positive_verdict():
     unsolved = {"status": {"NOT_CONVERGED": 0.42 * CYCLES}}
     finding = first(entry("RHC"), entry("FPI", "RHC", errors={"y": 0.5}, measured=unsolved))
     assert finding.outcome is Outcome.DOUBTFUL
-    assert finding.text.startswith("Its plans did not converge in 42 % of the cycles")
+    assert finding.text.startswith("FPI: its plans did not converge in 42 % of the cycles")
     assert finding.text.endswith("then compare. FPI lowers the rms error of y from 1 to 0.5 m (2 times less).")
     few = {"status": {"NOT_CONVERGED": 0.04 * CYCLES}}
     assert first(entry("RHC"), entry("FPI", "RHC", errors={"y": 0.5}, measured=few)).outcome is Outcome.BETTER

@@ -7,6 +7,7 @@ Every claim is computed from the entries, and every sentence about a pair carrie
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -82,6 +83,7 @@ def judge(plain: Entry, adaptive: Entry, yardstick: Yardstick) -> Finding:
         return Finding(text + (f" {worse}" if worse else "") + causes(plain, adaptive), outcome, pair, ratios)
     against = caveats(plain, adaptive, list(counted), yardstick)
     text += "".join(f" {s}" for s in (movement(plain, adaptive), effort_cause(adaptive)) if s)
+    against = re.sub("^Its ", f"{adaptive.name}: its ", against)  # nobody has been named yet
     return Finding(f"{against} {text}" if against else text, Outcome.DOUBTFUL if against else outcome, pair, ratios)
 
 
