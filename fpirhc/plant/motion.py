@@ -107,6 +107,12 @@ class Motion(Checked):
         if self.controlled is not None:
             return tuple(self.controlled)
         names, what = (tuple(self.outputs), "outputs") if self.outputs else (self.names, "coordinates")
+        if len(self.inputs) > len(names):
+            raise NotInvertible(
+                f"{len(self.inputs)} inputs ({', '.join(self.inputs)}) for {len(names)} of the {what} ({', '.join(names)}): every "
+                "input prescribes one. Add an output that the other input moves, leave an input out, or make one input of several, "
+                "with their shares in the response"
+            )
         if len(self.inputs) != len(names):
             raise NotInvertible(
                 f"{len(self.inputs)} input(s) cannot prescribe {len(names)} {what}: name the "

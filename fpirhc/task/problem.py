@@ -39,6 +39,7 @@ from fpirhc.task.reference import Reference
 from fpirhc.task.steps import check_steps
 
 MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
+_TRIED = 8  # states near the start, at which an input may have an effect that it lacks there
 _INSTANTS = 101  # at which signals from outside are tried before a run
 
 
@@ -428,8 +429,26 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
             weakest = plant.input.elements[int(np.argmin(np.linalg.norm(gain, axis=0)))]
             mistakes.add(
                 f"the response ({which} parameters) is not invertible at the start ({state}): input '{weakest}' has no "
-                "independent effect there; start elsewhere, or give Plant(inverse=...)"
+                f"independent effect there{_remedy(problem, gain_of, values, weakest)}"
             )
+
+
+def _remedy(problem: Problem, gain_of: ca.Function, values: np.ndarray, weakest: str) -> str:
+    """What helps where an input has no effect of its own at the start: another start; another output where it has none nearby."""
+    plant, random = problem.plant, np.random.default_rng(0)
+    for _ in range(_TRIED):
+        x, u = (
+            v + 0.1 * np.maximum(1, abs(v)) * random.normal(size=len(v))
+            for v in (problem.start_state, problem.inputs_before)
+        )
+        gain = np.asarray(gain_of(x, u, values)[0].full())
+        if np.isfinite(gain).all() and np.linalg.matrix_rank(gain) == len(gain):
+            return "; start elsewhere, or give Plant(inverse=...)"
+    x, u, p = plant.symbols()
+    rates = ca.jacobian_sparsity(plant.derivative_function(x, u, p), u)
+    column = np.asarray(ca.DM(rates, 1).full())[:, plant.input.elements.index(weakest)]
+    moved = ", ".join(f"the rate of {e}" for e, moves in zip(plant.state.elements, column, strict=True) if moves)
+    return f", nor near it. It moves {moved or 'nothing'} first: control what follows from that, or leave the input out"
 
 
 def problem_facts(problem: Problem) -> tuple[str, ...]:

@@ -126,6 +126,11 @@ PLANTS = {
     "no input in the response": one(
         PENDULUM, "u.torque - ", "0 - ", "no input reaches coordinate 'angle'", "use torque in the response"
     ),
+    "two inputs for one coordinate": Wrong(
+        PENDULUM,
+        (('{"torque": "N m"}', '{"torque": "N m", "brake": "N m"}'), ("u.torque - ", "u.torque - u.brake - ")),
+        ("2 inputs (torque, brake) for 1 of the coordinates (angle): every input prescribes one", "leave an input out"),
+    ),
     "controlled by one name": Wrong(
         TANKS,
         (

@@ -95,6 +95,48 @@ def test_underactuated_plant_asks_for_a_choice():
         _ = two_mass_chain().controlled_names
 
 
+def test_more_inputs_than_coordinates_are_told_what_to_do():
+    """To name the controlled one, as with fewer inputs, would be refused next."""
+    plant = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"drive": "N", "brake": "N"},
+        parameters={"m": fp.Parameter(1.0, 1.2, "kg")},
+        response=lambda _, v, u, p: {"y": (u.drive - u.brake - v.y) / p.m},
+    )
+    with pytest.raises(
+        NotInvertible, match=r"2 inputs \(drive, brake\) for 1 of the coordinates \(y\).*leave an input out"
+    ) as told:
+        _ = plant.controlled_names
+    assert "controlled=" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("second", "start", "said"),
+    [
+        (lambda x, _: 2 * x.a, 0.0, "'v' has no independent effect there, nor near it. It moves the rate of b first"),
+        (lambda x, _: x.b**2, 0.0, "'v' has no independent effect there; start elsewhere"),
+    ],
+)
+def test_inputs_without_an_effect_of_their_own_are_told_where_they_act(second, start, said):
+    """Another start helps only where the effect is lost at one point."""
+    plant = fp.Plant.of_states(
+        states={"a": "m", "b": "m"},
+        inputs={"u": "m/s", "v": "m/s"},
+        parameters={"k": fp.Parameter(1.0, 1.2, "1")},
+        rates=lambda _, u, p: {"a": p.k * u.u, "b": u.v},
+        outputs={"first": fp.Output("m", lambda x, _: x.a), "second": fp.Output("m", second)},
+    )
+    with pytest.raises(InvalidProblem) as told:
+        fp.Problem(
+            plant=plant,
+            reference=fp.Trajectory(lambda t: {"first": ca.sin(t), "second": 1 + ca.sin(t)}),
+            start={"a": start, "b": start},
+            period=0.01,
+            duration=1.0,
+        )
+    assert said in str(told.value)
+
+
 BAD: dict[str, dict[str, Any]] = {
     "exact must be a finite number, got inf": {"parameters": {**TWO, "m": fp.Parameter(1.0, float("inf"), "kg")}},
     "has no unit": {"parameters": {**TWO, "m": fp.Parameter(1.0, 1.0, "")}},
