@@ -6,6 +6,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
+from fpirhc.errors import NotSupported
+
 T = TypeVar("T")
 
 
@@ -28,12 +30,17 @@ class Latest(Generic[T]):
             build: function without arguments.
         """
         for objects, others, result in tuple(self._known):
-            if (
-                others == equal
-                and len(objects) == len(same)
-                and all(a is b for a, b in zip(objects, same, strict=True))
-            ):
+            alike = len(objects) == len(same) and all(a is b for a, b in zip(objects, same, strict=True))
+            if alike and _equal(others, equal):
                 return result
         result = build()
         self._known.append((same, equal, result))
         return result
+
+
+def _equal(one: tuple[object, ...], other: tuple[object, ...]) -> bool:
+    """Whether they are equal; a live number, which refuses to be compared, equals no other."""
+    try:
+        return one == other
+    except NotSupported:
+        return False

@@ -13,6 +13,12 @@ ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
+def test_the_readme_says_at_once_what_the_method_asks_for():
+    """Before anything can be tried: the response is measured or estimated in every cycle, and its noise reaches the command."""
+    begin = " ".join(README.partition("## ")[0].split())
+    assert "must be measured or estimated in every cycle, and its noise reaches the command" in begin
+
+
 def test_problem_of_the_readme_runs(tmp_path, monkeypatch, capsys):
     """Copied into a file, it compares and adaptation helps."""
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
