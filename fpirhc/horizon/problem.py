@@ -51,6 +51,8 @@ class OptimalControl:
         live_bounds: paths of the live limits of inputs, which are arguments of a call.
         derive: function of the numbers of settings, by path, that returns the numbers that the cost computes from them.
         inner: of a plant with outputs, for every state its place in the reference, or -1 and a value of its own; else empty.
+        runaway: function that returns the factors by which the stages along the reference make a motion grow that decays in the
+            plant, shape (N,).
         functions: Functions that were built for it; problems that differ in numbers of settings only share them.
     """
 
@@ -77,6 +79,7 @@ class OptimalControl:
     live_bounds: tuple[str, ...] = ()
     derive: Callable[[Mapping[str, float]], dict[str, float]] | None = None
     inner: tuple[tuple[int, float], ...] = ()
+    runaway: Callable[[], np.ndarray] = lambda: np.ones(1)
     functions: dict[object, ca.Function] = field(default_factory=dict, repr=False)
 
     @property

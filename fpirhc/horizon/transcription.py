@@ -32,6 +32,7 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.reference_expansion import expand_along, input_curvature
 from fpirhc.horizon.stage_data import data_layout, stage_data
 from fpirhc.plant.plant import Plant
+from fpirhc.plant.stiffness import spurious_growth
 from fpirhc.symbolic.latest import Latest
 from fpirhc.symbolic.layout import Expression, Named, Signal
 from fpirhc.symbolic.live import PREFIX, LiveNumber, live_numbers, nominal, settled
@@ -133,6 +134,9 @@ def _transcribed(
         live_bounds=tuple(live_numbers(limits.inputs)),
         derive=derive,
         inner=tuple(zip(plant.known_by_outputs, map(float, nodes[0][:, -1]), strict=False)) if plant.outputs else (),
+        runaway=lambda: spurious_growth(
+            plant, horizon.discretisation, horizon.step, nodes[0][: plant.state.size, :-1], nodes[1]
+        ),
         functions=functions,
     )
     return ocp.at(values)

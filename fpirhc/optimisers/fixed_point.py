@@ -120,7 +120,8 @@ class FixedPoint(Optimiser):
                 f"FixedPoint(tolerance={self.tolerance:g}): inputs of this size are rounded to {rounding:.1g}; "
                 f"use {1e3 * rounding:.0g}"
             )
-        _require_rollouts(ocp.along.growth())
+        # With limits of states a plan has states of its own and feedback between them, which holds a plant that runs away itself.
+        _require_rollouts(ocp.runaway() if ocp.bounds_states else ocp.along.growth())
         least = ocp.along.least_curvature()
         if least < -_CONVEX and (self.hessian is None or self.hessian.needs_convex_cost):
             raise NotSupported(
@@ -178,8 +179,8 @@ def _require_rollouts(growth: np.ndarray) -> None:
     raise NotSupported(
         f"FixedPoint rolls its plans out; the discretised model multiplies a motion by {growth.max():.3g} in a stage and by "
         f"{np.prod(growth):.1g} over the horizon, so plans have no digits. Where the plant itself does not run away so, a fast "
-        f"mode is the cause: use Horizon(discretisation=RadauIIA()), or RungeKutta4(substeps=...) with more sub-steps; else use "
-        f"fewer or shorter stages"
+        f"mode is the cause: use Horizon(discretisation=RadauIIA()), or RungeKutta4(substeps=...) with more sub-steps; else limit "
+        f"a state, however widely, Limits(states=...), so that plans have states of their own, or use fewer stages"
     )
 
 

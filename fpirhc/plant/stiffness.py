@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import casadi as ca
 import numpy as np
@@ -30,10 +31,8 @@ def stiffness(
     modes = poles(plant, state, command, parameters)
     if not np.isfinite(modes).all():
         return ""
-    growth = integrator.growth(modes * period)
-    if growth is None:
-        return ""
-    wrong = (growth > 1 + 1e-9) & (modes.real <= 1e-9 * np.abs(modes))
+    growth = _spurious(integrator, period, modes)
+    wrong = growth > 1 + 1e-9
     if not wrong.any():
         return ""
     fastest = modes[wrong][int(np.argmax(np.abs(modes[wrong])))]
@@ -49,12 +48,43 @@ def stiffness(
     )
 
 
+def spurious_growth(
+    plant: Plant, integrator: Integrator, period: float, states: np.ndarray, commands: np.ndarray
+) -> np.ndarray:
+    """Return the largest factor by which steps along a trajectory make a mode of the model grow that decays, shape (N,); 1: none.
+
+    Args:
+        plant: the model.
+        integrator: of its motion.
+        period: of a step, in the plant's unit of time.
+        states: shape (nx, N).
+        commands: shape (nu, N).
+    """
+    if plant.step is not None:
+        return np.ones(commands.shape[1])
+    points = zip(states.T, commands.T, strict=True)
+    modes = [poles(plant, state, command, plant.approximate) for state, command in points]
+    return np.array([_spurious(integrator, period, m).max(initial=1.0) if np.isfinite(m).all() else 1.0 for m in modes])
+
+
+def _spurious(integrator: Integrator, period: float, modes: np.ndarray) -> np.ndarray:
+    """Factor by which a step makes each decaying mode grow; 1 for the others."""
+    growth = integrator.growth(modes * period)
+    if growth is None:
+        return np.ones(len(modes))
+    return np.where(modes.real <= 1e-9 * np.abs(modes), np.maximum(growth, 1.0), 1.0)
+
+
 def poles(plant: Plant, state: np.ndarray, command: np.ndarray, parameters: np.ndarray) -> np.ndarray:
     """Return the eigenvalues of dx'/dx at a point, per unit of time, shape (nx,); not finite where the slope is not."""
-    x, u, p = plant.symbols()
-    slope_of = ca.Function("fpirhc_slope", [x, u, p], [ca.densify(ca.jacobian(plant.derivative_function(x, u, p), x))])
-    slope = np.asarray(slope_of(state, command, parameters).full())
+    slope = np.asarray(_slope_of(plant)(state, command, parameters).full())
     return np.linalg.eigvals(slope) if np.isfinite(slope).all() else np.full(len(slope), np.nan + 0j)
+
+
+@lru_cache(maxsize=8)
+def _slope_of(plant: Plant) -> ca.Function:
+    x, u, p = plant.symbols()
+    return ca.Function("fpirhc_slope", [x, u, p], [ca.densify(ca.jacobian(plant.derivative_function(x, u, p), x))])
 
 
 def _text(pole: complex) -> str:

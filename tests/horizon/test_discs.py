@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -69,3 +70,41 @@ def test_steps_with_which_the_model_runs_away_are_refused_with_a_remedy(substeps
         NotSupported, match=r"multiplies a motion by .* in a stage and by .* use Horizon\(discretisation=RadauIIA"
     ):
         fp.simulate(p, fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-2)), seed=0)
+
+
+def pendulum(length, horizon, limits):
+    """An upright pendulum, which falls with the rate sqrt(g / length)."""
+    plant = fp.Plant(
+        coordinates={"a": "rad"},
+        inputs={"M": "N m"},
+        parameters={"g": fp.Parameter(9.81, 9.81, "m/s^2")},
+        response=lambda q, v, u, p: {"a": p.g / length * ca.sin(q.a) + u.M / length**2 - 0.05 * v.a},
+    )
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"a": 0 * t}),
+        start={"a": 0.2},
+        period=0.02,
+        duration=0.6,
+        limits=fp.Limits(inputs={"M": (-20.0, 20.0)}, states=limits),
+        horizon=fp.Horizon(stages=round(horizon / 0.04), step=0.04),
+        cost=fp.Quadratic(states={"a": 10.0, "a'": 1.0}, effort={"M": 0.01}),
+    )
+
+
+PLANNED = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-4))
+
+
+def test_a_plant_that_runs_away_itself_is_planned_with_states_of_its_own():
+    """It multiplies a motion by 1e10 over the horizon; with limits of states the plans are those of IPOPT."""
+    problem = pendulum(0.25, 4.0, {"a": (-0.5, 0.5)})
+    run = fp.simulate(problem, PLANNED, seed=0)
+    other = fp.simulate(problem, fp.RecedingHorizon(fp.Ipopt(tolerance=1e-8)), seed=0)
+    assert set(fp.measure(problem, run).statuses) == {"OK"}
+    np.testing.assert_allclose(run["state"], other["state"], atol=1e-4)
+
+
+def test_a_plant_that_runs_away_itself_is_refused_without_them():
+    """A gradient by rollouts has no digits there, whatever the integrator; the message says what helps."""
+    with pytest.raises(NotSupported, match=r"limit a state, however widely, Limits\(states="):
+        fp.simulate(pendulum(0.25, 4.0, {}), PLANNED, seed=0)
