@@ -31,13 +31,14 @@ _FREQUENCIES = 300
 _LOWEST = 1e-5  # of the Nyquist frequency
 
 
-def margins_enough(problem: Problem, loops: Loops, *, adapts: bool) -> Answer:
+def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: bool) -> Answer:
     """Return the smallest margins of all inputs at the first point of the reference and where the largest |pole| is.
 
     Args:
         problem: the problem.
         loops: linear loops of the controller.
         adapts: whether the controller has a deformation.
+        planned: whether the controller is a plan, which has weights in place of a rate.
     """
     if not loops.loops:
         return Answer(QUESTION, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
@@ -59,9 +60,8 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool) -> Answer:
     if any(one.hidden.any() for one in loops.loops):
         text += "; neutral modes that no judged coordinate shows are left out"
     good = gain >= LEAST_GAIN and phase >= LEAST_PHASE
-    change = (
-        "" if good else "Lower the map's gain or the rate." if adapts else "Lower the rate, or weigh the inputs more."
-    )
+    gentler = "weigh the inputs more" if planned else "lower the rate"
+    change = "" if good else f"Lower the map's gain, or {gentler}." if adapts else f"{gentler.capitalize()}."
     return Answer(QUESTION, Verdict.YES if good else Verdict.UNKNOWN, text, change, numbers)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from fpirhc.controllers.base import Controller
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.grid import ReviewGrid
@@ -10,7 +12,9 @@ from fpirhc.review.maps import dead_cycles
 from fpirhc.review.neutral import NEUTRAL
 from fpirhc.review.stages import stiff_advice
 from fpirhc.review.stand_in import is_planned
+from fpirhc.review.zero_dynamics import zero_dynamics_rate
 
+_BESIDE = 1.1  # the growth of the zero dynamics is that of the plant, and the nominal loop is that of the model
 QUESTION = "Is the sampling fast enough for the tracking law?"
 
 
@@ -29,6 +33,9 @@ def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answ
     text += f"; in the nominal loop, plant = model, the slowest mode is multiplied by {radius:.6g} per cycle"
     if radius < 1:
         return Answer(QUESTION, Verdict.YES, text, "", numbers)
+    if _of_zero_dynamics(grid, radius):
+        change = "It is the mode of the zero dynamics, which no rate and no period changes: see there."
+        return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
     change = stiff_advice(grid, controller.parameters(grid.problem.plant), planned=is_planned(controller)) or (
         "Lower the rate, shorten the period, or predict over the dead time (Predicted)."
     )
@@ -36,6 +43,15 @@ def rates_inside(grid: ReviewGrid, controller: Controller, loops: Loops) -> Answ
         change = "A mode neither grows nor decays: weigh the state or the input in which it is."
         return Answer(QUESTION, Verdict.UNKNOWN, text, change, numbers)
     return Answer(QUESTION, Verdict.NO, text, change, numbers)
+
+
+def _of_zero_dynamics(grid: ReviewGrid, radius: float) -> bool:
+    """Whether the loop grows no faster than the states that the controlled coordinates leave to themselves."""
+    rate, period = zero_dynamics_rate(grid), grid.problem.period
+    if rate is None or not rate > 0:
+        return False
+    grown = rate * period if grid.problem.plant.step is not None else math.expm1(rate * period)
+    return radius - 1 <= _BESIDE * grown
 
 
 def _rate(controller: Controller) -> float | None:

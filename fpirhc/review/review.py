@@ -139,7 +139,8 @@ def _zero_dynamics(case: Case) -> Answer | None:
 
 
 def _margins(case: Case) -> Answer | None:
-    return margins_enough(case.problem, case.loops, adapts=case.controller.deformation.adapts)
+    adapts, planned = case.controller.deformation.adapts, is_planned(case.controller)
+    return margins_enough(case.problem, case.loops, adapts=adapts, planned=planned)
 
 
 def _more(case: Case) -> list[Answer]:

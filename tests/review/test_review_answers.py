@@ -106,12 +106,12 @@ def test_margins_of_an_integrator_by_hand(grid):
     """x+ = x + w, w = -0.1 x: L(-1) = -1/20; |z - 1| = 0.1 at 0.10004 rad a cycle, where the phase is -90 - 2.87 deg."""
     one = np.eye(1)
     integrator = LinearLoop(0.9 * one, one, -0.1 * one, np.array([0]), PERIOD)
-    answer = margins_enough(grid.problem, Loops((0,), (integrator,), integrator), adapts=True)
+    answer = margins_enough(grid.problem, Loops((0,), (integrator,), integrator), adapts=True, planned=False)
     assert answer.evidence == (
         "largest closed-loop pole magnitude 0.9; gain margin 20 (26 dB), phase margin 87.1 deg, delay margin 1.52 s (15.2 cycles)"
     )
     unstable = LinearLoop(1.1 * one, one, 0.1 * one, np.array([0]), PERIOD)
-    lost = margins_enough(grid.problem, Loops((0,), (unstable,), unstable), adapts=True)
+    lost = margins_enough(grid.problem, Loops((0,), (unstable,), unstable), adapts=True, planned=False)
     assert (lost.verdict, lost.numbers) == ("no", {"radius": 1.1})
     assert lost.evidence == (
         "largest closed-loop pole magnitude 1.1; a pole is outside the unit circle all along the reference"

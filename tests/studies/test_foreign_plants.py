@@ -97,6 +97,12 @@ def test_a_start_at_which_the_input_has_no_effect_is_no_error_inside():
         (rocket, "Are the zero dynamics stable?", "by 1.6 % over the run", "Weigh the other states in the cost"),
         (
             masses,
+            "Is the sampling fast enough for the tracking law?",
+            "is multiplied by 1.00038 per cycle",
+            "It is the mode of the zero dynamics",
+        ),
+        (
+            masses,
             "Is the horizon long enough?",
             "diverges at 0.000759 1/s",
             "A longer horizon plans the same: weigh what div",
