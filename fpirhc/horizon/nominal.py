@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import NotSupported
+from fpirhc.horizon.followed_state import followed_state
 from fpirhc.plant.instant import nominal_responses
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Matrix
@@ -45,7 +46,7 @@ def reference_state(plant: Plant, outputs: Matrix) -> Matrix:
 
 
 def feedforward(plant: Plant, outputs: Matrix, responses: Matrix, p: Matrix) -> Matrix:
-    """Return the input that the model needs along the reference.
+    """Return the input that the model needs along the reference, where every state follows from the outputs.
 
     Args:
         plant: the model.
@@ -56,7 +57,9 @@ def feedforward(plant: Plant, outputs: Matrix, responses: Matrix, p: Matrix) -> 
     Raises:
         NotSupported: see `reference_state`.
     """
-    return plant.inverse_function(reference_state(plant, outputs), nominal_responses(plant, outputs, responses), p)
+    follows = None if known_on_reference(plant) else followed_state(plant)
+    state = reference_state(plant, outputs) if follows is None else follows(outputs, p)
+    return plant.inverse_function(state, nominal_responses(plant, outputs, responses), p)
 
 
 def output_feedback(plant: Plant, x: Matrix, outputs: Matrix, p: Matrix, rate: float) -> Matrix:

@@ -1,0 +1,85 @@
+"""Deviations of inputs on plants with outputs: allowed where all states follow from the outputs, refused by name elsewhere."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.errors import NotSupported
+from fpirhc.horizon.followed_state import followed_state
+from fpirhc.horizon.stage_data import data_layout, stage_data
+
+K = 3.0  # 1/s
+REFERENCE = fp.Trajectory(lambda t: {"shown": 0.5 * ca.sin(t)})
+HORIZON = fp.Horizon(stages=20, step=0.05)
+COST: dict[str, Any] = {"outputs": {"shown": 1e3}}
+
+
+def lags(shown, second=None) -> fp.Plant:
+    """A' = u - a, b' = K (a - b), behind a display."""
+    return fp.Plant.of_states(
+        states={"a": "m", "b": "m"},
+        inputs={"u": "m/s"} | ({"v": "m/s"} if second else {}),
+        parameters={"k": fp.Parameter(K, 1.3 * K, "1/s")},
+        rates=lambda x, u, p: {"a": u.u - x.a, "b": p.k * (x.a - x.b) if not second else u.v - x.b},
+        outputs={"shown": fp.Output("m", shown)} | ({"other": fp.Output("m", second)} if second else {}),
+    )
+
+
+SCALED = lags(lambda x, _: 2 * x.b)
+
+
+def test_the_input_along_the_reference_is_that_of_the_lags():
+    """B = y / 2, a = b + b' / K, u = a' + a at every stage."""
+    cost = fp.Quadratic(**COST, deviation={"u": 1e-2})
+    data = np.asarray(stage_data(SCALED, REFERENCE, HORIZON, cost)(0.3, SCALED.approximate).full())
+    t = 0.3 + HORIZON.step * np.arange(HORIZON.stages + 1)
+    b, b1, b2 = 0.25 * np.sin(t), 0.25 * np.cos(t), -0.25 * np.sin(t)
+    needed = b1 + b2 / K + b + b1 / K
+    np.testing.assert_allclose(
+        data[data_layout(SCALED, HORIZON).slice("feedforward")][0], needed, rtol=1e-12, atol=1e-14
+    )
+
+
+def test_coupled_outputs_are_a_linear_system():
+    """Sum and difference of both states give both."""
+    plant = lags(lambda x, _: x.a + x.b, lambda x, _: x.a - x.b)
+    function = followed_state(plant)
+    assert function is not None
+    y = np.array([5.0, 1.0])
+    np.testing.assert_allclose(np.asarray(function(y, plant.approximate).full()).ravel(), [3.0, 2.0])
+
+
+@pytest.mark.parametrize("shown", [lambda x, _: x.a, lambda x, _: x.b**3 + x.a * x.b])
+def test_states_that_do_not_follow_are_refused_by_name(shown):
+    """An inner state, which no output shows, and one that stands in it in a power: `rate` is named."""
+    plant = lags(shown)
+    assert followed_state(plant) is None
+    with pytest.raises(NotSupported, match=r"needs the states .*, which no output gives.*rate"):
+        stage_data(plant, REFERENCE, HORIZON, fp.Quadratic(**COST, deviation={"u": 1e-2}))
+
+
+def test_a_loop_with_deviations_on_an_output_runs_and_adapts():
+    """With the exact model a plan follows; with the wrong one adaptation helps."""
+    problem = fp.Problem(
+        plant=SCALED,
+        reference=REFERENCE,
+        start={"a": 0.25 / K, "b": 0.0},
+        period=0.01,
+        duration=4.0,
+        measure_from=2.0,
+        horizon=HORIZON,
+        cost=fp.Quadratic(**COST, deviation={"u": 1e-2}),
+    )
+    plan = fp.RecedingHorizon(fp.FixedPoint(iterations=2, tolerance=1e-2))
+    adapted = plan.with_deformation(fp.ModelReferenced(fp.Affine(gain=-1.0)))
+    errors = [
+        fp.measure(problem, fp.simulate(problem, one, seed=0, compiled=False)).rms_error["shown"]
+        for one in (plan, adapted, fp.ExactModel(plan))
+    ]
+    assert errors[1] < 0.2 * errors[0]
+    assert errors[2] < 0.2 * errors[0]
