@@ -54,6 +54,8 @@ def _run(words: list[str]) -> ExitCode:
     if not words or words[0].startswith("-"):
         return _about(words, verbs)
     name, *rest = words
+    if name == "help":  # as git, pip and cargo have it
+        return _run([*rest[:1], "--help"])
     if name in former_names():
         new = former_names()[name]
         print(f"fpirhc: the command '{name}' is now '{new}'; the next version removes the old name", file=sys.stderr)

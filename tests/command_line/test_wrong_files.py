@@ -566,3 +566,13 @@ def test_a_long_list_of_valid_names_is_cut():
     said = str(caught.value)
     assert said.startswith("fpirhc has no name 'Sigmiod'. Did you mean 'Sigmoid'? Valid: Sigmoid, ")
     assert re.search(r" and \d+ more\.$", said)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"), [(["help", "run"], "usage: fpirhc run"), (["help"], "usage: fpirhc [--help]")]
+)
+def test_help_is_understood_as_a_command(words, said, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.startswith(said)
