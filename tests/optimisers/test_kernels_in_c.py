@@ -121,15 +121,26 @@ int t_policy(In slope, In matrix, In low, In high, Out v, int* free, Out lower, 
   box_policy(slope, matrix, low, high, v, free, lower, pivots);
   return 0;
 }
+int t_judged(In old, In u, In g, In next, double value, double after, double reach) {
+  static Search s;
+  static Plan best, plan;
+  casadi_real low[NU], high[NU];
+  int k;
+  for (k = 0; k < NU; ++k) low[k] = -10, high[k] = 10;
+  for (k = 0; k < N * NU; ++k) best.u[k] = old[k], plan.u[k] = u[k], best.g[k] = g[k], plan.g[k] = next[k];
+  best.value = value, plan.value = after;
+  s.tau = 1, s.gamma = 1e-3, s.envelope = value, s.reach = reach;
+  return judged(&s, &best, &plan, 1, low, high);
+}
 """
-PIVOT = 1e-9
+PIVOT, SHARE, ARMIJO = 1e-9, 0.9, 0.1
 
 
 def policy(inputs: int, rounds: int = 12) -> Any:
     """`fixed_point.c` with as many rounds of the box as this."""
     constants = defined(
-        NS=2, NU=inputs, N=1, NT=1, NM=1, MEMORY=1, WORK=1, INTEGERS=1, SCALE=[1.0] * inputs, FIRST_GAMMA=1.0,
-        ITERATIONS=1, STOP_EARLY=0, TOLERANCE=1e-6, DAMPING=0.0, SHARE=0.9, ARMIJO=1e-4, SHORTER=0.3, SHORTEST=0.03,
+        NS=2, NU=inputs, N=3, NT=1, NM=1, MEMORY=1, WORK=1, INTEGERS=1, SCALE=[1.0] * inputs, FIRST_GAMMA=1.0,
+        ITERATIONS=1, STOP_EARLY=0, TOLERANCE=1e-6, DAMPING=0.0, SHARE=SHARE, ARMIJO=ARMIJO, SHORTER=0.3, SHORTEST=0.03,
         DRAWN_IN=0.1, ROUNDING=1e-12, PLAIN=3, UNTRIED=1e299, PIVOT=PIVOT, ROUNDS=rounds, CONVERGED=0, NOT_CONVERGED=1,
         INFEASIBLE=2, NON_FINITE=4,
     )  # fmt: skip
@@ -175,12 +186,8 @@ def test_the_box_of_a_stage_has_the_best_move(inputs):
     for _ in range(200):
         matrix, slope = definite(rng, inputs), 2 * rng.normal(size=inputs)
         low, high = -rng.uniform(0, 1.5, inputs), rng.uniform(0, 1.5, inputs)
-        flags, lower, pivots, v = (
-            np.zeros(inputs, dtype=np.int32),
-            np.zeros(inputs**2),
-            np.zeros(inputs),
-            np.zeros(inputs),
-        )
+        flags, v = np.ones(inputs, dtype=np.int32), np.zeros(inputs)  # of another stage, with other factors
+        lower, pivots = np.full(inputs**2, np.nan), np.full(inputs, np.nan)
         call(alone, "t_policy", slope, columns(matrix), low, high, v, flags, lower, pivots)
         best = best_in_box(matrix, slope, low, high)
         assert 0.5 * v @ matrix @ v + slope @ v <= 0
@@ -204,6 +211,18 @@ def best_in_box(matrix: np.ndarray, slope: np.ndarray, low: np.ndarray, high: np
         if np.all((low - 1e-12 <= move) & (move <= high + 1e-12)):
             moves.append(move)
     return min(moves, key=lambda m: 0.5 * m @ matrix @ m + slope @ m)
+
+
+@pytest.mark.parametrize("inputs", [1, 2, 3])
+def test_a_step_along_the_direction_has_to_lower_the_cost_by_a_share_of_its_slope(inputs):
+    """With a flat gradient at its end: by ARMIJO of it, in every entry, or by SHARE (1 - SHARE) of the reach."""
+    rng, alone, size = np.random.default_rng(inputs), policy(inputs), 3 * inputs
+    for k in range(size):
+        old, move, slope = rng.normal(size=size), np.zeros(size), np.zeros(size)
+        move[k], slope[k] = 1.0, -4.0
+        flat = np.zeros(size)
+        for fall, far, accepted in ((0.3, 1e3, 0), (0.5, 1e3, 1), (0.05, 1e3, 0), (0.1, 1.0, 1), (-0.1, 1.0, 0)):
+            assert call(alone, "t_judged", old, old + move, slope, flat, 1.0, 1.0 - fall, far) == accepted, (k, fall)
 
 
 # The sweep of a plan with limits of states
@@ -233,6 +252,42 @@ int t_sweep(In f, In a, In b, In ls, In lu, In x, In tail, In final, In weight, 
   return ok;
 }
 int t_factorised(In matrix, Out lower, Out pivots) { return factorised(matrix, lower, pivots); }
+static const double* stage; /* f, cost, a, b, ls, lu of every stage; then cost, tail and final of the end */
+#define ENTRIES (NS + 1 + NS * NS + NS * NU + NS + NU)
+static int evaluate(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {
+  const double* from = stage + ENTRIES * (int)arg[2][0];
+  int k;
+  PUT(res[0], from, NS);
+  res[1][0] = from[NS], res[2][0] = arg[2][0];
+  return 0;
+}
+static int linearise(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {
+  const double* from = stage + ENTRIES * (int)arg[0][0] + NS + 1;
+  int k;
+  PUT(res[0], from, NS * NS); PUT(res[1], from + NS * NS, NS * NU);
+  PUT(res[2], from + NS * NS + NS * NU, NS); PUT(res[3], from + NS * NS + NS * NU + NS, NU);
+  return 0;
+}
+static int end(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {
+  const double* from = stage + ENTRIES * N;
+  int k;
+  res[0][0] = from[0];
+  PUT(res[1], from + 1, NS); PUT(res[2], from + 1 + NS, NS * NS);
+  return 0;
+}
+int t_expand(In all, In data, In k, int rolled, In gaps, In s0, In low, In high, Out x, Out u, Out value) {
+  static Point p;
+  static Scratch s;
+  int j, ok;
+  for (j = 0; j < (N + 1) * NS; ++j) p.x[j] = x[j];
+  for (j = 0; j < N * NU; ++j) p.u[j] = u[j];
+  stage = all;
+  ok = expand(&p, k, rolled, gaps, s0, data, low, high, &s);
+  for (j = 0; j < (N + 1) * NS; ++j) x[j] = p.x[j];
+  for (j = 0; j < N * NU; ++j) u[j] = p.u[j];
+  *value = p.value;
+  return ok;
+}
 """
 STAGES, COST, DAMPED = 4, 2.5, 0.3
 
@@ -244,7 +299,7 @@ def swept(states: int, inputs: int, places: list[int]) -> Any:
         DAMPING=DAMPED, PLACES=[*places, 0], CURVATURE=[0.5 + k for k in range(inputs)],
         UNITS=[1.0] * (inputs + len(places) + 1), SPREADS=[1.0 + 0.5 * j for j in range(states)],
     )  # fmt: skip
-    return library(("kernels", "limited_sweep"), constants, SWEEP, "plain")
+    return library(("kernels", "limited_sweep"), constants, SWEEP, "plain evaluate linearise end")
 
 
 @by_shape
@@ -328,3 +383,52 @@ def test_a_matrix_that_is_not_definite_is_told(inputs):
             assert call(alone, "t_factorised", columns(wrong), *arrays) == 0
     if inputs > 1:
         assert call(alone, "t_factorised", columns(np.ones((inputs, inputs))), *arrays) == 0
+
+
+STATES, INPUTS = 3, 2
+ENTRIES = STATES + 1 + STATES**2 + STATES * INPUTS + STATES + INPUTS
+
+
+def expanded(stages: np.ndarray, *, gaps: np.ndarray | None, rolled: int) -> tuple[int, np.ndarray, np.ndarray, float]:
+    """Whether a plan could be expanded, with its states, inputs and cost."""
+    rng = np.random.default_rng(5)
+    x, u, k = (rng.normal(size=n) for n in ((STAGES + 1) * STATES, STAGES * INPUTS, STAGES * STATES * INPUTS))
+    value, data = np.zeros(1), np.arange(STAGES + 1.0)
+    limits = np.full(INPUTS, 0.8)
+    given = stages, data, k, rolled, gaps, np.ones(STATES), -limits, limits
+    ok = call(swept(STATES, INPUTS, [0]), "t_expand", *given, x, u, value)
+    return ok, x.reshape(-1, STATES), u.reshape(-1, INPUTS), float(value[0])
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_an_expansion_with_anything_that_is_not_finite_is_none(bad):
+    """Values, slopes and Jacobians of every stage, and value and slope of the end, alone; also where the value is finite."""
+    good = np.random.default_rng(6).normal(size=ENTRIES * STAGES + 1 + STATES + STATES**2)
+    assert expanded(good, gaps=None, rolled=0)[0] == 1
+    for place in range(ENTRIES * STAGES + 1 + STATES):
+        wrong = good.copy()
+        wrong[place] = bad
+        assert expanded(wrong, gaps=None, rolled=0)[0] == 0, place
+
+
+def test_a_rollout_follows_the_model_less_the_gaps():
+    """With feedback from the states that it leaves, inside the limits of the inputs; the cost is that of all stages."""
+    stages = np.random.default_rng(6).normal(size=ENTRIES * STAGES + 1 + STATES + STATES**2)
+    rows = stages[: ENTRIES * STAGES].reshape(STAGES, ENTRIES)
+    gaps = np.random.default_rng(7).normal(size=STAGES * STATES)
+    rng = np.random.default_rng(5)
+    x, u, k = (rng.normal(size=n) for n in ((STAGES + 1) * STATES, STAGES * INPUTS, STAGES * STATES * INPUTS))
+    x, u, k = x.reshape(-1, STATES), u.reshape(-1, INPUTS), k.reshape(-1, STATES, INPUTS)
+    for given in (None, gaps):
+        ok, states, inputs, value = expanded(stages, gaps=given, rolled=1)
+        own = rows[:, :STATES] - (0 if given is None else gaps.reshape(-1, STATES))
+        expected = np.vstack([np.ones(STATES), own])
+        wanted = u + np.einsum("isl,is->il", k, expected[:-1] - x[:-1])
+        assert ok == 1
+        np.testing.assert_allclose(states, expected, rtol=1e-13)
+        np.testing.assert_allclose(inputs, np.clip(wanted, -0.8, 0.8), rtol=1e-12)
+        assert np.isclose(value, rows[:, STATES].sum() + stages[ENTRIES * STAGES])
+    _, states, inputs, _ = expanded(stages, gaps=None, rolled=0)
+    np.testing.assert_array_equal(states[0], np.ones(STATES))
+    np.testing.assert_array_equal(states[1:], x[1:])
+    np.testing.assert_array_equal(inputs, u)
