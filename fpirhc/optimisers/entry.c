@@ -1,15 +1,17 @@
 /* One library runs on every machine of its architecture: wider registers are used where there are some. Without fused
-   multiply-add both round alike. */
+   multiply-add both round alike. A library for one machine, which is known to have them (ALWAYS_WIDE), has the wider code alone. */
 #if defined(__GNUC__) && defined(__x86_64__)
 __attribute__((target("avx2"))) static int run_wide(const casadi_real** arg, casadi_real** res) { return run(arg, res); }
-static int can_run_wide(void) { return __builtin_cpu_supports("avx2"); }
 #else
 static int run_wide(const casadi_real** arg, casadi_real** res) { return 1; }
-static int can_run_wide(void) { return 0; }
 #endif
+#ifdef ALWAYS_WIDE
+#define run_plain run_wide
+#else
 static int run_plain(const casadi_real** arg, casadi_real** res) { return run(arg, res); }
+#endif
 
 int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {
   (void)iw, (void)w, (void)mem;
-  return can_run_wide() ? run_wide(arg, res) : run_plain(arg, res);
+  return WIDE ? run_wide(arg, res) : run_plain(arg, res);
 }

@@ -6,6 +6,15 @@
 #define INLINE static inline
 #endif
 
+/* Whether the machine has wide registers; ALWAYS_WIDE is defined where that is known. */
+#if defined(ALWAYS_WIDE)
+#define WIDE 1
+#elif defined(__GNUC__) && defined(__x86_64__)
+#define WIDE __builtin_cpu_supports("avx2")
+#else
+#define WIDE 0
+#endif
+
 typedef const casadi_real* In;
 typedef casadi_real* Out;
 

@@ -208,7 +208,17 @@ class _Unit:
 
 def _unit(source: str, compiler: str, more: Sequence[str]) -> _Unit:
     level = "-O3" if len(source) < _LARGE else "-O1"
-    return _Unit(source, (compiler, level, *_FLAGS, *more, "-c"))
+    return _Unit(source, (compiler, level, *_FLAGS, *_machine_flags(), *more, "-c"))
+
+
+@cache
+def _machine_flags() -> tuple[str, ...]:
+    """Definitions for this machine: where it has wide registers, the loops of optimisers leave out the code for those without."""
+    try:
+        facts = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        facts = ""
+    return ("-DALWAYS_WIDE",) if platform.machine() == "x86_64" and " avx2 " in facts else ()
 
 
 def _library(sources: Sequence[str], compiler: str, more: Sequence[str] = ()) -> ca.Function:

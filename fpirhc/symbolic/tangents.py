@@ -91,19 +91,21 @@ INLINE int {name}_lines(const casadi_real** arg, casadi_real** res, casadi_int* 
   return 0;
 }}
 
+#ifdef ALWAYS_WIDE
+#define {name}_plain {name}_wide
+#else
 APART static int {name}_plain(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w) {{
   return {name}_lines(arg, res, iw, w);
 }}
+#endif
 
 #if defined(__GNUC__) && defined(__x86_64__)
 APART __attribute__((target("avx2")))
 static int {name}_wide(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w) {{
   return {name}_lines(arg, res, iw, w);
 }}
-#define WIDE __builtin_cpu_supports("avx2")
 #else
 #define {name}_wide {name}_plain
-#define WIDE 0
 #endif
 
 INLINE int {name}(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {{
