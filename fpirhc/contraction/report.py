@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from fpirhc.contraction.gains import linear_limit, optimal_gain, predicted_factor, sector_limit
+from fpirhc.contraction.gains import linear_limit, predicted_factor, sector_limit
 from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import NotContractive
 from fpirhc.summary import line, number, table
-
-SECTOR_SHARE = 0.8  # recommended gains keep this distance from the sector bound
 
 
 @dataclass(frozen=True)
@@ -21,7 +18,8 @@ class ContractionReport:
     """Whether a deformation converges on plants with a given spectrum, and which gains do.
 
     Within the sector limit errors of any size converge. Between the two limits only small errors converge, and a large one may end
-    in a bounded oscillation. Where no gain converges the limits are empty and `recommended` is NaN.
+    in a bounded oscillation. Where no gain converges the limits are empty. These are limits of the map on a plant; those of the
+    whole loop, and a recommended gain, are answers of a review.
 
     Args:
         predicted: max|1 - a lambda|, the factor of an error of the request per cycle.
@@ -31,7 +29,6 @@ class ContractionReport:
         sector_limit: interval of the effective gain in which errors of any size converge.
         own_linear_limit: the linear limit in the deformation's own gain.
         own_sector_limit: the sector limit in the deformation's own gain.
-        recommended: a value of the deformation's own gain.
         contractive: whether the effective gain is within the linear limit.
         within_sector: whether the effective gain is within the sector limit.
         text: the verdict and the admissible gains, for a reader.
@@ -44,7 +41,6 @@ class ContractionReport:
     sector_limit: tuple[float, float]
     own_linear_limit: tuple[float, float]
     own_sector_limit: tuple[float, float]
-    recommended: float
     contractive: bool
     within_sector: bool
     text: str
@@ -65,7 +61,6 @@ class ContractionReport:
             ("predicted factor", number(self.predicted)),
             (f"linear limit of {self.gain_name}", linear),
             (f"sector limit of {self.gain_name}", sector),
-            (f"recommended {self.gain_name}", number(self.recommended)),
         ]
 
 
@@ -98,10 +93,8 @@ def assess_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionRepo
         return _hopeless(predicted, gain, name, text)
     sector = sector_limit(deformation, spectrum.eigenvalues)
     own_linear, own_sector = (_scaled(limit, own / gain) for limit in (linear, sector))
-    best = min(abs(optimal_gain(spectrum.eigenvalues)), SECTOR_SHARE * _size(sector))
-    recommended = best * (1 if linear[1] > 0 else -1) * own / gain
     contractive, within = linear[0] < gain < linear[1], sector[0] < gain < sector[1]
-    admissible = _admissible(name, own_linear, own_sector, recommended)
+    admissible = _admissible(name, own_linear, own_sector)
     what = f"{type(deformation).__name__}({name}={own:.4g})"
     verdict = _verdict(what, predicted, within, admissible) if contractive else ""
     return ContractionReport(
@@ -112,7 +105,6 @@ def assess_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionRepo
         sector_limit=sector,
         own_linear_limit=own_linear,
         own_sector_limit=own_sector,
-        recommended=recommended,
         contractive=contractive,
         within_sector=within,
         text=verdict or f"{what} {_fault(gain, linear, predicted)}; use {admissible}",
@@ -121,7 +113,7 @@ def assess_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionRepo
 
 def _hopeless(predicted: float, gain: float, name: str, text: str) -> ContractionReport:
     none = (0.0, 0.0)
-    return ContractionReport(predicted, gain, name, none, none, none, none, math.nan, False, False, text)
+    return ContractionReport(predicted, gain, name, none, none, none, none, False, False, text)
 
 
 def _fault(gain: float, linear: tuple[float, float], predicted: float) -> str:
@@ -145,12 +137,12 @@ def _size(limit: tuple[float, float]) -> float:
     return max(abs(limit[0]), abs(limit[1]))
 
 
-def _admissible(name: str, linear: tuple[float, float], sector: tuple[float, float], recommended: float) -> str:
-    sign = "positive" if recommended > 0 else "negative"
+def _admissible(name: str, linear: tuple[float, float], sector: tuple[float, float]) -> str:
+    sign = "positive" if sum(linear) > 0 else "negative"
     bounds = f"{_size(linear):.3g} (linear limit: small errors converge)"
     if not np.isclose(_size(linear), _size(sector)):
         bounds += f" and < {_size(sector):.3g} (sector limit: errors of any size converge)"
-    return f"a {sign} {name}, 0 < |{name}| < {bounds}; recommended {name}={recommended:.3g}"
+    return f"a {sign} {name}, 0 < |{name}| < {bounds}"
 
 
 def _verdict(what: str, predicted: float, within: bool, admissible: str) -> str:

@@ -100,7 +100,7 @@ def _mend(grid: ReviewGrid, controller: Controller, loops: Loops) -> str:
         stiff = stiff_advice(grid, believed, planned=is_planned(controller)) if advised else ""
         outer = "The outer loop does not converge even with the right model"
         return f"{outer}. {stiff}" if stiff else f"{outer}: lower its rate, or predict over the dead time."
-    return "Change the gain to the recommended one; under dead time pair the deformation."
+    return "See the question about the gain; under dead time pair the deformation."
 
 
 def _own_radii(grid: ReviewGrid, loops: Loops) -> tuple[np.ndarray, bool]:

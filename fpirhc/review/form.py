@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from fpirhc.deformation.base import Deformation
 from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.forms import INCREMENT, PLAIN, REFERENCED, forms_of
 from fpirhc.task.problem import Problem
 
-PLAIN, INCREMENT, REFERENCED = "plain", "increment", "model-referenced"
 _TRY = {
     PLAIN: "Try the map itself.",
     INCREMENT: "Try Increment(map, cycles=problem.response_delay).",
@@ -37,12 +39,23 @@ def form_of(deformation: Deformation) -> str:
     return PLAIN if deformation.pairing is None else "paired"
 
 
-def right_form(problem: Problem, deformation: Deformation) -> Answer:
-    """Whether the form in use is the recommended one; advice, so never no."""
+def right_form(problem: Problem, deformation: Deformation, harm: Callable[[Deformation], str]) -> Answer:
+    """Whether the form in use is the recommended one; advice, so never no.
+
+    Args:
+        problem: the problem.
+        deformation: in use.
+        harm: what runs show against a deformation; empty where it does no harm.
+    """
     question = "Is it the form of the iteration that the problem wants?"
     form, why = recommended_form(problem)
     used = form_of(deformation)
     text = f"it is {used}; measurements speak for {form}, because {why}"
     if used == form:
         return Answer(question, Verdict.YES, f"it is {used}: {why}")
+    proposed = forms_of(problem, deformation).get(form)
+    against = "" if proposed is None else harm(proposed)
+    if against:
+        change = "Keep the form that a comparison shows to be better."
+        return Answer(question, Verdict.UNKNOWN, f"{text}; but here {against}", change)
     return Answer(question, Verdict.UNKNOWN, text, _TRY[form])

@@ -5,8 +5,9 @@ from __future__ import annotations
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.deformation.wrappers.delayed import Increment
-from fpirhc.review.form import INCREMENT, PLAIN, REFERENCED
 from fpirhc.task.problem import Problem
+
+PLAIN, INCREMENT, REFERENCED = "plain", "increment", "model-referenced"
 
 
 def map_inside(deformation: Deformation) -> Deformation:

@@ -1,17 +1,18 @@
-"""Is the gain admissible? The map's own gain against its linear and sector limits, along the reference and over the box."""
+"""Is the gain admissible? The map's own gain against the limits of the map and of its whole loop, and the recommended gain."""
 
 from __future__ import annotations
-
-import math
 
 from fpirhc.contraction import ContractionReport, Spectrum, assess_gain
 from fpirhc.deformation.base import Deformation
 from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.recommended_gain import Recommended
 
 QUESTION = "Is the map's gain admissible?"
 
 
-def gain_admissible(deformation: Deformation, own: Spectrum, boxed: Spectrum, limit: float) -> Answer:
+def gain_admissible(
+    deformation: Deformation, own: Spectrum, boxed: Spectrum, limit: float, advice: Recommended
+) -> Answer:
     """Return the interval of admissible gains and the recommended value.
 
     Args:
@@ -19,26 +20,25 @@ def gain_admissible(deformation: Deformation, own: Spectrum, boxed: Spectrum, li
         own: eigenvalues of the response Jacobian along the reference, with the exact parameters.
         boxed: the same over the box of parameters.
         limit: limit of gain times eigenvalue, 2 without dead time.
+        advice: the recommended gain.
     """
     share = limit / 2
     near, wide = assess_gain(deformation, own), assess_gain(deformation, boxed)
+    if not near.sector_limit[0] < near.sector_limit[1]:
+        return Answer(QUESTION, Verdict.NO, near.text, "See the question about the eigenvalues' sign.")
     name = near.gain_name
-    best = wide if math.isfinite(wide.recommended) else near
-    sector, linear = (_ends(i, share) for i in (best.own_sector_limit, best.own_linear_limit))
+    best = wide if wide.sector_limit[0] < wide.sector_limit[1] else near
+    linear = _far(_ends(best.own_linear_limit, share))
     value = near.effective_gain if name == "effective gain" else float(getattr(deformation, name))
-    recommended = best.recommended * share
-    numbers = {"gain": value, "recommended": recommended, "factor": near.predicted}
-    numbers |= {"sector_limit": _far(sector), "linear_limit": _far(linear)}
-    text = (
-        f"{name} = {value:.4g}; admissible 0 to {_far(sector):.3g} for errors of any size, to {_far(linear):.3g} for small ones; "
-        f"recommended {recommended:.3g}"
+    numbers = {"gain": value, "recommended": advice.value, "factor": near.predicted}
+    numbers |= {"limit": advice.limit, "linear_limit": linear}
+    text = f"{name} = {value:.4g}; {advice.text}"
+    change = (
+        f"Use {name} = {advice.value:.3g}." if not advice.why_not else "Use another form, or leave the deformation out."
     )
-    if not math.isfinite(recommended):
-        return Answer(QUESTION, Verdict.NO, near.text, "See the question about the eigenvalues' sign.", numbers)
-    change = f"Use {name} = {recommended:.3g}."
     if not _within(near, near.linear_limit, share):
         return Answer(QUESTION, Verdict.NO, text, change, numbers)
-    good = _within(wide, wide.sector_limit, share)
+    good = 0 < value / advice.limit < 1 and _within(wide, wide.sector_limit, share)
     return Answer(QUESTION, Verdict.YES if good else Verdict.UNKNOWN, text, "" if good else change, numbers)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from fpirhc.contraction import assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import checked
 from fpirhc.errors import FpirhcError, InvalidValue
@@ -18,6 +19,7 @@ from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.inverse import inverse_exists
 from fpirhc.review.neighbourhood import spectrum_near
 from fpirhc.review.orders import relative_orders
+from fpirhc.review.recommended_gain import recommended_gain
 from fpirhc.review.signs import one_sign
 from fpirhc.review.well_posed import well_posed
 
@@ -55,4 +57,5 @@ def _of(grid: ReviewGrid, controller: Controller) -> tuple[Answer, ...]:
         own, boxed = (spectrum_near(grid, believed, draws, near=False) for draws in (grid.draws[:1], grid.draws))
     except InvalidValue as error:
         return (Answer("Do the eigenvalues of the response Jacobian have one sign?", Verdict.UNKNOWN, str(error)),)
-    return (one_sign(own, boxed), gain_admissible(ready.deformation, own, boxed, _LIMIT))
+    advice = recommended_gain(ready.deformation, assess_gain(ready.deformation, boxed), _LIMIT / 2, None)
+    return (one_sign(own, boxed), gain_admissible(ready.deformation, own, boxed, _LIMIT, advice))

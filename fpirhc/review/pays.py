@@ -42,7 +42,7 @@ def _no_gain(text: str, numbers: dict[str, float], *, elsewhere: bool) -> Answer
     if elsewhere:
         text += ", for the exact values of the model's own parameters, which move nothing beside a reality"
         return Answer(QUESTION, Verdict.UNKNOWN, text, "Run it and compare.", numbers)
-    change = "Raise the gain, shorten the period, or leave the deformation out: the model is right enough."
+    change = "Leave the deformation out, or use a form that leaves a right model alone: the model is right enough."
     return Answer(QUESTION, Verdict.NO, text, change, numbers)
 
 

@@ -17,17 +17,22 @@ from typing import TypeVar
 import numpy as np
 
 from fpirhc.controllers.base import Controller
+from fpirhc.deformation.base import Deformation
+from fpirhc.errors import FpirhcError
 from fpirhc.review import questions
 from fpirhc.review.answer import Answer
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import Loops
+from fpirhc.review.loops_by_gain import LoopsByGain, loops_by_gain
 from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.prediction import NominalRun
+from fpirhc.simulation.trials import Trials
 from fpirhc.task.problem import Problem
 
 GROUP = "fpirhc.questions"  # of entry points
 
 Kind = TypeVar("Kind", "ProblemQuestion", "ControllerQuestion")
+_TRIED = 1000  # cycles of a run that tries a form or a gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +60,30 @@ class Case:
     def believed(self) -> np.ndarray:
         """Parameters of the model, shape (np,)."""
         return self.controller.parameters(self.problem.plant)
+
+    @cached_property
+    def by_gain(self) -> LoopsByGain | None:
+        """The linear loops for every gain of the map; None where they are not known."""
+        return loops_by_gain(self.grid, self.controller, self.loops)
+
+    @cached_property
+    def _trials(self) -> Trials:
+        return Trials(self.grid.real or self.problem, self.controller.unadapted(), cycles=_TRIED)
+
+    def harm(self, deformation: Deformation) -> str:
+        """What runs on the plant and on the model show against a deformation, in a sentence; empty where it does no harm.
+
+        The exact parameters are those of the problem, so a form or a gain is proposed only after a run with the wrong model.
+        """
+        try:
+            real, null = self._trials.errors(self.controller.with_deformation(deformation))
+        except FpirhcError as error:
+            return f"it cannot be tried ({error})"
+        if real is not None and not real.passes:
+            return f"with the wrong model {real.sentence}"
+        if not null.passes and (real is None or null.adapted[null.worst] > real.without[null.worst]):
+            return f"with a right model {null.sentence}"
+        return ""
 
     @cached_property
     def nominal(self) -> NominalRun | str:

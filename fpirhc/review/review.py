@@ -18,6 +18,7 @@ from fpirhc.review.convergence import box_converges, converges
 from fpirhc.review.discretisation import discretisation_follows
 from fpirhc.review.form import right_form
 from fpirhc.review.gain import gain_admissible
+from fpirhc.review.gain_advice import gain_advice
 from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.horizon import horizon_long_enough
 from fpirhc.review.inverse import inverse_exists
@@ -26,6 +27,7 @@ from fpirhc.review.maps import largest_product
 from fpirhc.review.margins import margins_enough
 from fpirhc.review.neighbourhood import spectrum_near
 from fpirhc.review.nominal_runs import NominalRuns
+from fpirhc.review.null_test import leaves_right_model_alone
 from fpirhc.review.of_order_zero import controls_order_zero, review_of_order_zero
 from fpirhc.review.orders import relative_orders
 from fpirhc.review.pays import pays
@@ -100,7 +102,7 @@ def predict(problem: Problem, controller: Controller) -> Answer:
     case = Case(own, ready, loops, NominalRuns(own.problem))
     if ready.deforms_target:
         return converges(own, ready, loops, _doubts(_doubtful(case)))
-    suited = [*_speed_and_range(own, ready, loops), *_doubtful(case), free_of_two_cycles(own, ready, loops)]
+    suited = [*_speed_and_range(own, ready, loops), *_doubtful(case), free_of_two_cycles(case)]
     return converges(own, ready, loops, _doubts([*general, *suited]))
 
 
@@ -172,7 +174,8 @@ def _of_target(case: Case, general: list[Answer]) -> list[Answer]:
     )
     doubtful = _doubtful(case)
     verdict = converges(case.grid, case.controller, case.loops, _doubts(doubtful))
-    return [verdict, box_converges(case.loops), covered, *doubtful]
+    null = _asked(leaves_right_model_alone, case)
+    return [verdict, box_converges(case.loops), covered, *doubtful, *([] if null is None else [null])]
 
 
 def _of_map(case: Case, general: list[Answer]) -> list[Answer]:
@@ -183,20 +186,22 @@ def _of_map(case: Case, general: list[Answer]) -> list[Answer]:
     except InvalidValue as error:
         return [Answer("Do the eigenvalues of the response Jacobian have one sign?", Verdict.UNKNOWN, str(error))]
     limit = largest_product(grid.problem, deformation, own.eigenvalues)
-    two_cycles = _asked(free_of_two_cycles, grid, controller, loops)
+    null = _asked(leaves_right_model_alone, case)
+    two_cycles = _asked(free_of_two_cycles, case)
     suited = [*_speed_and_range(grid, controller, loops), *_doubtful(case)]
     answers = (
         _asked(converges, grid, controller, loops, _doubts([*general, *suited, two_cycles])),
         _asked(box_converges, loops),
         _asked(one_sign, own, boxed),
-        _asked(gain_admissible, deformation, own, boxed, limit),
+        _asked(gain_admissible, deformation, own, boxed, limit, gain_advice(case, boxed, null)),
         *suited,
         _asked(fast_enough, grid, controller, own),
         _asked(bears_lag, grid, controller, own),
         two_cycles,
         _asked(chatter_small, grid, controller),
-        _asked(right_form, grid.problem, deformation),
+        _asked(right_form, grid.problem, deformation, case.harm),
         _asked(pays, case),
+        null,
     )
     return [answer for answer in answers if answer is not None]
 

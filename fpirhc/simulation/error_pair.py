@@ -55,6 +55,13 @@ class ErrorPair:
         )
 
     @property
+    def sentence(self) -> str:
+        """Both errors of the worst coordinate, where a run may have ended early."""
+        before, after = self.without[self.worst], self.adapted[self.worst]
+        rest = f"{after:.3g} with it" if math.isfinite(after) else "a run that ends early with it"
+        return f"the rms error of {self.worst} is {before:.3g} without adaptation, {rest}"
+
+    @property
     def passes(self) -> bool:
         """Whether adaptation makes no coordinate worse by more than a fifth and by a thousandth of its range."""
         return not self._beyond(WORSE, SLIGHT)

@@ -7,7 +7,6 @@ is larger than that of the wrong model without adaptation. A plant outside is no
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,9 +14,7 @@ from contextlib import contextmanager
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, HarmfulAdaptation
 from fpirhc.fields.place import users_level
-from fpirhc.simulation.error_pair import ErrorPair, errors_of
-from fpirhc.simulation.model_as_plant import ModelAsPlant, shortened
-from fpirhc.simulation.simulate import simulator
+from fpirhc.simulation.trials import Trials
 from fpirhc.task.problem import Problem
 
 CYCLES = 300  # of a run
@@ -32,7 +29,7 @@ def warn_of_harm(problem: Problem, controller: Controller) -> None:
     if not controller.deformation.adapts or controller.learns or _ignored():
         return
     try:
-        reasons = _reasons(shortened(problem, CYCLES), controller)
+        reasons = _reasons(problem, controller)
     except FpirhcError:  # what the runs cannot do says nothing about the controller
         return
     if reasons:
@@ -58,23 +55,8 @@ def _ignored() -> bool:
 
 
 def _reasons(problem: Problem, controller: Controller) -> list[str]:
-    loops = [simulator(problem, c, compiled=False) for c in (controller.unadapted(), controller)]
-    model = ModelAsPlant(problem, seed=0).behind(loops[1].controller.deformation)
-    null = errors_of(model.problem, [model.run(loop) for loop in loops])
-    if problem.foreign is not None:
-        return [_sentence("on its own model", null)] if null.fails else []
-    real = errors_of(problem, [loop.run(seed=0) for loop in loops])
-    reasons = [_sentence("on the plant", real)] if real.fails else []
-    if null.fails and null.adapted[null.worst] > real.without[null.worst]:
-        reasons.append(_sentence("on its own model, with nothing to adapt", null))
+    real, null = Trials(problem, controller.unadapted(), cycles=CYCLES).errors(controller)
+    reasons = [] if real is None or not real.fails else [f"on the plant {real.sentence}"]
+    if null.fails and (real is None or null.adapted[null.worst] > real.without[null.worst]):
+        reasons.append(f"on its own model, with nothing to adapt {null.sentence}")
     return reasons
-
-
-def _sentence(where: str, errors: ErrorPair) -> str:
-    name = errors.worst
-    after = (
-        f"{errors.adapted[name]:.3g} with it"
-        if math.isfinite(errors.adapted[name])
-        else "a run that ends early with it"
-    )
-    return f"{where} the rms error of {name} is {errors.without[name]:.3g} without adaptation, {after}"

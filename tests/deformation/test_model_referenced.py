@@ -357,8 +357,12 @@ def test_review_says_which_form():
     for name, form in expected.items():
         module = fp.load_problem(name)
         assert recommended_form(module.problem)[0] == form
-    assert right_form(TWO_MASS.problem, fp.ModelReferenced(affine(0.5))).verdict == "yes"
-    advice = right_form(TWO_MASS.problem, affine(0.5))
+    harmless = lambda _: ""  # noqa: E731
+    assert right_form(TWO_MASS.problem, fp.ModelReferenced(affine(0.5)), harmless).verdict == "yes"
+    advice = right_form(TWO_MASS.problem, affine(0.5), harmless)
     assert advice.verdict == "unknown"
     assert "it is plain; measurements speak for model-referenced" in advice.evidence
     assert advice.change.startswith("Try ModelReferenced")
+    lost = right_form(TWO_MASS.problem, affine(0.5), lambda _: "with the wrong model it loses")
+    assert lost.evidence.endswith("; but here with the wrong model it loses")
+    assert "Try" not in lost.change

@@ -22,9 +22,9 @@ from fpirhc.review.grid import parameter_box, review_grid
 from fpirhc.review.loops import loops_along
 from fpirhc.review.margins import margins
 from fpirhc.review.nominal_runs import NominalRuns
+from fpirhc.review.null_test import leaves_right_model_alone
 from fpirhc.review.plan_feedback import plan_gains
 from fpirhc.review.question import Case
-from fpirhc.review.questions.null_test import leaves_right_model_alone
 from fpirhc.review.review import predict
 
 

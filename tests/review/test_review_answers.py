@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.contraction import Spectrum
+from fpirhc.contraction import Spectrum, assess_gain
 from fpirhc.deformation.base import Deformation
 from fpirhc.review.commands import commands_inside
 from fpirhc.review.convergence import box_converges, converges
@@ -20,6 +20,7 @@ from fpirhc.review.grid import ReviewGrid, review_grid
 from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import Loops
 from fpirhc.review.margins import margins_enough
+from fpirhc.review.recommended_gain import recommended_gain
 from fpirhc.review.slew import slew_enough
 from fpirhc.review.wording import duration, per_cycle
 
@@ -124,7 +125,8 @@ def test_the_range_along_the_reference_is_told(grid):
 
 
 @pytest.mark.parametrize(
-    ("ideal", "begin"), [(1.0, "The outer loop"), (0.999, "Change the gain"), (None, "Change the gain")]
+    ("ideal", "begin"),
+    [(1.0, "The outer loop"), (0.999, "See the question about the gain"), (None, "See the question about the gain")],
 )
 def test_the_fault_of_an_outer_loop_is_not_the_gains(grid, ideal, begin):
     """A loop that does not converge with the right model needs another rate, and no other gain."""
@@ -178,22 +180,23 @@ def test_share_of_the_box_that_converges(drawn, verdict, text):
 
 def admissible(gain: float, own: Any, boxed: Any, limit: float = 2.0) -> fp.Answer:
     plant, box = (Spectrum(np.array(eigenvalues, complex)[:, None]) for eigenvalues in (own, boxed))
-    return gain_admissible(fp.Affine(gain), plant, box, limit)
+    advice = recommended_gain(fp.Affine(gain), assess_gain(fp.Affine(gain), box), limit / 2, None)
+    return gain_admissible(fp.Affine(gain), plant, box, limit, advice)
 
 
 def test_numbers_of_the_gain():
-    """J from 1 to 1.5: A = -A_c / 2 below 2 / 1.5, best 1 / 1.25; under a dead time that halves the limit half of it all."""
+    """J from 1 to 1.5: A = -A_c / 2 below 2 / 1.5, half of it recommended; under a dead time that halves it, half of all."""
     one = admissible(-0.5, [1.0], [1.0, 1.5])
     assert (one.verdict, one.change) == ("yes", "")
     assert one.evidence == (
-        "gain = -0.5; admissible 0 to -2.67 for errors of any size, to -2.67 for small ones; recommended -1.6"
+        "gain = -0.5; the smallest limit is -2.67, set by the map's steepest secant; recommended -1.33, half of it"
     )
     assert one.numbers == pytest.approx(
-        {"gain": -0.5, "recommended": -1.6, "factor": 0.75, "sector_limit": -8 / 3, "linear_limit": -8 / 3}
+        {"gain": -0.5, "recommended": -4 / 3, "factor": 0.75, "limit": -8 / 3, "linear_limit": -8 / 3}
     )
     late = admissible(-0.5, [1.0], [1.0, 1.5], limit=1.0)
-    assert [late.numbers[n] for n in ("recommended", "sector_limit", "linear_limit")] == pytest.approx(
-        [-0.8, -4 / 3, -4 / 3]
+    assert [late.numbers[n] for n in ("recommended", "limit", "linear_limit")] == pytest.approx(
+        [-2 / 3, -4 / 3, -4 / 3]
     )
 
 
@@ -214,13 +217,14 @@ def test_where_a_gain_stops_being_admissible(gain, limit, verdict):
     """J = 1, and up to 2 in the box: the plant bears |A_c| < 4, the box |A_c| < 2, and half of both at half the limit."""
     one = admissible(gain, [1.0], [1.0, 2.0], limit)
     assert one.verdict == verdict
-    assert one.change == ("" if verdict == "yes" else f"Use gain = {-4 / 3 * limit / 2:.3g}.")
+    assert one.change == ("" if verdict == "yes" else f"Use gain = {-limit / 2:.3g}.")
 
 
 def test_both_signs_have_no_gain():
-    """In the box alone the plant's own limits are told; on the plant itself there is nothing to recommend."""
+    """Neither in the box nor on the plant itself is there a gain to recommend."""
     box = admissible(-0.5, [1.0], [-1.0, 1.0])
-    assert (box.verdict, box.change) == ("unknown", "Use gain = -2.")  # A = 1 / J
+    assert (box.verdict, box.change) == ("unknown", "Use another form, or leave the deformation out.")
+    assert box.evidence == "gain = -0.5; no gain is recommended, because no gain converges all over the box"
     own = admissible(-0.5, [-1.0, 1.0], [-1.0, 1.0])
     assert (own.verdict, own.change) == ("no", "See the question about the eigenvalues' sign.")
 

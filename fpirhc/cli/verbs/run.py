@@ -38,11 +38,13 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.report.figures import save_figure
     from fpirhc.report.terminal import announce_backend, progress_bars, show_run
     from fpirhc.simulation.metrics import measure
-    from fpirhc.studies.comparison.compare import select
+    from fpirhc.studies.comparison.compare import check_gains, select
     from fpirhc.studies.comparison.harm import harm_of_adaptation
 
     name = options.controller
     controller = select(task, [name])[name]
+    if not options.settings:
+        check_gains(task, {name: controller})
     folder = results_folder(options.out, task.name)
     with progress_bars() as progress:
         problem, changed, run = _simulated(

@@ -18,7 +18,6 @@ from fpirhc.review.question import Case, ControllerQuestion
 from fpirhc.review.speed import FAST
 
 _SPARE = 1.5
-_LOWER = 0.9  # gain of the second loop, as a share of the map's own
 _SMALLEST, _LARGEST, _STEPS = 1e-3, 30.0, 80  # factors of the map's own gain that are searched
 _POINTS = 3
 
@@ -54,20 +53,13 @@ def gain_times(deformation: Deformation, factor: float) -> str:
 
 def _least_factor(case: Case) -> float | None:
     """Smallest factor of the map's gain from which on gains converge; None where none of those tried does."""
-    controller, loops = case.controller, case.loops
-    gain = controller.deformation.effective_gain()
-    samples = np.unique(np.linspace(0, len(loops.places) - 1, _POINTS).astype(int))
-    lower = controller.with_deformation(controller.deformation.with_effective_gain(_LOWER * gain))
-    try:
-        others = loops_at(case.grid, lower, [loops.places[k] for k in samples])
-    except (FpirhcError, np.linalg.LinAlgError):
+    loops = case.by_gain
+    if loops is None:
         return None
-    own = [loops.loops[k].dynamics for k in samples]
-    slopes = [(f - other.dynamics) / (1 - _LOWER) for f, other in zip(own, others, strict=True)]
-    factors = np.geomspace(_SMALLEST, _LARGEST, _STEPS)
+    factors, pairs = np.geomspace(_SMALLEST, _LARGEST, _STEPS), loops.along(_POINTS)
 
     def stable(factor: float) -> bool:
-        return all(np.abs(np.linalg.eigvals(f + (factor - 1) * s)).max() < 1 for f, s in zip(own, slopes, strict=True))
+        return all(np.abs(loops.at(factor * loops.gain, pair).poles).max() < 1 for pair in pairs)
 
     first = next((k for k, factor in enumerate(factors) if stable(float(factor))), None)
     if first is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from typing import Any, cast
@@ -20,6 +20,7 @@ from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, No
 from fpirhc.fields.checked_call import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.review.gain_advice import recommended_for
 from fpirhc.review.response_prediction import Prediction, predict_response
 from fpirhc.simulation.changes import Changes
 from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
@@ -206,7 +207,7 @@ def compare(
         description=task.description,
         seed=seed,
         measure_from=task.problem.measure_from,
-        entries=tuple(entries),
+        entries=tuple(_advised(task, entries, judged[0], nulls)),
         skipped=skipped,
         findings=judged,
         command=command,
@@ -221,6 +222,16 @@ def compare(
     )
 
 
+def _advised(task: Task, entries: Sequence[Entry], first: Finding, nulls: Sequence[NullTest]) -> list[Entry]:
+    """The entries; the adaptive one of the first pair with the recommended gain, where it does not help and fails no null test."""
+    failed = any(test.harmful for test in nulls if test.pair == first.pair)
+    if first.pair is None or failed or first.outcome not in (Outcome.WORSE, Outcome.MIXED, Outcome.DOUBTFUL):
+        return list(entries)
+    advice = recommended_for(task.problem, task.controllers[first.pair[1]])
+    more = () if advice is None else (f"its gain: {advice.text}",)
+    return [replace(e, notes=(*e.notes, *more)) if e.name == first.pair[1] else e for e in entries]
+
+
 def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
     """Raise for gains of the wrong sign, which are mistakes in the file and no results, before anything runs."""
     mistakes = Mistakes(f"problem '{task.name}'")
@@ -228,7 +239,9 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
         try:
             checked(task.problem, controller)
         except NotContractive as error:
-            mistakes.add(f"controller '{name}': {error}")
+            advice = recommended_for(task.problem, controller)
+            known = "" if advice is None else f"; {advice.text}"
+            mistakes.add(f"controller '{name}': {error}{known}")
         except FpirhcError:
             continue  # reported later, as the reason why the controller is skipped
     mistakes.raise_if_any()

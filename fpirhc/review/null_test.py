@@ -21,7 +21,7 @@ from fpirhc.review.forms import forms_of
 from fpirhc.review.null_runs import null_problem, null_runs, with_form
 from fpirhc.review.pays import ROUNDING, nominal_size, rms
 from fpirhc.review.prediction import NominalRun, errors_without_adaptation, response_errors
-from fpirhc.review.question import Case, ControllerQuestion
+from fpirhc.review.question import Case
 from fpirhc.simulation.believed_way import with_believed_way
 from fpirhc.simulation.error_pair import SLIGHT, ErrorPair
 
@@ -64,9 +64,6 @@ def leaves_right_model_alone(case: Case) -> Answer:
     return Answer(QUESTION_TEXT, verdict, text, change, numbers | more)
 
 
-QUESTION = ControllerQuestion(leaves_right_model_alone, order=10, of_targets=True)
-
-
 def _cures_more(nominal: NominalRun | None, predicted: float | None) -> bool:
     """Whether the wrong model makes a larger response error without adaptation than adaptation makes of a right model."""
     return (
@@ -80,7 +77,7 @@ def _remedy(case: Case, runs: ErrorPair, predicted: float | None) -> tuple[str, 
     used = form_of(case.controller.deformation)
     for name, form in reversed(forms_of(case.problem, case.controller.deformation).items()):
         other = _other(case, form, runs) if name != used else None
-        if other is not None and other.passes:
+        if other is not None and other.passes and not case.harm(form):
             sentences.append(f"The {name} form passes: rms error of {runs.worst} {other.adapted[runs.worst]:.3g}.")
             numbers["with_form"] = other.adapted[runs.worst]
             break
@@ -92,7 +89,9 @@ def _remedy(case: Case, runs: ErrorPair, predicted: float | None) -> tuple[str, 
         sentences.append(text if shorter <= _PRACTICAL else "No practical period would do for the form in use.")
         numbers["period"] = period
     if not sentences:
-        sentences.append("No form passes: lower the gain, or choose other controlled coordinates.")
+        sentences.append(
+            "No form does better than none: leave the deformation out, or choose other controlled coordinates."
+        )
     return " ".join(sentences), numbers
 
 

@@ -1,0 +1,63 @@
+"""The recommended gain of a controller, tried in runs: the one number that review, report and refusal name."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from fpirhc.contraction import Spectrum, assess_gain
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import resolved
+from fpirhc.errors import FpirhcError
+from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.grid import review_grid
+from fpirhc.review.loops import loops_along
+from fpirhc.review.maps import largest_product
+from fpirhc.review.neighbourhood import spectrum_near
+from fpirhc.review.nominal_runs import NominalRuns
+from fpirhc.review.null_test import leaves_right_model_alone
+from fpirhc.review.question import Case
+from fpirhc.review.recommended_gain import Recommended, recommended_gain
+from fpirhc.task.problem import Problem
+
+
+def gain_advice(case: Case, boxed: Spectrum, null: Answer | None) -> Recommended:
+    """Return the recommended gain of a controller; none where it fails the null test, or where a run with that gain does harm.
+
+    Args:
+        case: of the controller.
+        boxed: eigenvalues of the response Jacobian over the box of parameters.
+        null: the answer whether adaptation leaves a right model alone.
+    """
+    deformation = case.controller.deformation
+    report = assess_gain(deformation, boxed)
+    share = largest_product(case.problem, deformation, boxed.eigenvalues) / 2
+    advice = recommended_gain(deformation, report, share, case.by_gain)
+    if advice.why_not:
+        return advice
+    against = ""
+    if null is not None and null.verdict == Verdict.NO:
+        against = "adaptation does not leave a right model alone"
+    else:
+        own = getattr(deformation, deformation.gain_name, None)
+        size = advice.value if own is None else advice.value / float(own) * deformation.effective_gain()
+        harm = case.harm(deformation.with_effective_gain(size))
+        against = f"with {advice.value:.3g}, half of it, {harm}" if harm else ""
+    return replace(advice, value=math.nan, why_not=against) if against else advice
+
+
+def recommended_for(problem: Problem, controller: Controller) -> Recommended | None:
+    """Return the gain that a review of a controller recommends, also where its own gain is refused; None where it has no answer."""
+    try:
+        grid = review_grid(problem, 0.0, 0)
+        deformation = controller.deformation
+        boxed = spectrum_near(grid, controller.parameters(grid.problem.plant), grid.draws, near=False)
+        share = largest_product(grid.problem, deformation, boxed.eigenvalues) / 2
+        allowed = 0.5 * share * sum(assess_gain(deformation, boxed).sector_limit)
+        if not allowed:
+            return None
+        safe = resolved(grid.problem, controller.with_deformation(deformation.with_effective_gain(allowed)))
+        case = Case(grid, safe, loops_along(grid, safe), NominalRuns(grid.problem))
+        return gain_advice(case, boxed, leaves_right_model_alone(case))
+    except FpirhcError:
+        return None

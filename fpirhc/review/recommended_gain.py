@@ -1,0 +1,147 @@
+"""The recommended gain of a map: half of the smallest limit of its whole loop. Every command that names a gain takes it from here.
+
+Limits of the effective gain a are set by
+
+    the steepest secant     a secant times every eigenvalue of the box is below 2, less behind a delay, an estimator or a filter
+    a two-cycle             the secant at which the whole loop has a bounded two-cycle, see `fpirhc.contraction.two_cycle`
+    the poles               a pole of the whole loop (tracking law or plan, delay, filter) reaches the unit circle, at a point of
+                            the reference or in a draw of the box
+    the margins             the gain margin of an input's loop falls below 1.4, or its phase margin below 25 degrees
+
+Below half of the first three the gain may double before anything happens; margins have their distance in themselves. In the plain
+form a gain that is too small is no good either: where half of the limit does not keep up with the plan, no gain is recommended.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fpirhc.contraction import ContractionReport, two_cycle_limit
+from fpirhc.deformation.base import Deformation
+from fpirhc.errors import FpirhcError
+from fpirhc.review.linear import LinearLoop
+from fpirhc.review.loops_by_gain import LoopsByGain
+from fpirhc.review.margins import LEAST_GAIN, LEAST_PHASE, margins
+from fpirhc.review.neutral import NEUTRAL
+
+MARGIN = 2.0
+SECANT, TWO_CYCLE = "the map's steepest secant", "a two-cycle of the whole loop"
+POLES, MARGINS = "the poles of the whole loop", "the margins of the whole loop"
+_ALONG, _DRAWN = 9, 8  # loops that are looked at
+_LEAST = 1e-3  # of the smallest other limit, down to which a stable gain is sought
+_STEPS, _BISECTIONS = 24, 12
+
+
+@dataclass(frozen=True)
+class Recommended:
+    """A gain, and what sets it.
+
+    Args:
+        value: of the map's own gain; NaN where none is recommended.
+        limit: of the map's own gain, the smallest one.
+        sets: which limit that is.
+        why_not: why none is recommended; empty where one is.
+        kept: whether it is less than half of the limit, so that the loop keeps its margins.
+    """
+
+    value: float
+    limit: float
+    sets: str
+    why_not: str = ""
+    kept: bool = False
+
+    @property
+    def text(self) -> str:
+        """Limit and recommendation as the end of a sentence."""
+        limit = f"the smallest limit is {self.limit:.3g}, set by {self.sets}; "
+        if self.why_not:
+            return f"{limit if math.isfinite(self.limit) else ''}no gain is recommended, because {self.why_not}"
+        if self.kept:
+            return f"{limit}recommended {self.value:.3g}, with which {MARGINS} suffice"
+        return f"{limit}recommended {self.value:.3g}, half of it"
+
+
+def recommended_gain(
+    deformation: Deformation, boxed: ContractionReport, share: float, loops: LoopsByGain | None
+) -> Recommended:
+    """Return the recommended gain of a map.
+
+    Args:
+        deformation: the map.
+        boxed: its report over the box of parameters.
+        share: limit of gain times eigenvalue as a share of 2, below 1 behind a delay, an estimator or a filter.
+        loops: its loops for every gain; None where no linear loop is known.
+    """
+    largest = share * max(map(abs, boxed.sector_limit))
+    if not largest:
+        return Recommended(math.nan, math.nan, "", "no gain converges all over the box")
+    sign = math.copysign(1.0, sum(boxed.sector_limit))
+    own = _own_per_effective(deformation)
+    limits = {SECANT: largest, **(_limits_of_loop(deformation, loops, largest, sign) if loops else {})}
+    sets = min(limits, key=lambda name: limits[name])
+    gain = limits[sets] / MARGIN
+    if loops and not _stable(loops, sign * gain):
+        why = f"with {sign * gain * own:.3g}, half of it, the loop does not converge"
+        return Recommended(math.nan, sign * limits[sets] * own, sets, why)
+    kept = gain if loops is None else _with_margins(loops, sign * gain)
+    return Recommended(sign * kept * own, sign * limits[sets] * own, sets, kept=kept < gain)
+
+
+def secant_limit(loops: LoopsByGain) -> float | None:
+    """Return the smallest secant gain with which the loop has a two-cycle along the reference; None where it is not known."""
+    try:
+        return min(two_cycle_limit(low.dynamics, own.dynamics, loops.gains) for low, own in loops.along(_ALONG))
+    except (FpirhcError, np.linalg.LinAlgError):
+        return None
+
+
+def _limits_of_loop(deformation: Deformation, loops: LoopsByGain, most: float, sign: float) -> Mapping[str, float]:
+    limits = {}
+    secant = secant_limit(loops)
+    if secant is not None and math.isfinite(secant):
+        right = deformation.with_effective_gain(sign * most)
+        limits[TWO_CYCLE] = secant * most / abs(right.secant_gain())
+    poles = _pole_limit(loops, sign, min([most, *limits.values()]))
+    return limits if poles is None else {**limits, POLES: poles}
+
+
+def _pole_limit(loops: LoopsByGain, sign: float, most: float) -> float | None:
+    """Largest stable gain below the other limits; None where the poles set none below them."""
+    if _stable(loops, sign * most):
+        return None
+    gains = most * np.geomspace(1.0, _LEAST, _STEPS)
+    first = next((k for k, gain in enumerate(gains) if _stable(loops, sign * float(gain))), None)
+    if first is None:
+        return None  # nothing converges, which half of the other limits shows
+    low, high = float(gains[first]), float(gains[first - 1])
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _stable(loops, sign * middle) else (low, middle)
+    return low
+
+
+def _stable(loops: LoopsByGain, gain: float) -> bool:
+    return all(loops.at(gain, pair).radius < 1 + NEUTRAL for pair in (*loops.along(_ALONG), *loops.over_box(_DRAWN)))
+
+
+def _with_margins(loops: LoopsByGain, gain: float) -> float:
+    """The size of the gain, or of the largest smaller one that keeps the margins; itself where smaller ones do not help."""
+    pair = max(loops.along(_ALONG), key=lambda pair: loops.at(gain, pair).radius)
+    for share in np.geomspace(1.0, 1 / MARGIN**2, 8):
+        if _keeps_margins(loops.at(float(share) * gain, pair)):
+            return abs(gain) * float(share)
+    return abs(gain)
+
+
+def _keeps_margins(loop: LinearLoop) -> bool:
+    sizes = [margins(loop, i)[:2] for i in range(loop.entry.shape[1])]
+    return all(gain >= LEAST_GAIN and phase >= LEAST_PHASE for gain, phase in sizes)
+
+
+def _own_per_effective(deformation: Deformation) -> float:
+    own = getattr(deformation, deformation.gain_name, None)
+    return 1.0 if own is None else float(own) / deformation.effective_gain()

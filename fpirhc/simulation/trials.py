@@ -1,0 +1,65 @@
+"""Short runs of a controller with adaptation and without, on the plant of a problem and on the controller's own model."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+
+import numpy as np
+
+from fpirhc.controllers.base import Controller
+from fpirhc.simulation.common_columns import judged_motion
+from fpirhc.simulation.error_pair import ErrorPair
+from fpirhc.simulation.metrics.entries.errors import rms_error
+from fpirhc.simulation.metrics.window import measured_errors
+from fpirhc.simulation.model_as_plant import ModelAsPlant, shortened
+from fpirhc.simulation.run import Run
+from fpirhc.simulation.simulate import simulator
+from fpirhc.task.problem import Problem
+
+
+class Trials:
+    """Runs beside one controller without adaptation, whose own runs are made once. A plant outside is not run."""
+
+    def __init__(self, problem: Problem, bare: Controller, *, cycles: int) -> None:
+        """Take the problem, the controller without adaptation, and the largest number of cycles of a run.
+
+        Raises:
+            FpirhcError: every error that the controller raises about the problem.
+        """
+        self.problem = shortened(problem, cycles)
+        self._model = ModelAsPlant(self.problem, seed=0)
+        self._bare = simulator(self.problem, bare, compiled=False)
+
+    @cached_property
+    def _plain(self) -> Run:
+        return self._bare.run(seed=0)
+
+    def errors(self, controller: Controller) -> tuple[ErrorPair | None, ErrorPair]:
+        """Return the errors on the plant, None where it is outside, and those on the model.
+
+        Raises:
+            FpirhcError: every error that the controller raises about the problem.
+        """
+        loop = simulator(self.problem, controller, compiled=False)
+        null = _pair(self._model.problem, self._model.run(self._bare), self._model.run(loop))
+        if self.problem.foreign is not None:
+            return None, null
+        return _pair(self.problem, self._plain, loop.run(seed=0)), null
+
+
+def _pair(problem: Problem, without: Run, adapted: Run) -> ErrorPair:
+    before, after = (
+        {name: value if math.isfinite(value) else math.inf for name, value in rms_error(problem, run).items()}
+        for run in (without, adapted)
+    )
+    return ErrorPair(before, after, _ranges(problem, without))
+
+
+def _ranges(problem: Problem, run: Run) -> dict[str, float]:
+    """Range of the reference, or the largest error where that is larger."""
+    errors, motion = run["true_error"], run[judged_motion(run.layout)]
+    places = [problem.plant.output.elements.index(name) for name in problem.judged_names]
+    spans = np.ptp(errors + motion[:, places], axis=0)
+    largest = np.abs(measured_errors(problem, run)).max(axis=0)
+    return {n: float(max(a, b)) for n, a, b in zip(problem.judged_names, spans, largest, strict=True)}
