@@ -17,9 +17,14 @@ _COLOURS = {"yes": "green", "no": "red", "unknown": "yellow"}
 
 
 def show_review(title: str, review: Review) -> None:
-    """Print every answer under its controller, and the number of answers of each kind."""
+    """Print what to do about every no, then every answer under its controller, and the number of answers of each kind."""
     console = Console()
     console.print(title, style="bold", markup=False, highlight=False)
+    for about, answer in review.to_do:
+        head = Text(f"  no      {about}: {answer.question}", _COLOURS["no"])
+        console.print(head + Text(f" -> {answer.advice}", "default"), highlight=False, soft_wrap=True)
+    if review.to_do:
+        console.print("\nproblem", style="bold", markup=False, highlight=False)
     _show(console, review.problem)
     for name, answers in review.controllers.items():
         console.print(f"\n{name}", style="bold", markup=False, highlight=False)
@@ -33,6 +38,7 @@ def review_to_json(name: str, review: Review) -> str:
         "problem": name,
         "mismatch": review.mismatch,
         "ready": review.ready,
+        "to_do": [{"about": about, "question": a.question, "what": a.advice} for about, a in review.to_do],
         "answers": [_facts(a) for a in review.problem],
         "controllers": {c: [_facts(a) for a in answers] for c, answers in review.controllers.items()},
     }

@@ -36,6 +36,12 @@ class Answer(FoundByName):
     change: str = ""
     numbers: Mapping[str, float] = field(default_factory=dict)
 
+    @property
+    def advice(self) -> str:
+        """What to do, in one line; the facts before it where it points at them or at other answers."""
+        points = not self.change or self.change.startswith("See ")
+        return " ".join(f"{f'{self.evidence}. ' if points else ''}{self.change}".split())
+
 
 @dataclass(frozen=True)
 class Review(FoundByName):
@@ -55,9 +61,10 @@ class Review(FoundByName):
         return line(self, "ready" if self.ready else "not ready", self._counts(), f"mismatch {self.mismatch:g} %")
 
     def _repr_html_(self) -> str:
-        """All answers as a table, for notebooks."""
+        """All answers as a table, for notebooks; those that are no come first."""
         groups = [("problem", self.problem), *self.controllers.items()]
         rows = [(name, a.question, str(a.verdict), a.evidence, a.change) for name, group in groups for a in group]
+        rows.sort(key=lambda row: row[2] != Verdict.NO)
         title = f"Review: {'ready' if self.ready else 'not ready'}"
         return table(title, ("about", "question", "answer", "facts", "what to change"), rows, [self._counts()])
 
@@ -70,9 +77,15 @@ class Review(FoundByName):
         return (*self.problem, *(a for group in self.controllers.values() for a in group))
 
     @property
+    def to_do(self) -> tuple[tuple[str, Answer], ...]:
+        """The answers that are no, each with what it is about: 'problem', or the name of a controller."""
+        groups = [("problem", self.problem), *self.controllers.items()]
+        return tuple((about, a) for about, group in groups for a in group if a.verdict == Verdict.NO)
+
+    @property
     def ready(self) -> bool:
         """Whether every answer is yes or unknown."""
-        return all(a.verdict != Verdict.NO for a in self.answers)
+        return not self.to_do
 
 
 def decided(good: bool) -> Verdict:

@@ -44,18 +44,9 @@ def null_runs(problem: Problem, controller: Controller, nominal: NominalRun | No
     else:
         states = nominal.states[:-1]
     without, ranges = _errors_along(model, states), _ranges(model, states)
-    return with_form(ErrorPair(without, without, ranges), model, controller)
-
-
-def with_form(runs: ErrorPair, model: Problem, controller: Controller) -> ErrorPair:
-    """Return the runs with the errors of another controller in place of the adapted one; `model` is the null problem.
-
-    Raises:
-        FpirhcError: every error that the controller raises about the problem.
-    """
     run = simulate(model, controller, seed=0, compiled=False)
-    lost = dict.fromkeys(runs.without, float("inf"))
-    return replace(runs, adapted=lost if run.stop is not None else _errors_along(model, run["plant_state"]))
+    lost = dict.fromkeys(without, float("inf"))
+    return ErrorPair(without, lost if run.stop is not None else _errors_along(model, run["plant_state"]), ranges)
 
 
 def null_problem(problem: Problem, controller: Controller) -> Problem:

@@ -13,12 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError
 from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.form import form_of
 from fpirhc.review.forms import forms_of
-from fpirhc.review.null_runs import null_problem, null_runs, with_form
+from fpirhc.review.null_runs import null_runs
 from fpirhc.review.pays import ROUNDING, nominal_size, rms
 from fpirhc.review.prediction import NominalRun, errors_without_adaptation, response_errors
 from fpirhc.review.question import Case
@@ -76,10 +75,11 @@ def _remedy(case: Case, runs: ErrorPair, predicted: float | None) -> tuple[str, 
     sentences, numbers = [], {}
     used = form_of(case.controller.deformation)
     for name, form in reversed(forms_of(case.problem, case.controller.deformation).items()):
-        other = _other(case, form, runs) if name != used else None
-        if other is not None and other.passes and not case.harm(form):
-            sentences.append(f"The {name} form passes: rms error of {runs.worst} {other.adapted[runs.worst]:.3g}.")
-            numbers["with_form"] = other.adapted[runs.worst]
+        trial = case.trial(form) if name != used else "it is in use"
+        if not isinstance(trial, str) and not case.harm(form):
+            null = trial[1]
+            sentences.append(f"The {name} form passes: rms error of {null.worst} {null.adapted[null.worst]:.3g}.")
+            numbers["with_form"] = null.adapted[null.worst]
             break
     grows = bool(case.loops.loops) and case.loops.radii.max() >= 1
     period = None if predicted is None or grows else _period(case, runs, predicted)
@@ -93,14 +93,6 @@ def _remedy(case: Case, runs: ErrorPair, predicted: float | None) -> tuple[str, 
             "No form does better than none: leave the deformation out, or choose other controlled coordinates."
         )
     return " ".join(sentences), numbers
-
-
-def _other(case: Case, form: Deformation, runs: ErrorPair) -> ErrorPair | None:
-    try:
-        model = null_problem(case.problem, case.controller)
-        return with_form(runs, model, case.controller.with_deformation(form))
-    except FpirhcError:
-        return None
 
 
 def _period(case: Case, runs: ErrorPair, predicted: float) -> float | None:

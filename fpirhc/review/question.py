@@ -26,6 +26,7 @@ from fpirhc.review.loops import Loops
 from fpirhc.review.loops_by_gain import LoopsByGain, loops_by_gain
 from fpirhc.review.nominal_runs import NominalRuns
 from fpirhc.review.prediction import NominalRun
+from fpirhc.simulation.error_pair import ErrorPair
 from fpirhc.simulation.trials import Trials
 from fpirhc.task.problem import Problem
 
@@ -70,15 +71,29 @@ class Case:
     def _trials(self) -> Trials:
         return Trials(self.grid.real or self.problem, self.controller.unadapted(), cycles=_TRIED)
 
+    @cached_property
+    def _tried(self) -> dict[str, tuple[ErrorPair | None, ErrorPair] | str]:
+        return {}
+
+    def trial(self, deformation: Deformation) -> tuple[ErrorPair | None, ErrorPair] | str:
+        """Return the errors with another deformation, on the plant (None for one outside) and on the model, or why there are none."""
+        name = repr(deformation)
+        if name not in self._tried:
+            try:
+                self._tried[name] = self._trials.errors(self.controller.with_deformation(deformation))
+            except FpirhcError as error:
+                self._tried[name] = f"it cannot be tried ({error})"
+        return self._tried[name]
+
     def harm(self, deformation: Deformation) -> str:
-        """What runs on the plant and on the model show against a deformation, in a sentence; empty where it does no harm.
+        """Return what runs on the plant and on the model show against a deformation, in a sentence; empty where it does no harm.
 
         The exact parameters are those of the problem, so a form or a gain is proposed only after a run with the wrong model.
         """
-        try:
-            real, null = self._trials.errors(self.controller.with_deformation(deformation))
-        except FpirhcError as error:
-            return f"it cannot be tried ({error})"
+        trial = self.trial(deformation)
+        if isinstance(trial, str):
+            return trial
+        real, null = trial
         if real is not None and not real.passes:
             return f"with the wrong model {real.sentence}"
         if not null.passes and (real is None or null.adapted[null.worst] > real.without[null.worst]):

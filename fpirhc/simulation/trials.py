@@ -18,6 +18,20 @@ from fpirhc.simulation.simulate import simulator
 from fpirhc.task.problem import Problem
 
 
+def weighed(problem: Problem, controller: Controller) -> frozenset[str] | None:
+    """Return the judged coordinates whose errors, or whose derivatives' errors, the plan's cost weighs.
+
+    None stands for all of them: the controller does not plan, the cost does not say, or it weighs no judged coordinate.
+    """
+    planner = controller.planner
+    cost = (planner.cost or problem.cost) if planner else None
+    weights = None if cost is None else cost.tracked
+    if weights is None:
+        return None
+    names = {state.rstrip("'") for state in weights}
+    return frozenset(n for n in problem.judged_names if n in names) or None
+
+
 class Trials:
     """Runs beside one controller without adaptation, whose own runs are made once. A plant outside is not run."""
 
@@ -36,21 +50,23 @@ class Trials:
         return self._bare.run(seed=0)
 
     def errors(self, controller: Controller) -> tuple[ErrorPair | None, ErrorPair]:
-        """Return the errors on the plant, None where it is outside, and those on the model.
+        """Return the errors on the plant, None where it is outside, and those on the model; of coordinates that the cost weighs.
 
         Raises:
             FpirhcError: every error that the controller raises about the problem.
         """
         loop = simulator(self.problem, controller, compiled=False)
-        null = _pair(self._model.problem, self._model.run(self._bare), self._model.run(loop))
+        names = weighed(self.problem, loop.controller) or frozenset(self.problem.judged_names)
+        model = self._model.behind(loop.controller.deformation)
+        null = _pair(model.problem, names, model.run(self._bare), model.run(loop))
         if self.problem.foreign is not None:
             return None, null
-        return _pair(self.problem, self._plain, loop.run(seed=0)), null
+        return _pair(self.problem, names, self._plain, loop.run(seed=0)), null
 
 
-def _pair(problem: Problem, without: Run, adapted: Run) -> ErrorPair:
+def _pair(problem: Problem, names: frozenset[str], without: Run, adapted: Run) -> ErrorPair:
     before, after = (
-        {name: value if math.isfinite(value) else math.inf for name, value in rms_error(problem, run).items()}
+        {n: value if math.isfinite(value) else math.inf for n, value in rms_error(problem, run).items() if n in names}
         for run in (without, adapted)
     )
     return ErrorPair(before, after, _ranges(problem, without))

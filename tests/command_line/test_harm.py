@@ -6,8 +6,10 @@ import json
 import re
 from pathlib import Path
 
+import abroad
 import pytest
 
+import fpirhc as fp
 from fpirhc.cli.main import main
 
 RED = "\x1b[1;31m"
@@ -118,3 +120,54 @@ def test_tuning_says_that_the_best_settings_do_harm(file, capsys):
     assert re.match(FAILS, red(before)[1])
     [saved] = Path("results").rglob("tuning.json")
     assert len(json.loads(saved.read_text())["controllers"]["CTC+gentle"]["harm"]) == 2
+
+
+def test_review_puts_every_no_first_with_what_to_do(file, capsys):
+    """A red line for each, before any other answer, under the name of its controller; all of them are below once more."""
+    assert main(["review", "line.py", "--json"]) == 1
+    facts = json.loads(capsys.readouterr().out)
+    noes = [(name, a) for name, group in facts["controllers"].items() for a in group if a["verdict"] == "no"]
+    assert {name for name, _ in noes} == {"CTC+gentle"}
+    assert [(one["about"], one["question"]) for one in facts["to_do"]] == [(n, a["question"]) for n, a in noes]
+    assert main(["review", "line.py"]) == 1
+    lines = [re.sub(r"\x1b\[[0-9;]*m", "", line) for line in capsys.readouterr().out.splitlines()]
+    assert lines[0] == "A mass on a line; the model has 2 % too little gain."
+    wanted = [f"  no      {one['about']}: {one['question']} -> {one['what']}" for one in facts["to_do"]]
+    assert lines[1 : len(wanted) + 2] == [*wanted, ""]
+    assert all(one["what"].endswith(".") for one in facts["to_do"])
+    assert sum(line.startswith("  no      ") for line in lines) == 2 * len(wanted)
+    [null] = [one["what"] for one in facts["to_do"] if "right model alone" in one["question"]]
+    assert null.startswith("The model-referenced form passes: rms error of y ")
+
+
+def test_a_review_without_a_no_begins_with_its_answers(file, capsys):
+    """Nothing stands before the problem's answers."""
+    assert main(["review", "line.py", "--controllers", "CTC+model-referenced"]) == 0
+    lines = [re.sub(r"\x1b\[[0-9;]*m", "", line) for line in capsys.readouterr().out.splitlines()]
+    assert lines[1] == "  yes     Is the problem well posed?"
+
+
+def test_a_form_that_loses_with_the_wrong_model_is_not_proposed(tmp_path, monkeypatch, capsys):
+    """do-mpc's reactor: the model-referenced form leaves a right model alone, and with the wrong one it loses to RHC alone."""
+    text = (Path(abroad.__file__).parent / "cstr.py").read_text()
+    monkeypatch.chdir(tmp_path)
+    Path("reactor.py").write_text(text.replace("problem = task(reactor(1.0, 1.0))\nwrong =", "problem ="))
+    main(["review", "reactor.py", "--controllers", "RHC+FPI", "--json"])
+    answers = json.loads(capsys.readouterr().out)["controllers"]["RHC+FPI"]
+    [form] = [a for a in answers if "form of the iteration" in a["question"]]
+    found = re.search(
+        r"but here with the wrong model the rms error of C_b is (\S+) without adaptation, (\S+) with it$",
+        form["evidence"],
+    )
+    assert found
+    assert form["change"] == "Keep the form that a comparison shows to be better."
+    task = abroad.load("cstr", "wrong")
+    bare = task.controllers["RHC"]
+    referenced = bare.with_deformation(fp.ModelReferenced(task.controllers["RHC+FPI"].deformation))
+    for controller, number in zip((bare, referenced), found.groups(), strict=True):
+        run = fp.simulate(task.problem, controller, seed=0, compiled=False)
+        assert fp.measure(task.problem, run).rms_error["C_b"] == pytest.approx(float(number), rel=0.01)
+    [null] = [a for a in answers if "right model alone" in a["question"]]
+    assert "form passes" not in null["change"]
+    [gain] = [a for a in answers if "gain admissible" in a["question"]]
+    assert gain["numbers"]["recommended"] is None

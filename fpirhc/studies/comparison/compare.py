@@ -31,10 +31,11 @@ from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import judged_run, simulator
 from fpirhc.simulation.stepper import Stepper
+from fpirhc.simulation.trials import weighed
 from fpirhc.studies.comparison.caveats import yardstick_of
 from fpirhc.studies.comparison.changes import scales
 from fpirhc.studies.comparison.entry import Contraction, Entry
-from fpirhc.studies.comparison.entry_facts import has_exact_model, plan_every, weighed
+from fpirhc.studies.comparison.entry_facts import has_exact_model, plan_every
 from fpirhc.studies.comparison.information import information, sentences
 from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import measure_optimality

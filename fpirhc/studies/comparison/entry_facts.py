@@ -18,20 +18,6 @@ from fpirhc.task.problem import Problem, cycles_per_stage
 _MUCH = 1e-2  # relative cost above the optimum
 
 
-def weighed(problem: Problem, controller: Controller) -> frozenset[str] | None:
-    """Return the judged coordinates whose errors, or whose derivatives' errors, the plan's cost weighs.
-
-    None stands for all of them: the controller does not plan, the cost does not say, or it weighs no judged coordinate.
-    """
-    planner = controller.planner
-    cost = (planner.cost or problem.cost) if planner else None
-    weights = None if cost is None else cost.tracked
-    if weights is None:
-        return None
-    names = {state.rstrip("'") for state in weights}
-    return frozenset(n for n in problem.judged_names if n in names) or None
-
-
 def plan_every(problem: Problem, controller: Controller) -> int:
     """Return the number of cycles from plan to plan; 1 for a controller that does not plan."""
     if controller.planner is None or problem.horizon is None:

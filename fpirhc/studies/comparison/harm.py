@@ -13,10 +13,10 @@ from fpirhc.errors import FpirhcError
 from fpirhc.simulation.metrics import Metric, measure
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.simulate import Simulator, judged_run, simulator
+from fpirhc.simulation.trials import weighed
 from fpirhc.studies.comparison.caveats import yardstick_of
 from fpirhc.studies.comparison.changes import scales
 from fpirhc.studies.comparison.entry import Entry
-from fpirhc.studies.comparison.entry_facts import weighed
 from fpirhc.studies.comparison.null_test import null_test
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.studies.comparison.verdict import judge
