@@ -28,8 +28,8 @@ def fast_enough(grid: ReviewGrid, controller: Controller, own: Spectrum) -> Answ
     text += f" at {rate:g} {grid.problem.rate_unit} need"
     numbers = {"product": product, "ratio": ratio}
     change = (
-        f"Multiply the gain by {_SPARE / ratio:.2g} or more, lower rate x period, or use a form that passes the desired response "
-        "at once (Increment, ModelReferenced)."
+        "Use a form that passes the desired response at once (ModelReferenced, Increment), multiply the gain by "
+        f"{_SPARE / ratio:.2g} or more, or lower rate x period."
     )
     if ratio >= _SPARE:
         return Answer(FAST, Verdict.YES, text, "", numbers)
