@@ -2,10 +2,12 @@
 When FPI fails, and how to see it before
 ========================================
 
-Six ways to lose, each with what the tools say about it. All start from the same mass on
-a spring, whose model is too heavy.
+Seven ways to lose, each with what the tools say about it. All start from the same mass
+on a spring, whose model is too heavy by half. That is far enough for the plain,
+published form with a large gain; the first way shows where it is not.
 """
 
+import warnings
 from dataclasses import replace
 
 import casadi as ca
@@ -48,7 +50,36 @@ print(
 )
 
 # %%
-# 1. The sign is wrong
+# 1. A cautious gain around a good model
+# --------------------------------------
+# The plain form passes every change of the desired response 1 / a cycles late. With a
+# model that is nearly right this is worse than no adaptation, and a smaller gain is worse
+# still. The model-referenced form changes nothing where the model is right.
+
+nearly = {
+    name: fp.Parameter(approximate=0.98 * p.exact, exact=p.exact, unit=p.unit)
+    for name, p in plant.parameters.items()
+}
+right = replace(problem, plant=replace(plant, parameters=nearly))
+print(f"without {error(right, fp.ComputedTorque(tracking)):.2f} mm")
+for gain in (-1.0, -0.1, -0.05):
+    map_ = fp.Sigmoid(gain=gain, scale=5.0)
+    both = (
+        fp.ComputedTorque(tracking, form) for form in (map_, fp.ModelReferenced(map_))
+    )
+    plain, referenced = (error(right, controller) for controller in both)
+    print(f"gain {gain}: plain {plain:.2f} mm, model-referenced {referenced:.2f} mm")
+
+# %%
+# A stepper for the machine warns of such a controller before it runs.
+
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    fp.Stepper(right, fp.ComputedTorque(tracking, map_))
+print(str(caught[0].message).partition(". ")[0])
+
+# %%
+# 2. The sign is wrong
 # --------------------
 # If the model has the sign of the input's effect wrong, every cycle enlarges the error.
 # It is refused before the run.
@@ -61,7 +92,7 @@ except fp.FpirhcError as reason:
     print(reason)
 
 # %%
-# 2. The gain is too large
+# 3. The gain is too large
 # ------------------------
 # Beyond the limit the loop chatters, bounded by the saturation of the map. `fpirhc
 # review` says so beforehand.
@@ -75,7 +106,7 @@ large = fp.ComputedTorque(tracking, fp.BeyondLimit(fp.Sigmoid(gain=-4.0, scale=5
 print(answer.verdict, "-", answer.evidence)
 
 # %%
-# 3. The map cannot keep up
+# 4. The map cannot keep up
 # -------------------------
 # The step of eq (6) is at most a multiple of its scale S per cycle. With a small S it
 # is slower than the task.
@@ -86,7 +117,7 @@ for scale in (5.0, 0.05, 0.005):
     )
 
 # %%
-# 4. The response comes late
+# 5. The response comes late
 # --------------------------
 # Ten cycles of dead time that nobody told the deformation about. Told, it is stable;
 # the tracking still pays for the delay.
@@ -115,7 +146,7 @@ axis.set(xlabel="time [s]", ylabel="true error [mm]")
 axis.legend()
 
 # %%
-# 5. The disturbance is out of reach
+# 6. The disturbance is out of reach
 # ----------------------------------
 # A deformation corrects the response that the input acts on, and nothing else. A leak
 # in the second of two tanks, while the pump fills the first, needs an estimator of
@@ -133,7 +164,7 @@ for name, controller in tanks.controllers.items():
     )
 
 # %%
-# 6. The measurement is noise
+# 7. The measurement is noise
 # ---------------------------
 # Noise of the response goes through: with deviation one it becomes the square root of a
 # / (2 - a) in the request. Tracking hardly notices, the actuator does.

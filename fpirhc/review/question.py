@@ -76,7 +76,7 @@ class Case:
         return {}
 
     def trial(self, deformation: Deformation) -> tuple[ErrorPair | None, ErrorPair] | str:
-        """Return the errors with another deformation on the plant (None for one outside) and on the model; or why there are none."""
+        """Return the errors with a deformation on the plant (None: it is outside) and on the model, or why there are none."""
         name = repr(deformation)
         if name not in self._tried:
             try:

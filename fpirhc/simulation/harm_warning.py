@@ -33,7 +33,7 @@ def warn_of_harm(problem: Problem, controller: Controller) -> None:
     except FpirhcError:  # what the runs cannot do says nothing about the controller
         return
     if reasons:
-        what = f"{problem.name}, {controller.task_name or type(controller).__name__}"
+        what = ", ".join(part for part in (problem.name, controller.task_name or type(controller).__name__) if part)
         text = f"{what}: adaptation does harm, by runs of {CYCLES} cycles: {'; '.join(reasons)}. {_REMEDY}"
         warnings.warn(text, HarmfulAdaptation, stacklevel=users_level())
 
