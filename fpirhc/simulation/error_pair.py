@@ -75,10 +75,14 @@ class ErrorPair:
         return any(not (self.ratio(n) <= ratio or self.added(n) <= share) for n in self.without)
 
 
-def errors_of(problem: Problem, runs: Sequence[Run]) -> ErrorPair:
-    """Return the errors of two runs, without adaptation and with it, from `measure_from` on."""
+def errors_of(problem: Problem, runs: Sequence[Run], names: frozenset[str] | None = None) -> ErrorPair:
+    """Return the errors of two runs, without adaptation and with it, from `measure_from` on; of some coordinates, or of all."""
     before, after = (
-        {name: value if math.isfinite(value) else math.inf for name, value in rms_error(problem, run).items()}
+        {
+            name: value if math.isfinite(value) else math.inf
+            for name, value in rms_error(problem, run).items()
+            if names is None or name in names
+        }
         for run in runs
     )
     return ErrorPair(before, after, _ranges(problem, runs[0]))

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from functools import cached_property
 
-import numpy as np
-
 from fpirhc.controllers.base import Controller
-from fpirhc.simulation.common_columns import judged_motion
-from fpirhc.simulation.error_pair import ErrorPair
-from fpirhc.simulation.metrics.entries.errors import rms_error
-from fpirhc.simulation.metrics.window import measured_errors
+from fpirhc.simulation.error_pair import ErrorPair, errors_of
 from fpirhc.simulation.model_as_plant import ModelAsPlant, shortened
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulator
@@ -56,26 +50,9 @@ class Trials:
             FpirhcError: every error that the controller raises about the problem.
         """
         loop = simulator(self.problem, controller, compiled=False)
-        names = weighed(self.problem, loop.controller) or frozenset(self.problem.judged_names)
+        names = weighed(self.problem, loop.controller)
         model = self._model.behind(loop.controller.deformation)
-        null = _pair(model.problem, names, model.run(self._bare), model.run(loop))
+        null = errors_of(model.problem, (model.run(self._bare), model.run(loop)), names)
         if self.problem.foreign is not None:
             return None, null
-        return _pair(self.problem, names, self._plain, loop.run(seed=0)), null
-
-
-def _pair(problem: Problem, names: frozenset[str], without: Run, adapted: Run) -> ErrorPair:
-    before, after = (
-        {n: value if math.isfinite(value) else math.inf for n, value in rms_error(problem, run).items() if n in names}
-        for run in (without, adapted)
-    )
-    return ErrorPair(before, after, _ranges(problem, without))
-
-
-def _ranges(problem: Problem, run: Run) -> dict[str, float]:
-    """Range of the reference, or the largest error where that is larger."""
-    errors, motion = run["true_error"], run[judged_motion(run.layout)]
-    places = [problem.plant.output.elements.index(name) for name in problem.judged_names]
-    spans = np.ptp(errors + motion[:, places], axis=0)
-    largest = np.abs(measured_errors(problem, run)).max(axis=0)
-    return {n: float(max(a, b)) for n, a, b in zip(problem.judged_names, spans, largest, strict=True)}
+        return errors_of(self.problem, (self._plain, loop.run(seed=0)), names), null
