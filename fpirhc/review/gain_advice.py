@@ -24,6 +24,8 @@ from fpirhc.task.problem import Problem
 def gain_advice(case: Case, boxed: Spectrum, null: Answer | None) -> Recommended:
     """Return the recommended gain of a controller; none where it fails the null test, or where a run with that gain does harm.
 
+    Where its own gain is beyond the limits, the null test of a gain within them counts.
+
     Args:
         case: of the controller.
         boxed: eigenvalues of the response Jacobian over the box of parameters.
@@ -32,10 +34,13 @@ def gain_advice(case: Case, boxed: Spectrum, null: Answer | None) -> Recommended
     deformation = case.controller.deformation
     report = assess_gain(deformation, boxed)
     share = largest_product(case.problem, deformation, boxed.eigenvalues) / 2
+    low, high = (share * end for end in report.sector_limit)
+    if low < high and not low < deformation.effective_gain() < high:
+        safe = _with_gain(case, 0.5 * (low + high))
+        return gain_advice(safe, boxed, leaves_right_model_alone(safe))
     advice = recommended_gain(deformation, report, share, case.by_gain)
     if advice.why_not:
         return advice
-    against = ""
     if null is not None and null.verdict == Verdict.NO:
         against = "adaptation does not leave a right model alone"
     else:
@@ -50,14 +55,16 @@ def recommended_for(problem: Problem, controller: Controller) -> Recommended | N
     """Return the gain that a review of a controller recommends, also where its own gain is refused; None where it has no answer."""
     try:
         grid = review_grid(problem, 0.0, 0)
-        deformation = controller.deformation
-        boxed = spectrum_near(grid, controller.parameters(grid.problem.plant), grid.draws, near=False)
-        share = largest_product(grid.problem, deformation, boxed.eigenvalues) / 2
-        allowed = 0.5 * share * sum(assess_gain(deformation, boxed).sector_limit)
-        if not allowed:
-            return None
-        safe = resolved(grid.problem, controller.with_deformation(deformation.with_effective_gain(allowed)))
-        case = Case(grid, safe, loops_along(grid, safe), NominalRuns(grid.problem))
+        ready = resolved(grid.problem, controller)
+        boxed = spectrum_near(grid, ready.parameters(grid.problem.plant), grid.draws, near=False)
+        case = Case(grid, ready, loops_along(grid, ready), NominalRuns(grid.problem))
         return gain_advice(case, boxed, leaves_right_model_alone(case))
     except FpirhcError:
         return None
+
+
+def _with_gain(case: Case, gain: float) -> Case:
+    """The case of the controller with another effective gain."""
+    deformation = case.controller.deformation.with_effective_gain(gain)
+    controller = resolved(case.problem, case.controller.with_deformation(deformation))
+    return Case(case.grid, controller, loops_along(case.grid, controller), case.runs)
