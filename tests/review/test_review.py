@@ -218,7 +218,9 @@ def test_wrong_sign_is_found_before_the_run():
     assert about(answers_by_question, "Does the deformation converge").verdict == "no"
     gain = about(answers_by_question, "gain admissible")
     assert gain.verdict == "no"
-    assert -1 / 0.396737 / 1.5 < gain.numbers["recommended"] < 0  # J from 1 to 1.5 over the box; the whole loop bears less
+    assert (
+        -1 / 0.396737 / 1.5 < gain.numbers["recommended"] < 0
+    )  # J from 1 to 1.5 over the box; the whole loop bears less
     assert gain.numbers["recommended"] == pytest.approx(0.5 * gain.numbers["limit"])
 
 
