@@ -7,8 +7,8 @@ user's own equations, a root finder inverts them, and the tracking law and the m
     delta_k = delta_{k-1} + A_c / 2 (f_k - f^_k + delta_{k-1})
     u_k     = inverse of the model at d_k + delta_k, clipped
 
-`chain` gives the derivatives of an output, differentiated by hand. `planned_by_hand` does the same with plans of IPOPT. The wrong
-parameters are ours; everything else is the source's.
+`chain` gives the derivatives of an output, differentiated by hand. `planned_by_hand` does the same with plans of IPOPT. The
+equations are the sources'; the wrong parameters, the tasks, and numbers that a source leaves open are ours.
 Run: .venv/bin/python benchmarks/foreign_plants.py [NAME ...]
 """
 
@@ -129,17 +129,16 @@ def steering() -> ForeignPlant:
 
 
 def servomechanism() -> ForeignPlant:
-    """A motor's arm against a spring at a distance (python-control, docs: nonlinear systems, `servomech`; Astrom and Murray)."""
+    """A motor's arm against a spring (python-control, docs, nonlinear systems, `servomech`: J = 100, b = 10, k r = 1)."""
 
     def response(q, v, u, p):
-        spring = p.stiffness * ca.sqrt(1 + 4 - 4 * ca.cos(q.angle) + 1e-12)
-        return {"angle": (u.torque - p.damping * v.angle - spring * ca.sin(q.angle)) / p.inertia}
+        return {"angle": (u.torque - p.damping * v.angle - p.stiffness * ca.sin(q.angle)) / p.inertia}
 
     plant = fp.Plant(
         coordinates={"angle": "rad"},
         inputs={"torque": "N m"},
         response=response,
-        parameters=known(inertia=(80.0, 100.0, "kg m^2"), damping=(10.0, 20.0, "N m s"), stiffness=(1.0, 3.0, "N m")),
+        parameters=known(inertia=(80.0, 100.0, "kg m^2"), damping=(4.0, 10.0, "N m s"), stiffness=(0.0, 1.0, "N m")),
     )
     return ForeignPlant(
         fp.Problem(
