@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 import fpirhc as fp
-from attack.faults import Cycle, Fault
+from attack.faults import FIRST, Cycle, Fault
 from fpirhc.controllers.contract import Controller, checked
 from fpirhc.errors import FpirhcError
 from fpirhc.sensing.base import response_names
@@ -42,7 +42,8 @@ class Outcome:
         outside: number of commands that were not finite or outside the limits.
         frozen: whether the controller still skipped its cycles, or held its command, at the end of the run.
         differs: for a single bad sample, whether something differs from the tick left out.
-        deviation: largest deviation of the command from the run without faults, in normal movements of the command per cycle.
+        deviation: largest deviation of the command from the run without faults, in normal movements of the command per cycle; of a
+            fault at the start from its end on.
         statuses: that occurred.
     """
 
@@ -100,7 +101,10 @@ class Bench:
         lower, upper = self.limits
         result.outside = int((~np.isfinite(commands) | (commands < lower) | (commands > upper)).any(axis=1).sum())
         result.statuses = set(statuses)
-        result.deviation = float((np.abs(commands - self.clean) / self.movement).max())
+        known = (
+            fault.end if fault.first == FIRST else 0
+        )  # before the first good sample the command is the one before the run
+        result.deviation = float((np.abs(commands - self.clean) / self.movement)[known:].max())
         late = range(CYCLES - LATE, CYCLES)
         # A command at a limit stays there for good reason; one that is held between its limits does not move again.
         still = bool((np.ptp(commands[-LATE:], axis=0) == 0).all()) and bool(

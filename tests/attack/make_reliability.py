@@ -61,7 +61,10 @@ def loop() -> str:
 after the fault has ended. A single bad sample must give the same commands, bit for bit, as the tick left out. After
 {lost} faults the simulated plant itself has left its domain (a tank below its bottom); these are not judged for freezing.
 The deviation is that of the command from the run without faults, in normal movements of the command per cycle (the larger of their
-median and their mean in that run): the median of the controllers, and what one in ten exceeds.
+median and their mean in that run): the median of the controllers, and what one in ten exceeds. At the start nothing is known before
+the first good sample, and the command is the one before the run, where the other run jumps to its first one. So deviations count
+from the end of such a fault on: what remains is that the plant moved meanwhile. A command that rests in the run without faults has
+movements of a millionth of its size, so there a small deviation is a large number of them.
 
 {_what_went(wrong)}"""
 

@@ -199,6 +199,18 @@ def test_the_box_of_a_stage_has_the_best_move(inputs):
     assert others <= (2 if inputs == 3 else 0)
 
 
+@pytest.mark.parametrize("inputs", [1, 2, 3])
+def test_the_first_round_has_factors_of_its_own(inputs):
+    """A move inside the box is found in one round, whatever the stage before had free, and with its factors."""
+    rng, alone = np.random.default_rng(inputs), policy(inputs, rounds=1)
+    for before in (0, 1):
+        matrix, slope, limit = definite(rng, inputs), rng.normal(size=inputs), np.full(inputs, 1e3)
+        flags, v = np.full(inputs, before, dtype=np.int32), np.zeros(inputs)
+        lower, pivots = np.full(inputs**2, np.nan), np.full(inputs, np.nan)
+        call(alone, "t_policy", slope, columns(matrix), -limit, limit, v, flags, lower, pivots)
+        np.testing.assert_allclose(v, -np.linalg.solve(matrix, slope), rtol=1e-9)
+
+
 def best_in_box(matrix: np.ndarray, slope: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """The least quadratic in a box, by trying all sets of active limits."""
     moves = []
