@@ -63,7 +63,7 @@ def loops_by_gain(grid: ReviewGrid, controller: Controller, own: Loops) -> Loops
     for share in _SHARES:
         first = own if share == 1 else _at(grid, controller, share * gain)
         lower = _at(grid, controller, _LOWER * share * gain) if first.loops else first
-        if lower.loops and len(lower.loops) == len(first.loops) and len(lower.drawn) == len(first.drawn):
+        if lower.loops and _sizes(lower) == _sizes(first):
             return LoopsByGain(first, lower, share * gain)
     return None
 
@@ -74,6 +74,11 @@ def _at(grid: ReviewGrid, controller: Controller, gain: float) -> Loops:
         return loops_along(grid, controller.with_deformation(controller.deformation.with_effective_gain(gain)))
     except FpirhcError as error:
         return Loops((), (), None, reason=str(error))
+
+
+def _sizes(loops: Loops) -> list[tuple[int, ...]]:
+    """Shapes of all loops; they differ where a gain leaves other entries of the memory at rest."""
+    return [one.dynamics.shape for one in (*loops.loops, *loops.drawn)]
 
 
 def _some(pairs: list[tuple[LinearLoop, LinearLoop]], most: int) -> list[tuple[LinearLoop, LinearLoop]]:

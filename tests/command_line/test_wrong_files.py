@@ -362,7 +362,7 @@ CONTROLLERS = {
         TANKS,
         "gain=-0.7",
         "gain=0.7",
-        "no Is the map's gain admissible? gain = 0.7; admissible 0 to -4",
+        "no Is the map's gain admissible? gain = 0.7; the smallest limit is -4",
         "Use gain = -2",
     ),
     "gains of a PID": one(

@@ -38,7 +38,7 @@ def test_tutorial_does_what_it_says(tmp_path, monkeypatch, capsys):
     assert main(["compare", "drone.py"]) == 0
     output = capsys.readouterr().out.replace("\n", " ")
     assert "from 0.0235 to 1.28e-05 m" in output
-    Path("turned.py").write_text(text.replace("gain=-3.1", "gain=3.1"))
+    Path("turned.py").write_text(text.replace("gain=-2.1", "gain=2.1"))
     assert main(["compare", "turned.py"]) == 2
     assert "has the wrong sign" in capsys.readouterr().err
     Path("light.py").write_text(text.replace("exact=1.6", "exact=0.2"))
