@@ -393,6 +393,7 @@ BUILDS = {
     "review/forms.py": {"Increment", "ModelReferenced"},  # the forms that are compared
     "review/prediction.py": {"Identity"},  # no adaptation
     "review/suggest.py": {"Filtered"},  # the suggested deformation
+    "simulation/linearise/asked_loop.py": {"Jump"},  # the entry of signals at the inputs
     "studies/comparison/left_alone.py": {"Identity"},  # no controller: nothing is adapted
     "studies/comparison/optimality.py": {"FixedPoint"},  # the converged optimum
     "task/map_task.py": {"MapSteps", "StepDifference"},  # what a map has in place of an integrator and of its response

@@ -38,7 +38,7 @@ def test_a_deviation_of_the_state_is_carried_on_as_by_the_step_itself(name):
     z, expected = linear.placed @ sizes, []
     for _ in range(periods):
         z = linear.dynamics @ z
-        expected.append(linear.state @ z)
+        expected.append(linear.cycles[0].state @ z)
     found = (runs[0] - runs[1]) / 2
     assert np.abs(found - expected).max(axis=0) / np.abs(found).max(axis=0) == pytest.approx(0, abs=2e-3)
 
@@ -63,22 +63,31 @@ def test_a_loop_whose_plans_wait_is_asked_over_a_whole_period():
 
 def test_a_mode_that_neither_plant_nor_command_shows_is_left_out():
     """A covariance that forgets grows by 1/lambda where nothing excites it; a growing state of the plant counts all the same."""
-    dynamics, nothing = np.diag([0.5, 1.01]), np.zeros((1, 2))
-    shown = np.array([[0.0, 1.0]])
-    cycle = LinearCycle(dynamics, np.ones((2, 1)), np.array([[1.0, 0.0]]))
-    errors = np.array([[1.0, 0.0]])
-    unseen = LinearLoop((cycle,), errors, nothing, nothing.T, 0.1)
-    assert unseen.radius == pytest.approx(0.5)
-    assert replace(unseen, state=shown).radius == pytest.approx(1.01)
-    assert replace(unseen, errors=shown).radius == pytest.approx(1.01)
+    shown, unseen = np.array([[0.0, 1.0]]), np.array([[1.0, 0.0]])
+    alone = diagonal(1.01, state=unseen, errors=unseen)
+    assert alone.radius == pytest.approx(0.5)
+    assert diagonal(1.01, state=shown, errors=unseen).radius == pytest.approx(1.01)
+    assert diagonal(1.01, state=unseen, errors=shown).radius == pytest.approx(1.01)
 
 
 def test_a_neutral_mode_counts_where_an_error_shows_it():
     """The amount of a drug that has left the body is no fault of the loop; the position of a plant that nothing holds is."""
-    cycle = LinearCycle(np.diag([0.5, 1.0]), np.ones((2, 1)), np.array([[1.0, 0.0]]))
-    amount = LinearLoop((cycle,), np.array([[1.0, 0.0]]), np.eye(2), np.eye(2), 0.1)
-    assert amount.radius == pytest.approx(0.5)
-    assert replace(amount, errors=np.eye(2)).radius == pytest.approx(1.0)
+    assert diagonal(1.0, state=np.eye(2), errors=np.array([[1.0, 0.0]])).radius == pytest.approx(0.5)
+    assert diagonal(1.0, state=np.eye(2), errors=np.eye(2)).radius == pytest.approx(1.0)
+
+
+def diagonal(pole: float, *, state: np.ndarray, errors: np.ndarray) -> LinearLoop:
+    """A loop with the poles 0.5, which the command shows, and another one."""
+    cycle = LinearCycle(np.diag([0.5, pole]), np.ones((2, 1)), np.array([[1.0, 0.0]]), state)
+    return LinearLoop((cycle,), errors, np.eye(2), 0.1)
+
+
+def test_the_spread_of_noise_over_a_period_is_that_of_its_cycles():
+    """z+ = f_k z + w with f = 0.5, 0.9: the variance before the first cycle is P = .45^2 P + .81 + 1."""
+    one, other = (LinearCycle(np.array([[f]]), np.eye(1), np.eye(1), np.eye(1)) for f in (0.5, 0.9))
+    loop = LinearLoop((one, other), np.eye(1), np.eye(1), 0.1)
+    assert loop.spread(np.eye(1))[0, 0] == pytest.approx(1.81 / (1 - 0.45**2))
+    assert loop.radius == pytest.approx(np.sqrt(0.45))
 
 
 def test_noise_and_quantum_are_no_part_of_the_linear_loop():
@@ -103,3 +112,12 @@ def test_other_parameters_are_another_memory_and_no_other_build():
     rebuilt = AskedLoop(replace(task.problem, plant=plant.with_exact(plant.approximate)), task.controllers["CTC"])
     other = rebuilt.at(rebuilt.run(rebuilt.start(), 50).memories[50])
     assert np.sort(np.abs(own.poles)) == pytest.approx(np.sort(np.abs(other.poles)), rel=1e-9, abs=1e-9)
+
+
+def test_a_gain_that_a_run_refuses_has_poles_too():
+    """J = 1.5 and a = 1.59: the iteration is multiplied by 1 - a J = -1.38; the wrong sign grows as well."""
+    for deformation in (fp.Affine(gain=-2 * 1.59), fp.Affine(gain=0.5)):
+        loop = AskedLoop(mass(), fp.ComputedTorque(fp.Exponential(rate=1.0), deformation))
+        factor = 1 - deformation.effective_gain() * 1.5
+        poles = loop.at(loop.run(loop.start(), 3).memories[2]).poles
+        assert np.abs(poles - factor).min() < 2e-2

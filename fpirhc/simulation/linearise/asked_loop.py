@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,9 +17,10 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
+from fpirhc.controllers.gain_check import any_gain
 from fpirhc.errors import NotSupported
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
-from fpirhc.simulation.linearise.slopes import Step, Way, reached
+from fpirhc.simulation.linearise.slopes import Directions, Step, Way, along, reached
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.symbolic.block import Composite
 from fpirhc.task.disturbance import Step as Jump
@@ -60,13 +62,16 @@ class AskedLoop:
         if problem.foreign is not None:
             raise NotSupported("the step of a loop with a foreign reality cannot be evaluated twice at one point")
         self.problem, self.controller = _calm(problem), resolved(problem, controller)
-        self.loop: Composite = close_loop(self.problem, self.controller)
+        with any_gain():  # one that a run refuses has poles too
+            self.loop: Composite = close_loop(self.problem, self.controller)
         self._step = Step(self.loop)
         names = self.loop.trace.names
         self._command = self.loop.trace.slice("command")
         self._arriving = self.loop.trace.slice("arriving" if "arriving" in names else "command")
         self._errors = self.loop.trace.slice("true_error" if "true_error" in names else "error")
         self._state = self.loop.memory.slice("_state_before")
+        self._request = [k for k, c in enumerate(self.loop.memory.columns) if "_deformed_last." in c]
+        self._inputs = len(self.problem.plant.inputs)
 
     @property
     def quick(self) -> bool:
@@ -94,23 +99,24 @@ class AskedLoop:
             before: inputs before; None: those of the problem.
             exact: parameters of the plant that moves; None: its own.
         """
-        moved = self.problem if state is None else replace(self.problem, start=state)
-        if before is not None:
-            moved = replace(moved, input_before=before, dead_time=replace(moved.dead_time, before={}))
-        memory = start_memory(self.loop, moved, self.controller)
+        memory = start_memory(self.loop, _started(self.problem, state, before), self.controller)
         memory[self.loop.memory.slice("cycle")] = round(time / self.problem.period)
-        if exact is not None:
+        if exact is not None and exact.size:  # an empty signal has one entry
             memory[self.loop.memory.slice("_exact")] = exact
         return memory
 
-    def run(self, memory: np.ndarray, cycles: int, led: np.ndarray | None = None) -> Passage:
+    def run(
+        self, memory: np.ndarray, cycles: int, led: np.ndarray | None = None, request: np.ndarray | None = None
+    ) -> Passage:
         """Return the run from a memory; it ends before the first cycle that is not finite, or where it is led and has come to rest.
 
         Args:
             memory: at its start.
             cycles: at most.
             led: states (cycles, nx) at which the plant is put after each cycle, so that it stays on the reference while what the
-                controller remembers finds its place there; None: the plant moves by itself.
+                controller remembers finds its place there; those that are NaN move by themselves. None: all do.
+            request: that is put in place of the last deformed response once everything else has found its place, so that an
+                iteration that does not converge is near its fixed point too; None: none is.
         """
         memories, traces, still = [memory], [], 0
         for k in range(cycles):
@@ -118,7 +124,9 @@ class AskedLoop:
             if not (np.isfinite(following).all() and np.isfinite(trace[self._arriving]).all()):
                 break
             if led is not None:
-                following[self._state] = led[k]
+                following[self._state] = np.where(np.isfinite(led[k]), led[k], following[self._state])
+            if request is not None and k == self._warm and len(self._request) == request.size:
+                following[self._request] = request
             memories.append(following)
             traces.append(trace)
             if led is not None and k > self._warm:
@@ -128,8 +136,8 @@ class AskedLoop:
                     break
         return Passage(np.array(memories), np.array(traces).reshape(-1, self.loop.trace.size))
 
-    def quietest(self, passage: Passage) -> LinearLoop:
-        """Return the linear loop in the quietest part of a run: where commands differ least from those of the period before.
+    def quietest(self, passage: Passage) -> np.ndarray:
+        """Return the memory in the quietest part of a run: where commands differ least from those of the period before.
 
         Cycles at a limit are left out as long as there are others: there a command has no slope.
 
@@ -147,27 +155,45 @@ class AskedLoop:
         quiet = np.logical_and(inside[n:], inside[:-n])
         quiet[: min(self._warm, len(quiet) - 1)] = False
         change = np.where(quiet, change, np.inf) if quiet.any() else change
-        return self.at(passage.memories[n + len(change) - 1 - int(np.argmin(change[::-1]))])
+        return np.asarray(passage.memories[n + len(change) - 1 - int(np.argmin(change[::-1]))])
 
     def at(self, memory: np.ndarray) -> LinearLoop:
         """Return the linear loop of the period that begins at a memory."""
-        ways = [self._step.way(one, self._scales(memory)) for one in self._period(memory)]
-        free, places = self._free, np.arange(self._state.start, self._state.stop)
-        nu, scales = len(self.problem.plant.inputs), self._scales(memory)[places]
-        whole = [np.eye(memory.size)[:, free]] * len(ways)
-        bases = whole if self.quick else reached(ways, free, places, nu)
-        cycles = [self._cycle(*one) for one in zip(ways, bases, [*bases[1:], bases[0]], strict=True)]
-        errors = np.column_stack([ways[0](direction, np.zeros(nu))[1][self._errors] for direction in bases[0].T])
-        state, placed = bases[0][places] * scales[:, None], (bases[0][places] / scales[:, None]).T
-        return LinearLoop(tuple(cycles), errors, state, placed, self.problem.period)
+        return self._among((self,), self._period(memory))[0]
 
-    def _cycle(self, way: Way, basis: np.ndarray, following: np.ndarray) -> LinearCycle:
-        """F, G, C of one cycle, from the directions at its beginning to those at its end."""
-        nu, nothing = len(self.problem.plant.inputs), np.zeros(len(basis))
-        images = [way(direction, np.zeros(nu)) for direction in basis.T]
-        moved, trace = (np.column_stack(columns) for columns in zip(*images, strict=True))
-        entry = np.column_stack([way(nothing, one)[0] for one in np.eye(nu)])
-        return LinearCycle(following.T @ moved, following.T @ entry, trace[self._arriving])
+    def beside(self, other: AskedLoop, memory: np.ndarray, *, held: bool = False) -> tuple[LinearLoop, LinearLoop]:
+        """Return its linear loop and that of another loop with the same memory, in the same coordinates z.
+
+        Args:
+            other: with the same memory, such as one with another gain.
+            memory: at which both are linearised.
+            held: whether plans are held for ever, as far as there are cycles between them.
+        """
+        period = self._period(memory)
+        one, second = self._among((self, other), period[1:2] or period if held else period)
+        return one, second
+
+    def _among(self, loops: tuple[AskedLoop, ...], memories: list[np.ndarray]) -> tuple[LinearLoop, ...]:
+        memory, scales = memories[0], self._scales(memories[0])
+        ways = [[one._step.way(at, scales) for one in loops] for at in memories]
+        places, whole = np.arange(self._state.start, self._state.stop), np.eye(memory.size)[:, self._free]
+        if self.quick:
+            directions = [along(some, whole, self._inputs) for some in ways]
+        else:
+            directions = reached(ways, self._free, places, self._inputs)
+        return tuple(self._linear([at[k] for at in ways], directions, k, scales[places]) for k in range(len(loops)))
+
+    def _linear(self, ways: list[Way], directions: list[Directions], number: int, scales: np.ndarray) -> LinearLoop:
+        """The linear loop of one of the ways of every cycle."""
+        cycles, nothing = [], np.zeros(self.loop.memory.size)
+        for way, at, following in zip(ways, directions, [*directions[1:], directions[0]], strict=True):
+            entry = np.column_stack([way(nothing, one)[0] for one in np.eye(self._inputs)])
+            state, arriving = at.basis[self._state] * scales[:, None], at.traces[number][self._arriving]
+            onto = following.basis.T
+            cycles.append(LinearCycle(onto @ at.moved[number], onto @ entry, arriving, state))
+        first = directions[0]
+        placed = (first.basis[self._state] / scales[:, None]).T
+        return LinearLoop(tuple(cycles), first.traces[number][self._errors], placed, self.problem.period)
 
     @cached_property
     def _longest(self) -> int:
@@ -230,6 +256,19 @@ class AskedLoop:
         for k, column in enumerate(self.loop.memory.columns):
             groups.setdefault(column.split("@")[0], []).append(k)
         return [places for places in groups.values() if len(places) > 1]
+
+
+def _started(problem: Problem, state: Mapping[str, float] | None, before: Mapping[str, float] | None) -> Problem:
+    """The problem with another start, which is not checked again: that takes longer than the linearisation."""
+    changes: dict[str, object] = {} if state is None else {"start": state}
+    if before is not None:
+        changes |= {"input_before": before, "dead_time": replace(problem.dead_time, before={})}
+    moved = copy(problem)
+    for name in ("start_state", "inputs_before", "real_start", "start_output"):  # which the problem remembers
+        vars(moved).pop(name, None)
+    for name, value in changes.items():
+        object.__setattr__(moved, name, value)
+    return moved
 
 
 def _calm(problem: Problem) -> Problem:

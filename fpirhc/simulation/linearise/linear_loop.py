@@ -13,16 +13,17 @@ import numpy as np
 import scipy.linalg
 
 NEUTRAL = 1e-6  # distance of |pole| from 1, where a mode neither decays nor grows
-_SHOWN = 1e-6  # share of a judged error in an eigenvector, in balanced units
+_SHOWN = 1e-6  # share of a judged error in an eigenvector, in scales
 
 
 @dataclass(frozen=True, eq=False)
 class LinearCycle:
-    """One cycle: F (n, n), G (n, nu), C (nu, n)."""
+    """One cycle: F (n, n), G (n, nu), C (nu, n), and X (nx, n), the states of the plant that moves."""
 
     dynamics: np.ndarray
     entry: np.ndarray
     arriving: np.ndarray
+    state: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,14 +33,12 @@ class LinearLoop:
     Args:
         cycles: as many as the loop needs to repeat itself; one for plans in every cycle.
         errors: E (judged, n); no rows: every mode counts.
-        state: X (nx, n), the states of the plant that moves, at the first cycle.
         placed: Z (n, nx), the deviation z of a deviation of the plant's state alone.
         period: of the control cycle.
     """
 
     cycles: tuple[LinearCycle, ...]
     errors: np.ndarray
-    state: np.ndarray
     placed: np.ndarray
     period: float
 
@@ -71,20 +70,45 @@ class LinearLoop:
         if not len(self.errors) or not lasting.any():
             return np.zeros(len(self.poles), dtype=bool)
         neutral = lasting & (np.abs(self.poles) < 1 + NEUTRAL * count)
-        balanced, (scale, _) = scipy.linalg.matrix_balance(self.dynamics, permute=False, separate=True)
-        values, vectors = np.linalg.eig(balanced)
+        values, vectors = np.linalg.eig(self.dynamics)  # z is in scales already
         sizes = np.abs(vectors).max(axis=0)
-        by_error, by_any = (_seen(rows * scale, vectors) / sizes for rows in (self.errors, self._everything))
+        by_error, by_any = (_seen(rows, vectors) / sizes for rows in (self.errors, self._everything))
         near = [np.abs(values - pole) < 10 * NEUTRAL * count for pole in self.poles]
         no_error, nothing = (
             np.array([share[one].max(initial=0.0) < _SHOWN for one in near]) for share in (by_error, by_any)
         )
         return (neutral & no_error) | (lasting & nothing)
 
+    def carried(self, deviation: np.ndarray, cycles: int, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Return states (cycles, nx, ...) and arriving commands (cycles, nu, ...) after a deviation z (n, ...).
+
+        Args:
+            deviation: at the first of them.
+            cycles: number of cycles.
+            first: number of the cycle in its period at which the deviation is.
+        """
+        z, states, commands = deviation, [], []
+        for k in range(cycles):
+            one = self.cycles[(first + k) % len(self.cycles)]
+            states.append(one.state @ z)
+            commands.append(one.arriving @ z)
+            z = one.dynamics @ z
+        return np.array(states), np.array(commands)
+
+    def spread(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the covariance (n, n) of z at the first cycle where w is white noise with a covariance (nu, nu) in every cycle.
+
+        It solves P = F P F' + Q over a period, where Q is what the noise of its cycles adds up to.
+        """
+        added = np.zeros_like(self.dynamics, shape=2 * self.cycles[0].dynamics.shape[1:])
+        for one in self.cycles:
+            added = one.dynamics @ added @ one.dynamics.T + one.entry @ covariance @ one.entry.T
+        return np.asarray(scipy.linalg.solve_discrete_lyapunov(self.dynamics, added))
+
     @property
     def _everything(self) -> np.ndarray:
         """What plant, errors and commands show of the deviation at the first cycle, by rows."""
-        rows, moved = [self.errors, self.state], np.eye(len(self.cycles[0].dynamics.T))
+        rows, moved = [self.errors, self.cycles[0].state], np.eye(len(self.cycles[0].dynamics.T))
         for one in self.cycles:
             rows.append(one.arriving @ moved)
             moved = one.dynamics @ moved

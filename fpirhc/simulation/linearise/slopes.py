@@ -14,6 +14,7 @@ the next direction, until nothing is (Arnoldi's iteration).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import casadi as ca
@@ -78,11 +79,32 @@ class Step:
         return move
 
 
-def reached(ways: Sequence[Way], free: np.ndarray, first: np.ndarray, inputs: int) -> list[np.ndarray]:
-    """Return orthonormal directions (n, m) at every cycle of a period that the motion from some first ones does not leave.
+@dataclass(frozen=True, eq=False)
+class Directions:
+    """Directions of one cycle, and what each way makes of them.
 
     Args:
-        ways: of the cycles of the period.
+        basis: orthonormal directions (n, m) at its beginning, in scales.
+        moved: by way, the next deviations (n, m).
+        traces: by way, the deviations of the trace (columns, m).
+    """
+
+    basis: np.ndarray
+    moved: list[np.ndarray]
+    traces: list[np.ndarray]
+
+
+def along(ways: Sequence[Way], basis: np.ndarray, inputs: int) -> Directions:
+    """Return given directions (n, m) of a cycle, moved."""
+    images = [[way(one, np.zeros(inputs)) for one in basis.T] for way in ways]
+    return _collected(basis, images)
+
+
+def reached(ways: Sequence[Sequence[Way]], free: np.ndarray, first: np.ndarray, inputs: int) -> list[Directions]:
+    """Return directions at every cycle of a period that the motion from some first ones does not leave.
+
+    Args:
+        ways: of the cycles of the period, one or several each.
         free: which entries may deviate, (n,).
         first: places of the plant's state.
         inputs: number of inputs.
@@ -91,12 +113,12 @@ def reached(ways: Sequence[Way], free: np.ndarray, first: np.ndarray, inputs: in
         NotSupported: more directions than a loop should need.
     """
     still, calm, count = np.zeros(free.size), np.zeros(inputs), len(ways)
-    inputs_first = [
-        ((k + 1) % count, way(still, one)[0] * free) for k, way in enumerate(ways) for one in np.eye(inputs)
-    ]
     waiting = [(0, np.eye(free.size)[k]) for k in first]
-    waiting += [(k, one / (np.linalg.norm(one) or 1.0)) for k, one in inputs_first]
+    for k, some in enumerate(ways):
+        moved = [way(still, one)[0] * free for way in some for one in np.eye(inputs)]
+        waiting += [((k + 1) % count, one / (np.linalg.norm(one) or 1.0)) for one in moved]
     bases = [np.zeros((0, free.size))] * count
+    images: list[list[list[tuple[np.ndarray, np.ndarray]]]] = [[[] for _ in some] for some in ways]
     while waiting:
         place, one = waiting.pop(0)
         basis = bases[place]
@@ -108,8 +130,15 @@ def reached(ways: Sequence[Way], free: np.ndarray, first: np.ndarray, inputs: in
         if len(basis) >= _LARGEST:
             raise NotSupported(f"the loop moves in more than {_LARGEST} directions")
         bases[place] = np.vstack([basis, one / length])
-        waiting.append(((place + 1) % count, ways[place](one / length, calm)[0] * free))
-    return [basis.T for basis in bases]
+        for way, known in zip(ways[place], images[place], strict=True):
+            known.append(way(one / length, calm))
+            waiting.append(((place + 1) % count, known[-1][0] * free))
+    return [_collected(basis.T, known) for basis, known in zip(bases, images, strict=True)]
+
+
+def _collected(basis: np.ndarray, images: Sequence[Sequence[tuple[np.ndarray, np.ndarray]]]) -> Directions:
+    moved, traces = ([np.column_stack([one[k] for one in known]) for known in images] for k in (0, 1))
+    return Directions(basis, moved, traces)
 
 
 def _derivative(function: ca.Function) -> ca.Function:
