@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -9,9 +10,14 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from fpirhc.controllers.gap import AGAIN, Gap
+import fpirhc as fp
+from fpirhc.conformance.loops import two_masses
+from fpirhc.controllers.gap import AGAIN, Gap, across_gaps, gap_of
+from fpirhc.controllers.seeing import compose_seeing
 from fpirhc.status import Status
+from fpirhc.symbolic.block import Block, compose
 from fpirhc.symbolic.gap import LONG
+from fpirhc.symbolic.layout import Layout, scalar
 
 NAMES = ("missing_cycles", "still_settling")
 
@@ -77,3 +83,25 @@ def test_counts_that_cannot_be_are_those_of_the_start(bad):
     assert cycle(gap, bad, fits=True)[:2] == ((0.0, 0.0), Status.OK)
     for good in ((6.0, 0.0), (0.0, 3.0), (6.0, 3.0)):
         assert cycle(gap, good, fits=False)[2] == good if good[0] == 6.0 else (1.0, good[1])
+
+
+def test_the_counter_of_a_problem():
+    """Nothing settles where everything is measured; else the window of the start does, and a filter forgets. It begins at -1."""
+    measured = two_masses()
+    windows = {fp.SavitzkyGolay(window=11, degree=4): 0, fp.StateVariableFilter(bandwidth=100.0): 1}
+    assert gap_of(measured, 7) == Gap(7, 0.0)
+    for estimator, forgets in windows.items():
+        problem = replace(measured, sensing=fp.Sensing(estimator=estimator))
+        assert gap_of(problem, 7) == Gap(7, problem.longest_warm_up + forgets * estimator.settles(2, problem.period))
+    assert Layout(Gap(7, 0.0).memory).start().tolist() == [-1.0, 0.0]
+
+
+def test_a_step_reads_the_gap_where_a_block_knows_it():
+    """A step without such a block stays the same object."""
+    problem = replace(two_masses(), sensing=fp.Sensing(estimator=fp.PositionDifference()))
+    step = compose_seeing(problem, fp.ComputedTorque(fp.Exponential(rate=6.0)))
+    assert "gap" not in step.reads
+    assert "gap" in across_gaps(step).reads
+    block = Block("b", Layout((scalar("a"),)), Layout((scalar("c"),)), lambda s: {"c": s.a})
+    plain = compose("plain", block.reads, [block])
+    assert across_gaps(plain) is plain
