@@ -4,7 +4,8 @@ With z+ = F z + G w and v = C z (commands that arrive) the loop of input i is op
 
     L_i(zeta) = -C_i (zeta I - F + G_i C_i)^-1 G_i,
 
-all other loops closed. The deformation, dead time and prediction are in it.
+all other loops closed. The deformation, dead time and prediction are in it. Plans that are not made in every cycle are judged over
+the whole period from plan to plan, see `fpirhc.review.plan_period`.
 
 References: K. J. Astrom, R. M. Murray, Feedback Systems, 2008, section 9.3, for the margins.
 """
@@ -12,6 +13,7 @@ References: K. J. Astrom, R. M. Murray, Feedback Systems, 2008, section 9.3, for
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.linalg
@@ -20,7 +22,9 @@ from fpirhc.review.answer import Answer, Verdict
 from fpirhc.review.linear import LinearLoop
 from fpirhc.review.loops import Loops
 from fpirhc.review.neutral import NEUTRAL
+from fpirhc.review.plan_period import period_margins
 from fpirhc.review.wording import duration
+from fpirhc.simulation.linearise.linear_loop import LinearLoop as OverPeriod
 from fpirhc.task.problem import Problem
 
 QUESTION = "Has the linear loop enough margin?"
@@ -31,7 +35,9 @@ _FREQUENCIES = 300
 _LOWEST = 1e-5  # of the Nyquist frequency
 
 
-def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: bool) -> Answer:
+def margins_enough(
+    problem: Problem, loops: Loops, *, adapts: bool, planned: bool, whole: Sequence[OverPeriod] = ()
+) -> Answer:
     """Return the smallest margins of all inputs at the first point of the reference and where the largest |pole| is.
 
     Args:
@@ -39,25 +45,31 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: boo
         loops: linear loops of the controller.
         adapts: whether the controller has a deformation.
         planned: whether the controller is a plan, which has weights in place of a rate.
+        whole: loops over a whole period of plans that are not made in every cycle; they are judged then.
     """
-    if not loops.loops:
+    every = whole or loops.loops
+    if not every:
         return Answer(QUESTION, Verdict.UNKNOWN, f"no linear loop: {loops.reason}")
-    if len(loops.loops[0].dynamics) > _LARGEST:
-        radius = float(loops.radii.max())
-        text = f"largest closed-loop pole magnitude {radius:.6g}; no margins of a loop of {len(loops.loops[0].dynamics)} states"
-        return Answer(QUESTION, Verdict.UNKNOWN, text, "", {"radius": radius})
-    radius = float(loops.radii.max())
+    radii = np.array([one.radius for one in every])
+    radius = float(radii.max())
     text = f"largest closed-loop pole magnitude {radius:.6g}"
+    if not whole and len(loops.loops[0].dynamics) > _LARGEST:
+        text += f"; no margins of a loop of {len(loops.loops[0].dynamics)} states"
+        return Answer(QUESTION, Verdict.UNKNOWN, text, "", {"radius": radius})
     if radius >= 1:  # there is no margin to lose
-        return _outside(loops, text, {"radius": radius})
-    places = {0, int(np.argmax(loops.radii))}
-    all_margins = [margins(loops.loops[k], i) for k in sorted(places) for i in range(len(problem.plant.inputs))]
+        return _outside(radii, text, {"radius": radius}, learns=loops.learns)
+    places, inputs = sorted({0, int(np.argmax(radii))}), range(len(problem.plant.inputs))
+    if whole:
+        all_margins = [period_margins(whole[k], i) for k in places for i in inputs]
+        text += f" per cycle, over the {len(whole[0].cycles)} cycles from plan to plan"
+    else:
+        all_margins = [margins(loops.loops[k], i) for k in places for i in inputs]
     gain, phase, delay = (min(column) for column in zip(*all_margins, strict=True))
     numbers = {"radius": radius, "gain_margin": gain, "phase_margin": phase, "delay_margin": delay}
     text += f"; {_sizes(gain, phase, delay, problem)}"
     if loops.learns:
         text += ", before the controller has learned anything"
-    if any(one.hidden.any() for one in loops.loops):
+    if any(one.hidden.any() for one in every):
         text += "; neutral modes that no judged coordinate shows are left out"
     good = gain >= LEAST_GAIN and phase >= LEAST_PHASE
     gentler = "weigh the inputs more" if planned else "lower the rate"
@@ -65,13 +77,13 @@ def margins_enough(problem: Problem, loops: Loops, *, adapts: bool, planned: boo
     return Answer(QUESTION, Verdict.YES if good else Verdict.UNKNOWN, text, change, numbers)
 
 
-def _outside(loops: Loops, text: str, numbers: dict[str, float]) -> Answer:
+def _outside(radii: np.ndarray, text: str, numbers: dict[str, float], *, learns: bool) -> Answer:
     """The answer where the largest |pole| is at least 1."""
-    smallest = float(loops.radii.min())
+    smallest = float(radii.min())
     where = "all along" if smallest >= 1 else "at some points of"
-    on_circle = float(loops.radii.max()) < 1 + NEUTRAL
+    on_circle = float(radii.max()) < 1 + NEUTRAL
     text += f"; a pole is {'on' if on_circle else 'outside'} the unit circle {where} the reference"
-    verdict = Verdict.NO if smallest >= 1 + NEUTRAL and not loops.learns else Verdict.UNKNOWN
+    verdict = Verdict.NO if smallest >= 1 + NEUTRAL and not learns else Verdict.UNKNOWN
     return Answer(
         QUESTION, verdict, text, "See the rates, the zero dynamics, and the convergence of a deformation.", numbers
     )

@@ -31,6 +31,7 @@ from fpirhc.review.null_test import leaves_right_model_alone
 from fpirhc.review.of_order_zero import controls_order_zero, review_of_order_zero
 from fpirhc.review.orders import relative_orders
 from fpirhc.review.pays import pays
+from fpirhc.review.plan_period import loops_of_periods, plans_seldom
 from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, known_questions
 from fpirhc.review.rates import rates_inside
 from fpirhc.review.reach import range_enough
@@ -142,7 +143,9 @@ def _zero_dynamics(case: Case) -> Answer | None:
 
 def _margins(case: Case) -> Answer | None:
     adapts, planned = case.controller.deformation.adapts, is_planned(case.controller)
-    return margins_enough(case.problem, case.loops, adapts=adapts, planned=planned)
+    seldom = bool(case.loops.loops) and plans_seldom(case.problem, case.controller)
+    whole = loops_of_periods(case.grid, case.controller) if seldom else ()
+    return margins_enough(case.problem, case.loops, adapts=adapts, planned=planned, whole=whole)
 
 
 def _more(case: Case) -> list[Answer]:

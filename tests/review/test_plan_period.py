@@ -1,0 +1,76 @@
+"""Margins of plans that are made every n cycles: a run with the command multiplied by more, or by less, decides who is right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.controllers.contract import resolved
+from fpirhc.review.grid import review_grid
+from fpirhc.review.plan_period import loops_of_periods, period_margins, plans_seldom
+
+
+class Multiplied:
+    """Inputs by name, all of them multiplied."""
+
+    def __init__(self, inputs: Any, factor: float) -> None:
+        self._inputs, self._factor = inputs, factor
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._inputs, name) * self._factor
+
+
+def multiplied(problem: fp.Problem, factor: float) -> fp.Problem:
+    """The problem whose plant is given its inputs multiplied, which the controllers do not know."""
+    plant: fp.Plant = problem.plant
+    response: Callable[..., Any] = plant.response
+    if max(plant.orders) == 1:
+        other = replace(plant, response=lambda x, u, p: response(x, Multiplied(u, factor), p), inverse=None)
+    else:
+        other = replace(plant, response=lambda q, v, u, p: response(q, v, Multiplied(u, factor), p), inverse=None)
+    return replace(problem, reality=fp.Reality(other))
+
+
+def movement(problem: fp.Problem, controller: Any) -> float:
+    """Median change of the command from cycle to cycle in the last third of a run."""
+    run = fp.simulate(problem, controller, seed=0, compiled=False)
+    assert run.stop is None
+    changes = np.abs(np.diff(run["command"], axis=0)).max(axis=1)
+    return float(changes[-run.cycles // 3 :].mean())
+
+
+@pytest.mark.parametrize(("name", "duration"), [("two_mass", 3.0), ("leaking_tanks", None)])
+def test_a_command_multiplied_by_less_than_the_gain_margin_is_calm_and_by_more_is_not(
+    name: str, duration: float | None
+) -> None:
+    """The margin is 3.96 on the two masses, where a plan in every cycle would have 39.5."""
+    task = fp.load_problem(name)
+    problem = task.problem if duration is None else replace(task.problem, duration=duration, measure_from=0.0)
+    controller, grid = task.controllers["RHC"], review_grid(task.problem, 0.0, 0)
+    assert plans_seldom(problem, controller)
+    loops = loops_of_periods(grid, resolved(grid.problem, controller))
+    inputs = range(len(problem.plant.inputs))
+    margin = min(period_margins(one, i)[0] for one in loops for i in inputs)
+    calm, wild = (movement(multiplied(problem, share * margin), controller) for share in (0.85, 1.3))
+    assert wild > 5 * calm
+
+
+def test_the_answer_is_that_of_the_whole_period() -> None:
+    task = fp.load_problem("two_mass")
+    answers = fp.review(task.problem, {"RHC": task.controllers["RHC"]}, mismatch=0.0, seed=0).controllers["RHC"]
+    answer = next(a for a in answers if a.question == "Has the linear loop enough margin?")
+    assert "per cycle, over the 10 cycles from plan to plan" in answer.evidence
+    assert answer.numbers["gain_margin"] == pytest.approx(3.96, rel=0.02)
+
+
+def test_plans_in_every_cycle_and_laws_have_no_period() -> None:
+    task = fp.load_problem("two_mass")
+    assert task.problem.horizon is not None
+    every = replace(task.problem, horizon=replace(task.problem.horizon, step=task.problem.period))
+    assert not plans_seldom(every, task.controllers["RHC"])
+    assert not plans_seldom(task.problem, task.controllers["CTC"])
