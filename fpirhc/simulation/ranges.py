@@ -1,14 +1,22 @@
-"""Physical ranges of states, checked along a run: a level below zero is a run that no plant would make."""
+"""Ranges that end a run: physical ones of states, and errors of a loop that has run away.
+
+A level below zero is a run that no plant would make. An error of a million times the reference is no result of a controller.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
 from fpirhc.symbolic.layout import Layout
 from fpirhc.task.problem import Problem
 
+_Entries: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[str, str]]]
+_RUNAWAY = 1e6  # times the largest value of the reference, or of the start
+_INSTANTS = 200  # of the reference
+_ERRORS = ("true_error", "error")  # where they are logged: the first that a run has
 _SIGNALS = (
     "foreign",
     "reality_state",
@@ -19,23 +27,23 @@ _SIGNALS = (
 
 @dataclass(frozen=True, eq=False)
 class Ranges:
-    """The ranges of the logged states of the plant that moves.
+    """Where logged numbers must be, and what is said of one that is not.
 
     Args:
         columns: of the log, shape (m,).
         lower: shape (m,).
         upper: shape (m,).
-        names: of the states, with their units.
+        words: (before, behind) a number that is outside.
     """
 
     columns: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
-    names: tuple[tuple[str, str], ...]
+    words: tuple[tuple[str, str], ...]
 
     def first_outside(self, rows: np.ndarray) -> tuple[int, str] | None:
-        """Return the first row of a log in which a state is outside, and which one; None where all are inside."""
-        if not self.names:
+        """Return the first row of a log in which a number is outside, and which one; None where all are inside."""
+        if not self.words:
             return None
         values = rows[:, self.columns]
         outside = (values < self.lower) | (values > self.upper)
@@ -43,17 +51,49 @@ class Ranges:
             return None
         row = int(np.argmax(outside.any(axis=1)))
         k = int(np.argmax(outside[row]))
-        name, unit = self.names[k]
-        reach = f"{self.lower[k]:g} to {self.upper[k]:g} {unit}"
-        return row, f"state '{name}' is {values[row, k]:.6g} {unit}, outside its physical range of {reach}"
+        before, behind = self.words[k]
+        return row, f"{before} {values[row, k]:.6g} {behind}"
 
 
 def ranges_of(problem: Problem, trace: Layout) -> Ranges:
-    """Return the ranges of the plant that a run moves, at the columns where its states are logged."""
+    """Return the physical ranges of the plant that a run moves, and what errors may be, at the columns where they are logged."""
+    states, errors = _of_states(problem, trace), _of_errors(problem, trace)
+    columns, lower, upper = (np.concatenate([a, b]) for a, b in zip(states[:3], errors[:3], strict=True))
+    return Ranges(columns.astype(int), lower, upper, (*states[3], *errors[3]))
+
+
+def _of_states(problem: Problem, trace: Layout) -> _Entries:
     signal = trace[next(name for name in _SIGNALS if name in trace)]
     first = trace.slice(signal.name).start
     named = [(n, ends) for n, ends in problem.real_plant.ranges.items() if n in signal.elements]
     places = [signal.elements.index(n) for n, _ in named]
     lower, upper = (np.array([ends[k] for _, ends in named], dtype=float) for k in (0, 1))
-    units = tuple((n, signal.entry_units[k]) for (n, _), k in zip(named, places, strict=True))
-    return Ranges(np.array([first + k for k in places], dtype=int), lower, upper, units)
+    words = []
+    for (name, (low, high)), k in zip(named, places, strict=True):
+        unit = signal.entry_units[k]
+        words.append((f"state '{name}' is", f"{unit}, outside its physical range of {low:g} to {high:g} {unit}"))
+    return np.array([first + k for k in places], dtype=int), lower, upper, words
+
+
+def _of_errors(problem: Problem, trace: Layout) -> _Entries:
+    """Errors that no reference explains: the loop has run away, whatever its signals still are."""
+    signal = trace[next(name for name in _ERRORS if name in trace)]
+    plant, first = problem.plant, trace.slice(signal.name).start
+    times = np.linspace(0.0, problem.duration, _INSTANTS)
+    motion = np.asarray(problem.reference.function(plant).map(_INSTANTS)(times[None, :])[0].full())
+    places, sizes, words = [], [], []
+    for k, name in enumerate(signal.elements):
+        row = plant.output.elements.index(name)
+        along = np.append(motion[row], problem.start_output[row])
+        size = float(np.abs(along[np.isfinite(along)]).max(initial=0.0))
+        if size > 0:
+            places.append(first + k)
+            sizes.append(_RUNAWAY * size)
+            unit = signal.entry_units[k]
+            words.append(
+                (
+                    f"the error of '{name}' is",
+                    f"{unit}, more than a million times its reference of at most {size:.3g} {unit}",
+                )
+            )
+    return np.array(places, dtype=int), -np.array(sizes), np.array(sizes), words

@@ -183,8 +183,8 @@ def simulate(
 ) -> Run:
     """Run the closed loop of problem and controller and return every signal, also those that judge the run.
 
-    A signal that becomes NaN or infinite, or a state that leaves its physical range, ends the run there. The run keeps the cycles
-    before it, and `Run.stop` is the reason.
+    A signal that becomes NaN or infinite, a state that leaves its physical range, or an error of more than a million times the
+    reference ends the run there. The run keeps the cycles before it, and `Run.stop` is the reason.
 
     Args:
         problem: the task.
