@@ -32,9 +32,9 @@ _SMALL = 1e-3  # feedback of a point at a limit, as a share of the others'
 
 
 def plans_seldom(problem: Problem, controller: Controller) -> bool:
-    """Whether plans that restart from the measured state are made less often than every cycle, by a model that does not learn."""
+    """Whether plans that restart from the measured state are made less often than every cycle."""
     planner, horizon = controller.planner, problem.horizon
-    if planner is None or horizon is None or not planner.restarts or controller.learns:
+    if planner is None or horizon is None or not planner.restarts:
         return False
     return cycles_per_stage(horizon, problem.period) > 1
 
@@ -42,8 +42,10 @@ def plans_seldom(problem: Problem, controller: Controller) -> bool:
 def loops_of_periods(grid: ReviewGrid, controller: Controller) -> tuple[LinearLoop, ...]:
     """Return the linear loops at some points of the reference where plans are inside the limits; none where there are none.
 
-    A plan at a limit feeds nothing back.
+    A plan at a limit feeds nothing back. Of a controller that learns they are those before it has learned anything.
     """
+    while controller.learns and controller.inner is not None:
+        controller = controller.inner
     finite = [k for k in range(len(grid.times)) if np.isfinite(grid.commands[0, k]).all()]
     places = np.unique(np.linspace(0, len(finite) - 1, _POINTS).astype(int)) if finite else ()
     try:

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 
 from fpirhc.simulation.dropped_steps import Dropped
-from fpirhc.simulation.ranges import ranges_of
+from fpirhc.simulation.ranges import physical_ranges
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.task.problem import Problem
@@ -45,7 +45,7 @@ def run_foreign(
     assert foreign is not None
     memory, *inputs = evaluator.arguments
     *random, answer, held = inputs
-    log, ranges, bridged = np.empty((cycles, trace.size)), ranges_of(problem, trace), 0
+    log, ranges, bridged = np.empty((cycles, trace.size)), physical_ranges(problem, trace), 0
     memory[:], held[0] = start, 0.0
     answer[:] = foreign.first(seed)
     for k in range(cycles):

@@ -62,6 +62,12 @@ def ranges_of(problem: Problem, trace: Layout) -> Ranges:
     return Ranges(columns.astype(int), lower, upper, (*states[3], *errors[3]))
 
 
+def physical_ranges(problem: Problem, trace: Layout) -> Ranges:
+    """Return the physical ranges alone, for what a body outside gives: one absurd sample is no loop that runs away."""
+    columns, lower, upper, words = _of_states(problem, trace)
+    return Ranges(columns, lower, upper, tuple(words))
+
+
 def _of_states(problem: Problem, trace: Layout) -> _Entries:
     signal = trace[next(name for name in _SIGNALS if name in trace)]
     first = trace.slice(signal.name).start

@@ -6,11 +6,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import abroad
 import numpy as np
 import pytest
 
 import fpirhc as fp
 from fpirhc.controllers.contract import resolved
+from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.grid import review_grid
 from fpirhc.review.plan_period import loops_of_periods, period_margins, plans_seldom
 
@@ -44,19 +46,27 @@ def movement(problem: fp.Problem, controller: Any) -> float:
     return float(changes[-run.cycles // 3 :].mean())
 
 
-@pytest.mark.parametrize(("name", "duration"), [("two_mass", 3.0), ("leaking_tanks", None)])
+@pytest.mark.parametrize(
+    ("task", "controller", "duration", "up"),
+    [
+        (fp.load_problem("two_mass"), "RHC", 3.0, True),
+        (fp.load_problem("leaking_tanks"), "RHC", None, True),
+        (abroad.load("flexible_servo"), "RHC", None, True),
+        (abroad.load("flexible_servo"), "RHC+FPI", None, False),
+    ],
+    ids=["two_mass", "leaking_tanks", "servo", "servo with adaptation"],
+)
 def test_a_command_multiplied_by_less_than_the_gain_margin_is_calm_and_by_more_is_not(
-    name: str, duration: float | None
+    task: Task, controller: str, duration: float | None, up: bool
 ) -> None:
-    """The margin is 3.96 on the two masses, where a plan in every cycle would have 39.5."""
-    task = fp.load_problem(name)
+    """The margin is 3.96 on the two masses, where a plan in every cycle would have 39.5; that of the last one is downwards."""
     problem = task.problem if duration is None else replace(task.problem, duration=duration, measure_from=0.0)
-    controller, grid = task.controllers["RHC"], review_grid(task.problem, 0.0, 0)
-    assert plans_seldom(problem, controller)
-    loops = loops_of_periods(grid, resolved(grid.problem, controller))
-    inputs = range(len(problem.plant.inputs))
-    margin = min(period_margins(one, i)[0] for one in loops for i in inputs)
-    calm, wild = (movement(multiplied(problem, share * margin), controller) for share in (0.85, 1.3))
+    one, grid = task.controllers[controller], review_grid(task.problem, 0.0, 0)
+    assert plans_seldom(problem, one)
+    loops = loops_of_periods(grid, resolved(grid.problem, one))
+    margin = min(period_margins(loop, i)[0] for loop in loops for i in range(len(problem.plant.inputs)))
+    factors = (0.85 * margin, 1.3 * margin) if up else (1 / (0.85 * margin), 1 / (1.3 * margin))
+    calm, wild = (movement(multiplied(problem, factor), one) for factor in factors)
     assert wild > 5 * calm
 
 

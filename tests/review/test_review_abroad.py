@@ -76,11 +76,17 @@ def test_the_servo_has_nothing_to_adapt():
 
 
 def test_the_weighed_change_of_the_voltage_leaves_no_answer_out():
-    """The cost weighs the change of the voltage: margins, rates and convergence have numbers."""
+    """The cost weighs the change of the voltage: margins, rates and convergence have numbers.
+
+    Plans are made every 10 cycles, and between them the deformation acts on: a voltage of half the size is too little for it
+    (`test_plan_period`), where a plan in every cycle would bear a nineteenth.
+    """
     review = reviewed("flexible_servo")
     for words in ("margin", "sampling fast enough", "zero dynamics"):
         for controller in ("RHC", "RHC+FPI", "RHC exact model"):
-            assert about(review, words, controller).verdict == "yes", (words, controller)
+            wanted = "unknown" if (words, controller) == ("margin", "RHC+FPI") else "yes"
+            assert about(review, words, controller).verdict == wanted, (words, controller)
+    assert about(review, "margin", "RHC+FPI").numbers["gain_margin"] == pytest.approx(1.74, rel=0.02)
     assert about(review, "horizon long").verdict == "yes"
 
 
