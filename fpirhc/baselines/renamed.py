@@ -12,24 +12,9 @@ from typing import Any
 
 from fpirhc.baselines.bands import Expected
 from fpirhc.baselines.settings import Settings
+from fpirhc.members import FORMER
 
 METRICS = {"cost.correction": "cost.deviation"}
-CLASSES = {
-    "BacksteppingMrac": "BacksteppingMRAC",
-    "ForceMrac": "ForceMRAC",
-    "General": "CustomCost",
-    "Informed": "ExactModel",
-    "InteriorPoint": "Ipopt",
-    "LqrTerminal": "LQRTerminal",
-    "LyapunovMrac": "LyapunovMRAC",
-    "OpenPlan": "FromPlan",
-    "Path": "PathConstraint",
-    "Pid": "PID",
-    "Restart": "FromMeasurement",
-    "RestartAndTrack": "FromMeasurementTracked",
-    "Rfpt": "RFPT",
-    "RfptVector": "RFPTVector",
-}
 # A setting's parent stands before it, so that a coordinate of a user's may have any name.
 _SETTINGS = {
     r"((?:^|\bcontroller\.)(?:controller\.)*)nominal(?=\.)": r"\1replanning",
@@ -63,9 +48,9 @@ def _flat(flat: Mapping[str, Any], changed: dict[str, str]) -> dict[str, Any]:
         if name != key:
             changed[_without_entry(key)] = _without_entry(name)
         is_class = name == "is" or name.endswith(".is")
-        if is_class and value in CLASSES:
-            changed[value] = CLASSES[value]
-        renamed[name] = CLASSES.get(value, value) if is_class else value
+        if is_class and value in FORMER:
+            changed[value] = FORMER[value]
+        renamed[name] = FORMER.get(value, value) if is_class else value
     return renamed
 
 
