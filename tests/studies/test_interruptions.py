@@ -32,7 +32,7 @@ COMMAND = [
 ]
 PLANNED = """measure_from=0.5,
     horizon=fp.Horizon(stages=30, step=5e-3),
-    cost=fp.Quadratic(states={'y': 1.0}),"""
+    cost=fp.Quadratic(states={'y': 1.0}, deviation={'u': 1e-3}),"""
 LONG = LINE.replace("measure_from=0.5,", PLANNED).replace(
     "controllers = {", "controllers = {\n    'RHC': fp.RecedingHorizon(fp.Ipopt()),"
 )
