@@ -143,7 +143,9 @@ def _zero_dynamics(case: Case) -> Answer | None:
 
 def _margins(case: Case) -> Answer | None:
     adapts, planned = case.controller.deformation.adapts, is_planned(case.controller)
-    stable = bool(case.loops.loops) and bool(case.loops.radii.max() < 1)  # a loop of plans in every cycle; else it cannot be run
+    stable = bool(case.loops.loops) and bool(
+        case.loops.radii.max() < 1
+    )  # a loop of plans in every cycle; else it cannot be run
     seldom = stable and plans_seldom(case.problem, case.controller)
     whole = loops_of_periods(case.grid, case.controller) if seldom else ()
     return margins_enough(case.problem, case.loops, adapts=adapts, planned=planned, whole=whole)
