@@ -128,14 +128,14 @@ def public_member(name: str) -> Any:
     """The member `FooBar` of the module `foo_bar`, or of a module of another distribution; None if there is none."""
     own = [package for kind in FAMILIES.values() for package in kind.packages]
     for package in own:
-        found = _in_module_of_its_name(importlib.import_module(package), name)
-        if found is not None:
-            return found
+        member = _in_module_of_its_name(importlib.import_module(package), name)
+        if member is not None:
+            return member
     for point in entry_points(group=GROUP):
         root = importlib.import_module(point.value)
-        found = getattr(root, name, None) or _in_module_of_its_name(root, name)
-        if found is not None:
-            return found
+        member = getattr(root, name, None) or _in_module_of_its_name(root, name)
+        if member is not None:
+            return member
     return None
 
 

@@ -5,15 +5,12 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import casadi as ca
 
 from fpirhc.errors import NotSupported
+from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression, Named
-
-if TYPE_CHECKING:
-    from fpirhc.plant.plant import Plant
 
 
 def behind_actuators(plant: Plant, lags: Sequence[float]) -> Plant:

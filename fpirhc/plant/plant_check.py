@@ -108,14 +108,14 @@ def _wrong_arguments(plant: Motion, expected: int) -> str:
     """What a response of another number of arguments is, and what it should be."""
     quantity, function = plant.words
     kinds = [one.kind for one in inspect.signature(plant.response).parameters.values()]
-    given, order = len(kinds), max(plant.orders, default=0)
+    arguments, order = len(kinds), max(plant.orders, default=0)
     lower = ["x"] if quantity == "state" else ["q", "v", "a"] + [f"d{k}" for k in range(3, 12)]
     names = [*lower[:order], "u", "p", *(["z"] if plant.algebraic else [])]
-    state, fitting, place = quantity == "state", order + given - expected, place_of(plant.response)
-    mend = f"; {given} arguments are those of order {fitting}" if fitting > 0 else _OF_STATES
+    state, fitting, place = quantity == "state", order + arguments - expected, place_of(plant.response)
+    mend = f"; {arguments} arguments are those of order {fitting}" if fitting > 0 else _OF_STATES
     mend = "" if state or inspect.Parameter.KEYWORD_ONLY in kinds else mend
     return (
-        f"{function} takes {given} argument(s){f' ({place})' if place else ''}; "
+        f"{function} takes {arguments} argument(s){f' ({place})' if place else ''}; "
         f"{'' if state else f'with order {order} '}it is called as {function}({', '.join(names)}){mend}"
     )
 

@@ -45,14 +45,14 @@ class Recommended:
         limit: of the map's own gain, the smallest one.
         sets: which limit that is.
         why_not: why none is recommended; empty where one is.
-        kept: whether it is less than half of the limit, so that the loop keeps its margins.
+        lowered: whether it is less than half of the limit, so that the loop keeps its margins.
     """
 
     value: float
     limit: float
     sets: str
     why_not: str = ""
-    kept: bool = False
+    lowered: bool = False
 
     @property
     def text(self) -> str:
@@ -60,7 +60,7 @@ class Recommended:
         limit = f"the smallest limit is {self.limit:.3g}, set by {self.sets}; "
         if self.why_not:
             return f"{limit if math.isfinite(self.limit) else ''}no gain is recommended, because {self.why_not}"
-        if self.kept:
+        if self.lowered:
             return f"{limit}recommended {self.value:.3g}, with which {MARGINS} suffice"
         return f"{limit}recommended {self.value:.3g}, half of it"
 
@@ -87,8 +87,8 @@ def recommended_gain(
     if loops and not _stable(loops, sign * gain):
         why = f"with {sign * gain * own:.3g}, half of it, the loop does not converge"
         return Recommended(math.nan, sign * limits[sets] * own, sets, why)
-    kept = gain if loops is None else _with_margins(loops, sign * gain)
-    return Recommended(sign * kept * own, sign * limits[sets] * own, sets, kept=kept < gain)
+    size = gain if loops is None else _with_margins(loops, sign * gain)
+    return Recommended(sign * size * own, sign * limits[sets] * own, sets, lowered=size < gain)
 
 
 def secant_limit(loops: LoopsByGain) -> float | None:

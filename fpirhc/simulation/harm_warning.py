@@ -15,9 +15,11 @@ from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, HarmfulAdaptation
 from fpirhc.fields.place import users_level
 from fpirhc.simulation.trials import Trials
+from fpirhc.symbolic.latest import Latest
 from fpirhc.task.problem import Problem
 
 CYCLES = 300  # of a run
+_REASONS: Latest[list[str]] = Latest(8)  # the same values run alike
 _REMEDY = (
     "Use ModelReferenced(map), which leaves an exact model alone, or ask fpirhc review. To silence this, and spare the runs: "
     'warnings.simplefilter("ignore", fpirhc.HarmfulAdaptation)'
@@ -29,7 +31,7 @@ def warn_of_harm(problem: Problem, controller: Controller) -> None:
     if not controller.deformation.adapts or controller.learns or _ignored():
         return
     try:
-        reasons = _reasons(problem, controller)
+        reasons = _REASONS.of((problem, controller), (), lambda: _reasons(problem, controller))
     except FpirhcError:  # what the runs cannot do says nothing about the controller
         return
     if reasons:

@@ -99,7 +99,7 @@ def _of_errors(problem: Problem, trace: Layout) -> _Entries:
             words.append(
                 (
                     f"the error of '{name}' is",
-                    f"{unit}, more than a million times its reference of at most {size:.3g} {unit}",
+                    f"{unit}, more than a million times the {size:.3g} {unit} of its reference and start",
                 )
             )
     return np.array(places, dtype=int), -np.array(sizes), np.array(sizes), words

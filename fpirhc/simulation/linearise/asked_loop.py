@@ -120,14 +120,14 @@ class AskedLoop:
         """
         memories, traces, still = [memory], [], 0
         for k in range(cycles):
-            following, trace = self._step(memories[-1])
-            if not (np.isfinite(following).all() and np.isfinite(trace[self._arriving]).all()):
+            memory_next, trace = self._step(memories[-1])
+            if not (np.isfinite(memory_next).all() and np.isfinite(trace[self._arriving]).all()):
                 break
             if led is not None:
-                following[self._state] = np.where(np.isfinite(led[k]), led[k], following[self._state])
+                memory_next[self._state] = np.where(np.isfinite(led[k]), led[k], memory_next[self._state])
             if request is not None and k == self._warm and len(self._request) == request.size:
-                following[self._request] = request
-            memories.append(following)
+                memory_next[self._request] = request
+            memories.append(memory_next)
             traces.append(trace)
             if led is not None and k > self._warm:
                 command, before = trace[self._command], traces[-1 - self.repeats][self._command]
@@ -186,10 +186,10 @@ class AskedLoop:
     def _linear(self, ways: list[Way], directions: list[Directions], number: int, scales: np.ndarray) -> LinearLoop:
         """The linear loop of one of the ways of every cycle."""
         cycles, nothing = [], np.zeros(self.loop.memory.size)
-        for way, at, following in zip(ways, directions, [*directions[1:], directions[0]], strict=True):
+        for way, at, later in zip(ways, directions, [*directions[1:], directions[0]], strict=True):
             entry = np.column_stack([way(nothing, one)[0] for one in np.eye(self._inputs)])
             state, arriving = at.basis[self._state] * scales[:, None], at.traces[number][self._arriving]
-            onto = following.basis.T
+            onto = later.basis.T
             cycles.append(LinearCycle(onto @ at.moved[number], onto @ entry, arriving, state))
         first = directions[0]
         placed = (first.basis[self._state] / scales[:, None]).T
@@ -210,10 +210,10 @@ class AskedLoop:
         phases = np.array([column.endswith("_phase") for column in self.loop.memory.columns])
         memories = [memory]
         while True:
-            following, _ = self._step(memories[-1])
-            if np.array_equal(following[phases], memory[phases]):
+            memory_next, _ = self._step(memories[-1])
+            if np.array_equal(memory_next[phases], memory[phases]):
                 return memories
-            memories.append(following)
+            memories.append(memory_next)
 
     @cached_property
     def _free(self) -> np.ndarray:

@@ -319,7 +319,7 @@ def _entry(
     optimality = part("the excess cost of the plans", measure_optimality, problem, ready, run, compiled=compiled)
     predicts = adaptive and name in (task.headline or ())
     prediction = part("the prediction", _predicted, problem, controller, compiled) if predicts else None
-    told = part("the sentence about what it measures", information, problem, ready, loop.loop, every)
+    informed = part("the sentence about what it measures", information, problem, ready, loop.loop, every)
     return Entry(
         name=name,
         run=run,
@@ -336,7 +336,7 @@ def _entry(
         exact=has_exact_model(problem, ready),
         learns=ready.learns,
         plan_every=every,
-        information=told,
+        information=informed,
         automatic=tuple(controller.deformation.automatic),
     )
 
