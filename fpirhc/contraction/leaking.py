@@ -20,6 +20,7 @@ from fpirhc.contraction.spectrum import Array
 
 _PER_TERM = 64  # points of the unit circle per term of the polynomial
 _STEPS, _HALVINGS = 400, 30
+_AT_ONCE = 20  # gains, so that a search that ends early is short
 _RANGE = 1e-3, 20.0  # of the gain times |lambda| that is searched
 
 
@@ -47,17 +48,25 @@ def leaking_limit(
     if complex(eigenvalue).real <= 0:
         return 0.0
 
-    def stable(gain: float) -> bool:
-        return _stable(loop_polynomial(weights, gain, cycles, leak, pole, eigenvalue, referenced, width))
+    at_zero, at_one = (
+        _on_circle(loop_polynomial(weights, gain, cycles, leak, pole, eigenvalue, referenced, width))
+        for gain in (0.0, 1.0)
+    )
+
+    def stable(gains: Array) -> Array:
+        return _circled_nothing(at_zero + gains[:, np.newaxis] * (at_one - at_zero))
 
     gains = np.geomspace(*_RANGE, _STEPS) / abs(eigenvalue)
-    wrong = next((k for k, gain in enumerate(gains) if not stable(float(gain))), None)
+    wrong = next(
+        (k + first for k in range(0, _STEPS, _AT_ONCE) for first in np.flatnonzero(~stable(gains[k : k + _AT_ONCE]))),
+        None,
+    )
     if wrong is None:
         return math.inf
     low, high = (float(gains[wrong - 1]) if wrong else 0.0), float(gains[wrong])
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if stable(middle) else (low, middle)
+        low, high = (middle, high) if stable(np.array([middle]))[0] else (low, middle)
     return low
 
 
@@ -87,11 +96,12 @@ def loop_polynomial(
     return np.asarray(np.pad(left_side, (0, right_side.size - left_side.size)) - right_side)
 
 
-def _stable(coefficients: Array) -> bool:
-    """Whether every root z is inside the unit circle: the curve over the circle does not go round zero."""
-    size = 2 ** math.ceil(math.log2(_PER_TERM * coefficients.size))
-    curve = np.fft.fft(coefficients, size)
-    if np.abs(curve).min() < 1e-12:
-        return False
-    turned = np.angle(np.roll(curve, -1) / curve).sum() / (2 * np.pi)
-    return bool(abs(turned) < 0.5)
+def _on_circle(coefficients: Array) -> Array:
+    """The polynomial in 1 / z at points round the unit circle."""
+    return np.fft.fft(coefficients, 2 ** math.ceil(math.log2(_PER_TERM * coefficients.size)))
+
+
+def _circled_nothing(curves: Array) -> Array:
+    """Whether all roots are inside the unit circle, a curve a row: it does not go round zero."""
+    turned = np.angle(np.roll(curves, -1, axis=1) * np.conj(curves)).sum(axis=1) / (2 * np.pi)
+    return (np.abs(curves).min(axis=1) >= 1e-12) & (np.abs(turned) < 0.5)
