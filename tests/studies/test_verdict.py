@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -11,10 +12,12 @@ import pytest
 from plants import linear
 
 import fpirhc as fp
+from fpirhc.errors import NotSupported
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.metrics import Metrics, known_metrics
 from fpirhc.studies.comparison.compare import compare
 from fpirhc.studies.comparison.entry import Entry
+from fpirhc.studies.comparison.harm import partners
 from fpirhc.studies.comparison.outcome import Outcome
 from fpirhc.studies.comparison.timing import CycleTime, Price, measure_price, price_of
 from fpirhc.studies.comparison.verdict import findings
@@ -22,8 +25,8 @@ from fpirhc.studies.comparison.verdict import findings
 TRACK = fp.Exponential(rate=6.0)
 
 
-def judged(deformation, gain=1.6, **changes):
-    """Compare computed torque with and without this deformation on a linear plant."""
+def case(deformation, gain=1.6, **changes):
+    """Computed torque with and without this deformation on a linear plant."""
     problem = fp.Problem(
         plant=linear(gain, 1.0),
         reference=fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}),
@@ -34,8 +37,12 @@ def judged(deformation, gain=1.6, **changes):
         **changes,
     )
     controllers = {"plain": fp.ComputedTorque(TRACK), "adaptive": fp.ComputedTorque(TRACK, deformation)}
-    task = Task("case", Path("case.py"), "a case", "", problem, controllers)
-    return compare(task, seed=0, compiled=False)
+    return Task("case", Path("case.py"), "a case", "", problem, controllers)
+
+
+def judged(deformation, gain=1.6, **changes):
+    """The comparison of that case."""
+    return compare(case(deformation, gain, **changes), seed=0, compiled=False)
 
 
 def test_help_is_stated_with_numbers():
@@ -82,6 +89,54 @@ def test_controller_that_cannot_serve_is_skipped_with_its_reason():
     assert "needs Problem(horizon=...)" in comparison.skipped["RHC"]
     assert comparison.verdict[-1].startswith("Not run: RHC")
     assert comparison.outcome is Outcome.NOT_COMPARABLE
+
+
+def test_a_row_without_its_pair_is_judged_beside_itself_without_adaptation():
+    """The same numbers, outcome and null test as beside a row; the sentence says that the other is no row."""
+    task = case(fp.Sigmoid(gain=-0.5, scale=10.0))
+    both, one = (compare(task, seed=0, compiled=False, controllers=names) for names in (None, ["adaptive"]))
+    assert [e.name for e in one.entries] == ["adaptive"]
+    assert one.outcome is both.outcome is Outcome.BETTER
+    assert one.findings[0].ratios == both.findings[0].ratios
+    assert one.findings[0].pair == ("adaptive without adaptation", "adaptive")
+    assert one.verdict[0].endswith(" adaptive without adaptation is no row: it ran for this.")
+    assert (one.null.before, one.null.after) == (both.null.before, both.null.after)
+
+
+def test_a_deformation_that_cannot_be_left_out_is_not_judged():
+    """The verdict says so by name."""
+
+    class Bound(fp.ComputedTorque):
+        def unadapted(self):
+            raise NotSupported("the map is part of the law")
+
+    task = case(fp.Sigmoid(gain=-0.5, scale=10.0))
+    bound = replace(task, controllers={"bound": Bound(TRACK, fp.Sigmoid(gain=-0.5, scale=10.0))})
+    told = compare(bound, seed=0, compiled=False).verdict
+    assert "bound is not judged: it cannot run without adaptation (the map is part of the law)." in told
+
+
+def test_a_plant_outside_is_not_run_for_a_sentence():
+    """It may be a machine: it runs for the rows that a user asked for, and the verdict names what is missing."""
+    problem = case(fp.Identity()).problem
+    outside = replace(problem, reality=fp.Foreign(_Still(), measures={"y": "m", "y'": "m/s", "y''": "m/s^2"}), disturbances={})
+    row = SimpleNamespace(name="adaptive", adaptive=True, pair=None)
+    found, missing = partners(outside, [row], {}, seed=0, compiled=False)
+    assert not found
+    assert missing == {"adaptive": "its pair without adaptation is not among the controllers, and the plant is outside"}
+
+
+class _Still:
+    """A body that does not move."""
+
+    def reset(self):
+        """What it measures."""
+        return [0.0, 3.0, 0.0]
+
+    def step(self, time, command):
+        """The same."""
+        del time, command
+        return [0.0, 3.0, 0.0]
 
 
 def test_unknown_entry_offers_the_nearest():

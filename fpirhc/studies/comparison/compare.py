@@ -36,6 +36,7 @@ from fpirhc.studies.comparison.caveats import yardstick_of
 from fpirhc.studies.comparison.changes import scales
 from fpirhc.studies.comparison.entry import Contraction, Entry
 from fpirhc.studies.comparison.entry_facts import has_exact_model, plan_every
+from fpirhc.studies.comparison.harm import partners
 from fpirhc.studies.comparison.information import information, sentences
 from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import measure_optimality
@@ -194,14 +195,24 @@ def compare(
     built: dict[str, Built] = {}
     ran, skipped = _entries(task, selected, seed, compiled, progress, built, changes or {})
     sizes = scales(task.problem)
+    found, unjudged = partners(task.problem, ran, selected, seed=seed, compiled=compiled, metrics=task.metrics)
+    alone = [entry for entry, _ in found.values()]
+    ran = [replace(e, pair=found[e.name][0].name) if e.name in found else e for e in ran]
     entries = beside_each_other(task.problem, ran, built, sizes)
+    built |= {entry.name: Built(loop, None) for entry, loop in found.values()}
     broken: list[str] = []
-    yardstick = yardstick_of(task.problem, seed=seed)
-    judged = findings(entries, skipped, task.headline, yardstick)
-    entries = with_slow_gains(task.problem, entries, built, judged)
-    judged = findings(entries, skipped, task.headline, yardstick)
+    judge = partial(
+        findings,
+        skipped=skipped,
+        headline=task.headline,
+        yardstick=yardstick_of(task.problem, seed=seed),
+        partners=alone,
+        unjudged=unjudged,
+    )
+    entries = with_slow_gains(task.problem, entries, built, judge(entries))
+    judged = judge(entries)
     pairs = [finding.pair for finding in judged if finding.pair]
-    nulls = null_tests(task.problem, pairs, entries, built, sizes, seed=seed, broken=broken)
+    nulls = null_tests(task.problem, pairs, [*entries, *alone], built, sizes, seed=seed, broken=broken)
     return Comparison(
         problem=task.name,
         title=task.title,

@@ -1,7 +1,7 @@
 """What speaks against the adaptation of one controller, judged beside itself without adaptation.
 
-Both run on the plant and on the model as plant, so a command that runs one controller says what a comparison of the pair would say.
-A plant outside is not run for that: then the null test stands alone.
+Both run on the plant and on the model as plant, so a command that runs one controller says what a comparison of the pair would say;
+and so a comparison judges a row whose pair is no row. A plant outside is not run for that: then the null test stands alone.
 """
 
 from __future__ import annotations
@@ -79,8 +79,45 @@ def _harm(
     return (*losses, *([test.text] if test.harmful else []))
 
 
+def partners(
+    problem: Problem,
+    entries: Sequence[Entry],
+    controllers: Mapping[str, Controller],
+    *,
+    seed: int,
+    compiled: bool,
+    metrics: Sequence[Metric] | None = None,
+) -> tuple[dict[str, tuple[Entry, Simulator]], dict[str, str]]:
+    """Return runs without adaptation of the adaptive rows that have no pair, by row, and why others have none.
+
+    Args:
+        problem: of the comparison.
+        entries: its rows.
+        controllers: their controllers, by name.
+        seed: of the disturbances and the noise.
+        compiled: whether the loops are compiled to C.
+        metrics: of the task.
+    """
+    found: dict[str, tuple[Entry, Simulator]] = {}
+    missing: dict[str, str] = {}
+    for name in (e.name for e in entries if e.adaptive and e.pair is None):
+        if problem.foreign is not None:
+            missing[name] = "its pair without adaptation is not among the controllers, and the plant is outside"
+            continue
+        try:
+            loop = simulator(problem, controllers[name].unadapted(), compiled=compiled)
+            found[name] = _entry(problem, f"{name} without adaptation", loop, seed, metrics), loop
+        except FpirhcError as error:
+            missing[name] = f"it cannot run without adaptation ({error})"
+        except KeyboardInterrupt:
+            missing[name] = "interrupted before it ran without adaptation"
+            break
+    return found, missing
+
+
 def _entry(problem: Problem, name: str, loop: Simulator, seed: int, metrics: Sequence[Metric] | None) -> Entry:
     """A row of a comparison with what a verdict reads."""
     run = judged_run(loop, seed=seed, name=name)
     counted = weighed(problem, loop.controller)
-    return Entry(name, run, measure(problem, run, metrics), None, True, None, None, weighed=counted)
+    adapts = loop.controller.deformation.adapts
+    return Entry(name, run, measure(problem, run, metrics), None, adapts, None, None, weighed=counted)

@@ -39,7 +39,7 @@ def _far_better(entries: Sequence[Entry], pair: tuple[Entry, Entry] | None, scal
     if pair is None:
         return []
     weighed = pair[1].weighed
-    error = {e.name: relative_error(e, scales, weighed) for e in entries}
+    error = {e.name: relative_error(e, scales, weighed) for e in (*entries, *pair)}
     ahead = min(pair, key=lambda e: error[e.name])
     others = [e for e in entries if e not in pair and not e.exact]
     best = min(others, key=lambda e: error[e.name], default=None)

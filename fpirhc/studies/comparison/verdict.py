@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from fpirhc.plant.units import with_space
@@ -28,6 +29,9 @@ def findings(
     skipped: Mapping[str, str],
     headline: tuple[str, str] | None,
     yardstick: Yardstick | None = None,
+    *,
+    partners: Sequence[Entry] = (),
+    unjudged: Mapping[str, str] | None = None,
 ) -> tuple[Finding, ...]:
     """Return the verdict's sentences: the headline pair first, the other pairs, what other rows show, what was not run.
 
@@ -36,20 +40,32 @@ def findings(
         skipped: reasons why others did not.
         headline: names without and with adaptation of the pair that comes first.
         yardstick: what errors are measured against; None: each in its own unit.
+        partners: runs without adaptation that are no rows, of rows whose pair they are.
+        unjudged: why adaptive rows without a pair are not judged, by name.
     """
     measure = yardstick or Yardstick()
-    by_name = {e.name: e for e in entries}
+    by_name = {e.name: e for e in (*entries, *partners)}
     pairs = [(by_name[e.pair], e) for e in entries if e.pair in by_name]
     first = [p for p in pairs if headline and (p[0].name, p[1].name) == headline]
     receding = [p for p in pairs if "solve" in p[1].run.layout]
     ordered = list(dict.fromkeys([*first, *receding, *pairs]))
-    judged = [judge(plain, adaptive, measure) for plain, adaptive in ordered] or [_no_pair(entries)]
+    judged = [_told_of_partner(judge(*pair, measure), pair[0] in partners) for pair in ordered] or [_no_pair(entries)]
     left = (leaves_reference(entry, measure) for entry in entries)
     judged += [Finding(text) for text in left if text]
+    judged += [Finding(f"{name} is not judged: {why}.") for name, why in (unjudged or {}).items()]
     judged += remarks(entries, ordered[0] if ordered else None, measure.scales)
     if skipped:
         judged.append(Finding("Not run: " + "; ".join(f"{name} ({why})" for name, why in skipped.items()) + "."))
     return tuple(judged)
+
+
+def _told_of_partner(finding: Finding, apart: bool) -> Finding:
+    """The finding; with a sentence where the run without adaptation is no row."""
+    return (
+        replace(finding, text=f"{finding.text} {finding.pair[0]} is no row: it ran for this.")
+        if apart and finding.pair
+        else finding
+    )
 
 
 def judge(plain: Entry, adaptive: Entry, yardstick: Yardstick) -> Finding:
