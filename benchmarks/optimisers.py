@@ -28,8 +28,15 @@ from fpirhc.horizon.rollout import rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser, judge
-from fpirhc.optimisers.multiple_shooting import MultipleShooting
-from fpirhc.optimisers.shooting import interleave, program, separate, shift_dynamics, shift_variables, sizes
+from fpirhc.optimisers.multiple_shooting import (
+    MultipleShooting,
+    interleave,
+    program,
+    separate,
+    shift_dynamics,
+    shift_variables,
+    sizes,
+)
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import native
 

@@ -21,8 +21,7 @@ import optimisers
 
 import fpirhc as fp
 from fpirhc.horizon.hessian_models import GaussNewton
-from fpirhc.optimisers.plain import plain_driver
-from fpirhc.optimisers.plain_settings import PlainSettings
+from fpirhc.optimisers.plain import PlainSettings, plain_driver
 from fpirhc.symbolic.native import find_compiler
 
 CALLS = 2000

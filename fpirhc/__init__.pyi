@@ -67,9 +67,8 @@ from .optimisers.fixed_point import FixedPoint
 from .optimisers.full_space import FullSpaceFixedPoint
 from .optimisers.gradient_fixed_point import GradientFixedPoint
 from .optimisers.ladder import Ladder
-from .optimisers.nlp import Fatrop, Ipopt, SequentialQuadratic
+from .optimisers.nlp import Fatrop, Ipopt, Osqp, Qrqp, SequentialQuadratic
 from .optimisers.plan import Plan, solve
-from .optimisers.quadratic_solvers import Osqp, Qrqp
 from .optimisers.reduced_gradient import ReducedGradient
 from .plant.algebraic import Algebraic
 from .plant.implicit import ImplicitMidpoint, RadauIIA

@@ -153,7 +153,7 @@ def clip(columns: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
     return ca.fmin(ca.fmax(columns, ca.repmat(lower, 1, stages)), ca.repmat(upper, 1, stages))
 
 
-def largest(value: ca.MX) -> ca.MX:
+def _largest(value: ca.MX) -> ca.MX:
     """Return the largest absolute entry."""
     return ca.norm_inf(ca.vec(value))
 
@@ -163,10 +163,10 @@ def stationarity(
 ) -> ca.MX:
     """Return the projected residual of a plan (see the module's docstring); live settings need the stages' data."""
     scale = ca.repmat(ocp.scale_in(data), 1, ocp.stages)
-    return largest(inputs - clip(inputs - scale * gradient, lower, upper))
+    return _largest(inputs - clip(inputs - scale * gradient, lower, upper))
 
 
-def state_violation(ocp: OptimalControl, states: ca.MX) -> ca.MX:
+def _state_violation(ocp: OptimalControl, states: ca.MX) -> ca.MX:
     """Return the largest violation of a hard state bound by s_1 ... s_N; zero without bounds."""
     worst: ca.MX = ca.MX(0)
     for k in np.flatnonzero(ocp.hard).tolist():
@@ -190,7 +190,7 @@ def judge(ocp: OptimalControl) -> ca.Function:
     if ocp.bounds_states:
         valid = _valid_multipliers(ocp, rollout(ocp)(s0, inputs, data)[0], multipliers)
     value, slope, states, _ = reduced_gradient(ocp)(s0, inputs, data, valid)
-    results = [value, stationarity(ocp, inputs, slope, lower, upper, data), state_violation(ocp, states)]
+    results = [value, stationarity(ocp, inputs, slope, lower, upper, data), _state_violation(ocp, states)]
     return ca.Function("fpirhc_judge", [inputs, s0, data, lower, upper, multipliers], results)
 
 
@@ -247,3 +247,49 @@ class _Same:
 
     def __hash__(self) -> int:
         return id(self.value)
+
+
+_PATIENCE = 4  # calls in a row that may leave the violation as it is
+_SHRINKING = 0.9  # a violation counts as shrinking below this share of the last one
+
+
+def improved(
+    optimiser: Optimiser,
+    ocp: OptimalControl,
+    state: np.ndarray,
+    data: np.ndarray | ca.DM,
+    memory: np.ndarray,
+    *,
+    calls: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Improve a plan until its status is OK; with a violated limit of a state, as long as the violation shrinks.
+
+    Args:
+        optimiser: the optimiser.
+        ocp: the problem.
+        state: the first state, shape (ns,).
+        data: shape (ntheta, N + 1).
+        memory: from which the first call begins.
+        calls: most calls.
+
+    Returns:
+        Plan (nu, N), diagnostics with the iterations of all calls, memory, and the number of calls.
+    """
+    step, bounds, rescue = built(optimiser, ocp, "converging"), (ocp.input_lower, ocp.input_upper), None
+    status, count, iterations, violation, stuck = Status.NOT_CONVERGED, 0, 0.0, np.inf, 0
+    inputs, diagnostics = np.zeros((ocp.input.size, ocp.stages)), np.zeros(5)
+    while status in (Status.NOT_CONVERGED, Status.INFEASIBLE) and stuck < _PATIENCE and count < calls:
+        arguments = (state, data, *bounds, memory)
+        results = step(*arguments)
+        if int(results[1][4]) != Status.OK:
+            # Built only here, because most horizons do not need it.
+            rescue = rescue or optimiser.rescue(ocp)
+            results = rescue(*arguments, *results) if rescue else results
+        inputs, diagnostics, memory = (np.asarray(v.full()) for v in results)
+        diagnostics, memory = diagnostics.ravel(), memory.ravel()
+        iterations += diagnostics[3]
+        status, count = Status(int(diagnostics[4])), count + 1
+        better = status == Status.NOT_CONVERGED or diagnostics[2] < _SHRINKING * violation
+        stuck, violation = (0 if better else stuck + 1), min(violation, diagnostics[2])
+    diagnostics[3] = iterations if diagnostics[3] >= 0 else diagnostics[3]
+    return inputs, diagnostics, memory, count

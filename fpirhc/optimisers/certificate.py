@@ -1,23 +1,6 @@
 """What is known about a plan beyond its residual: how fast the iteration contracts there, and how far the optimum is.
 
-At a plan U with free inputs (not held by an active bound) let H be the exact Hessian of V and M the Hessian of the quadratic
-model, both on the free inputs. One step of the preconditioned iteration multiplies a small error by I - a M^-1 H, which is
-self-adjoint in the inner product of M, so that its norm there is its spectral radius, the contraction factor
-
-    K = |I - a M^-1 H|_M = max |1 - a eig(M^-1 H)|.
-
-With K < 1, Banach's a-posteriori bound and strong convexity relative to M give, with the step h = M^-1 g,
-
-    |U - U*|_M <= a |h|_M / (1 - K),        V(U) - V(U*) <= g'h / (2 (1 - K_1)),   K_1 = |I - M^-1 H|_M.
-
-Both hold where H varies little between U and U* and the same bounds stay active. H is therefore computed at U and one step further:
-K is the larger of both plus their difference. Where the sets of free inputs differ, no bound is given. The ratio of the last two
-steps is not such a bound and is not used as one.
-
-Active limits of states, those with a multiplier, are equations J U = const to first order. H is then the Hessian of the Lagrangian,
-and H, M and g are restricted to the directions Z with J Z = 0; the shortest move back onto the limits is added to the error.
-
-References: S. Banach, Fund. Math. 3, 1922; J. M. Ortega, W. C. Rheinboldt, Iterative Solution of Nonlinear Equations, 1970, ch. 12.
+The bounds, and where they hold, stand in docs/theory-optimisers.md.
 """
 
 from __future__ import annotations
@@ -32,8 +15,7 @@ from fpirhc.fields.checked_call import checked_call
 from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stage, linear_stage
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import reduced_gradient
-from fpirhc.optimisers.active import active_limits, directions, largest_return
-from fpirhc.optimisers.plan import Plan
+from fpirhc.optimisers.plan import Plan, sensitivity_of
 from fpirhc.summary import line, number, table
 
 _ROUNDING = 1e-14  # relative to the trace, added to the model before it is factorised
@@ -110,9 +92,9 @@ def certify(plan: Plan, *, gain: float = 1.0) -> Certificate:
     """
     _, stationarity, feasibility = plan.verify()
     slope, hessian = _second_order(plan, plan.inputs)
-    free, held = _free(plan, plan.inputs, slope), active_limits(plan)
+    free, held = _free(plan, plan.inputs, slope), _active_limits(plan)
     about = held.count, held.complementarity, plan.violations()
-    basis = directions(free, held)
+    basis = _directions(free, held)
     if not basis.shape[1]:
         return Certificate(stationarity, feasibility, 0.0, 0.0, 0.0, 0.0, 0, float("inf"), *about)
     model, pull = basis.T @ _model(plan) @ basis, basis.T @ slope
@@ -129,7 +111,7 @@ def certify(plan: Plan, *, gain: float = 1.0) -> Certificate:
     error = gain * length / (1 - factor) if factor < 1 else float("nan")
     spread = float(np.sqrt(np.einsum("ij,jk,ik->i", basis, np.linalg.inv(model), basis).max()))
     suboptimality = length**2 / (2 * (1 - unit)) + held.complementarity * held.count if unit < 1 else float("nan")
-    least, back = float(values.min()), largest_return(held, free)
+    least, back = float(values.min()), _largest_return(held, free)
     return Certificate(
         *(stationarity, feasibility, factor, error, spread * error + back, suboptimality, basis.shape[1], least), *about
     )
@@ -207,3 +189,59 @@ def _model(plan: Plan) -> np.ndarray:
         sensitivity[:, own] += b
     final = np.asarray(end(plan.states[:, n], data[:, n])[2].full())
     return np.asarray(total + sensitivity.T @ final @ sensitivity)
+
+
+_RANK = 1e-9  # relative singular value below which active limits depend on each other
+
+
+@dataclass(frozen=True, eq=False)
+class _Active:
+    """Active limits of states.
+
+    Args:
+        rows: J, shape (count, N nu).
+        distances: of the states beyond their limits, positive where violated, shape (count,).
+        complementarity: largest product of a multiplier and the distance of its limit.
+    """
+
+    rows: np.ndarray
+    distances: np.ndarray
+    complementarity: float
+
+    @property
+    def count(self) -> int:
+        """Number of active limits."""
+        return self.rows.shape[0]
+
+
+def _active_limits(plan: Plan) -> _Active:
+    """Return the limits of states that have a multiplier at this plan."""
+    ocp, multipliers = plan.problem, plan.state_multipliers
+    has_multiplier = multipliers.ravel(order="F") != 0
+    if not has_multiplier.any():
+        return _Active(np.zeros((0, plan.inputs.size)), np.zeros(0), 0.0)
+    _, _, sensitivity = sensitivity_of(ocp)(plan.states[:, 0], plan.inputs, plan.data)
+    limits = np.where(multipliers > 0, ocp.state_upper[:, None], ocp.state_lower[:, None]).ravel(order="F")[
+        has_multiplier
+    ]
+    active = multipliers.ravel(order="F")[has_multiplier]
+    beyond = np.sign(active) * (plan.states[:, 1:].ravel(order="F")[has_multiplier] - limits)
+    products = np.abs(beyond * active)
+    return _Active(np.asarray(sensitivity.full())[has_multiplier], beyond, float(products.max()))
+
+
+def _directions(free: np.ndarray, active: _Active) -> np.ndarray:
+    """Return an orthonormal basis (N nu, k) of the moves of free inputs along which no active limit changes."""
+    selected = np.eye(free.size)[:, free]
+    if not active.count or not free.any():
+        return selected
+    _, sizes, turned = np.linalg.svd(active.rows[:, free])
+    rank = int((sizes > _RANK * sizes.max()).sum())
+    return np.asarray(selected @ turned[rank:].T)
+
+
+def _largest_return(active: _Active, free: np.ndarray) -> float:
+    """Return the largest entry of the shortest move of free inputs that puts the active limits right, to first order."""
+    if not active.count or not free.any():
+        return 0.0
+    return float(np.abs(np.linalg.pinv(active.rows[:, free], rcond=_RANK) @ active.distances).max())

@@ -1,37 +1,7 @@
 """Fixed-point iteration on the reduced gradient, preconditioned by one Riccati sweep: the default optimiser.
 
-The gradient of the auxiliary function vanishes where the reduced gradient g(U) does. The desired value of g is zero, and the
-iteration deforms the plan as a control loop deforms its request,
-
-    U+ = G(U, h, 0),     h = M^-1 g,
-
-with any deformation map G and M the (Gauss-Newton) Hessian of V, never formed: one backward sweep (`fpirhc.horizon.riccati`) gives
-a feedforward v = -h and a feedback K, and the new plan is rolled out with them,
-
-    u_i = clip(U_i + [G(U, -v, 0) - U]_i + K_i (x_i - X_i)),
-
-which keeps unstable models together. The contraction factor is |1 - a eig(M^-1 V'')|, a few hundredths where M is close to V''.
-
-Globalisation (Stella, Themelis, Sopasakis, Patrinos: PANOC, IEEE CDC 2017). With T = clip(U - gamma D g) the plain fixed-point
-step and gamma < 1 / L, a new plan must decrease the forward-backward envelope
-
-    phi(U) = V + g'(T - U) + 1/(2 gamma) |T - U|^2
-
-by a share of |T - U|^2 (a short step: V by a share of its first-order decrease), and raise neither phi nor V. Otherwise the step
-is shortened. The last resort is T itself, which always decreases phi. T is tested for the quadratic upper bound that gamma
-implies; where the test fails gamma is shortened, at least to its half. D = 1/(step c) is the scale of `OptimalControl`.
-
-A call evaluates the remembered plan, rolled out with its remembered feedback, which corrects it to first order for a new initial
-state. An iteration finds a direction by one Riccati sweep and evaluates the plan there, by one rollout with Jacobians and one
-adjoint sweep. Every plan that is returned has therefore been evaluated.
-
-With limits of states the iteration is that of `fpirhc.optimisers.limited`: the same step with the active limits as equalities, and
-interior steps where it does not contract. It ends where the plan is solved, in a loop as in open loop; a loop bounds its
-iterations. An open-loop solve without limits of states uses that iteration where its own one does
-not converge.
-
-References: H. Khan, J. K. Tar, I. J. Rudas on fixed-point iteration in place of the reduced gradient (2017-2018); H. Issa,
-J. K. Tar, Electronics 11, 1243, 2022, for the transition between gradient descent and Newton (`damping`).
+U+ = G(U, h, 0) with h = M^-1 g deforms the plan as a control loop deforms its request (docs/theory-optimisers.md). With limits of
+states the iteration is that of `fpirhc.optimisers.limited`; it ends where the plan is solved, in a loop as in open loop.
 """
 
 from __future__ import annotations
@@ -48,14 +18,11 @@ from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.kinds import Count
 from fpirhc.horizon.hessian_models import GaussNewton, HessianModel
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.base import Optimiser, require_settings
-from fpirhc.optimisers.improved import improved
+from fpirhc.optimisers.base import Optimiser, improved, require_settings, sane, shift
 from fpirhc.optimisers.limited import limited_step, shifted_limited
-from fpirhc.optimisers.limited_memory import limited_memory
-from fpirhc.optimisers.limited_settings import LimitedSettings
-from fpirhc.optimisers.plain import plain_step, shifted_plain
-from fpirhc.optimisers.plain_settings import MOST, PlainSettings, plain_memory
-from fpirhc.optimisers.rescue import rescue
+from fpirhc.optimisers.limited_settings import MU_WARM, LimitedSettings, limited_memory
+from fpirhc.optimisers.plain import MOST, PlainSettings, plain_memory, plain_step, shifted_plain
+from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.live import settled
 
@@ -157,7 +124,7 @@ class FixedPoint(Optimiser):
         # Here the settings are numbers: a rescue runs outside the loop, for the numbers of one call.
         own = settled(self, ocp.setting_numbers)
         limited = limited_step(replace(ocp, settings=()), own._limited(_MOST_LIMITED))
-        return rescue(ocp, self.converging(ocp), self.memory(ocp), limited)
+        return _rescue(ocp, self.converging(ocp), self.memory(ocp), limited)
 
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:
         """The memory after the first horizon is solved to the tolerance, as far as that succeeds."""
@@ -186,3 +153,54 @@ def _require_rollouts(growth: np.ndarray) -> None:
 
 EXAMPLES = (FixedPoint(iterations=20, tolerance=1e-6), FixedPoint(iterations=1, tolerance=1e-6))
 CHOICES = {"fixed-point": ("FPI", lambda tolerance: FixedPoint(iterations=1, tolerance=tolerance))}
+
+
+def _rescue(ocp: OptimalControl, plain: ca.Function, layout: Layout, limited: ca.Function) -> ca.Function:
+    """Function (arguments of `plain`, its results) -> the better results of `plain` and `limited`, with the memory of `plain`.
+
+    Where the plain iteration gives up, its plan is the first guess of the iteration with limits if a plan was remembered.
+    Otherwise that iteration begins from its own first guess.
+    """
+    arguments = [ca.MX.sym(plain.name_in(k), *plain.size_in(k)) for k in range(plain.n_in())]
+    results = [ca.MX.sym(f"r{k}", *plain.size_out(k)) for k in range(3)]
+    work = ca.Function("fpirhc_rescue", [*arguments, *results], _better(ocp, layout, limited, arguments, results))
+    rest = ca.Function("fpirhc_no_rescue", [*arguments, *results], results)
+    needed = ca.logic_and(results[1][4] != int(Status.OK), sane(*arguments[:4]))
+    choice = ca.Function.if_else("fpirhc_rescue_if_needed", work, rest)
+    return ca.Function("fpirhc_rescued", [*arguments, *results], list(choice(needed, *arguments, *results)))
+
+
+def _better(
+    ocp: OptimalControl, layout: Layout, limited: ca.Function, arguments: list[ca.MX], first: list[ca.MX]
+) -> list[ca.MX]:
+    """The results of both, the better one of them, in the plain iteration's memory."""
+    n, ns = ocp.stages, ocp.state.size
+    before, plan, plain_memory = layout.split(arguments[4]), limited_memory(ocp), layout.split(first[2])
+    evaluated = first[1][4] < int(Status.INFEASIBLE)
+    warm = ca.logic_and(before["plan_step"] > 0, evaluated)
+    begin = {name: ca.MX.zeros(plan[name].size) for name in plan.names}
+    begin["plan_inputs"] = ca.if_else(warm, plain_memory["plan_inputs"], before["plan_inputs"])
+    states = ca.vec(shift(ca.reshape(plain_memory["plan_states"], ns, n)))
+    begin |= {"plan_states": ca.if_else(warm, states, 0), "plan_gains": ca.if_else(warm, plain_memory["plan_gains"], 0)}
+    begin["plan_barrier"] = ca.if_else(warm, MU_WARM, 0)
+    second = limited(*arguments[:4], plan.join(begin))
+    inputs, diagnostics, after = second
+    interior_memory = plan.split(after)
+
+    nodes = ca.reshape(interior_memory["plan_states"], ns, n)
+    earlier = ca.horzcat(arguments[0], nodes[:, : n - 1])
+    memory: dict[str, ca.MX] = {
+        "plan_inputs": ca.vec(inputs),
+        "plan_states": ca.vec(earlier),
+        "plan_gains": interior_memory["plan_gains"],
+        "plan_gamma": ca.MX(0),
+        "plan_step": ca.MX(1),
+    }
+    usable = diagnostics[4] < int(Status.INFEASIBLE)
+    closer = ca.logic_or(
+        diagnostics[4] == int(Status.OK), ca.logic_or(ca.logic_not(evaluated), diagnostics[1] < first[1][1])
+    )
+    better = ca.logic_and(usable, closer)
+    count = ca.vertcat(ca.MX.zeros(3), first[1][3], 0)
+    results = [inputs, diagnostics + count, layout.join(memory)]
+    return [ca.if_else(better, new, old) for new, old in zip(results, first, strict=True)]

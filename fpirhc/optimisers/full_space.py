@@ -1,15 +1,8 @@
 """The published fixed-point optimiser: states, inputs and multipliers together, the gradient of the auxiliary function to zero.
 
-    z = (S, U, mu),   g = grad Psi(z),   H = Hessian of Psi (the KKT matrix),   h = H'g,
-    z+ = G(z, h, 0),     for eq. (6)  z + S [zeta(A_c |h|/S + x*) - x*] h/|h|.
+    z = (S, U, mu),   g = grad Psi(z),   H = Hessian of Psi (the KKT matrix),   h = H'g,   z+ = G(z, h, 0)
 
-H is indefinite, so an iteration on g itself would violate the eigenvalue condition; h has the Jacobian H'H at a solution, which
-satisfies it for 0 < gain < 2 / sigma_max(H)^2. The price is the condition number squared: the rate is
-(kappa^2 - 1)/(kappa^2 + 1), with kappa = cond H between 10^3 and 10^6 on ordinary horizons, and the plan is feasible only once
-it is converged. It is the baseline to which `GradientFixedPoint` and `FixedPoint` are compared. It does not serve limits.
-
-References: H. Khan, J. K. Tar, I. J. Rudas, on fixed-point iteration in place of the reduced gradient (2017-2018), the exact
-formula reconstructed.
+It is the baseline to which `GradientFixedPoint` and `FixedPoint` are compared (docs/theory-optimisers.md); it serves no limits.
 """
 
 from __future__ import annotations
@@ -24,7 +17,6 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import require_own_requests
 from fpirhc.errors import NotContractive, NotSupported
 from fpirhc.fields.kinds import Count
-from fpirhc.horizon.auxiliary import auxiliary_gradient, auxiliary_hessian
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.anderson import Anderson, iterated
@@ -154,3 +146,41 @@ def _scaling(ocp: OptimalControl, scaled: bool) -> tuple[np.ndarray, float]:
 
 
 EXAMPLES = (FullSpaceFixedPoint(iterations=300, tolerance=1e-6, scaled=True, acceleration=Anderson(8)),)
+
+
+def _auxiliary(ocp: OptimalControl) -> ca.Function:
+    """Function (S (ns, N), U (nu, N), mu (ns, N), s0, data) -> Psi."""
+    n = ocp.stages
+    states, inputs = ca.MX.sym("S", ocp.state.size, n), ca.MX.sym("U", ocp.input.size, n)
+    multipliers = ca.MX.sym("mu", ocp.state.size, n)
+    s0, data = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size, n + 1)
+    before = ca.horzcat(s0, states[:, : n - 1])
+    next_states = ocp.dynamics.map(n)(before, inputs, data[:, :n])
+    costs, _ = ocp.stage_cost.map(n)(before, inputs, data[:, :n])
+    value = ca.sum2(costs) + ocp.terminal_cost(states[:, n - 1], data[:, n])
+    value += ca.dot(multipliers, states - next_states)
+    names = ["S", "U", "mu", "s0", "data"]
+    return ca.Function("fpirhc_auxiliary", [states, inputs, multipliers, s0, data], [value], names, ["psi"])
+
+
+def auxiliary_gradient(ocp: OptimalControl) -> ca.Function:
+    """Function (S, U, mu, s0, data) -> gradients of Psi with respect to S, U and mu, shaped like them."""
+    psi = _auxiliary(ocp)
+    symbols = [ca.MX.sym(psi.name_in(k), *psi.size_in(k)) for k in range(psi.n_in())]
+    value = psi(*symbols)
+    gradients = [ca.gradient(value, v) for v in symbols[:3]]
+    return ca.Function("fpirhc_auxiliary_gradient", symbols, gradients, psi.name_in(), ["dS", "dU", "dmu"])
+
+
+def auxiliary_hessian(ocp: OptimalControl) -> ca.Function:
+    """Function (S, U, mu, s0, data) -> Hessian of Psi with respect to z = (vec S, vec U, vec mu), symmetric."""
+    n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
+    z = ca.MX.sym("z", n * (2 * ns + nu))
+    s0, data = ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
+    states, inputs, multipliers = ca.vertsplit(z, [0, n * ns, n * (ns + nu), n * (2 * ns + nu)])
+    shaped = (ca.reshape(states, ns, n), ca.reshape(inputs, nu, n), ca.reshape(multipliers, ns, n))
+    hessian, _ = ca.hessian(_auxiliary(ocp)(*shaped, s0, data), z)
+    flat = ca.Function("fpirhc_hessian", [z, s0, data], [hessian])
+    arguments = [ca.MX.sym(name, rows, n) for name, rows in (("S", ns), ("U", nu), ("mu", ns))]
+    packed = ca.vertcat(*(ca.vec(v) for v in arguments))
+    return ca.Function("fpirhc_auxiliary_hessian", [*arguments, s0, data], [flat(packed, s0, data)])

@@ -24,10 +24,9 @@ from fpirhc.horizon.sweep import PIVOT
 from fpirhc.optimisers import limited_settings as numbers
 from fpirhc.optimisers.base import FEASIBLE, KEPT, shift, shift_gains
 from fpirhc.optimisers.bounds import BOUNDARY, ENOUGH, HAIR, STIFF
-from fpirhc.optimisers.guess import guess
 from fpirhc.optimisers.limited_graph import limited_graph
-from fpirhc.optimisers.limited_memory import limited_memory
-from fpirhc.optimisers.limited_settings import LimitedSettings
+from fpirhc.optimisers.limited_settings import LimitedSettings, limited_memory
+from fpirhc.optimisers.limited_state import guess
 from fpirhc.optimisers.scales import Scales, scales
 from fpirhc.optimisers.search import deformed_move
 from fpirhc.status import Status

@@ -9,13 +9,22 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.sweep import Expansion, expand, expansion_shapes
 from fpirhc.optimisers.base import FEASIBLE, KEPT, clip, sane
 from fpirhc.optimisers.certified import Certified
-from fpirhc.optimisers.guess import guesses
-from fpirhc.optimisers.limited_memory import limited_memory
-from fpirhc.optimisers.limited_settings import FILTER, MU_END, MU_WARM, LimitedSettings
-from fpirhc.optimisers.limited_turn.call import Call
-from fpirhc.optimisers.limited_turn.phases import begin_cold
-from fpirhc.optimisers.limited_turn.state import BEGINS, PURE, WARM, State, as_point, choose, constant, fixed, point
-from fpirhc.optimisers.limited_turn.turn import Turn, is_usable, returned_left
+from fpirhc.optimisers.limited_settings import FILTER, MU_END, MU_WARM, LimitedSettings, limited_memory
+from fpirhc.optimisers.limited_state import (
+    BEGINS,
+    PURE,
+    WARM,
+    Call,
+    State,
+    as_point,
+    begin_cold,
+    choose,
+    constant,
+    fixed,
+    guesses,
+    point,
+)
+from fpirhc.optimisers.limited_turn import Turn, is_usable, returned_left
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import FINITE, is_finite
 

@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import casadi as ca
+import numpy as np
 
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.optimisers.base import UNKNOWN_ITERATIONS, Optimiser, clip, judge, remembered_plan, sane, shift, status_of
-from fpirhc.optimisers.quadratic_solvers import Options
-from fpirhc.optimisers.shooting import (
-    interleave,
-    program,
-    program_values,
-    separate,
-    shift_dynamics,
-    shift_variables,
-    sizes,
-    stage_bounds,
-)
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Layout, Signal
 
+Setting: TypeAlias = "bool | int | float | str | Sequence[bool] | ca.Function | Mapping[str, Setting]"
+Options: TypeAlias = Mapping[str, Setting]
 _LARGEST_MULTIPLIER = 1e12
 
 
@@ -102,7 +96,7 @@ class MultipleShooting(Optimiser):
         """
         s0, data, lower, upper, _ = arguments = self._arguments(ocp)
         start, states = self._guess(ocp)(*arguments)
-        begin = program_values(ocp)(interleave(states, start), ca.vec(data))
+        begin = _program_values(ocp)(interleave(states, start), ca.vec(data))
         usable = ca.logic_and(sane(s0, data, lower, upper), is_finite(begin))
         run, skip = self._solve(ocp, "fpirhc_shooting"), self._skip(ocp)
         results = ca.Function.if_else("fpirhc_guarded_shooting", run, skip)(usable, *arguments)
@@ -145,8 +139,8 @@ class MultipleShooting(Optimiser):
         solution = ca.nlpsol("fpirhc_shooting_solver", self.plugin, program(ocp), self.options(ocp))(
             x0=interleave(states, start),
             p=ca.vec(data),
-            lbx=interleave(stage_bounds(ocp, s0, ocp.state_lower), ca.repmat(lower, 1, n)),
-            ubx=interleave(stage_bounds(ocp, s0, ocp.state_upper), ca.repmat(upper, 1, n)),
+            lbx=interleave(_stage_bounds(ocp, s0, ocp.state_lower), ca.repmat(lower, 1, n)),
+            ubx=interleave(_stage_bounds(ocp, s0, ocp.state_upper), ca.repmat(upper, 1, n)),
             lbg=0,
             ubg=0,
             lam_x0=_usable(remembered["plan_variable_multipliers"]),
@@ -172,3 +166,68 @@ class MultipleShooting(Optimiser):
 def _usable(multipliers: ca.MX) -> ca.MX:
     """Forget multipliers that are not finite or absurdly large: they would poison a warm start."""
     return ca.if_else(ca.fabs(multipliers) <= _LARGEST_MULTIPLIER, multipliers, 0)
+
+
+def _program_values(ocp: OptimalControl) -> ca.Function:
+    """Function (w, p) -> cost, constraints and their first derivatives in one column."""
+    nlp = program(ocp)
+    slopes = ca.gradient(nlp["f"], nlp["x"]), ca.jacobian(nlp["g"], nlp["x"])
+    column = ca.vertcat(nlp["f"], nlp["g"], ca.densify(slopes[0]), ca.vec(slopes[1].nz[:]))
+    return ca.Function("fpirhc_program_values", [nlp["x"], nlp["p"]], [column])
+
+
+def sizes(ocp: OptimalControl) -> tuple[int, int]:
+    """Return the numbers of variables and of constraints."""
+    return ocp.stages * (ocp.state.size + ocp.input.size) + ocp.state.size, ocp.stages * ocp.state.size
+
+
+def interleave(states: ca.MX, inputs: ca.MX) -> ca.MX:
+    """Return states (ns, N + 1) and inputs (nu, N) as a column (s_0, u_0, s_1, ..., s_N)."""
+    n = inputs.shape[1]
+    return ca.vertcat(ca.vec(ca.vertcat(states[:, :n], inputs)), states[:, n])
+
+
+def separate(ocp: OptimalControl, column: ca.MX) -> tuple[ca.MX, ca.MX]:
+    """Return states (ns, N + 1) and inputs (nu, N) of a column: the inverse of `interleave`."""
+    ns, nu, n = ocp.state.size, ocp.input.size, ocp.stages
+    stages = ca.reshape(column[: n * (ns + nu)], ns + nu, n)
+    return ca.horzcat(stages[:ns, :], column[n * (ns + nu) :]), stages[ns:, :]
+
+
+def _stage_bounds(ocp: OptimalControl, s0: ca.MX, bound: np.ndarray) -> ca.MX:
+    """Return the bounds of s_0 ... s_N; the first state is fixed."""
+    return ca.horzcat(s0, ca.repmat(ca.DM(bound), 1, ocp.stages))
+
+
+def shift_variables(ocp: OptimalControl, column: ca.MX) -> ca.MX:
+    """Return variables, or their multipliers, one stage later."""
+    states, inputs = separate(ocp, column)
+    return interleave(shift(states), shift(inputs))
+
+
+def shift_dynamics(ocp: OptimalControl, column: ca.MX) -> ca.MX:
+    """Return multipliers of the dynamics one stage later."""
+    stages: ca.MX = ca.reshape(column, ocp.state.size, ocp.stages)
+    return ca.vec(shift(stages))
+
+
+def program(ocp: OptimalControl) -> dict[str, ca.MX]:
+    """Return the program as CasADi's `nlpsol` takes it, with the data of all stages as its parameter."""
+    n = ocp.stages
+    w, flat = ca.MX.sym("w", sizes(ocp)[0]), ca.MX.sym("p", ocp.data.size * (n + 1))
+    states, inputs = separate(ocp, w)
+    data = ca.reshape(flat, ocp.data.size, n + 1)
+    costs, _ = ocp.stage_cost.map(n)(states[:, :n], inputs, data[:, :n])
+    value = ca.sum2(costs) + ocp.terminal_cost(states[:, n], data[:, n])
+    next_states = ocp.dynamics.map(n)(states[:, :n], inputs, data[:, :n])
+    return {"x": w, "p": flat, "f": value, "g": ca.vec(states[:, 1:] - next_states)}
+
+
+def gauss_newton_hessian(ocp: OptimalControl) -> ca.Function:
+    """Function (x, p, lam_f, lam_g) -> Hessian of the cost alone, block by block, with both triangles."""
+    nlp = program(ocp)
+    hessian, _ = ca.hessian(nlp["f"], nlp["x"])
+    weight, multipliers = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", sizes(ocp)[1])
+    inputs = [nlp["x"], nlp["p"], weight, multipliers]
+    names = ["x", "p", "lam_f", "lam_g"]
+    return ca.Function("nlp_hess_l", inputs, [weight * hessian], names, ["hess_gamma_x_x"])

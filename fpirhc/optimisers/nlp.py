@@ -10,14 +10,15 @@ References: J. A. E. Andersson et al., CasADi, Math. Program. Comput. 11, 2019.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 
+from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Accuracy, Count, Positive
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.multiple_shooting import MultipleShooting
-from fpirhc.optimisers.quadratic_solvers import Options, Osqp, Qrqp, QuadraticSolver
-from fpirhc.optimisers.shooting import gauss_newton_hessian
+from fpirhc.optimisers.multiple_shooting import MultipleShooting, Options, gauss_newton_hessian
 
+_OSQP_BOUNDED = 2000  # iterations that are a bound of time on a machine
 _QUIET: Options = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
 
 
@@ -99,12 +100,86 @@ class Fatrop(MultipleShooting):
 
 
 @dataclass(frozen=True)
+class QuadraticSolver(Checked, ABC):
+    """Contract: a solver of the quadratic programs inside `SequentialQuadratic`."""
+
+    @property
+    @abstractmethod
+    def plugin(self) -> str:
+        """CasADi's name of the solver."""
+
+    @abstractmethod
+    def options(self) -> Options:
+        """CasADi's options of the solver."""
+
+    @property
+    def unbounded(self) -> str:
+        """Why a call may take any time, with a remedy; empty where its work is bounded."""
+        return ""
+
+
+@dataclass(frozen=True)
+class Qrqp(QuadraticSolver):
+    """CasADi's own active-set solver on a sparse QR factorisation.
+
+    Args:
+        iterations: most iterations of one program.
+    """
+
+    iterations: Count = 200
+
+    @property
+    def plugin(self) -> str:
+        """CasADi's name of the solver."""
+        return "qrqp"
+
+    def options(self) -> Options:
+        """Quiet, with an iteration limit."""
+        quiet = {"print_iter": False, "print_header": False, "print_info": False, "print_lincomb": False}
+        return {**quiet, "max_iter": self.iterations, "error_on_fail": False}
+
+
+@dataclass(frozen=True)
+class Osqp(QuadraticSolver):
+    """OSQP, an operator-splitting method.
+
+    Args:
+        accuracy: of both residuals.
+        iterations: most iterations of one quadratic program. CasADi passes no time limit on.
+    """
+
+    accuracy: Accuracy = 1e-8
+    iterations: Count = 20000
+
+    @property
+    def plugin(self) -> str:
+        """CasADi's name of the solver."""
+        return "osqp"
+
+    def options(self) -> Options:
+        """Quiet, with the accuracy for both residuals and without polishing."""
+        inner = {"verbose": False, "eps_abs": self.accuracy, "eps_rel": self.accuracy, "max_iter": self.iterations}
+        return {"osqp": inner, "error_on_fail": False}
+
+    @property
+    def unbounded(self) -> str:
+        """An infeasible program takes all iterations."""
+        if self.iterations <= _OSQP_BOUNDED:
+            return ""
+        return (
+            f"OSQP has no time limit, and an infeasible program takes all {self.iterations} iterations: "
+            f"give Osqp(iterations=...), at most {_OSQP_BOUNDED}"
+        )
+
+
+@dataclass(frozen=True)
 class SequentialQuadratic(MultipleShooting):
     """Gauss-Newton SQP: the cost's own second derivatives, the dynamics linearised.
 
     Args:
         tolerance: of the stationarity, in the unit of the inputs.
-        quadratic: solves the programs inside.
+        quadratic: solves the programs inside. CasADi's interfaces to fatrop and hpipm are not among them: the first has returned
+            infeasible points marked as solved, the second needs finite bounds on everything.
         iterations: of SQP per call; 1 is a real-time iteration.
     """
 

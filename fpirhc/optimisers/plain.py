@@ -2,24 +2,77 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from importlib import resources
 
 import casadi as ca
 
-from fpirhc.horizon.hessian_models import hessian_end, hessian_stage
+from fpirhc.deformation.base import Deformation
+from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage
 from fpirhc.horizon.live_data import SCALE, STEEPEST
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import PIVOT, rounds
 from fpirhc.horizon.split_stage import partial_count, stage_leaves
-from fpirhc.optimisers.anchor import ARMIJO, DRAWN_IN, ROUNDING, SHARE, SHORTER, SHORTEST, UNTRIED
-from fpirhc.optimisers.base import shift, shift_gains
-from fpirhc.optimisers.plain_graph import plain_graph
-from fpirhc.optimisers.plain_settings import MOST_PLAIN, PlainSettings, plain_memory
-from fpirhc.optimisers.search import deformed_move, first_gamma
+from fpirhc.optimisers.base import clip, sane, shift, shift_gains, stationarity, status_of
+from fpirhc.optimisers.search import (
+    ARMIJO,
+    DRAWN_IN,
+    ROUNDING,
+    SHARE,
+    SHORTER,
+    SHORTEST,
+    UNTRIED,
+    Anchor,
+    Arguments,
+    Search,
+    deformed_move,
+    first_gamma,
+)
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, with_driver
-from fpirhc.symbolic.expression import FINITE
+from fpirhc.symbolic.expression import FINITE, is_finite
+from fpirhc.symbolic.latest import Latest
+from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.symbolic.live import LiveNumber, Number
+
+MOST = 100  # iterations of one converging call
+_MOST_PLAIN = 30  # plain steps after which a converging call gives up
+
+
+@dataclass(frozen=True)
+class PlainSettings:
+    """Settings of one Function.
+
+    Args:
+        tolerance: of the stationarity, in the unit of the inputs.
+        map: the deformation that makes the next plan.
+        hessian: second derivatives of the quadratic model.
+        damping: added to the curvature of the inputs, in units of it.
+        iterations: most iterations of one call.
+        converging: whether a call stops where the tolerance is met.
+    """
+
+    tolerance: Number
+    map: Deformation
+    hessian: HessianModel
+    damping: Number
+    iterations: int
+    converging: bool
+
+
+def plain_memory(ocp: OptimalControl) -> Layout:
+    """Return the layout of the plan, its states and feedback, and the line search's step lengths."""
+    n, state, inputs = ocp.stages, ocp.state.elements, ocp.input.elements
+    return Layout(
+        (
+            Signal("plan_inputs", tuple(f"{i}@{k}" for k in range(n) for i in inputs)),
+            Signal("plan_states", tuple(f"{s}@{k}" for k in range(n) for s in state)),
+            Signal("plan_gains", tuple(f"{i}/{s}@{k}" for k in range(n) for s in state for i in inputs)),
+            scalar("plan_gamma", start=0.0),
+            scalar("plan_step", start=0.0),
+        )
+    )
+
 
 _TEXTS = ("kernels", "fixed_point", "entry")
 
@@ -93,7 +146,7 @@ def _constants(ocp: OptimalControl, settings: PlainSettings) -> dict[str, object
         "SHORTEST": SHORTEST,
         "DRAWN_IN": DRAWN_IN,
         "ROUNDING": ROUNDING,
-        "PLAIN": MOST_PLAIN,
+        "PLAIN": _MOST_PLAIN,
         "UNTRIED": UNTRIED,
         "FINITE": FINITE,
         "PIVOT": PIVOT,
@@ -103,3 +156,126 @@ def _constants(ocp: OptimalControl, settings: PlainSettings) -> dict[str, object
         "INFEASIBLE": int(Status.INFEASIBLE),
         "NON_FINITE": int(Status.NON_FINITE),
     }
+
+
+_SEARCHES: Latest[Search] = Latest(4)
+
+
+def plain_graph(ocp: OptimalControl, settings: PlainSettings, name: str) -> ca.Function:
+    """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
+    arguments, memory = call_symbols(ocp)
+    search, anchor = _search(ocp, settings), first_anchor(ocp, arguments, memory)
+    if settings.converging:
+        anchor, count = _converged(ocp, settings, search, arguments, anchor)
+        return ca.Function(name, [*arguments, memory], _results(ocp, settings, arguments, memory, anchor, count - 1))
+    for _ in range(settings.iterations):
+        anchor, plan = search.tried(anchor, arguments)
+        anchor = search.directed(anchor, plan, arguments)
+    anchor, _ = search.tried(anchor, arguments)
+    results = _results(ocp, settings, arguments, memory, anchor, settings.iterations)
+    return ca.Function(name, [*arguments, memory], results)
+
+
+def call_symbols(ocp: OptimalControl) -> tuple[Arguments, ca.MX]:
+    """Return symbols of the arguments and of the memory of one call."""
+    nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
+    s0, data = ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
+    lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
+    return Arguments(s0, data, lower, upper), ca.MX.sym("memory", plain_memory(ocp).size)
+
+
+def first_anchor(ocp: OptimalControl, arguments: Arguments, memory: ca.MX) -> Anchor:
+    """Return the remembered plan, not evaluated yet; a memory that is not finite is forgotten."""
+    nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
+    remembered = plain_memory(ocp).split(ca.if_else(is_finite(memory), memory, 0))
+    inputs = clip(ca.reshape(remembered["plan_inputs"], nu, n), arguments.lower, arguments.upper)
+    none = ca.MX.zeros(nu, n)
+    first = first_gamma(ocp, arguments.data)
+    resume = ca.if_else(remembered["plan_step"] > 0, ca.fmin(remembered["plan_step"], 1), 1)
+    # After a rejected T a longer gamma would be rejected again, in every call of one iteration.
+    longer = ca.if_else(resume < SHORTEST, 1, 2) * remembered["plan_gamma"]
+    gamma = ca.if_else(remembered["plan_gamma"] > 0, ca.fmin(longer, first), first)
+    return Anchor(
+        inputs=inputs,
+        states=ca.reshape(remembered["plan_states"], ns, n),
+        move=none,
+        gains=ca.reshape(remembered["plan_gains"], nu, ns * n),
+        plain=clip(none, arguments.lower, arguments.upper),
+        slope=none,
+        value=ca.MX(10 * UNTRIED),
+        envelope=ca.MX(10 * UNTRIED),
+        step=ca.MX(1),
+        gamma=gamma,
+        resume=resume,
+    )
+
+
+def _search(ocp: OptimalControl, settings: PlainSettings) -> Search:
+    own = settings.hessian, settings.damping
+    return _SEARCHES.of((ocp, settings.map), own, lambda: Search(ocp, settings.hessian, settings.map, settings.damping))
+
+
+def _converged(
+    ocp: OptimalControl, settings: PlainSettings, search: Search, arguments: Arguments, anchor: Anchor
+) -> tuple[Anchor, ca.MX]:
+    """The anchor after the last iteration that is needed, and how many plans were tried."""
+    count, plain = ca.MX(0), ca.MX(0)
+    symbols = Anchor(*(ca.MX.sym(name, *v.shape) for name, v in zip(Anchor._fields, anchor, strict=True)))
+    tried, plan = search.tried(symbols, arguments)
+    work = ca.Function("fpirhc_iteration", [*arguments, *symbols], list(search.directed(tried, plan, arguments)))
+    rest = ca.Function("fpirhc_rest", [*arguments, *symbols], list(symbols))
+    choice = ca.Function.if_else("fpirhc_iteration_if_needed", work, rest)
+    again = _needed(ocp, settings, arguments, symbols)
+    for _ in range(settings.iterations + 1):
+        needed = again(*arguments, anchor.inputs, anchor.slope, anchor.value, plain)
+        plain += ca.logic_and(needed, anchor.step < SHORTEST)
+        anchor, count = Anchor(*choice(needed, *arguments, *anchor)), count + needed
+    return anchor, count
+
+
+def _needed(ocp: OptimalControl, settings: PlainSettings, arguments: Arguments, anchor: Anchor) -> ca.Function:
+    """Function (arguments, inputs, slope, value, plain steps) -> whether another iteration is needed."""
+    plain = ca.MX.sym("plain")
+    residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper, arguments.data)
+    solved = ca.logic_and(anchor.value < UNTRIED, residual <= ocp.number_in(settings.tolerance, arguments.data))
+    needed = ca.logic_and(ca.logic_not(solved), plain < _MOST_PLAIN)
+    return ca.Function("fpirhc_needed", [*arguments, anchor.inputs, anchor.slope, anchor.value, plain], [needed])
+
+
+def _results(
+    ocp: OptimalControl,
+    settings: PlainSettings,
+    arguments: Arguments,
+    memory: ca.MX,
+    anchor: Anchor,
+    iterations: ca.MX | int,
+) -> list[ca.MX]:
+    """Plan, diagnostics and memory at the end of a call."""
+    posed, evaluated = sane(*arguments), anchor.value < UNTRIED
+    finite = ca.logic_and(posed, evaluated)
+    residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper, arguments.data)
+    empty = ca.mmax(arguments.lower - arguments.upper) > 0
+    tolerance = ocp.number_in(settings.tolerance, arguments.data)
+    status = ca.if_else(empty, int(Status.INFEASIBLE), status_of(finite, residual, 0, tolerance))
+    numbers = ca.if_else(finite, ca.vertcat(anchor.value, residual), ca.MX.zeros(2))
+    solved = plain_memory(ocp).join(
+        {
+            "plan_inputs": ca.vec(anchor.inputs),
+            "plan_states": ca.vec(anchor.states),
+            "plan_gains": ca.vec(anchor.gains),
+            "plan_gamma": anchor.gamma,
+            "plan_step": anchor.step,
+        }
+    )
+    # A remembered plan under which a well-posed problem overflows is given up, so that the next call can succeed.
+    next_memory = ca.if_else(finite, solved, ca.if_else(posed, _afresh(ocp, arguments), memory))
+    return [anchor.inputs, ca.vertcat(numbers, 0, iterations, status), next_memory]
+
+
+def _afresh(ocp: OptimalControl, arguments: Arguments) -> ca.MX:
+    """The memory of a plan in the middle of the limits: without any input a plant may run empty."""
+    lower, upper = arguments.lower, arguments.upper
+    both = ca.logic_and(ca.fabs(lower) <= FINITE, ca.fabs(upper) <= FINITE)
+    middle = ca.if_else(both, 0.5 * (lower + upper), 0)
+    rest = plain_memory(ocp).size - ocp.stages * ocp.input.size
+    return ca.vertcat(ca.repmat(middle, ocp.stages, 1), ca.MX.zeros(rest))

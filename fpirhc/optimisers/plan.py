@@ -12,11 +12,8 @@ import numpy as np
 from fpirhc.by_name import ByName
 from fpirhc.fields.checked_call import checked_call
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.rollout import rollout
-from fpirhc.optimisers.base import Optimiser, judge
-from fpirhc.optimisers.improved import improved
-from fpirhc.optimisers.infeasible import reasons
-from fpirhc.optimisers.multipliers import fit_multipliers
+from fpirhc.horizon.rollout import reduced_gradient, rollout
+from fpirhc.optimisers.base import FEASIBLE, Optimiser, improved, judge
 from fpirhc.optimisers.scales import tolerated
 from fpirhc.status import Status
 from fpirhc.summary import line, number, table
@@ -76,7 +73,7 @@ class Plan:
     @cached_property
     def state_multipliers(self) -> np.ndarray:
         """Multipliers of the state bounds, shape (ns, N), fitted to the plan alone, without its optimiser."""
-        return fit_multipliers(self.problem, self.inputs, self.states[:, 0], self.data, self.bounds)
+        return _fit_multipliers(self.problem, self.inputs, self.states[:, 0], self.data, self.bounds)
 
     def violations(self) -> tuple[str, ...]:
         """Return the five worst violations of state bounds in words, the first state first; empty when there are none."""
@@ -96,7 +93,7 @@ class Plan:
 
     def reasons(self) -> tuple[str, ...]:
         """Return for every limit that the plan violates what stops it, and whether softening would help."""
-        return reasons(self.problem, self.states, self.inputs, self.bounds)
+        return _reasons(self.problem, self.states, self.inputs, self.bounds)
 
     def overflow(self) -> str:
         """Return where the plan stops being finite: the state, input or cost term and its stage, in words; empty when nowhere."""
@@ -187,3 +184,174 @@ def solve(
 
 def _shown(value: float | None, text: Callable[[float], str]) -> str:
     return "none" if value is None else text(value)
+
+
+_EQUATION = 1e-6  # limits closer together than this are an equation
+_AT_LIMIT = 1e-3  # of its range: an input this near counts as at its limit
+_MOSTLY = 0.5  # share of the stages on which an input that stands at its limit is named
+
+
+@dataclass(frozen=True, eq=False)
+class _Breach:
+    """One side of one limit, and by how much the states s_0 ... s_N are beyond it.
+
+    Args:
+        name: of the state.
+        unit: of the state.
+        limit: the number.
+        side: 'above' or 'below'.
+        beyond: shape (N + 1,), zero where the limit is kept; s_0 of a written entry counts as kept.
+        equation: whether both sides are the same.
+        tolerated: violation that still counts as kept.
+    """
+
+    name: str
+    unit: str
+    limit: float
+    side: str
+    beyond: np.ndarray
+    equation: bool
+    tolerated: float
+
+    @property
+    def stages(self) -> np.ndarray:
+        """The nodes after the first one at which it is violated."""
+        return 1 + np.flatnonzero(self.beyond[1:] > self.tolerated)
+
+
+def _breaches(ocp: OptimalControl, states: np.ndarray) -> list[_Breach]:
+    """The hard limits that a trajectory violates after its first state, the largest violation first."""
+    violated, most = [], tolerated(ocp)
+    for k in np.flatnonzero(ocp.hard).tolist():
+        low, high = ocp.state_lower[k], ocp.state_upper[k]
+        with np.errstate(invalid="ignore"):  # a plan that is not finite is beyond no limit
+            sides = ("above", high, states[k] - high), ("below", low, low - states[k])
+        for side, limit, over in sides:
+            beyond = np.where(np.isfinite(over), np.maximum(over, 0), 0.0)
+            if k >= ocp.state.size - ocp.written:
+                beyond[0] = 0
+            equation = bool(high - low <= _EQUATION)
+            one = _Breach(
+                ocp.state.elements[k], ocp.state.units[k], float(limit), side, beyond, equation, float(most[k])
+            )
+            if one.stages.size:
+                violated.append(one)
+    return sorted(violated, key=lambda b: -float(b.beyond[1:].max()))
+
+
+def _reasons(
+    ocp: OptimalControl, states: np.ndarray, inputs: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
+) -> tuple[str, ...]:
+    """One sentence for every violated limit: what stops the plan of least violation, and whether a soft limit would help.
+
+    Where the limit is passed, whether the plan comes back, and which inputs are at their limits meanwhile differ in their remedies.
+    """
+    violated = _breaches(ocp, states)
+    sentences = []
+    for breach in violated:
+        stuck = _at_their_limits(ocp, inputs[:, : int(breach.stages[-1])], bounds)
+        others = [f"'{b.name}'" for b in violated if b is not breach]
+        sentences.append(_sentence(ocp, breach, stuck, others))
+    return tuple(sentences)
+
+
+def _sentence(ocp: OptimalControl, breach: _Breach, stuck: list[str], others: list[str]) -> str:
+    last, most = int(breach.stages[-1]), float(breach.beyond[1:].max())
+    amount = f"{most:.3g} {breach.unit}".strip()
+    length = f"{ocp.stages} stages ({ocp.stages * ocp.step:g} {ocp.time_unit})"
+    held = f" with {' and '.join(stuck)} at the limit" if stuck else ""
+    if breach.equation and breach.name.endswith(" at the end"):
+        return (
+            f"'{breach.name}' misses the reference by {amount}{held}: a horizon of {length} is too short to reach it; "
+            f"lengthen it, or take '{breach.name.removesuffix(' at the end')}' out of Horizon(terminal=...)"
+        )
+    limit = f"'{breach.name}' {breach.side} {breach.limit:g}"
+    begins = breach.beyond[0] > breach.tolerated
+    start = f"begins {breach.beyond[0]:.3g} {breach.unit} beyond it".replace("  ", " ") if begins else "begins inside"
+    if last == ocp.stages:
+        left = f"{breach.beyond[-1]:.3g} {breach.unit}".strip()
+        why = "softening would not bring it inside" if begins else "softening would only let it leave"
+        return (
+            f"{limit}: {start} and is still {left} beyond at the end of {length}{held}; {why}. {_remedy(stuck, others)}"
+        )
+    back = f"stage {last + 1} ({(last + 1) * ocp.step:g} {ocp.time_unit})"
+    middle = "cannot be back" if begins else f"passes it by {amount} and cannot be back"
+    return (
+        f"{limit}: {start}, {middle} before {back}{held}; softening helps: with "
+        f"Limits(soft={{{_softened(breach.name)!r}: ...}}) the limit is violated until then, and kept afterwards"
+    )
+
+
+def _remedy(stuck: list[str], others: list[str]) -> str:
+    if stuck:
+        return "Give the inputs more range, lengthen the horizon, or widen the limit"
+    if others:
+        return f"No input is at its limit, so limits contradict one another: it stands against {', '.join(others)}"
+    return "No input is at its limit: the inputs do not reach this state within the horizon; lengthen it or widen the limit"
+
+
+def _softened(name: str) -> str:
+    return name.removesuffix(" rate").removesuffix(" with margin")
+
+
+def _at_their_limits(ocp: OptimalControl, inputs: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> list[str]:
+    """Inputs that stand at a limit on most of these stages."""
+    lower, upper = bounds
+    with np.errstate(invalid="ignore"):
+        reach = np.where(np.isfinite(upper - lower), upper - lower, 1.0)
+    near = _AT_LIMIT * reach[:, None]
+    share = ((inputs - lower[:, None] <= near) | (upper[:, None] - inputs <= near)).mean(axis=1)
+    return [f"'{ocp.input.elements[k]}'" for k in np.flatnonzero(share >= _MOSTLY)]
+
+
+_AT_BOUND = 1e-6  # relative distance within which an input counts as at its bound
+
+
+def _fit_multipliers(
+    ocp: OptimalControl, inputs: np.ndarray, state: np.ndarray, data: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """The multipliers M (ns, N) of state bounds, each with the sign of its bound; zero where no state is at a bound.
+
+    At a solution g + (dS/dU)' M = 0 in every input that is not at its own bound: a non-negative least-squares problem.
+    """
+    none = np.zeros((ocp.state.size, ocp.stages))
+    if not ocp.bounds_states:
+        return none
+    slope, states, sensitivity = (np.asarray(v.full()) for v in sensitivity_of(ocp)(state, inputs, data))
+    flat = states[:, 1:].ravel(order="F")
+    upper = flat >= np.tile(ocp.state_upper, ocp.stages) - FEASIBLE
+    lower = flat <= np.tile(ocp.state_lower, ocp.stages) + FEASIBLE
+    free = ~_at_bound(inputs, bounds).ravel(order="F")
+    if not (upper.any() or lower.any()) or not free.any() or not np.isfinite(sensitivity).all():
+        return none
+    # Rows in the units of the stationarity, so that the fit weighs what is judged.
+    weight = np.tile(1 / (ocp.step * ocp.curvature), ocp.stages)[free]
+    columns = weight[:, None] * sensitivity.T[free]
+    return _fit(columns, -weight * slope.ravel(order="F")[free], upper, lower).reshape(none.shape, order="F")
+
+
+def _fit(columns: np.ndarray, target: np.ndarray, upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
+    from scipy.optimize import nnls
+
+    signed = np.hstack([columns[:, upper], -columns[:, lower]])
+    size = np.maximum(np.linalg.norm(signed, axis=0), 1e-300)
+    weights, _ = nnls(signed / size, target)
+    fitted = np.zeros(upper.size)
+    fitted[upper] += (weights / size)[: upper.sum()]
+    fitted[lower] -= (weights / size)[upper.sum() :]
+    return fitted
+
+
+def _at_bound(inputs: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    near = _AT_BOUND * (1 + np.abs(inputs))
+    return (inputs <= bounds[0][:, None] + near) | (inputs >= bounds[1][:, None] - near)
+
+
+def sensitivity_of(ocp: OptimalControl) -> ca.Function:
+    """Return the Function (s0, U, data) -> (g, S, d vec(s_1 ... s_N) / d vec(U))."""
+    s0, data = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size, ocp.stages + 1)
+    inputs = ca.MX.sym("U", ocp.input.size, ocp.stages)
+    states, _, _ = rollout(ocp)(s0, inputs, data)
+    slope = reduced_gradient(ocp)(s0, inputs, data, ca.MX.zeros(ocp.state.size, ocp.stages))[1]
+    sensitivity = ca.jacobian(ca.vec(states[:, 1:]), ca.vec(inputs))
+    return ca.Function("fpirhc_sensitivity", [s0, inputs, data], [slope, states, ca.densify(sensitivity)])

@@ -10,7 +10,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.errors import NotSupported
-from fpirhc.horizon.followed_state import followed_state
+from fpirhc.horizon.nominal import followed_state
 from fpirhc.horizon.stage_data import data_layout, stage_data
 
 K = 3.0  # 1/s

@@ -10,10 +10,10 @@ from plants import chain, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
-from fpirhc.horizon.auxiliary import auxiliary_gradient, auxiliary_hessian
 from fpirhc.horizon.rollout import reduced_gradient, rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
+from fpirhc.optimisers.full_space import auxiliary_gradient, auxiliary_hessian
 
 TASK = fp.load_problem("two_mass")
 PENDULUM_REFERENCE = fp.Trajectory(lambda t: {"angle": 0.5 * ca.sin(2 * t)})

@@ -15,13 +15,11 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.errors import NotSupported
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.rollout import rollout
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import status_of
-from fpirhc.optimisers.nlp import Ipopt, SequentialQuadratic
-from fpirhc.optimisers.quadratic_solvers import Osqp, quadratic_solver
+from fpirhc.optimisers.nlp import Ipopt, Osqp, SequentialQuadratic
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.functions import SMOOTHING, signed_power
@@ -67,12 +65,6 @@ def test_osqp_fills_infeasible_answers_with_finite_numbers():
     first = np.array([2.0, 1.0])
     _, diagnosis, _ = optimiser.step(ocp)(first, ocp.nodes[2], ocp.input_lower, ocp.input_upper, memory)
     assert fp.Status(int(diagnosis[4])) != fp.Status.OK
-
-
-def test_fatrop_is_no_quadratic_solver():
-    """CasADi's conic interface to fatrop returned infeasible points as solved: it is refused."""
-    with pytest.raises(NotSupported, match="fatrop"):
-        quadratic_solver("fatrop")
 
 
 def test_ipopt_prints_nothing(capfd):

@@ -11,9 +11,9 @@ from test_fixed_point import linear_problem, pendulum_problem
 
 import fpirhc as fp
 from fpirhc.errors import NotContractive, NotSupported
-from fpirhc.horizon.auxiliary import auxiliary_hessian
 from fpirhc.horizon.reference_expansion import steepest_curvature
 from fpirhc.horizon.rollout import reduced_gradient
+from fpirhc.optimisers.full_space import auxiliary_hessian
 
 FIRST = np.array([0.5, -0.5])
 

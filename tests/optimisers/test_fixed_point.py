@@ -20,7 +20,7 @@ from fpirhc.horizon.rollout import reduced_gradient
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import judge
-from fpirhc.optimisers.plain_graph import call_symbols, first_anchor
+from fpirhc.optimisers.plain import call_symbols, first_anchor
 from fpirhc.optimisers.search import Search
 from fpirhc.symbolic.driver import substitute
 from fpirhc.symbolic.native import find_compiler, generate, native

@@ -20,7 +20,6 @@ from fpirhc.horizon.rollout import rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import judge
-from fpirhc.optimisers.quadratic_solvers import quadratic_solver
 from fpirhc.symbolic.native import generate, native
 
 TASK: Any = fp.load_problem("two_mass")
@@ -144,15 +143,11 @@ def test_memory_is_shifted_by_one_stage(optimiser):
 
 
 def test_settings_are_checked():
-    """Numbers that cannot be meant are refused; traps among the solvers are refused by name with the reason."""
+    """Numbers that cannot be meant are refused."""
     with pytest.raises(InvalidValue, match=r"ReducedGradient.iterations: expected a whole number from 1"):
         fp.ReducedGradient(iterations=0, tolerance=1e-3)
     with pytest.raises(InvalidValue, match="positive tolerance"):
         fp.Ipopt(tolerance=0.0)
-    with pytest.raises(NotSupported, match="infeasible points marked as solved"):
-        quadratic_solver("fatrop")
-    with pytest.raises(InvalidValue, match="Did you mean 'osqp'"):
-        quadratic_solver("osq")
 
 
 def receding(optimiser, deformation=None, **settings):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import fpirhc as fp
 from fpirhc.controllers.receding_horizon import RecedingHorizon
 from fpirhc.controllers.wrappers.exact_model import ExactModel
-from fpirhc.optimisers.plain_graph import plain_graph
+from fpirhc.optimisers.plain import plain_graph
 
 
 def test_a_comparison_composes_every_controller_once(monkeypatch):
