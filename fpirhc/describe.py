@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import Field, fields, is_dataclass, replace
+from dataclasses import MISSING, Field, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -36,6 +36,18 @@ def describe(value: Any) -> Any:
 def _is_setting(one: Field[Any], content: object) -> bool:
     kind = one.metadata.get("setting", True)
     return bool(content) if kind == "where given" else bool(kind)
+
+
+def as_written(value: Any) -> str:
+    """Return a dataclass as a user would write it: 'Class(field=...)' with those fields that differ from their defaults."""
+    told = [(f.name, getattr(value, f.name)) for f in fields(value) if f.init and _differs(f, getattr(value, f.name))]
+    return f"{type(value).__name__}({', '.join(f'{name}={content!r}' for name, content in told)})"
+
+
+def _differs(one: Field[Any], content: object) -> bool:
+    if one.default_factory is not MISSING:
+        return repr(content) != repr(one.default_factory())
+    return one.default is MISSING or repr(content) != repr(one.default)
 
 
 def replaced(value: Value, field: str, content: object) -> Value | None:

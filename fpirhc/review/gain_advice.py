@@ -37,7 +37,7 @@ def gain_advice(case: Case, boxed: Spectrum, null: Answer | None) -> Recommended
     low, high = (share * end for end in report.sector_limit)
     if low < high and not low < deformation.effective_gain() < high:
         safe = _with_gain(case, 0.5 * (low + high))
-        return gain_advice(safe, boxed, leaves_right_model_alone(safe))
+        return replace(gain_advice(safe, boxed, leaves_right_model_alone(safe)), exceeded=True)
     advice = recommended_gain(deformation, report, share, case.by_gain)
     if advice.why_not:
         return advice

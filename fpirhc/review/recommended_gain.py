@@ -46,6 +46,7 @@ class Recommended:
         sets: which limit that is.
         why_not: why none is recommended; empty where one is.
         lowered: whether it is less than half of the limit, so that the loop keeps its margins.
+        exceeded: whether the gain in use is beyond the limit.
     """
 
     value: float
@@ -53,6 +54,7 @@ class Recommended:
     sets: str
     why_not: str = ""
     lowered: bool = False
+    exceeded: bool = False
 
     @property
     def text(self) -> str:

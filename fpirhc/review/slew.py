@@ -19,7 +19,7 @@ from fpirhc.review.linear import LinearLoop, controlled_gain
 from fpirhc.review.straight import straightened
 
 QUESTION = "Is the map fast enough for reference and disturbances?"
-_SPARE = 2.0  # how many times faster than the reference the map should be
+SPARE = 2.0  # how many times faster than the reference the map should be
 _POINTS = 2001
 _CYCLES = 1000  # after the start
 
@@ -49,8 +49,8 @@ def slew_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray
     if sudden:
         text += f"; a jump of a disturbance takes the map {math.ceil(sudden / step)} cycles"
     ratio = step / problem.period / max(needed, 1e-300)
-    change = f"Raise the map's scale at least {_SPARE / ratio:.2g} times, or leave it out to have it chosen."
-    if ratio >= _SPARE:
+    change = f"Raise the map's scale at least {SPARE / ratio:.2g} times, or leave it out to have it chosen."
+    if ratio >= SPARE:
         return Answer(QUESTION, Verdict.YES, text, "", numbers)
     return Answer(QUESTION, Verdict.NO if ratio < 1 else Verdict.UNKNOWN, text, change, numbers)
 

@@ -1,10 +1,11 @@
-"""Is the gain large enough? The reason that a review gives, for the verdict on a run in which adaptation did not help."""
+"""Is it the gain? What a review says of one, for the verdict on a run in which adaptation did not help."""
 
 from __future__ import annotations
 
 from fpirhc.broken import attempted
 from fpirhc.controllers.base import Controller
 from fpirhc.review.answer import Answer, Verdict
+from fpirhc.review.gain_advice import recommended_for
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
 from fpirhc.review.neighbourhood import spectrum_near
@@ -15,15 +16,19 @@ from fpirhc.review.speed import fast_enough
 from fpirhc.task.problem import Problem
 
 
-def slow_gain(problem: Problem, controller: Controller) -> str:
-    """Return evidence and advice of a review that answers no to 'Does the iteration keep up?'; empty where it does not.
+def reviewed_gain(problem: Problem, controller: Controller, *, grows: bool) -> str:
+    """Return what a review says of the gain: the recommended one where errors grow, else whether it is too small, else nothing.
 
     Args:
         problem: of the run.
         controller: resolved.
+        grows: whether the iteration is no contraction along the run.
     """
     if controller.deforms_target or not controller.deformation.adapts:
         return ""
+    if grows:
+        advice = recommended_for(problem, controller)
+        return "" if advice is None else f"Its gain{' is too large' if advice.exceeded else ''}: {advice.text}."
     answer = attempted("the speed of the iteration", _answer, problem, controller, broken=[])
     if answer is None or answer.verdict is not Verdict.NO:
         return ""

@@ -27,6 +27,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.fields.checked_call import checked_call
+from fpirhc.plant.units import derivative_unit, with_space
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Feedback
@@ -41,12 +42,14 @@ class LyapunovView:
         response_error: h, shape (cycles - 1, controlled coordinates).
         rate: of the law, 1/s.
         since: first cycle of the measured part.
+        unit: of S; empty where coordinates have several.
     """
 
     surface: np.ndarray
     response_error: np.ndarray
     rate: float
     since: int
+    unit: str = ""
 
     @property
     def function(self) -> np.ndarray:
@@ -72,7 +75,10 @@ class LyapunovView:
     def text(self) -> str:
         """One sentence for a reader of results."""
         first = float(np.sqrt(2 * self.function[self.since]))
-        text = f"Lyapunov: |S| at most {self.largest:.3g}; ultimate bound sup|h| / rate = {self.ultimate:.3g}"
+        unit = with_space(self.unit) if self.unit else " (coordinates of several units)"
+        text = (
+            f"Lyapunov: |S| at most {self.largest:.3g}{unit}; ultimate bound sup|h| / rate = {self.ultimate:.3g}{unit}"
+        )
         return (
             text
             if first <= self.ultimate
@@ -95,7 +101,17 @@ def lyapunov_view(problem: Problem, controller: Controller, run: Run) -> Lyapuno
     if rate is None or any(law.rate != rate for law in laws):
         return None
     surface, response_error = _signals(problem, laws, rate, run)
-    return LyapunovView(surface, response_error, rate, since)
+    return LyapunovView(surface, response_error, rate, since, _unit(problem))
+
+
+def _unit(problem: Problem) -> str:
+    """Unit of S = (d/dt + rate)^n e_int, that of a derivative of order n - 1; empty where coordinates have several."""
+    plant, time = problem.plant.face, problem.time_unit
+    units = {
+        derivative_unit(plant.coordinates[n], plant.orders[plant.names.index(n)] - 1, time)
+        for n in plant.controlled_names
+    }
+    return units.pop() if len(units) == 1 else ""
 
 
 def _feedbacks(problem: Problem, controller: Controller) -> list[Feedback]:

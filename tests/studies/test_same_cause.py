@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
+from test_verdict import case
 from test_verdict_sentences import EFFORT, entry, first, no_difference
 
 import fpirhc as fp
-from fpirhc.review.slow_gain import slow_gain
+from fpirhc.review.gain_advice import recommended_for
+from fpirhc.review.slow_gain import reviewed_gain
 from fpirhc.studies.comparison.outcome import Outcome
 
 SLOW = "Its gain is too small: the effective gain is 0.1. Use gain = -3 or more."
@@ -31,18 +34,28 @@ def test_a_gentle_gain_is_blamed_and_not_the_limits_that_it_swings_between(daily
     assert comparison.outcome is Outcome.WORSE
     assert f" Its gain is too small: {slow.evidence}. {slow.change}" in comparison.verdict[0]
     assert "stands at a limit" not in comparison.verdict[0]
-    assert slow_gain(daily.problem, daily.controllers["RHC+FPI"]) == ""
-    assert slow_gain(daily.problem, daily.controllers["RHC"]) == ""
+    assert reviewed_gain(daily.problem, daily.controllers["RHC+FPI"], grows=False) == ""
+    assert reviewed_gain(daily.problem, daily.controllers["RHC"], grows=True) == ""
+
+
+def test_a_gain_that_is_too_large_is_told_with_the_recommended_one():
+    """The verdict, the review and the refusal name one number, 1 / 1.6 times half of 2; a note beside the row says it no more."""
+    task = case(fp.BeyondLimit(fp.Affine(gain=-2.9)))
+    comparison = fp.compare(task, seed=0, compiled=False)
+    advice: Any = recommended_for(task.problem, task.controllers["adaptive"])
+    assert comparison.verdict[0].endswith(f"(predicted factor 1.32). Its gain is too large: {advice.text}.")
+    assert advice.value == pytest.approx(-2 / 1.6, rel=0.01)
+    assert not [note for note in comparison["adaptive"].notes if "gain" in note]
 
 
 def test_causes_stand_in_the_order_in_which_they_act():
     """The cost before the plans, the plans before the gain; limits are an effect of the gain."""
     often = {"at_limit": {"": 0.9}, "status": {"NOT_CONVERGED": 0.0}}
-    assert no_difference(facts={"slow_gain": SLOW}, measured=often) == f" {SLOW}"
-    assert no_difference(facts={"slow_gain": SLOW}, settings={"weighs_effort": True}) == f"{EFFORT} {SLOW}"
-    assert no_difference(facts={"slow_gain": SLOW}, factor=1.5, growing=1.0).startswith(
-        " Its iteration is no contraction"
-    )
+    assert no_difference(facts={"reviewed_gain": SLOW}, measured=often) == f" {SLOW}"
+    assert no_difference(facts={"reviewed_gain": SLOW}, settings={"weighs_effort": True}) == f"{EFFORT} {SLOW}"
+    grows = " Its iteration is no contraction (predicted factor 1.5)."
+    assert no_difference(factor=1.5) == f"{grows} Lower the gain."
+    assert no_difference(facts={"reviewed_gain": "Its gain: 1."}, factor=1.5) == f"{grows} Its gain: 1."
 
 
 def test_a_weight_of_the_effort_is_named_whether_adaptation_helps_or_not():

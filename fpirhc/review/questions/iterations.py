@@ -11,7 +11,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import without_deformation
-from fpirhc.describe import describe
+from fpirhc.describe import as_written, describe
 from fpirhc.errors import FpirhcError
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.review.answer import Answer, Verdict
@@ -71,7 +71,7 @@ def _remedy(model: Problem, bare: Controller, optimiser: Optimiser) -> str:
             return "Take an optimiser that iterates until its plans are solved, or shorten the horizon."
         try:
             if unsolved(model, bare.with_optimiser(longer))[1] < MANY:
-                return f"Give the optimiser {times} times the iterations: {longer!r}."
+                return f"Give the optimiser {times} times the iterations: {as_written(longer)}."
         except FpirhcError:
             break
     return f"Not even {_MORE[-1]} times the iterations suffice: shorten the horizon, or make the cost or its reference gentler."

@@ -16,6 +16,7 @@ import numpy as np
 from fpirhc.plant.units import with_space
 from fpirhc.review.questions import effort
 from fpirhc.review.questions.iterations import MANY
+from fpirhc.review.slew import SPARE
 from fpirhc.status import Status
 from fpirhc.studies.comparison.changes import times
 from fpirhc.summary import in_percent
@@ -46,12 +47,16 @@ def causes(plain: Entry, adaptive: Entry) -> str:
 
 def _gain_cause(entry: Entry) -> str:
     one = entry.contraction
-    if one is None or one.growing < MANY:
-        return entry.slow_gain
+    if one is None or not grows(entry):
+        return entry.reviewed_gain
     share = "" if one.growing == 1 else f" in {in_percent(one.growing)} of the cycles"
-    return (
-        f"Its iteration is no contraction{share} (predicted factor {one.predicted:.3g}): {one.report.text.rstrip('.')}."
-    )
+    advice = entry.reviewed_gain or f"{one.report.text.rstrip('.')}."
+    return f"Its iteration is no contraction{share} (predicted factor {one.predicted:.3g}). {advice}"
+
+
+def grows(entry: Entry) -> bool:
+    """Whether the iteration is no contraction in so many cycles that the gain is the cause."""
+    return entry.contraction is not None and entry.contraction.growing >= MANY
 
 
 def _slew_cause(plain: Entry, adaptive: Entry) -> str:
@@ -62,7 +67,7 @@ def _slew_cause(plain: Entry, adaptive: Entry) -> str:
     largest = float(np.linalg.norm(np.diff(plain.run["desired"], axis=0), axis=1).max())
     if largest < limit:
         return ""
-    more = f"at least {1.25 * largest / limit:.2g} times"
+    more = f"at least {SPARE * largest / limit:.2g} times"
     change = f"raise its scale S {more}, or leave S out to have it chosen"
     if "scale" in adaptive.automatic:
         change = f"the scale S that was chosen automatically did not foresee this, so state one that is {more} as large"

@@ -40,8 +40,10 @@ class Yardstick:
         """What the rms error of a coordinate exceeds, in words: the range of its reference, or a quarter turn; else nothing."""
         error = entry.metrics.rms_error[name]
         if error > self.ranges.get(name, math.inf):
-            return f"the range of its reference {self.ranges[name]:.3g}"
-        return f"a quarter turn {self.turns[name]:.3g}" if error > self.turns.get(name, math.inf) else ""
+            return f"more than the range of its reference, {self.ranges[name]:.3g}{_unit(entry, name)}"
+        if error > self.turns.get(name, math.inf):
+            return f"more than a quarter turn, {self.turns[name]:.3g}{_unit(entry, name)}"
+        return ""
 
 
 def yardstick_of(problem: Problem, *, seed: int) -> Yardstick:

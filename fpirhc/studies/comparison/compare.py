@@ -41,7 +41,7 @@ from fpirhc.studies.comparison.information import information, sentences
 from fpirhc.studies.comparison.null_test import NullTest
 from fpirhc.studies.comparison.optimality import measure_optimality
 from fpirhc.studies.comparison.outcome import Finding, Outcome
-from fpirhc.studies.comparison.side_by_side import Built, beside_each_other, null_tests, with_slow_gains
+from fpirhc.studies.comparison.side_by_side import Built, beside_each_other, null_tests, with_reviewed_gains
 from fpirhc.studies.comparison.timing import CycleTime, measure_cycle, stepper_to_time
 from fpirhc.studies.comparison.verdict import findings
 from fpirhc.summary import line, number, table
@@ -209,7 +209,7 @@ def compare(
         partners=alone,
         unjudged=unjudged,
     )
-    entries = with_slow_gains(task.problem, entries, built, judge(entries))
+    entries = with_reviewed_gains(task.problem, entries, built, judge(entries))
     judged = judge(entries)
     pairs = [finding.pair for finding in judged if finding.pair]
     nulls = null_tests(task.problem, pairs, [*entries, *alone], built, sizes, seed=seed, broken=broken)
@@ -237,7 +237,9 @@ def compare(
 def _advised(task: Task, entries: Sequence[Entry], first: Finding, nulls: Sequence[NullTest]) -> list[Entry]:
     """The entries; the adaptive one of the first pair with the recommended gain, where it does not help and fails no null test."""
     failed = any(test.harmful for test in nulls if test.pair == first.pair)
-    if first.pair is None or failed or first.outcome not in (Outcome.WORSE, Outcome.MIXED, Outcome.DOUBTFUL):
+    adaptive = next((e for e in entries if first.pair and e.name == first.pair[1]), None)
+    said = adaptive is None or bool(adaptive.reviewed_gain)
+    if first.pair is None or failed or said or first.outcome not in (Outcome.WORSE, Outcome.MIXED, Outcome.DOUBTFUL):
         return list(entries)
     advice = recommended_for(task.problem, task.controllers[first.pair[1]])
     more = () if advice is None else (f"its gain: {advice.text}",)

@@ -57,7 +57,7 @@ class Entry:
         no_bound: why it is no bound, for an exact model that an adapted controller beats.
         information: what it measures and when it acts; None: not asked.
         automatic: settings of its deformation that were chosen automatically.
-        slow_gain: what a review says of a gain that is too small; empty where it is not, or was not asked.
+        reviewed_gain: what a review says of a gain that is too large or too small; empty where it is neither, or was not asked.
     """
 
     name: str
@@ -79,4 +79,4 @@ class Entry:
     no_bound: tuple[str, ...] = ()
     information: Information | None = None
     automatic: tuple[str, ...] = ()
-    slow_gain: str = ""
+    reviewed_gain: str = ""

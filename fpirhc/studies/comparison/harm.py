@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError
-from fpirhc.review.slow_gain import slow_gain
+from fpirhc.review.slow_gain import reviewed_gain
 from fpirhc.simulation.metrics import Metric, measure
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.simulate import Simulator, judged_run, simulator
@@ -73,7 +73,8 @@ def _harm(
         yardstick = yardstick_of(problem, seed=seed)
         finding = judge(plain, adaptive, yardstick)
         if finding.outcome is Outcome.WORSE:
-            finding = judge(plain, replace(adaptive, slow_gain=slow_gain(problem, loops[1].controller)), yardstick)
+            said = reviewed_gain(problem, loops[1].controller, grows=False)  # nothing predicts a contraction here
+            finding = judge(plain, replace(adaptive, reviewed_gain=said), yardstick)
         losses, cured = [finding.text] * (finding.outcome is Outcome.WORSE), plain.metrics.rms_error
     test = null_test(model, loops, pair, sizes, counted, cured=cured)
     return (*losses, *([test.text] if test.harmful else []))

@@ -10,10 +10,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from fpirhc.broken import attempted
-from fpirhc.review.slow_gain import slow_gain
+from fpirhc.review.slow_gain import reviewed_gain
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.simulate import Simulator
 from fpirhc.simulation.stepper import Stepper
+from fpirhc.studies.comparison.causes import grows
 from fpirhc.studies.comparison.entry_facts import no_bound_because
 from fpirhc.studies.comparison.null_test import NullTest, null_test
 from fpirhc.studies.comparison.other_rows import beaten_by
@@ -52,7 +53,7 @@ def beside_each_other(
     return shown
 
 
-def with_slow_gains(
+def with_reviewed_gains(
     problem: Problem, entries: Sequence[Entry], built: Mapping[str, Built], judged: Sequence[Finding]
 ) -> list[Entry]:
     """Return the entries with what a review says of their gain, where a pair's verdict is not plainly positive.
@@ -65,7 +66,9 @@ def with_slow_gains(
     """
     asked = {finding.pair[1] for finding in judged if finding.pair and finding.outcome is not Outcome.BETTER}
     return [
-        replace(e, slow_gain=slow_gain(problem, built[e.name].loop.controller)) if e.name in asked else e
+        replace(e, reviewed_gain=reviewed_gain(problem, built[e.name].loop.controller, grows=grows(e)))
+        if e.name in asked
+        else e
         for e in entries
     ]
 

@@ -92,15 +92,22 @@ def judge(plain: Entry, adaptive: Entry, yardstick: Yardstick) -> Finding:
     ratios = {n: c.ratio for n, c in counted.items()}
     lost_both = not_followed(plain, adaptive, list(counted), yardstick)
     if lost_both:
-        return Finding(f"{lost_both}{causes(plain, adaptive)}", Outcome.NOT_COMPARABLE, pair, ratios)
+        why = _of(adaptive, causes(plain, adaptive))
+        return Finding(f"{lost_both}{why}", Outcome.NOT_COMPARABLE, pair, ratios)
     text = _SENTENCES[outcome](plain, adaptive, list(counted.values())) + beside
     if outcome is not Outcome.BETTER:
         worse = left_alone_is_better(plain, adaptive, list(counted), yardstick)
-        return Finding(text + (f" {worse}" if worse else "") + causes(plain, adaptive), outcome, pair, ratios)
+        why = causes(plain, adaptive)
+        return Finding(text + (f" {worse}{_of(adaptive, why)}" if worse else why), outcome, pair, ratios)
     against = caveats(plain, adaptive, list(counted), yardstick)
     text += "".join(f" {s}" for s in (movement(plain, adaptive), effort_cause(adaptive)) if s)
-    against = re.sub("^Its ", f"{adaptive.name}: its ", against)  # nobody has been named yet
+    against = _of(adaptive, against)
     return Finding(f"{against} {text}" if against else text, Outcome.DOUBTFUL if against else outcome, pair, ratios)
+
+
+def _of(entry: Entry, sentences: str) -> str:
+    """Sentences with the controller that the first is about, where those before are about another, about two, or about none."""
+    return re.sub("^( ?)Its ", lambda found: f"{found[1]}{entry.name}: its ", sentences)
 
 
 def _changes(plain: Entry, adaptive: Entry, scales: Mapping[str, float]) -> dict[str, Change]:
@@ -111,14 +118,14 @@ def _changes(plain: Entry, adaptive: Entry, scales: Mapping[str, float]) -> dict
 def _better(plain: Entry, adaptive: Entry, changes: list[Change]) -> str:
     stays = [c for c in changes if c.outcome is Outcome.NO_DIFFERENCE]
     lower = _listed(adaptive, [c for c in changes if c not in stays])
-    rest = f"; that of {_listed(adaptive, stays, factors=False)} stays" if stays else ""
+    rest = f"; no clear change: {_listed(adaptive, stays, factors=False)}" if stays else ""
     return f"{adaptive.name} lowers the rms error of {lower}{rest}{_price(plain, adaptive)}."
 
 
 def _worse(_: Entry, adaptive: Entry, changes: list[Change]) -> str:
     stays = [c for c in changes if c.outcome is Outcome.NO_DIFFERENCE]
     higher = _listed(adaptive, [c for c in changes if c not in stays])
-    rest = f"; that of {_listed(adaptive, stays, factors=False)} stays" if stays else ""
+    rest = f"; no clear change: {_listed(adaptive, stays, factors=False)}" if stays else ""
     return f"{adaptive.name} does not help: it raises the rms error of {higher}{rest}."
 
 
@@ -126,7 +133,7 @@ def _mixed(_: Entry, adaptive: Entry, changes: list[Change]) -> str:
     higher, lower, stays = (
         [c for c in changes if c.outcome is one] for one in (Outcome.WORSE, Outcome.BETTER, Outcome.NO_DIFFERENCE)
     )
-    rest = f"; that of {_listed(adaptive, stays, factors=False)} stays" if stays else ""
+    rest = f"; no clear change: {_listed(adaptive, stays, factors=False)}" if stays else ""
     return (
         f"{adaptive.name} has mixed results: it raises the rms error of {_listed(adaptive, higher)} and lowers that of "
         f"{_listed(adaptive, lower)}{rest}."
