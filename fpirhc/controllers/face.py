@@ -29,7 +29,7 @@ def on_face(plant: Plant, block: Block) -> Block:
     own, name = plant.face.state.name, plant.output.name
 
     def renamed(layout: Layout) -> Layout:
-        return Layout(tuple(replace(s, name=name) if s.name == own else s for s in layout.signals))
+        return Layout(tuple([replace(s, name=name) if s.name == own else s for s in layout.signals]))
 
     def step(s: Signals) -> dict[str, Value]:
         seen = Signals({**vars(s), own: getattr(s, name)} if own in block.reads else vars(s))

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -71,44 +72,44 @@ class Gate:
     max_age: float | None = None
     gap: Gap | None = None
 
-    @property
+    @cached_property
     def reads(self) -> Layout:
         """What the step reads: as the controller, and the time stamp of the sample where its age counts."""
-        own = Layout(tuple(s for s in self.inner.reads.signals if s not in GAPS))
+        own = Layout(tuple([s for s in self.inner.reads.signals if s not in GAPS]))
         return own if self.max_age is None else own + Layout((scalar(TAKEN, "s"),))
 
-    @property
+    @cached_property
     def sample(self) -> Layout:
         """The signals of one sample that are checked."""
-        return Layout(tuple(s for s in self.reads.signals if s.name in _SAMPLE and s.name not in self.trusted))
+        return Layout(tuple([s for s in self.reads.signals if s.name in _SAMPLE and s.name not in self.trusted]))
 
-    @property
+    @cached_property
     def stored(self) -> Layout:
         """The signals of the last good sample that are kept: all for a graph, and the time stamp that the next one must exceed."""
-        return Layout(tuple(s for s in self.sample.signals if self.inner.opaque or s.name == TAKEN))
+        return Layout(tuple([s for s in self.sample.signals if self.inner.opaque or s.name == TAKEN]))
 
     @property
     def memory(self) -> Layout:
         """The last command, what is kept of the last good sample, the count of doubted ones, and the controller's memory."""
         plant = self.problem.plant
-        starts = {"state": tuple(float(v) for v in self.problem.start_state), TAKEN: (-FINITE,)}
+        starts = {"state": tuple(map(float, self.problem.start_state)), TAKEN: (-FINITE,)}
         if plant.outputs:
-            starts["output"] = tuple(float(v) for v in self.problem.start_output)
+            starts["output"] = tuple(map(float, self.problem.start_output))
         first = self.problem.inputs_before
-        held = Signal(HELD, plant.input.elements, plant.input.units, tuple(float(v) for v in first))
+        held = Signal(HELD, plant.input.elements, plant.input.units, tuple(map(float, first)))
         good = [replace(s, name=f"good_{s.name}", start=starts.get(s.name, s.start)) for s in self.stored.signals]
         doubted = [scalar(DOUBTED)] if self.plausible else []
         failed = [] if "memory" in self.trusted else [scalar(FAILED)]
         counts = self.gap.memory if self.gap is not None else ()
         return Layout((held, *good, *doubted, *failed, *counts)) + self.controller_memory
 
-    @property
+    @cached_property
     def controller_memory(self) -> Layout:
         """The controller's memory; of a graph as one signal, because a graph copies every signal of a long memory one by one."""
         memory = self.inner.memory
         if not self.inner.opaque:
             return memory
-        return Layout((Signal(INNER, memory.columns, memory.units, tuple(float(v) for v in memory.start())),))
+        return Layout((Signal(INNER, memory.columns, memory.units, tuple(map(float, memory.start()))),))
 
     def named(self, memory: Layout) -> Layout:
         """Return a layout with the controller's memory under the names of its signals, where it is one signal there."""

@@ -78,7 +78,8 @@ def with_measured_state(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
 def measured_reads(plant: Plant, blocks: Sequence[Block]) -> tuple[Signal, ...]:
     """Return the signals of the measured state and outputs and of their time, as far as some blocks read them."""
     every = measured_state(plant), measured_output(plant), replace(plant.time, name=MEASURED_TIME)
-    return tuple(signal for signal in every if any(signal.name in block.reads for block in blocks))
+    read = {name for block in blocks for name in block.reads.names}
+    return tuple([signal for signal in every if signal.name in read])
 
 
 def _instant_block(path: Path) -> Block:

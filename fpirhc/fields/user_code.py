@@ -177,9 +177,8 @@ def _holds_nan(made: Expression) -> bool:
         return False
     function = ca.Function("fpirhc_result", ca.symvar(made), [made])
     places = range(function.n_instructions())
-    return any(
-        function.instruction_id(k) == ca.OP_CONST and math.isnan(function.instruction_constant(k)) for k in places
-    )
+    constants = [function.instruction_constant(k) for k in places if function.instruction_id(k) == ca.OP_CONST]
+    return any(map(math.isnan, constants))
 
 
 def _first_line(text: str) -> str:

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import chain
+from itertools import accumulate
 from typing import cast
 
 import casadi as ca
@@ -108,7 +108,7 @@ class Block:
         symbols = {s.name: matrix.sym(s.name, s.size) for s in arguments}
         values = self.step(Signals(symbols))
         results = []
-        for signal, key in self._results():
+        for key, signal in self._results.items():
             if key not in values:
                 raise InvalidName(f"block '{self.name}' does not give '{key}'.{nearest(key, values)}")
             value = matrix(values[key])
@@ -117,7 +117,7 @@ class Block:
                     f"block '{self.name}' gives '{key}' with {value.numel()} entries, expected {signal.size}"
                 )
             results.append(ca.densify(value.reshape((signal.size, 1))))
-        keys = [key for _, key in self._results()]
+        keys = list(self._results)
         name, columns = PREFIX + self.name, list(symbols.values())
         function = ca.Function(name, columns, results, list(symbols), keys, {"allow_free": True})
         if not function.has_free():
@@ -130,9 +130,12 @@ class Block:
         columns[at:at], names = settings, [*self.reads.names, *_identifiers(settings), *self.memory.names]
         return ca.Function(name, columns, results, names, keys), inputs
 
-    def _results(self) -> list[tuple[Signal, str]]:
-        written = [(s, s.name) for s in self.writes.signals]
-        return written + [(s, f"{s.name}_next") for s in self.memory.signals]
+    @cached_property
+    def _results(self) -> dict[str, Signal]:
+        """The signals that the step returns, by their keys."""
+        results = {s.name: s for s in self.writes.signals}
+        results.update({f"{s.name}_next": s for s in self.memory.signals})
+        return results
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +181,7 @@ class Composite:
         stale = {name: words for part in parts for name, words in part.stale.items()}
         return Derived(signals, lambda: {name: value for part in parts for name, value in part.memory().items()}, stale)
 
-    @property
+    @cached_property
     def opaque(self) -> bool:
         """Whether some block holds operations that scalar expressions cannot."""
         return any(b.opaque for b in self.blocks)
@@ -210,8 +213,9 @@ class Composite:
 
     def _bridged(self) -> Composite:
         blocks = [bridged(b) for b in self.blocks]
-        gaps = (g for g in GAPS if g.name not in self.reads and any(g.name in b.reads for b in blocks))
-        return compose(self.name, self.reads + Layout(tuple(gaps)), blocks, self.delays, self.outputs)
+        read = {name for b in blocks for name in b.reads.names} - set(self.reads.names)
+        gaps = [g for g in GAPS if g.name in read]
+        return compose(self.name, self.reads + Layout((*gaps,)), blocks, self.delays, self.outputs)
 
 
 def bridged(block: Block) -> Block:
@@ -235,19 +239,19 @@ def compose(
         InvalidName: a block reads a signal that no earlier block writes, or two blocks write the same signal.
         InvalidShape: a reader and a writer disagree on a size.
     """
-    memory = Layout(tuple(d.now for d in delays) + tuple(s for b in blocks for s in b.memory.signals))
+    memory = Layout((*[d.now for d in delays], *[s for b in blocks for s in b.memory.signals]))
     held = {*reads.names, *memory.names}
-    reads = reads + Layout(tuple(s for s in open_settings(blocks).signals if s.name not in held))
+    reads = reads + Layout(tuple([s for s in open_settings(blocks).signals if s.name not in held]))
     inputs = {s.name: ca.MX.sym(s.name, s.size) for s in reads.signals}
     remembered = ca.MX.sym("memory", memory.size)
     known: dict[str, ca.MX] = {**memory.split(remembered), **inputs}
     next_memory: dict[str, ca.MX] = {}
     for block in blocks:
         call(block, known, next_memory)
-    trace = Layout(tuple(s for b in blocks for s in b.writes.signals if not s.name.startswith("_")))
+    trace = Layout(tuple([s for b in blocks for s in b.writes.signals if not s.name.startswith("_")]))
     for delay in delays:
         next_memory[delay.now.name] = _lookup(f"delay '{delay.now.name}'", delay.now, delay.source, known)
-    returned = [memory.join(next_memory), trace.join(known), *(known[o] for o in outputs)]
+    returned = [memory.join(next_memory), trace.join(known), *[known[o] for o in outputs]]
     function = ca.Function(
         PREFIX + name,
         [remembered, *inputs.values()],
@@ -274,22 +278,30 @@ def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix])
         InvalidName: a signal that it reads is not known, or one that it writes is.
         InvalidShape: they disagree on a size.
     """
-    reads = [_lookup(f"block '{block.name}'", s, s.name, known) for s in block.inputs.signals]
-    returned = block.function(*reads, *(known[m] for m in block.memory.names))
-    keys = [key for _, key in block._results()]
+    function, inputs = block._built
+    arguments = []
+    for s in inputs.signals:
+        value = known.get(s.name)
+        if value is None or value.numel() != s.size:
+            value = _lookup(f"block '{block.name}'", s, s.name, known)
+        arguments.append(value)
+    for m in block.memory.names:
+        arguments.append(known[m])
+    returned = function(*arguments)
     # A Function returns a tuple of several results, one bare result, and None for none.
-    values = returned if isinstance(returned, tuple) else (returned,) * len(keys)
-    results = cast(dict[str, Matrix], dict(zip(keys, values, strict=True)))
+    values = returned if isinstance(returned, tuple) else (returned,) * len(block._results)
+    results = cast(dict[str, Matrix], dict(zip(block._results, values, strict=True)))
     for name in block.writes.names:
         if name in known:
             raise InvalidName(f"block '{block.name}' writes '{name}', which is already written")
         known[name] = results[name]
-    next_memory.update({m: results[f"{m}_next"] for m in block.memory.names})
+    for m in block.memory.names:
+        next_memory[m] = results[f"{m}_next"]
 
 
 def open_settings(blocks: Sequence[Block]) -> Layout:
     """Return the signals of all settings and derived numbers that some blocks read."""
-    return _settings(chain.from_iterable(b.inputs.signals for b in blocks))
+    return _settings([s for b in blocks for s in b._built[1].signals])
 
 
 def unseen(block: Block, samples: Sequence[str]) -> Block:
@@ -335,7 +347,7 @@ def every(block: Block, cycles: int) -> Block:
         choice = ca.Function.if_else(f"{PREFIX}{block.name}_every", run, hold)
         due = getattr(signals, phase.name) < 0.5
         column = choice(due, *arguments)
-        values = dict(zip([key for _, key in block._results()], ca.vertsplit(column, _ends(block)), strict=True))
+        values = dict(zip(block._results, ca.vertsplit(column, _ends(block)), strict=True))
         values |= {f"{h}_next": values[s] for h, s in zip(held.names, block.writes.names, strict=True)}
         next_phase = getattr(signals, phase.name) + 1
         values[f"{phase.name}_next"] = ca.if_else(next_phase > cycles - 0.5, 0, next_phase)
@@ -347,7 +359,7 @@ def every(block: Block, cycles: int) -> Block:
 
 def _settings(signals: Iterable[Signal]) -> Layout:
     """The settings among some signals, each once."""
-    return Layout(tuple({s.name: s for s in signals if s.name.startswith(SETTING)}.values()))
+    return Layout((*{s.name: s for s in signals if s.name.startswith(SETTING)}.values(),))
 
 
 def _identifiers(names: Iterable[object]) -> list[str]:
@@ -357,10 +369,7 @@ def _identifiers(names: Iterable[object]) -> list[str]:
 
 
 def _ends(block: Block) -> list[int]:
-    ends = [0]
-    for signal, _ in block._results():
-        ends.append(ends[-1] + signal.size)
-    return ends
+    return [0, *accumulate(signal.size for signal in block._results.values())]
 
 
 def _branches(block: Block, held: Layout) -> tuple[ca.Function, ca.Function]:

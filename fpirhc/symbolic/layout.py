@@ -7,8 +7,9 @@ CasADi expressions alike. `Named` gives a vector's elements by attribute: `q.q1`
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import casadi as ca
@@ -37,7 +38,7 @@ class Signal:
     units: tuple[str, ...] = ()
     start: tuple[float, ...] = ()
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Number of entries."""
         return max(1, len(self.elements))
@@ -45,7 +46,7 @@ class Signal:
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the entries in a table: 'desired.q1', or the signal's name for a scalar."""
-        return tuple(f"{self.name}.{e}" for e in self.elements) or (self.name,)
+        return tuple([f"{self.name}.{e}" for e in self.elements]) or (self.name,)
 
     @property
     def entry_units(self) -> tuple[str, ...]:
@@ -67,7 +68,7 @@ def scalar(name: str, unit: str = "1", start: float = 0.0) -> Signal:
 def vector(name: str, elements: Sequence[str], units: Sequence[str] | str = "1", start: Sequence[float] = ()) -> Signal:
     """Return a vector signal with named elements; one unit serves all."""
     every = (units,) * len(elements) if isinstance(units, str) else tuple(units)
-    return Signal(name, tuple(elements), every, tuple(float(v) for v in start))
+    return Signal(name, tuple(elements), every, tuple(map(float, start)))
 
 
 class Named:
@@ -98,48 +99,36 @@ class Named:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """An ordered set of named signals in one flat vector."""
+    """An ordered set of named signals in one flat vector: their names in order, and the length of the vector."""
 
     signals: tuple[Signal, ...] = ()
+    names: tuple[str, ...] = field(init=False, repr=False)
+    size: int = field(init=False, repr=False)
+    _slices: dict[str, slice] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        names = [s.name for s in self.signals]
-        for name in names:
-            if names.count(name) > 1:
-                raise InvalidName(f"signal '{name}' appears twice in one layout")
+        slices, at = dict[str, slice](), 0
         for s in self.signals:
+            if s.name in slices:
+                raise InvalidName(f"signal '{s.name}' appears twice in one layout")
             if s.start and len(s.start) != s.size:
                 raise InvalidShape(f"signal '{s.name}' has {s.size} entries but {len(s.start)} start values")
-            if not np.all(np.isfinite(s.start_vector())):
+            if not all(map(math.isfinite, s.start)):
                 raise InvalidValue(f"start value of '{s.name}' is not finite: {s.start}")
-
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """Names of the signals in order."""
-        return tuple(s.name for s in self.signals)
-
-    @cached_property
-    def size(self) -> int:
-        """Length of the flat vector."""
-        return sum(s.size for s in self.signals)
+            slices[s.name] = slice(at, at + s.size)
+            at += s.size
+        # Layouts are built and asked many times while a loop is composed; their names and places are plain attributes.
+        vars(self).update(names=tuple(slices), size=at, _slices=slices)
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
         """Names of all entries of the flat vector."""
-        return tuple(c for s in self.signals for c in s.columns)
+        return tuple([c for s in self.signals for c in s.columns])
 
     @cached_property
     def units(self) -> tuple[str, ...]:
         """Units of all entries of the flat vector."""
-        return tuple(u for s in self.signals for u in s.entry_units)
-
-    @cached_property
-    def _slices(self) -> dict[str, slice]:
-        slices, at = {}, 0
-        for s in self.signals:
-            slices[s.name] = slice(at, at + s.size)
-            at += s.size
-        return slices
+        return tuple([u for s in self.signals for u in s.entry_units])
 
     def __getitem__(self, name: str) -> Signal:
         self.slice(name)
@@ -205,7 +194,7 @@ class Layout:
         """CasADi column -> expressions by name."""
         if not self.signals:
             return {}
-        ends = [0, *(place.stop for place in self._slices.values())]
+        ends = [0, *[place.stop for place in self._slices.values()]]
         return dict(zip(self.names, ca.vertsplit(flat, ends), strict=True))
 
     def join(self, expressions: Mapping[str, Matrix]) -> Matrix:

@@ -12,9 +12,11 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass
+from types import FunctionType
 from typing import NoReturn, TypeVar, cast
+from weakref import WeakValueDictionary
 
 import casadi as ca
 import numpy as np
@@ -29,6 +31,8 @@ Kind = TypeVar("Kind", float, ca.SX, ca.MX)
 Value = TypeVar("Value", ca.SX, ca.MX)
 _Of = Callable[[type], object]  # kind (float, ca.SX or ca.MX) -> number or expression of that kind
 _Operation = Callable[[object, object], object]
+_LEAVES = {float, int, bool, str, type(None), np.ndarray, FunctionType}
+_PLAIN: WeakValueDictionary[int, object] = WeakValueDictionary()  # frozen values without live numbers, by address
 
 
 class LiveNumber(SymbolicNumber):
@@ -209,22 +213,44 @@ def copied(value: T, changes: Mapping[str, object]) -> T:
 
 
 def _mapped(value: object, change: Callable[[LiveNumber], object]) -> object:
-    """The value with `change` applied to its live numbers; the same object where nothing changes."""
+    """The value with `change` applied to its live numbers; the same object where it has none."""
+    return _changed(value, change) if _has_live(value) else value
+
+
+def _changed(value: object, change: Callable[[LiveNumber], object]) -> object:
     if isinstance(value, LiveNumber):
         return change(value)
     if isinstance(value, Mapping):
-        entries = {key: _mapped(entry, change) for key, entry in value.items()}
-        return value if all(entries[key] is entry for key, entry in value.items()) else entries
+        return {key: _mapped(entry, change) for key, entry in value.items()}
     if isinstance(value, tuple | list):
-        items = [_mapped(entry, change) for entry in value]
-        same = all(new is old for new, old in zip(items, value, strict=True))
-        return value if same else type(value)(items)
-    if is_dataclass(value) and not isinstance(value, type):
-        contents = {f.name: getattr(value, f.name) for f in fields(value)}
-        changed = {name: _mapped(content, change) for name, content in contents.items()}
-        same = all(changed[name] is content for name, content in contents.items())
-        return value if same else copied(value, changed)
-    return value
+        return type(value)([_mapped(entry, change) for entry in value])
+    contents = {f.name: getattr(value, f.name) for f in fields(value)}  # type: ignore[arg-type]  # a dataclass
+    changed = {name: _mapped(content, change) for name, content in contents.items()}
+    same = all(changed[name] is content for name, content in contents.items())
+    return value if same else copied(value, changed)
+
+
+def _has_live(value: object) -> bool:
+    """Whether a live number stands in a value. Frozen ones that have none are remembered: most are searched many times."""
+    if isinstance(value, LiveNumber):
+        return True
+    parts: Iterable[object]
+    if isinstance(value, Mapping):
+        parts = value.values()
+    elif isinstance(value, tuple | list):
+        parts = value
+    elif is_dataclass(value) and not isinstance(value, type):
+        if _PLAIN.get(id(value)) is value:
+            return False
+        parts = [getattr(value, f.name) for f in fields(value)]
+    else:
+        return False
+    for part in parts:
+        if type(part) not in _LEAVES and _has_live(part):
+            return True
+    if is_dataclass(value):
+        _PLAIN[id(value)] = value
+    return False
 
 
 def _combined(operation: _Operation, left: object, right: object) -> LiveNumber:

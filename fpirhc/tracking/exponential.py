@@ -50,7 +50,7 @@ class Exponential(LinearLaw):
     def gains(self, order: int) -> tuple[float, ...]:
         """Gains of (e_int, e, e', ...) with the integral, of (e, e', ...) without; lowest derivative first."""
         degree = order + 1 if self.integral else order
-        return tuple(math.comb(degree, s) * power(self.rate, degree - s) for s in range(degree))
+        return tuple([math.comb(degree, s) * power(self.rate, degree - s) for s in range(degree)])
 
     @property
     def speed(self) -> float:

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import fpirhc as fp
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue
+from fpirhc.simulation.loop import close_loop
 from fpirhc.symbolic.block import Block, Delay, compose, every
 from fpirhc.symbolic.layout import Layout, Named, Signal, scalar, vector
+from fpirhc.symbolic.live import copied, is_live, live_number, live_numbers, nominal
+from fpirhc.symbolic.paths import changed_at
 
 U, Y = scalar("u"), scalar("y")
 
@@ -161,3 +168,30 @@ def test_layout_mistakes():
         Layout((Signal("q", ("a", "b"), (), (1.0,)),))
     with pytest.raises(InvalidName, match=r"coordinate 'q3' is unknown. Did you mean 'q[12]'"):
         _ = Named(("q1", "q2"), ca.SX.sym("q", 2), "coordinate").q3
+
+
+def test_a_live_number_is_found_in_a_copy_of_a_value_that_was_searched_before():
+    plain = replace(fp.Exponential(rate=6.0), largest=(1.0, 2.0))
+    assert nominal(plain) is plain
+    assert not is_live({"law": [plain]})
+    open_rate = changed_at(plain, "rate", live_number("rate", 6.0), copy=copied)
+    assert list(live_numbers([plain, open_rate])) == ["rate"]
+    assert nominal(open_rate) == plain
+
+
+def test_a_loop_is_closed_in_few_calls():
+    """Each call costs more than the work in it; searches of frozen values, names and places are done once."""
+    problem = fp.load_problem("two_mass").problem
+    law = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5))
+    calls = 0
+
+    def count(frame, event, _):
+        nonlocal calls
+        calls += event == "call" and "/fpirhc/" in frame.f_code.co_filename
+
+    sys.setprofile(count)
+    try:
+        close_loop(problem, law)
+    finally:
+        sys.setprofile(None)
+    assert calls <= 2000
